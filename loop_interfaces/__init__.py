@@ -1,0 +1,1 @@
+"""What the nodes share: topics, array codec, problem parameters, the nodes' event loop."""

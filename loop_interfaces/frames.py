@@ -1,0 +1,175 @@
+"""The array on the wire: std_msgs/Float64MultiArray with a four-number header, as CDR bytes.
+
+Every array of the loop travels as one `Float64MultiArray` whose `layout.dim` is labelled and filled
+in, whose `layout.data_offset` is 4 and whose `data` is
+
+    [run, episode, step, time, values...]        (values in row-major order of the dims)
+
+`run`, `episode` and `step` are whole numbers below 2^53 (exact in float64), `time` is simulated
+time in seconds. The bytes are the plain CDR encoding of the message (OMG CDR 1.0, as used by every
+ROS 2 middleware), so a node that uses ordinary message objects reads and writes the same thing;
+encoding them here once, with a prefix that depends only on the shape, keeps per-element Python out
+of the hot path.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+HEADER = 4
+"""Numbers in front of the values: run, episode, step, time."""
+MAX_ID = 2**53
+"""Ids are whole numbers below this: the largest range a float64 holds exactly."""
+MAX_VALUES = 2**24
+"""Largest number of values accepted in one array (128 MiB): the bound on what a peer can send."""
+
+
+class FrameError(ValueError):
+    """An array message that does not follow the interface; the text says what and what was expected."""
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One array of the loop with its header.
+
+    run, episode, step: whole numbers in [0, 2^53); time: simulated time (s);
+    values: float64, one axis per label of its topic.
+    """
+
+    run: int
+    episode: int
+    step: int
+    time: float
+    values: NDArray[np.float64]
+
+
+class ArrayCodec:
+    """Encodes and decodes the arrays of one topic.
+
+    labels: the names of the axes, in order (`layout.dim[i].label`).
+    """
+
+    def __init__(self, labels: tuple[str, ...]) -> None:
+        self.labels = labels
+        self._templates: dict[tuple[int, ...], tuple[bytearray, NDArray[np.float64], bytes]] = {}
+        self._last: tuple[bytes, tuple[int, ...]] | None = None
+
+    def encode(self, frame: Frame) -> bytes:
+        """CDR bytes of `frame`, little-endian. Raises FrameError on a wrong number of axes."""
+        values = frame.values
+        template = self._templates.get(values.shape)
+        if template is None:
+            template = self._template(values.shape)
+        buffer, data, _ = template
+        data[0] = frame.run
+        data[1] = frame.episode
+        data[2] = frame.step
+        data[3] = frame.time
+        data[HEADER:] = values.reshape(-1)
+        return bytes(buffer)
+
+    def decode(self, raw: bytes) -> Frame:
+        """The frame in the CDR bytes `raw`.
+
+        Raises FrameError when the bytes are no Float64MultiArray of these axes, an id is not a
+        whole number in [0, 2^53), or any number is NaN or infinite.
+        """
+        shape, numbers = self._values(raw)
+        head = numbers[:HEADER].tolist()
+        if not np.isfinite(numbers).all():
+            raise FrameError("expected finite numbers, got NaN or infinity")
+        for name, number in zip(("run", "episode", "step"), head, strict=False):
+            if not (0 <= number < MAX_ID and number == math.floor(number)):
+                raise FrameError(f"expected {name} to be a whole number in [0, 2^53), got {number}")
+        return Frame(
+            int(head[0]), int(head[1]), int(head[2]), head[3], numbers[HEADER:].reshape(shape)
+        )
+
+    def _template(self, shape: tuple[int, ...]) -> tuple[bytearray, NDArray[np.float64], bytes]:
+        if len(shape) != len(self.labels):
+            raise FrameError(f"expected the axes {self.labels}, got an array of shape {shape}")
+        total = math.prod(shape)
+        head = bytearray(b"\x00\x01\x00\x00") + struct.pack("<I", len(shape))
+        stride = total
+        for label, size in zip(self.labels, shape, strict=True):
+            text = label.encode() + b"\0"
+            head += struct.pack("<I", len(text)) + text
+            head += bytes(-(len(head) - 4) % 4) + struct.pack("<II", size, stride)
+            stride = stride // size if size else 0
+        head += struct.pack("<II", HEADER, HEADER + total)
+        head += bytes(-(len(head) - 4) % 8)
+        prefix = bytes(head)
+        buffer = head + bytes(8 * (HEADER + total))
+        data = np.frombuffer(buffer, dtype="<f8", offset=len(prefix))
+        if len(self._templates) >= 64:  # shapes are few; a bound keeps a long life flat
+            self._templates.clear()
+        self._templates[shape] = (buffer, data, prefix)
+        return self._templates[shape]
+
+    def _values(self, raw: bytes) -> tuple[tuple[int, ...], NDArray[np.float64]]:
+        # A peer of ours sends the same prefix each time; ordinary message objects leave padding
+        # bytes undefined and take the general path below.
+        if self._last is not None:
+            prefix, shape = self._last
+            start = len(prefix)
+            if len(raw) - start == 8 * (HEADER + math.prod(shape)) and raw.startswith(prefix):
+                return shape, np.frombuffer(raw, dtype="<f8", offset=start)
+        shape, start, order = self._parse(raw)
+        if order == "<":
+            self._last = (raw[:start], shape)
+        count = HEADER + math.prod(shape)
+        numbers = np.frombuffer(raw, dtype=f"{order}f8", offset=start, count=count)
+        return shape, numbers.astype(np.float64, copy=False)
+
+    def _parse(self, raw: bytes) -> tuple[tuple[int, ...], int, str]:
+        """Shape, offset of the data and byte order of the message in `raw`."""
+        if len(raw) < 8 or raw[0] != 0 or raw[1] not in (0, 1):
+            raise FrameError("expected CDR bytes, got something else")
+        order = "<" if raw[1] else ">"
+        position = 4
+
+        def number() -> int:
+            nonlocal position
+            position += -(position - 4) % 4
+            if position + 4 > len(raw):
+                raise FrameError(f"the message ends after {len(raw)} bytes, within its layout")
+            (value,) = struct.unpack_from(f"{order}I", raw, position)
+            position += 4
+            return int(value)
+
+        axes = number()
+        if axes != len(self.labels):
+            raise FrameError(f"expected {len(self.labels)} axes {self.labels}, got {axes}")
+        shape, strides = [], []
+        for expected in self.labels:
+            length = number()
+            label = raw[position : position + length].rstrip(b"\0")
+            if length > 256 or label != expected.encode():
+                raise FrameError(f"expected an axis labelled {expected!r}, got {label[:32]!r}")
+            position += length
+            shape.append(number())
+            strides.append(number())
+        stride = math.prod(shape)
+        if stride > MAX_VALUES:
+            raise FrameError(f"expected at most {MAX_VALUES} values, got a layout of {shape}")
+        for size, given in zip(shape, strides, strict=True):
+            if given != stride:
+                raise FrameError(f"expected row-major strides for {shape}, got {strides}")
+            stride = stride // size if size else 0
+        offset, count = number(), number()
+        if offset != HEADER:
+            raise FrameError(f"expected layout.data_offset {HEADER}, got {offset}")
+        if count != HEADER + math.prod(shape):
+            raise FrameError(
+                f"expected {HEADER} + {math.prod(shape)} numbers for {shape}, got {count}"
+            )
+        position += -(position - 4) % 8
+        # RTPS rounds a payload up to 4 bytes; our data ends on 8, so at most 3 bytes may follow.
+        if not 0 <= len(raw) - position - 8 * count < 4:
+            raise FrameError(f"expected {count} numbers after the layout, got another length")
+        return tuple(shape), position, order

@@ -1,0 +1,61 @@
+"""How a reduced model with its gains is laid out as one array of rows with n_s columns.
+
+Every part has n_s columns (or is transposed to have), so the parts stack:
+
+    rows              part     meaning
+    n_z               U        projection, s = U^T z
+    n_s               A        s_{k+1} = A s_k + B a_k
+    n_a               B^T
+    n_a               K_a      feedback gain
+    n_a               K_b      gain of the target
+    1                 s_r      U^T z_r, the target in reduced coordinates
+
+n_s is the number of columns, n_a that of the axis `actuator`; n_z follows from the row count.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ModelRows:
+    """A reduced model, its warm-start gains and its target.
+
+    A (n_s, n_s), B (n_s, n_a), U (n_z, n_s), K_a (n_a, n_s), K_b (n_a, n_s), s_r (n_s,).
+    """
+
+    A: Array
+    B: Array
+    U: Array
+    K_a: Array
+    K_b: Array
+    s_r: Array
+
+    @property
+    def policy(self) -> Array:
+        """[K_a K_b], shape (n_a, 2 n_s)."""
+        return np.hstack([self.K_a, self.K_b])
+
+
+def pack(model: ModelRows) -> Array:
+    """The rows of `model`, shape (n_z + n_s + 3 n_a + 1, n_s)."""
+    return np.vstack([model.U, model.A, model.B.T, model.K_a, model.K_b, model.s_r[np.newaxis, :]])
+
+
+def unpack(rows: Array, n_a: int) -> ModelRows:
+    """The model in `rows`; raises ValueError when the row count leaves no room for U."""
+    n_s = rows.shape[1]
+    n_z = rows.shape[0] - n_s - 3 * n_a - 1
+    if n_s < 1 or n_z < n_s:
+        raise ValueError(
+            f"a model of {rows.shape[0]} rows and {n_s} columns with {n_a} actuators leaves "
+            f"{n_z} rows for U; expected at least {max(n_s, 1)}"
+        )
+    U, A, Bt, K_a, K_b, s_r = np.split(rows, np.cumsum([n_z, n_s, n_a, n_a, n_a]))
+    return ModelRows(A=A, B=Bt.T.copy(), U=U, K_a=K_a, K_b=K_b, s_r=s_r[0])

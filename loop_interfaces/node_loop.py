@@ -1,0 +1,254 @@
+"""The event loop of a node: raw array topics on a WaitSet, everything else on an executor.
+
+The hot path takes serialised bytes from the middleware, decodes them with one `frombuffer`, and
+publishes bytes; it is driven by a WaitSet of the node's array subscriptions alone. Parameter
+services, timers and whatever else the node has are served by an ordinary executor every
+`HOUSEKEEPING` seconds, off the critical path. Array subscriptions sit in a callback group that the
+executor never runs, so both can share one node and ROS tools see one node.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from types import FrameType
+from typing import Any, Protocol
+
+import rclpy
+from rclpy.callback_groups import CallbackGroup
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
+from rclpy.utilities import try_shutdown
+from std_msgs.msg import Float64MultiArray
+
+from loop_interfaces.frames import ArrayCodec, Frame
+from loop_interfaces.topics import Topic
+
+HOUSEKEEPING = 0.05
+"""Seconds between two rounds of the executor and of the node's slow duties."""
+
+
+class _OutsideExecutor(CallbackGroup):
+    """Entities of this group are never taken by an executor."""
+
+    def can_execute(self, entity: Any) -> bool:
+        return False
+
+    def beginning_execution(self, entity: Any) -> bool:
+        return False
+
+    def ending_execution(self, entity: Any) -> None:
+        return None
+
+
+def qos(topic: Topic, depth: int | None = None) -> QoSProfile:
+    """The quality of service of a topic; always reliable, so that only a dying peer loses data."""
+    return QoSProfile(
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if topic.latched else DurabilityPolicy.VOLATILE,
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth or topic.depth,
+    )
+
+
+def scoped(namespace: str, name: str) -> str:
+    """`name` below the relative `namespace` (empty: the node's own)."""
+    return f"{namespace.strip('/')}/{name}" if namespace.strip("/") else name
+
+
+class Sender:
+    """Publishes frames on one topic."""
+
+    def __init__(self, node: Node, topic: Topic, namespace: str = "") -> None:
+        self._codec = ArrayCodec(topic.labels)
+        self.publisher: Publisher = node.create_publisher(
+            Float64MultiArray, scoped(namespace, topic.name), qos(topic)
+        )
+
+    def send(self, frame: Frame) -> None:
+        self.publisher.publish(self._codec.encode(frame))
+
+
+class _Receiver:
+    """Takes frames from one topic and hands them to a callback."""
+
+    def __init__(
+        self, node: Node, topic: Topic, callback: Callable[[Frame], None], namespace: str
+    ) -> None:
+        self.callback = callback
+        self.codec = ArrayCodec(topic.labels)
+        self.subscription: Subscription = node.create_subscription(
+            Float64MultiArray,
+            scoped(namespace, topic.name),
+            lambda _: None,  # never called: see _OutsideExecutor
+            qos(topic),
+            callback_group=_OutsideExecutor(),
+            raw=True,
+        )
+
+
+class NodeLoop:
+    """Runs one node until it is told to stop.
+
+    refused counts the messages that were refused, by reason; new ones are reported through the
+    node's logger at most once a second.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self.node = node
+        self.refused: Counter[str] = Counter()
+        self._receivers: list[_Receiver] = []
+        self._stop_reason: str | None = None
+        self._executor = SingleThreadedExecutor(context=node.context)
+        self._executor.add_node(node)
+        self._reported = 0
+        self._report_at = 0.0
+
+    def sender(self, topic: Topic, namespace: str = "") -> Sender:
+        """A publisher of frames on `topic`."""
+        return Sender(self.node, topic, namespace)
+
+    def receive(
+        self, topic: Topic, callback: Callable[[Frame], None], namespace: str = ""
+    ) -> Subscription:
+        """Call `callback` with every frame of `topic`; a ValueError it raises refuses the message."""
+        receiver = _Receiver(self.node, topic, callback, namespace)
+        self._receivers.append(receiver)
+        return receiver.subscription
+
+    @staticmethod
+    def now() -> float:
+        """Monotonic time in s, as handed to `tick` and `housekeeping`."""
+        return time.monotonic()
+
+    def stop(self, reason: str) -> None:
+        """Leave `run` after the present event."""
+        self._stop_reason = reason
+
+    def run(
+        self,
+        *,
+        tick: Callable[[float], None],
+        deadline: Callable[[], float | None],
+        housekeeping: Callable[[float], None],
+    ) -> str:
+        """Handle events until `stop` or a signal; returns the reason.
+
+        tick(now) is called when `deadline()` (monotonic s, or None) has passed; housekeeping(now)
+        every HOUSEKEEPING seconds.
+        """
+        context = self.node.context
+        count = len(self._receivers)
+        wait_set = _rclpy.WaitSet(count, 0, 0, 0, 0, 0, context.handle)
+        handles = [receiver.subscription.handle for receiver in self._receivers]
+        by_pointer = {r.subscription.handle.pointer: r for r in self._receivers}
+        next_round = time.monotonic()
+        while self._stop_reason is None and context.ok():
+            now = time.monotonic()
+            if now >= next_round:
+                self._executor.spin_once(timeout_sec=0)
+                housekeeping(now)
+                self._report(now)
+                next_round = now + HOUSEKEEPING
+            due = deadline()
+            if due is not None and now >= due:
+                tick(now)
+                continue
+            wake = next_round if due is None else min(due, next_round)
+            wait_set.clear_entities()
+            for handle in handles:
+                wait_set.add_subscription(handle)
+            wait_set.wait(max(0, int((wake - now) * 1e9)))
+            for pointer in wait_set.get_ready_entities("subscription"):
+                self._take(by_pointer[pointer])
+        return self._stop_reason or "shutdown"
+
+    def _take(self, receiver: _Receiver) -> None:
+        taken = receiver.subscription.handle.take_message(Float64MultiArray, True)
+        if taken is None:
+            return
+        try:
+            receiver.callback(receiver.codec.decode(taken[0]))
+        except ValueError as error:
+            self.refused[f"{receiver.subscription.topic_name}: {error}"[:300]] += 1
+            if len(self.refused) > 1000:  # a flood with ever new reasons must not grow memory
+                self.refused = Counter({"others": sum(self.refused.values())})
+
+    def _report(self, now: float) -> None:
+        total = sum(self.refused.values())
+        if total > self._reported and now >= self._report_at:
+            reason = next(reversed(self.refused))
+            self.node.get_logger().warning(
+                f"refused {total - self._reported} message(s); the last new reason: {reason}"
+            )
+            self._reported = total
+            self._report_at = now + 1.0
+
+
+class ConfigurationError(Exception):
+    """A node cannot start as it was asked to; the text is one sentence for the user."""
+
+
+@contextlib.contextmanager
+def ros_node(name: str, args: list[str] | None) -> Iterator[tuple[Node, NodeLoop]]:
+    """A node with its loop: initialises ROS, handles SIGINT and SIGTERM, and leaves nothing behind."""
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # rcl raises bare RuntimeErrors and its own types
+        raise ConfigurationError(_first_line(error)) from error
+    node = None
+    try:
+        try:
+            node = Node(name, start_parameter_services=True)
+        except Exception as error:
+            raise ConfigurationError(_first_line(error)) from error
+        loop = NodeLoop(node)
+
+        def stop(number: int, frame: FrameType | None) -> None:
+            loop.stop(signal.Signals(number).name)
+
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, stop)
+        yield node, loop
+    finally:
+        if node is not None:
+            node.destroy_node()
+        try_shutdown()
+
+
+class NodeBody(Protocol):
+    """What a node does: constructed with its parameters and topics, then run."""
+
+    def run(self) -> int:
+        """Work until the loop stops; returns the exit code."""
+
+
+def node_main(name: str, args: list[str] | None, make: Callable[[Node, NodeLoop], NodeBody]) -> int:
+    """The `main` of a node: makes its body, runs it and returns the exit code.
+
+    1 with one line on stderr when the node cannot start as it was asked to: a ConfigurationError,
+    or a ValueError while it is made (a parameter out of range, a plant that cannot be built).
+    """
+    try:
+        with ros_node(name, args) as (node, loop):
+            try:
+                body = make(node, loop)
+            except ValueError as error:
+                raise ConfigurationError(str(error)) from error
+            return body.run()
+    except ConfigurationError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 1
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

@@ -1,0 +1,301 @@
+"""Parameters as data: name, type, default, range, unit and meaning, in one table. No ROS import.
+
+A problem is one YAML file in ROS parameter-file form (`/**: ros__parameters: ...`), read unchanged
+by the three nodes (`--params-file`) and by the command line. The nodes declare from this table,
+the command line validates by it and docs/interfaces.md lists it.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+Value = bool | int | float | str | list[str]
+MAX_YAML_BYTES = 1_000_000
+
+
+class ParameterError(ValueError):
+    """A parameter that is missing, unknown or out of range; the text names it, its value and range."""
+
+
+@dataclass(frozen=True)
+class Spec:
+    """One parameter. The type is the default's; `required` ones have no usable default.
+
+    minimum, maximum: inclusive, unless `positive` (then value > 0). choices: the allowed words.
+    """
+
+    name: str
+    default: Value
+    description: str
+    minimum: float | None = None
+    maximum: float | None = None
+    unit: str = ""
+    choices: tuple[str, ...] = ()
+    positive: bool = False
+    multiple_of: int = 1
+
+    @property
+    def type(self) -> type:
+        return type(self.default)
+
+    @property
+    def range(self) -> str:
+        """The allowed values in words."""
+        if self.choices:
+            return "one of " + ", ".join(self.choices)
+        words = {int: "a whole number", float: "a number", str: "a text", bool: "true or false"}
+        text = words.get(self.type, "a list of texts")
+        if self.multiple_of == 2:
+            text = "an even whole number"
+        if self.positive:
+            text += " above 0"
+        elif self.minimum is not None and self.maximum is not None:
+            return f"{text} from {self.minimum:g} to {self.maximum:g}"
+        elif self.minimum is not None:
+            text += f" of at least {self.minimum:g}"
+        if self.maximum is not None:
+            text += f", at most {self.maximum:g}"
+        return text
+
+    def check(self, value: Any) -> Value:
+        """`value` in the parameter's type; raises ParameterError naming value and range."""
+        good: Value | None = self._coerce(value)
+        if good is None:
+            raise ParameterError(
+                f"parameter '{self.name}' is {value!r}; expected {self.range}"
+                + (f" ({self.unit})" if self.unit else "")
+            )
+        return good
+
+    def _coerce(self, value: Any) -> Any:
+        if self.type is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if not isinstance(value, self.type) or (self.type is int and isinstance(value, bool)):
+            return None
+        if isinstance(value, list):
+            return value if all(isinstance(item, str) for item in value) else None
+        if self.choices:
+            return value if value in self.choices else None
+        if isinstance(value, (int, float)) and not isinstance(value, bool):
+            if not math.isfinite(value) or (self.positive and value <= 0):
+                return None
+            if self.minimum is not None and value < self.minimum:
+                return None
+            if self.maximum is not None and value > self.maximum:
+                return None
+            if isinstance(value, int) and value % self.multiple_of:
+                return None
+        return value
+
+
+MAX_SEED = 2**53 - 1
+
+PROBLEM = (
+    Spec("problem", "burgers", "name of the problem, used in messages and result folders"),
+    Spec(
+        "equation",
+        "burgers",
+        "PDE of the plant: a known name, 'package.module:Class' or 'path/to/file.py:Class'",
+    ),
+    Spec("length", 1.0, "length L of the periodic domain", positive=True, unit="m"),
+    Spec("n_z", 128, "grid points, the size of the state", 8, 65536, multiple_of=2),
+    Spec("n_a", 6, "actuators, the size of the action", 1, 1024),
+    Spec("actuator_width", 0.15, "width of one actuator as a share of L", positive=True, maximum=1),
+    Spec("sample_time", 0.05, "sampling time; the action is held over it", positive=True, unit="s"),
+    Spec(
+        "integration_time",
+        0.0025,
+        "internal step of the integrator; sample_time is a whole multiple of it",
+        positive=True,
+        unit="s",
+    ),
+    Spec("horizon", 300, "steps T of an episode", 1, 1_000_000),
+    Spec("state_weight", 1.0, "q of Q = q I in the stage cost", positive=True),
+    Spec("action_weight", 1.0, "r of R = r I in the stage cost", positive=True),
+    Spec(
+        "divergence_bound",
+        1e3,
+        "an environment whose field exceeds this magnitude has diverged",
+        positive=True,
+        maximum=1e6,
+    ),
+    Spec("dmdc_rank", 8, "p, rank of the DMDc regression on [Z; A]", 1, 4096),
+    Spec("reduced_order", 4, "n_s, order of the reduced model", 1, 1024),
+    Spec(
+        "exploration_variance",
+        0.1,
+        "variance of each exploratory action, drawn from N(0, variance)",
+        positive=True,
+    ),
+    Spec(
+        "learning_rate", 1e-4, "eta of the policy gradient from the LQT warm start", positive=True
+    ),
+    Spec("learning_rate_from_zero", 1e-5, "eta of the policy gradient from zero", positive=True),
+    Spec("smoothing_radius", 0.1, "r, size of the two-point perturbation", positive=True),
+)
+"""What a problem's YAML file may set, besides `physical.*` (the equation's own parameters)."""
+
+PLANT = (
+    Spec(
+        "action_timeout",
+        0.05,
+        "silence after which the plant publishes its state again",
+        0.001,
+        60.0,
+        unit="s",
+    ),
+    Spec(
+        "max_repeats",
+        600,
+        "repeats of one state without an answer after which the episode is void",
+        1,
+        1_000_000,
+    ),
+    Spec(
+        "run_hold",
+        10.0,
+        "silence of a run's tuner after which another run may take the plant",
+        0.1,
+        3600.0,
+        unit="s",
+    ),
+    Spec("publish_clock", True, "publish simulated time on /clock while somebody listens"),
+)
+
+TUNER = (
+    Spec("seed", 0, "seed of everything random in the training", 0, MAX_SEED),
+    Spec(
+        "seeds", 1, "trainings side by side in one batch, with seeds seed, seed + 1, ...", 1, 1024
+    ),
+    Spec("iterations", 40, "iterations of the adapt phase", 1, 1_000_000),
+    Spec(
+        "start",
+        "lqt",
+        "where the policy starts: the LQT gains of the reduced model, or zero",
+        choices=("lqt", "zero"),
+    ),
+    Spec(
+        "identification_attempts",
+        10,
+        "exploratory episodes a seed may use until its LQT law beats no control on the mean "
+        "field; 1: take the first, unchecked, as the paper does",
+        1,
+        1000,
+    ),
+    Spec("evaluation_fields", 10, "sampled initial fields of the closing evaluation", 1, 1000),
+    Spec(
+        "evaluation_seed",
+        0,
+        "seed of those fields: the same for every training seed, so that runs compare",
+        0,
+        MAX_SEED,
+    ),
+    Spec("out", "", "folder of the results and the checkpoint; empty: keep nothing"),
+    Spec("resume", False, "continue the run whose checkpoint is in 'out'"),
+    Spec("max_batch", 1024, "environments of one episode at the most", 1, 65536),
+    Spec(
+        "episode_timeout",
+        600.0,
+        "silence of a plant and controller after which an episode is started again",
+        1.0,
+        86400.0,
+        unit="s",
+    ),
+    Spec(
+        "max_attempts",
+        5,
+        "attempts at one episode after which the run stops with an error",
+        1,
+        1000,
+    ),
+    Spec(
+        "optimizer",
+        "two_point",
+        "method of the adapt phase",
+        choices=("two_point", "directions"),
+    ),
+    Spec(
+        "pairs",
+        [""],
+        "namespaces of the plant and controller pairs that serve this tuner, relative to its own",
+    ),
+)
+
+
+def table() -> tuple[Spec, ...]:
+    """Every parameter of the three nodes."""
+    return (*PROBLEM, *PLANT, *TUNER)
+
+
+def check_names(names: Iterable[str], known: Iterable[str]) -> None:
+    """Raises ParameterError for the first name that is not known, with the nearest known one."""
+    known = list(known)
+    for name in names:
+        if name not in known and not name.startswith("physical."):
+            close = difflib.get_close_matches(name, known, n=1)
+            hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known)}"
+            raise ParameterError(f"unknown parameter '{name}'; {hint}")
+
+
+def check(specs: Iterable[Spec], given: Mapping[str, Any]) -> dict[str, Any]:
+    """Every parameter of `specs`, from `given` or its default, checked against its range."""
+    return {spec.name: spec.check(given.get(spec.name, spec.default)) for spec in specs}
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The parameters of a ROS parameter file, flattened with dots.
+
+    Raises ParameterError when the file cannot be read or is not in that form.
+    """
+    try:
+        with path.open("rb") as file:
+            raw = file.read(MAX_YAML_BYTES + 1)
+    except OSError as error:
+        raise ParameterError(f"cannot read {path}: {error.strerror}") from error
+    if len(raw) > MAX_YAML_BYTES:
+        raise ParameterError(f"{path} is larger than {MAX_YAML_BYTES} bytes; not a parameter file")
+    try:
+        document = yaml.safe_load(raw)
+    except (yaml.YAMLError, UnicodeDecodeError, ValueError, RecursionError) as error:
+        first = str(error).splitlines()[0]
+        raise ParameterError(f"{path} is not valid YAML: {first}") from error
+    flat: dict[str, Any] = {}
+    sections = document.values() if isinstance(document, dict) else [None]
+    for section in sections:
+        body = section.get("ros__parameters") if isinstance(section, dict) else None
+        if not isinstance(body, dict):
+            raise ParameterError(
+                f"{path} is not a ROS parameter file; expected '/**:' with 'ros__parameters:' in it"
+            )
+        flat.update(_flatten(body))
+    return flat
+
+
+def _flatten(body: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in body.items():
+        if isinstance(value, dict):
+            flat.update(_flatten(value, f"{prefix}{key}."))
+        else:
+            flat[f"{prefix}{key}"] = value
+    return flat
+
+
+def write_yaml(path: Path, values: Mapping[str, Any], comment: str = "") -> None:
+    """Writes `values` as a ROS parameter file; dotted names become nested maps."""
+    nested: dict[str, Any] = {}
+    for name, value in values.items():
+        *groups, last = name.split(".")
+        place = nested
+        for group in groups:
+            place = place.setdefault(group, {})
+        place[last] = value
+    text = yaml.safe_dump({"/**": {"ros__parameters": nested}}, sort_keys=False)
+    path.write_text("".join(f"# {line}\n" for line in comment.splitlines()) + text)

@@ -1,0 +1,67 @@
+"""Where the problems are, and a problem's resolved parameters. No ROS import."""
+
+from __future__ import annotations
+
+import sysconfig
+from pathlib import Path
+from typing import Any
+
+from loop_interfaces.parameters import PROBLEM, ParameterError, check, check_names, read_yaml
+
+
+def config_folder() -> Path:
+    """The folder of the shipped configuration: beside the sources, or share/pdeloop/config."""
+    beside = Path(__file__).resolve().parent.parent / "config"
+    if beside.is_dir():
+        return beside
+    return Path(sysconfig.get_path("data")) / "share" / "pdeloop" / "config"
+
+
+def shipped_problems() -> dict[str, Path]:
+    """Name and file of every shipped problem."""
+    folder = config_folder() / "problems"
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+
+
+def find_problem(name: str) -> Path:
+    """The YAML file of a shipped problem's name or of a path; ParameterError if there is none."""
+    shipped = shipped_problems()
+    if name in shipped:
+        return shipped[name]
+    path = Path(name)
+    if path.suffix in (".yaml", ".yml") or path.exists():
+        if not path.is_file():
+            raise ParameterError(f"no problem file at {name}; give the path of a YAML file")
+        return path
+    raise ParameterError(
+        f"unknown problem '{name}'; expected one of {', '.join(shipped)}, or the path of a YAML file"
+    )
+
+
+def load_problem(name: str) -> dict[str, Any]:
+    """The checked parameters of a problem, `physical.*` included as given.
+
+    A relative file of an equation ('file.py:Class') is taken relative to the YAML file.
+    """
+    path = find_problem(name)
+    given = read_yaml(path)
+    check_names(given, [spec.name for spec in PROBLEM])
+    return {**resolve(given), "equation": _equation_path(str(given.get("equation", "")), path)}
+
+
+def resolve(given: dict[str, Any]) -> dict[str, Any]:
+    """Checked problem parameters with defaults filled in, and the given `physical.*`."""
+    physical: dict[str, float] = {}
+    for name, value in given.items():
+        if name.startswith("physical."):
+            if isinstance(value, bool) or not isinstance(value, (int, float)):
+                raise ParameterError(f"parameter '{name}' is {value!r}; expected a number")
+            physical[name] = float(value)
+    return {**check(PROBLEM, given), **physical}
+
+
+def _equation_path(equation: str, yaml_file: Path) -> str:
+    file, colon, name = equation.rpartition(":")
+    if colon and file.endswith(".py") and not Path(file).is_absolute():
+        return f"{(yaml_file.resolve().parent / file)}:{name}"
+    return equation or "burgers"

@@ -1,0 +1,62 @@
+"""What the protocols of the three nodes return: messages to send. No ROS import.
+
+A node's protocol is an object without clock, thread or network: an event comes in (a frame, or the
+time), messages come out, and the node's only job is to move them. So every fault is a unit test.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import dataclass
+
+from loop_interfaces.frames import Frame
+from loop_interfaces.topics import Topic
+
+
+@dataclass(frozen=True, slots=True)
+class Send:
+    """Publish `frame` on `topic`."""
+
+    topic: Topic
+    frame: Frame
+
+
+@dataclass(frozen=True)
+class ModelFailure:
+    """Why an identification episode gave no model.
+
+    retry: the samples were incomplete and the same episode can be run again; otherwise the data
+    allow no model and `reason` says why.
+    """
+
+    run: int
+    episode: int
+    retry: bool
+    reason: str
+
+    def to_json(self) -> str:
+        return json.dumps(
+            {"run": self.run, "episode": self.episode, "retry": self.retry, "reason": self.reason}
+        )
+
+    @staticmethod
+    def from_json(text: str) -> ModelFailure:
+        """Raises ValueError when `text` is not the JSON of a failure."""
+        try:
+            fields = json.loads(text[:10_000])
+            return ModelFailure(
+                run=int(fields["run"]),
+                episode=int(fields["episode"]),
+                retry=bool(fields["retry"]),
+                reason=str(fields["reason"]),
+            )
+        except (KeyError, TypeError, ValueError, RecursionError) as error:
+            raise ValueError(f"expected the JSON of a model failure, got {text[:80]!r}") from error
+
+
+class Tally(Counter[str]):
+    """Counts of messages that were dropped, late, repeated or foreign, by reason."""
+
+    def summary(self) -> str:
+        return ", ".join(f"{count} {reason}" for reason, count in sorted(self.items()))

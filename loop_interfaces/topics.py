@@ -1,0 +1,67 @@
+"""The topics of the loop: names, axes, quality of service, and why. No ROS import.
+
+Names are relative, so a namespace makes a second loop. docs/interfaces.md describes them for
+somebody who writes a node of their own; this is the same table for our nodes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One topic of arrays.
+
+    name: relative topic name; labels: names of the axes; latched: transient local with depth 1, so
+    that a node which starts late or again receives the last one; depth: history of the reader.
+    """
+
+    name: str
+    labels: tuple[str, ...]
+    latched: bool
+    depth: int = 1
+
+
+class StartColumn(IntEnum):
+    """Columns of `episode/start`, one row per environment."""
+
+    SEED = 0
+    """Seed of the initial field (>= 0: drawn from the initial distribution; -1: its mean)."""
+    EXCITATION = 1
+    """Seed of the exploratory actions (>= 0), or -1: the policy acts."""
+    MODEL = 2
+    """Index of the reduced model the environment's policy belongs to."""
+
+
+class CostColumn(IntEnum):
+    """Columns of `episode/cost`, one row per environment."""
+
+    MEAN = 0
+    """Mean stage cost J = (1/T) sum of l_k."""
+    TOTAL = 1
+    """Sum of the stage costs."""
+    ENDED = 2
+    """-1: completed; k >= 0: diverged at step k (J is 1e9); -2: void, not a cost."""
+
+
+COMPLETED = -1
+VOID = -2
+
+# Latched: a node that restarts in the middle of an episode must learn of it without asking.
+START = Topic("episode/start", ("env", "seed_excitation_model"), latched=True)
+POLICY = Topic("policy", ("env", "actuator", "gain"), latched=True)
+COST = Topic("episode/cost", ("env", "mean_total_ended"), latched=True)
+MODEL = Topic("model", ("model", "row", "mode"), latched=True)
+MODEL_IDENTIFIED = Topic("model/identified", ("model", "row", "mode"), latched=True)
+TARGET = Topic("target", ("x",), latched=True)
+
+# Volatile, depth 1: in lock-step only the newest sample has a meaning; the plant repeats what is lost.
+STATE = Topic("state", ("env", "x"), latched=False)
+ACTION = Topic("action", ("env", "actuator"), latched=False)
+
+MODEL_FAILED = "model/failed"
+"""std_msgs/String, latched: why an identification gave no model (JSON, see docs/interfaces.md)."""
+
+ARRAYS = (START, STATE, ACTION, POLICY, COST, MODEL_IDENTIFIED, MODEL, TARGET)
