@@ -1,0 +1,1 @@
+"""The plant: equations, time stepping, and the node that publishes its state."""

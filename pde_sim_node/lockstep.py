@@ -1,0 +1,179 @@
+"""The plant's side of the loop: lock-step, at-least-once, idempotent. Pure: no ROS, no clock.
+
+    start(e) -> state(e, 0) <- action(e, 0) -> state(e, 1) ... state(e, T) <- action(e, T) -> cost(e)
+
+The plant advances only on the action stamped with the run, episode and step it waits for. Without
+one for `action_timeout` it sends its state again; after `max_repeats` the episode is void, which
+is not a cost. The answer to state T moves nothing: it says that the last state has arrived.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from loop_interfaces.frames import MAX_VALUES, Frame, FrameError
+from loop_interfaces.protocol import Send, Tally
+from loop_interfaces.topics import COMPLETED, COST, STATE, TARGET, VOID, StartColumn
+from pde_sim_node.plant import Plant
+
+
+class Lockstep:
+    """One plant serving the episodes of one run at a time.
+
+    plant: what is stepped; sample_time (s): simulated time per step; action_timeout (s),
+    max_repeats, run_hold (s): see loop_interfaces.parameters. `now` is any monotonic time in s.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        *,
+        sample_time: float,
+        action_timeout: float,
+        max_repeats: int,
+        run_hold: float,
+    ) -> None:
+        self._plant = plant
+        self._sample_time = sample_time
+        self._action_timeout = action_timeout
+        self._max_repeats = max_repeats
+        self._run_hold = run_hold
+        self.tally = Tally()
+        self.time = 0.0
+        self.run = 0
+        self.episode = -1
+        self.steps_total = 0
+        self.episodes_total = 0
+        self._rows = np.empty((0, len(StartColumn)))
+        self._active = False
+        self._reply: Send | None = None
+        self._repeats = 0
+        self._tuner_heard = -np.inf
+        self._deadline: float | None = None
+
+    @property
+    def deadline(self) -> float | None:
+        """When `tick` wants to be called next; None while no answer is awaited."""
+        return self._deadline
+
+    @property
+    def active(self) -> bool:
+        """Whether an episode is under way."""
+        return self._active
+
+    @property
+    def step(self) -> int:
+        return self._plant.step_index
+
+    def overdue(self) -> bool:
+        """Whether the awaited action has been missing for many repeats."""
+        return self._deadline is not None and self._repeats * self._action_timeout > 2.0
+
+    def announcement(self) -> Send:
+        """The target z_r, sent once at the start and latched."""
+        return Send(TARGET, Frame(0, 0, 0, 0.0, self._plant.target))
+
+    def start(self, frame: Frame, now: float) -> list[Send]:
+        """Begin an episode, or answer again for one that is known.
+
+        Raises FrameError for a malformed seed list or another run's episode while one is under way.
+        """
+        rows = self._check_rows(frame)
+        if frame.run != self.run:
+            if self.run and now - self._tuner_heard < self._run_hold:
+                raise FrameError(
+                    f"run {frame.run} asked for an episode, but run {self.run} has this plant "
+                    f"(until it ends, or is silent for {self._run_hold:g} s)"
+                )
+            self.run, self.episode, self._active, self._reply = frame.run, -1, False, None
+            self._deadline = None
+        self._tuner_heard = now
+        if not len(rows):
+            self.run, self.episode, self._active, self._deadline = 0, -1, False, None
+            return []
+        if frame.episode < self.episode:
+            self.tally["starts of an earlier episode"] += 1
+            return []
+        if frame.episode == self.episode:
+            if not np.array_equal(rows, self._rows):
+                raise FrameError(
+                    f"episode {frame.episode} was started with other seeds; "
+                    "a new episode needs a new number"
+                )
+            self.tally["starts repeated"] += 1
+            return [self._reply] if self._reply else []
+        states = self._plant.reset(rows[:, StartColumn.SEED].astype(np.int64))
+        self.episode, self._rows, self._active = frame.episode, rows.copy(), True
+        self.time = max(self.time, frame.time) + self._sample_time
+        return self._publish_state(states, now)
+
+    def action(self, frame: Frame, now: float) -> list[Send]:
+        """Advance on the awaited action; ignore any other.
+
+        Raises FrameError when the awaited action has the wrong shape.
+        """
+        plant = self._plant
+        if not self._active or frame.run != self.run or frame.episode != self.episode:
+            self.tally["actions of another episode"] += 1
+            return []
+        if frame.step != plant.step_index:
+            self.tally["actions of another step"] += 1
+            return []
+        expected = (plant.batch, plant.n_a)
+        if frame.values.shape != expected:
+            raise FrameError(
+                f"expected an action of shape {expected} (env, actuator), got {frame.values.shape}"
+            )
+        self._tuner_heard = now
+        if plant.step_index == plant.horizon:
+            return [self._finish(void=False)]
+        states = plant.step(frame.values)
+        self.steps_total += plant.batch
+        self.time += self._sample_time
+        return self._publish_state(states, now)
+
+    def tick(self, now: float) -> list[Send]:
+        """Send the state again when its answer is overdue; give the episode up after max_repeats."""
+        if self._deadline is None or now < self._deadline or self._reply is None:
+            return []
+        if self._repeats >= self._max_repeats:
+            return [self._finish(void=True)]
+        self._repeats += 1
+        self.tally["states repeated"] += 1
+        self._deadline = now + self._action_timeout
+        return [self._reply]
+
+    def _publish_state(self, states: np.ndarray, now: float) -> list[Send]:
+        self._reply = Send(
+            STATE, Frame(self.run, self.episode, self._plant.step_index, self.time, states)
+        )
+        self._repeats = 0
+        self._deadline = now + self._action_timeout
+        return [self._reply]
+
+    def _finish(self, *, void: bool) -> Send:
+        costs = self._plant.episode_costs()
+        ended = np.where(costs.diverged_step >= 0, costs.diverged_step, COMPLETED)
+        if void:
+            ended = np.full(self._plant.batch, VOID)
+            self.tally["episodes void"] += 1
+        values = np.column_stack([costs.mean, costs.total, ended.astype(np.float64)])
+        self._reply = Send(
+            COST, Frame(self.run, self.episode, self._plant.step_index, self.time, values)
+        )
+        self._active, self._deadline = False, None
+        self.episodes_total += not void
+        return self._reply
+
+    def _check_rows(self, frame: Frame) -> np.ndarray:
+        rows = frame.values
+        if rows.shape[1] != len(StartColumn):
+            raise FrameError(
+                f"expected rows of {len(StartColumn)} numbers (seed, excitation, model), "
+                f"got {rows.shape[1]}"
+            )
+        if rows.shape[0] * max(self._plant.n_z, self._plant.n_a) > MAX_VALUES:
+            raise FrameError(f"{rows.shape[0]} environments are more than one message can hold")
+        if rows.size and (rows.min() < -1 or (rows != np.floor(rows)).any()):
+            raise FrameError("expected seeds that are whole numbers of at least -1")
+        return rows

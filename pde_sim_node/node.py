@@ -1,0 +1,122 @@
+"""pde_sim_node: the plant as a ROS 2 node.
+
+Subscribes  episode/start, action            Publishes  state, episode/cost, target, /clock
+Messages, order and parameters: docs/interfaces.md. The protocol is pde_sim_node.lockstep.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import fields
+from typing import Any
+
+import rclpy.time
+from rclpy.node import Node
+from rosgraph_msgs.msg import Clock
+
+from loop_interfaces.frames import Frame
+from loop_interfaces.isolation import keep_on_this_machine
+from loop_interfaces.node_loop import NodeLoop, node_main
+from loop_interfaces.parameters import PLANT, PROBLEM, Spec
+from loop_interfaces.protocol import Send
+from loop_interfaces.ros_parameters import declare, given_parameters
+from loop_interfaces.topics import ACTION, COST, START, STATE, TARGET
+from pde_sim_node.build import build_plant
+from pde_sim_node.equations import load_equation
+from pde_sim_node.lockstep import Lockstep
+
+
+def declare_parameters(node: Node) -> dict[str, Any]:
+    """The plant's parameters, with the chosen equation's own under `physical.`."""
+    given = given_parameters(node)
+    names = {spec.name for spec in PLANT_PARAMETERS}
+    physical = {name: value for name, value in given.items() if name.startswith("physical.")}
+    values = declare(node, [s for s in PROBLEM if s.name in names] + list(PLANT), given)
+    specs = [
+        Spec(
+            f"physical.{item.name}",
+            float(item.default),  # type: ignore[arg-type]
+            item.metadata["description"],
+            item.metadata["minimum"],
+            item.metadata["maximum"],
+            unit=item.metadata.get("unit", ""),
+        )
+        for item in fields(load_equation(str(values["equation"])))
+        if item.name != "length"
+    ]
+    return {**physical, **values, **declare(node, specs, given)}
+
+
+PLANT_PARAMETERS = tuple(
+    spec
+    for spec in PROBLEM
+    if not spec.name.startswith(("dmdc", "reduced", "exploration", "learning", "smoothing"))
+)
+"""The problem parameters that concern the plant."""
+
+
+class PlantNode:
+    """Moves messages between the topics and the lock-step protocol."""
+
+    def __init__(self, node: Node, loop: NodeLoop) -> None:
+        values = declare_parameters(node)
+        plant = build_plant(values)
+        self._lockstep = Lockstep(
+            plant,
+            sample_time=values["sample_time"],
+            action_timeout=values["action_timeout"],
+            max_repeats=values["max_repeats"],
+            run_hold=values["run_hold"],
+        )
+        self._node, self._loop = node, loop
+        self._senders = {topic: loop.sender(topic) for topic in (STATE, COST, TARGET)}
+        self._clock = node.create_publisher(Clock, "/clock", 1) if values["publish_clock"] else None
+        self._clock_wanted = False
+        loop.receive(START, self._on_start)
+        loop.receive(ACTION, self._on_action)
+        self._send([self._lockstep.announcement()])
+        node.get_logger().info(
+            f"{values['problem']}: {plant.n_z} points, {plant.n_a} actuators, "
+            f"{plant.horizon} steps of {values['sample_time']:g} s"
+        )
+
+    def run(self) -> int:
+        lockstep = self._lockstep
+        self._loop.run(
+            tick=lambda now: self._send(lockstep.tick(now)),
+            deadline=lambda: lockstep.deadline,
+            housekeeping=self._housekeeping,
+        )
+        return 0
+
+    def _on_start(self, frame: Frame) -> None:
+        self._send(self._lockstep.start(frame, self._loop.now()))
+
+    def _on_action(self, frame: Frame) -> None:
+        self._send(self._lockstep.action(frame, self._loop.now()))
+
+    def _send(self, sends: list[Send]) -> None:
+        for send in sends:
+            self._senders[send.topic].send(send.frame)
+            if self._clock_wanted and self._clock is not None and send.topic is STATE:
+                seconds = rclpy.time.Time(nanoseconds=round(send.frame.time * 1e9))
+                self._clock.publish(Clock(clock=seconds.to_msg()))
+
+    def _housekeeping(self, now: float) -> None:
+        self._clock_wanted = self._clock is not None and self._clock.get_subscription_count() > 0
+        if self._lockstep.overdue():
+            self._node.get_logger().warning(
+                f"no action for step {self._lockstep.step} of episode {self._lockstep.episode}; "
+                "is the controller running?",
+                throttle_duration_sec=5.0,
+            )
+
+
+def main(args: list[str] | None = None) -> int:
+    """Console script."""
+    keep_on_this_machine()
+    return node_main("pde_sim_node", args, PlantNode)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

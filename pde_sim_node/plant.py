@@ -1,0 +1,269 @@
+"""The plant: M sampled PDEs side by side, each z_{k+1} = f(z_k, a_k)."""
+
+import math
+import operator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .equations import Equation
+from .etdrk4 import Integrator
+from .supports import indicator_supports
+
+__all__ = ["DIVERGED_COST", "MEAN_FIELD", "EpisodeCosts", "Plant"]
+
+DIVERGED_COST = 1e9
+"""Mean stage cost of an environment that diverged: very bad, and finite."""
+MEAN_FIELD = -1
+"""The seed that stands for the mean of the initial distribution."""
+
+
+@dataclass(frozen=True)
+class EpisodeCosts:
+    """The costs of one episode, one entry for each of the M environments.
+
+    Attributes
+    ----------
+    mean : (M,)
+        Mean of the stage costs so far; DIVERGED_COST where the environment diverged.
+    total : (M,)
+        Sum of the stage costs so far; horizon * DIVERGED_COST where the environment diverged.
+    diverged_step : (M,) int64
+        The step k whose new state was refused, -1 where none was.
+    """
+
+    mean: NDArray[np.float64]
+    total: NDArray[np.float64]
+    diverged_step: NDArray[np.int64]
+
+
+class Plant:
+    """M environments of one equation, advanced in lock-step.
+
+    u_t = F(u, u_x, ...) + sum_j Phi_j(x) a_j(t) on the grid x_i = i L / n_z, with the action held over a sampling
+    time: z_{k+1} = f(z_k, a_k). The result for an environment is the same to the last bit whatever the number of
+    environments, its place among them, the threads and the process.
+
+    Parameters
+    ----------
+    equation
+        The PDE.
+    n_z
+        Number of grid points, even, at least 8.
+    n_a
+        Number of actuators.
+    width
+        Width of one actuator's support as a fraction of the domain, width * n_a <= 1.
+    sample_time
+        Sampling time, a whole multiple of ``integration_time``.
+    integration_time
+        Internal step of the integrator.
+    horizon
+        Steps of an episode.
+    state_weight, action_weight
+        Q = state_weight I and R = action_weight I of the stage cost (z - z_r)'Q(z - z_r) + a'R a.
+    divergence_bound
+        An environment whose new state is not finite or exceeds this magnitude anywhere has diverged.
+
+    Attributes
+    ----------
+    x : (n_z,)
+        Grid points.
+    target : (n_z,)
+        Field z_r to be tracked.
+    supports : (n_z, n_a)
+        Phi_j(x_i), entries 0 or 1.
+    compiled_in_seconds : float
+        Time the constructor spent on compiling the kernel; 0.0 if it was compiled before.
+
+    Raises
+    ------
+    ValueError
+        A parameter has no usable value; the message names it and what would be right.
+    """
+
+    def __init__(
+        self,
+        equation: Equation,
+        *,
+        n_z: int,
+        n_a: int,
+        width: float,
+        sample_time: float,
+        integration_time: float,
+        horizon: int,
+        state_weight: float,
+        action_weight: float,
+        divergence_bound: float = 1e3,
+    ) -> None:
+        self.n_z, self.n_a, self.horizon = whole("n_z", n_z, 8), whole("n_a", n_a, 1), whole("horizon", horizon, 1)
+        if n_z % 2:
+            raise ValueError(f"n_z must be even, got {n_z}: take {n_z + 1}")
+        self.equation = equation
+        self.sample_time = positive("sample_time", sample_time)
+        self.integration_time = positive("integration_time", integration_time)
+        self.state_weight = positive("state_weight", state_weight)
+        self.action_weight = positive("action_weight", action_weight)
+        self.divergence_bound = positive("divergence_bound", divergence_bound)
+        self.supports = indicator_supports(n_z, n_a, positive("width", width))
+        self.x = equation.length * np.arange(n_z) / n_z
+        self.target = checked_field("target", equation.target(self.x), n_z)
+        self._integrator = Integrator(
+            equation,
+            n_z=n_z,
+            supports=self.supports,
+            integration_time=integration_time,
+            steps=internal_steps(sample_time, integration_time),
+        )
+        self.compiled_in_seconds = 0.0
+        self._allocate(0)
+
+    def _allocate(self, batch: int) -> None:
+        self.batch, self.step_index = batch, 0
+        self.states = np.zeros((batch, self.n_z))
+        self._total = np.zeros(batch)
+        self._diverged_step = np.full(batch, -1, dtype=np.int64)
+
+    def reset(self, seeds: ArrayLike) -> NDArray[np.float64]:
+        """Begin an episode.
+
+        Parameters
+        ----------
+        seeds : (M,) int
+            One seed for each environment: 0 or more draws the initial field from its distribution, equal seeds
+            giving equal fields; -1 is the mean field.
+
+        Returns
+        -------
+        (M, n_z)
+            The states z_0, in the plant's own array: copy what must outlive the next step.
+
+        Raises
+        ------
+        ValueError
+            The seeds have another shape or type, or one is below -1. The plant is left as it was.
+        """
+        seeds = np.asarray(seeds)
+        if seeds.ndim != 1 or seeds.size == 0 or not np.issubdtype(seeds.dtype, np.integer):
+            raise ValueError(
+                f"seeds must be a one-dimensional array of integers, one for each environment, "
+                f"got shape {seeds.shape} of {seeds.dtype}"
+            )
+        if seeds.min() < MEAN_FIELD:
+            raise ValueError(f"seeds must be 0 or more, or -1 for the mean field, got {seeds.min()}")
+        drawn = [self._initial_field(int(seed)) for seed in seeds]
+        if self.batch != seeds.size:
+            self._allocate(seeds.size)
+        self.step_index = 0
+        self._total.fill(0.0)
+        self._diverged_step.fill(-1)
+        for state, initial in zip(self.states, drawn, strict=True):
+            state[:] = initial
+        return self.states
+
+    def _initial_field(self, seed: int) -> NDArray[np.float64]:
+        rng = None if seed == MEAN_FIELD else np.random.default_rng(seed)
+        return checked_field("initial_field", self.equation.initial_field(self.x, rng), self.n_z)
+
+    def step(self, actions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Hold the actions for one sampling time, and count the stage cost of the states before it.
+
+        Parameters
+        ----------
+        actions : (M, n_a)
+            a_k, held over [t_k, t_{k+1}).
+
+        Returns
+        -------
+        (M, n_z)
+            The states z_{k+1}, in the plant's own array: copy what must outlive the next step.
+
+        Raises
+        ------
+        ValueError
+            The actions have another shape or are not finite. The plant is left as it was.
+        RuntimeError
+            No episode was begun, or its horizon is reached.
+        """
+        if not self.batch:
+            raise RuntimeError("no episode has begun: call reset(seeds) before step(actions)")
+        if self.step_index >= self.horizon:
+            raise RuntimeError(f"the episode is over after {self.horizon} steps: call reset(seeds)")
+        actions = np.asarray(actions, dtype=np.float64)
+        if actions.shape != (self.batch, self.n_a):
+            raise ValueError(f"actions must have shape {(self.batch, self.n_a)}, got {actions.shape}")
+        if not np.isfinite(actions).all():
+            raise ValueError("actions must be finite, got NaN or infinity")
+        costs = self.stage_costs(self.states, actions)
+        new = self.f(self.states, actions)
+        for i in range(self.batch):
+            if self._diverged_step[i] < 0:
+                self._total[i] += costs[i]
+                if np.all(np.abs(new[i]) <= self.divergence_bound) and np.isfinite(self._total[i]):
+                    self.states[i] = new[i]
+                else:
+                    self._diverged_step[i] = self.step_index
+        self.step_index += 1
+        return self.states
+
+    def f(self, states: NDArray[np.float64], actions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """z_{k+1} of the states (M, n_z) under the actions (M, n_a): a pure function, whatever the episode does."""
+        return self._integrator.advance(states, actions)
+
+    def stage_costs(self, states: NDArray[np.float64], actions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """l_k of the states (M, n_z) and the actions (M, n_a): (M,)."""
+        with np.errstate(all="ignore"):
+            return np.array(
+                [
+                    self.state_weight * float(np.sum((z - self.target) ** 2))
+                    + self.action_weight * float(np.sum(a**2))
+                    for z, a in zip(states, actions, strict=True)
+                ]
+            )
+
+    def episode_costs(self) -> EpisodeCosts:
+        """The costs of the episode so far."""
+        diverged = self._diverged_step >= 0
+        total = np.where(diverged, DIVERGED_COST * self.horizon, self._total)
+        mean = np.where(diverged, DIVERGED_COST, self._total / max(self.step_index, 1))
+        return EpisodeCosts(mean=mean, total=total, diverged_step=self._diverged_step.copy())
+
+
+def whole(name: str, value: int, minimum: int) -> int:
+    try:
+        number = operator.index(value)
+    except TypeError:
+        raise ValueError(f"{name} must be a whole number, got {value!r}") from None
+    if number < minimum:
+        raise ValueError(f"{name} must be at least {minimum}, got {number}")
+    return number
+
+
+def positive(name: str, value: float) -> float:
+    if not 0 < value < math.inf:
+        raise ValueError(f"{name} must be positive and finite, got {value!r}")
+    return float(value)
+
+
+def internal_steps(sample_time: float, integration_time: float) -> int:
+    """How many internal steps make a sampling time; rounded, as 0.01 // 0.00001 is 999 in floating point."""
+    ratio = sample_time / integration_time
+    steps = round(ratio)
+    if steps < 1 or abs(ratio - steps) > 1e-9 * ratio:
+        near = max(steps, 1)
+        raise ValueError(
+            f"sample_time must be a whole multiple of integration_time, got {sample_time!r} and "
+            f"{integration_time!r}: take an integration_time of {sample_time / near:.12g}"
+        )
+    return steps
+
+
+def checked_field(what: str, values: NDArray[np.float64], n_z: int) -> NDArray[np.float64]:
+    values = np.asarray(values, dtype=np.float64)
+    if values.shape != (n_z,) or not np.isfinite(values).all():
+        raise ValueError(
+            f"{what} of the equation must return {n_z} finite numbers for x of shape ({n_z},), "
+            f"got shape {values.shape}"
+        )
+    return values
