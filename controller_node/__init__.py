@@ -1,0 +1,1 @@
+"""The controller: reduced model, LQ tracking, projected law, and the node that answers states."""

@@ -1,0 +1,154 @@
+"""Linear-quadratic tracking gains of a reduced model.
+
+For s_{k+1} = A s_k + B a_k and the stage cost (s - s_r)^T Q (s - s_r) + a^T R a with a constant
+target s_r, let P be the stabilising solution of the discrete algebraic Riccati equation
+
+    P = Q + A^T P A - A^T P B (R + B^T P B)^{-1} B^T P A,        S = R + B^T P B.
+
+The law a = K_a s + K_b s_r with
+
+    K_a = -S^{-1} B^T P A,        K_b = S^{-1} B^T (I - (A + B K_a)^T)^{-1} Q
+
+is optimal over an infinite horizon. The weights are multiples of the identity on the full state and
+the actions, so Q = U^T (state_weight I) U = state_weight I, as U has orthonormal columns, and R =
+action_weight I.
+
+References
+----------
+Zhang, Mowlavi, Benosman, Basar, "Policy Optimization for PDE Control with a Warm Start",
+arXiv:2403.01005.
+Anderson, Moore, "Optimal Control: Linear Quadratic Methods", chapter 4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+from threadpoolctl import threadpool_limits
+
+from controller_node.dmdc import ReducedModel
+
+__all__ = ["DesignError", "Gains", "track"]
+
+Array = NDArray[np.float64]
+
+# A direction that the inputs move by less than this, relative to the model's size, counts as out of
+# reach.
+_REACH = 1e-12
+# I - (A + B K_a)^T with a smaller reciprocal condition number has no usable inverse.
+_RECIPROCAL_CONDITION = 1e-14
+
+
+class DesignError(ValueError):
+    """The reduced model admits no tracking law."""
+
+
+@dataclass(frozen=True, eq=False)
+class Gains:
+    """The gains of a = K_a s + K_b s_r.
+
+    Attributes
+    ----------
+    K_a : (n_a, n_s) array
+        Feedback of the reduced state.
+    K_b : (n_a, n_s) array
+        Feedforward of the reduced target.
+    """
+
+    K_a: Array
+    K_b: Array
+
+    @property
+    def policy(self) -> Array:
+        """[K_a K_b], shape (n_a, 2 n_s)."""
+        return np.hstack([self.K_a, self.K_b])
+
+
+def track(model: ReducedModel, *, state_weight: float, action_weight: float) -> Gains:
+    """Design the tracking gains of a reduced model.
+
+    Parameters
+    ----------
+    model : ReducedModel
+        Must be stabilisable; its modes may be unstable as long as the actuators reach them.
+    state_weight, action_weight : float
+        Positive; Q = state_weight I on the full state and R = action_weight I.
+
+    Raises
+    ------
+    ValueError
+        A weight that is not positive and finite.
+    DesignError
+        A mode on or outside the unit circle that no actuator reaches, or a Riccati equation or a
+        steady-state map without a usable solution.
+    """
+    for name, weight in (("state_weight", state_weight), ("action_weight", action_weight)):
+        if not (np.isfinite(weight) and weight > 0.0):
+            raise ValueError(f"{name} must be positive and finite, but it is {weight}.")
+    A, B = model.A, model.B
+    Q = state_weight * np.eye(model.n_s)
+    R = action_weight * np.eye(model.n_a)
+    # One thread: a threaded LAPACK rounds differently for another number of threads.
+    with threadpool_limits(limits=1):
+        _require_stabilisable(A, B)
+        try:
+            P = linalg.solve_discrete_are(A, B, Q, R)
+        except (linalg.LinAlgError, ValueError) as error:
+            raise DesignError(
+                f"the Riccati equation of the reduced model has no stabilising solution ({error}); "
+                f"its spectral radius is {_spectral_radius(A):.6g}, so identify with another seed "
+                "or another n_s."
+            ) from error
+        S = R + B.T @ P @ B
+        K_a = -linalg.solve(S, B.T @ P @ A, assume_a="pos")
+        closed_loop = A + B @ K_a
+        if not _spectral_radius(closed_loop) < 1.0:
+            raise DesignError(
+                f"the closed loop must have a spectral radius below 1, but it is "
+                f"{_spectral_radius(closed_loop):.17g}; the reduced model is barely stabilisable, "
+                "so identify with another seed or another n_s."
+            )
+        K_b = linalg.solve(S, B.T @ _steady_state_map(closed_loop) @ Q, assume_a="pos")
+    return Gains(K_a=K_a, K_b=K_b)
+
+
+def _spectral_radius(matrix: Array) -> float:
+    return float(np.abs(linalg.eigvals(matrix)).max())
+
+
+def _require_stabilisable(A: Array, B: Array) -> None:
+    # Popov-Belevitch-Hautus: [lambda I - A, B] keeps full row rank at every eigenvalue with
+    # |lambda| >= 1.
+    size = max(float(linalg.norm(A, 2)), float(linalg.norm(B, 2)))
+    for eigenvalue in linalg.eigvals(A):
+        if abs(eigenvalue) < 1.0 - _REACH:
+            continue
+        pencil = np.hstack([eigenvalue * np.eye(len(A)) - A, B])
+        reach = float(linalg.svdvals(pencil)[-1])
+        if reach <= _REACH * size:
+            raise DesignError(
+                f"the reduced model is not stabilisable: no actuator reaches the mode with "
+                f"eigenvalue magnitude {abs(eigenvalue):.6g} (smallest singular value of [lambda I "
+                f"- A, B] {reach:.1e}); place actuators that reach it or identify with another "
+                "seed or n_s."
+            )
+
+
+def _steady_state_map(closed_loop: Array) -> Array:
+    """(I - (A + B K_a)^T)^{-1}."""
+    matrix = np.eye(len(closed_loop)) - closed_loop.T
+    singular_values = linalg.svdvals(matrix)
+    reciprocal = (
+        float(singular_values[-1] / singular_values[0]) if singular_values[0] > 0.0 else 0.0
+    )
+    if reciprocal < _RECIPROCAL_CONDITION:
+        raise DesignError(
+            f"I - (A + B K_a)^T is singular (reciprocal condition number {reciprocal:.1e}): the "
+            "closed loop has a mode at 1 and no steady state, so raise state_weight or identify "
+            "with another seed."
+        )
+    inverse: Array = linalg.inv(matrix)
+    return inverse

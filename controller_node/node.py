@@ -1,0 +1,100 @@
+"""controller_node: the projected LQ-tracking law as a ROS 2 node.
+
+Subscribes  state, target, episode/start, policy, model, episode/cost
+Publishes   action, model/identified, model/failed
+Messages, order and parameters: docs/interfaces.md. The protocol is controller_node.responder.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+
+from rclpy.node import Node
+from std_msgs.msg import String
+
+from controller_node.identification import DesignSettings
+from controller_node.responder import Responder
+from loop_interfaces.frames import Frame
+from loop_interfaces.isolation import keep_on_this_machine
+from loop_interfaces.node_loop import NodeLoop, node_main, qos
+from loop_interfaces.parameters import PROBLEM
+from loop_interfaces.protocol import ModelFailure, Send
+from loop_interfaces.ros_parameters import declare, given_parameters
+from loop_interfaces.topics import (
+    ACTION,
+    COST,
+    MODEL,
+    MODEL_FAILED,
+    MODEL_IDENTIFIED,
+    POLICY,
+    START,
+    STATE,
+    TARGET,
+)
+
+CONTROLLER_PARAMETERS = tuple(
+    spec
+    for spec in PROBLEM
+    if spec.name
+    in (
+        "problem",
+        "n_a",
+        "dmdc_rank",
+        "reduced_order",
+        "state_weight",
+        "action_weight",
+        "exploration_variance",
+    )
+)
+"""The problem parameters that concern the controller."""
+
+
+class ControllerNode:
+    """Moves messages between the topics and the responder."""
+
+    def __init__(self, node: Node, loop: NodeLoop) -> None:
+        values = declare(node, CONTROLLER_PARAMETERS, given_parameters(node))
+        settings = {k: v for k, v in values.items() if k != "problem"}
+        responder = Responder(DesignSettings(**settings))
+        self._node, self._loop = node, loop
+        self._senders = {topic: loop.sender(topic) for topic in (ACTION, MODEL_IDENTIFIED)}
+        self._failed = node.create_publisher(String, MODEL_FAILED, qos(MODEL))
+        handlers: dict[object, Callable[[Frame], Sequence[Send | ModelFailure]]] = {
+            STATE: responder.state,
+            TARGET: responder.target,
+            START: responder.start,
+            POLICY: responder.policy,
+            MODEL: responder.model,
+            COST: responder.cost,
+        }
+        for topic in (STATE, TARGET, START, POLICY, MODEL, COST):
+            loop.receive(topic, self._performer(handlers[topic]))
+        node.get_logger().info(f"{values['problem']}: order {values['reduced_order']} tracking law")
+
+    def run(self) -> int:
+        self._loop.run(tick=lambda now: None, deadline=lambda: None, housekeeping=lambda now: None)
+        return 0
+
+    def _performer(
+        self, handler: Callable[[Frame], Sequence[Send | ModelFailure]]
+    ) -> Callable[[Frame], None]:
+        def perform(frame: Frame) -> None:
+            for send in handler(frame):
+                if isinstance(send, Send):
+                    self._senders[send.topic].send(send.frame)
+                else:
+                    self._failed.publish(String(data=send.to_json()))
+                    self._node.get_logger().error(f"no reduced model: {send.reason}")
+
+        return perform
+
+
+def main(args: list[str] | None = None) -> int:
+    """Console script."""
+    keep_on_this_machine()
+    return node_main("controller_node", args, ControllerNode)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

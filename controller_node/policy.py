@@ -1,0 +1,214 @@
+"""The projected control law, for a batch of environments that each have their own policy.
+
+    a = K_a U^T z + K_b U^T z_r,        policy = [K_a K_b], shape (n_a, 2 n_s)
+
+An environment's action does not depend on how many environments are in the batch, nor on its place
+in it, to the last bit: every sum runs over its terms one after the other (no BLAS, no
+reassociation), and what is vectorised is the independent sums beside each other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["ProjectedLaw", "control", "excitation"]
+
+Array = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
+
+
+@njit(cache=True)
+def control(
+    feedback: Array,
+    constant: Array,
+    bases: Array,
+    model_index: IndexArray,
+    states: Array,
+    reduced: Array,
+    actions: Array,
+) -> None:
+    """Write a[m] = constant[m] + feedback[m]^T U[model_index[m]]^T z[m] into `actions`.
+
+    feedback : (M, n_s, n_a), K_a transposed; constant : (M, n_a), K_b s_r; bases : (models, n_z,
+    n_s);
+    model_index : (M,); states : (M, n_z); reduced : (n_s,), workspace; actions : (M, n_a), written.
+    """
+    n_z, n_s = bases.shape[1], bases.shape[2]
+    n_a = actions.shape[1]
+    for m in range(states.shape[0]):
+        basis = bases[model_index[m]]
+        for j in range(n_s):
+            reduced[j] = 0.0
+        for i in range(n_z):
+            value = states[m, i]
+            for j in range(n_s):
+                reduced[j] += basis[i, j] * value
+        for k in range(n_a):
+            actions[m, k] = constant[m, k]
+        for j in range(n_s):
+            value = reduced[j]
+            for k in range(n_a):
+                actions[m, k] += feedback[m, j, k] * value
+
+
+class ProjectedLaw:
+    """The projected law of M environments.
+
+    Parameters
+    ----------
+    models : sequence of (n_z, n_s) arrays
+        The bases U that environments can use; all of one shape.
+    target : (n_z,) array
+        The target field z_r.
+
+    Call `set` before the first `actions`. Anything malformed raises a ValueError and leaves the law
+    as it was.
+    """
+
+    def __init__(self, models: Sequence[ArrayLike], target: ArrayLike) -> None:
+        bases = [np.asarray(basis, dtype=np.float64) for basis in models]
+        shapes = {basis.shape for basis in bases}
+        if len(shapes) != 1 or bases[0].ndim != 2 or 0 in bases[0].shape:
+            raise ValueError(
+                f"models must be one or more bases of one shape (n_z, n_s), but the shapes are "
+                f"{[basis.shape for basis in bases]}."
+            )
+        self._bases = np.ascontiguousarray(np.stack(bases))
+        self._n_z, self._n_s = bases[0].shape
+        z_r = np.asarray(target, dtype=np.float64)
+        if z_r.shape != (self._n_z,):
+            raise ValueError(
+                f"target must have shape ({self._n_z},) like a state, but it has {z_r.shape}."
+            )
+        if not np.isfinite(self._bases).all() or not np.isfinite(z_r).all():
+            raise ValueError(
+                "models and target must be finite, but there is NaN or infinity in them."
+            )
+        # The reduced targets come from the same kernel as the reduced states: an identity for the
+        # feedback.
+        count = len(bases)
+        self._reduced_targets = np.empty((count, self._n_s))
+        self._reduced = np.empty(self._n_s)
+        control(
+            np.ascontiguousarray(np.broadcast_to(np.eye(self._n_s), (count, self._n_s, self._n_s))),
+            np.zeros((count, self._n_s)),
+            self._bases,
+            np.arange(count, dtype=np.int64),
+            np.ascontiguousarray(np.broadcast_to(z_r, (count, self._n_z))),
+            self._reduced,
+            self._reduced_targets,
+        )
+        self._feedback: Array | None = None
+        self._constant: Array = np.empty((0, 0))
+        self._model_index = np.empty(0, dtype=np.int64)
+
+    @property
+    def reduced_targets(self) -> Array:
+        """s_r = U^T z_r of every model, shape (models, n_s)."""
+        return self._reduced_targets.copy()
+
+    def set(self, policies: ArrayLike, model_index: ArrayLike | None = None) -> None:
+        """Take the policies of the next episode.
+
+        Parameters
+        ----------
+        policies : (M, n_a, 2 n_s) array
+            [K_a K_b] of every environment.
+        model_index : (M,) array of int, optional
+            Which of the models an environment projects with; the first one if not given.
+        """
+        gains = np.asarray(policies, dtype=np.float64)
+        if gains.ndim != 3 or 0 in gains.shape or gains.shape[2] != 2 * self._n_s:
+            raise ValueError(
+                f"policies must have shape (environments, actuators, {2 * self._n_s}) for "
+                f"{self._n_s} modes, but the shape is {gains.shape}."
+            )
+        if not np.isfinite(gains).all():
+            raise ValueError("policies must be finite, but there is NaN or infinity in them.")
+        count = gains.shape[0]
+        index = np.zeros(count, dtype=np.int64) if model_index is None else np.array(model_index)
+        if index.shape != (count,) or not np.issubdtype(index.dtype, np.integer):
+            raise ValueError(
+                f"model_index must be {count} integers, one per policy, but it has shape "
+                f"{index.shape} and type {index.dtype}."
+            )
+        if index.min() < 0 or index.max() >= len(self._bases):
+            raise ValueError(
+                f"model_index must lie in 0 .. {len(self._bases) - 1}, but it holds {index.min()} "
+                f".. {index.max()}."
+            )
+        # A plain sum over the modes, one environment beside the other.
+        constant: Array = np.zeros(gains.shape[:2])
+        for j in range(self._n_s):
+            constant += gains[:, :, self._n_s + j] * self._reduced_targets[index, j, None]
+        self._feedback = np.ascontiguousarray(gains[:, :, : self._n_s].transpose(0, 2, 1))
+        self._constant = constant
+        self._model_index = index.astype(np.int64)
+
+    def actions(self, states: ArrayLike, out: Array | None = None) -> Array:
+        """The actions that answer the states.
+
+        Parameters
+        ----------
+        states : (M, n_z) array
+            The fields at t_k. An environment whose field is not finite gets an action that is not
+            finite and does not disturb the others.
+        out : (M, n_a) C-contiguous float64 array, optional
+            Written and returned; without it every call allocates the result.
+
+        Returns
+        -------
+        (M, n_a) array
+            The actions held over [t_k, t_{k+1}).
+        """
+        if self._feedback is None:
+            raise ValueError("the law has no policies yet; call set() before actions().")
+        z = np.ascontiguousarray(states, dtype=np.float64)
+        shape = self._constant.shape
+        if z.shape != (shape[0], self._n_z):
+            raise ValueError(
+                f"states must have shape ({shape[0]}, {self._n_z}), one field per policy, but the "
+                f"shape is {z.shape}."
+            )
+        if out is None:
+            out = np.empty(shape)
+        elif out.shape != shape or out.dtype != np.float64 or not out.flags.c_contiguous:
+            raise ValueError(
+                f"out must be a C-contiguous float64 array of shape {shape}, but it is {out.dtype} "
+                f"of shape {out.shape}."
+            )
+        control(
+            self._feedback, self._constant, self._bases, self._model_index, z, self._reduced, out
+        )
+        return out
+
+
+def excitation(seed: int, step: int, n_a: int, variance: float) -> Array:
+    """The exploratory action of one step, drawn from N(0, variance I).
+
+    A pure function of (seed, step), so that a step that is answered twice gets the same action
+    twice.
+
+    Parameters
+    ----------
+    seed, step : int
+        Not negative.
+    n_a : int
+        Number of actuators.
+    variance : float
+        Variance of every entry, not its standard deviation.
+    """
+    if seed < 0 or step < 0 or n_a < 1:
+        raise ValueError(
+            f"excitation needs seed >= 0, step >= 0 and n_a >= 1, but got seed {seed}, step "
+            f"{step}, n_a {n_a}."
+        )
+    if not (np.isfinite(variance) and variance >= 0.0):
+        raise ValueError(f"variance must be finite and not negative, but it is {variance}.")
+    draw: Array = np.random.default_rng([seed, step]).standard_normal(n_a)
+    return math.sqrt(variance) * draw

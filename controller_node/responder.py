@@ -1,0 +1,223 @@
+"""The controller's side of the loop: answer every state. Pure: no ROS, no clock.
+
+It answers every state of the episode it was told of, also one it has answered before, and the
+answer depends only on (state, policy, model) or, in an exploratory episode, on (seed, step). It
+keeps nothing that the latched topics do not give it back after a restart, except the samples of an
+exploratory episode: if it missed some, it says so and the episode is run again.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from controller_node.identification import DesignSettings, design
+from controller_node.policy import ProjectedLaw, excitation
+from loop_interfaces import model_rows
+from loop_interfaces.frames import Frame, FrameError
+from loop_interfaces.protocol import ModelFailure, Send, Tally
+from loop_interfaces.topics import (
+    ACTION,
+    COMPLETED,
+    MODEL_IDENTIFIED,
+    VOID,
+    CostColumn,
+    StartColumn,
+)
+
+MAX_GAIN = 1e9
+"""Largest gain accepted: with fields below the divergence bound no action can overflow."""
+
+
+MAX_RUNS = 4
+"""Runs whose messages are kept apart; the least recently heard one is forgotten first."""
+
+
+@dataclass
+class _Run:
+    """What one run's tuner has said, and what was made of it."""
+
+    start: Frame | None = None
+    policy: Frame | None = None
+    models: list[model_rows.ModelRows] = field(default_factory=list)
+    law: ProjectedLaw | None = None
+    law_episode: int = -1
+    samples: dict[int, np.ndarray] = field(default_factory=dict)
+    identified: Send | ModelFailure | None = None
+
+    def episode_start(self, frame: Frame) -> Frame | None:
+        """The start of the frame's episode, if it is the one this run is in."""
+        start = self.start
+        return start if start is not None and start.episode == frame.episode else None
+
+
+class Responder:
+    """One controller. It answers whichever run the plant serves; runs never share anything."""
+
+    def __init__(self, settings: DesignSettings) -> None:
+        self._settings = settings
+        self._target: np.ndarray | None = None
+        self._runs: OrderedDict[int, _Run] = OrderedDict()
+        self._pending: Frame | None = None
+        self.tally = Tally()
+        self.answered = 0
+        self.episode = -1
+
+    def target(self, frame: Frame) -> list[Send]:
+        """Take the plant's target z_r."""
+        if self._target is None or not np.array_equal(self._target, frame.values):
+            self._target = frame.values.copy()
+            for run in self._runs.values():
+                run.law, run.law_episode = None, -1
+        return self._answer_pending()
+
+    def start(self, frame: Frame) -> list[Send]:
+        """Learn of an episode: who explores, which model each environment uses."""
+        rows = frame.values
+        if rows.shape[1] != len(StartColumn):
+            raise FrameError(f"expected rows of {len(StartColumn)} numbers, got {rows.shape[1]}")
+        if not len(rows):
+            self._runs.pop(frame.run, None)
+            return []
+        exploring = rows[:, StartColumn.EXCITATION] >= 0
+        if exploring.any() and not exploring.all():
+            raise FrameError("expected all environments of an episode to explore, or none")
+        if (rows[:, StartColumn.MODEL] < 0).any() or (rows != np.floor(rows)).any():
+            raise FrameError("expected seeds and model indices that are whole numbers")
+        run = self._run(frame.run)
+        if run.episode_start(frame) is None:
+            run.start = Frame(frame.run, frame.episode, 0, frame.time, rows.copy())
+            run.samples, run.identified, run.law_episode = {}, None, -1
+        return self._answer_pending()
+
+    def policy(self, frame: Frame) -> list[Send]:
+        """Take the policies [K_a K_b] of an episode's environments."""
+        n_a = self._settings.n_a
+        if frame.values.shape[1] != n_a:
+            raise FrameError(f"expected gains of {n_a} actuators, got {frame.values.shape[1]}")
+        if frame.values.size and np.abs(frame.values).max() > MAX_GAIN:
+            raise FrameError(f"expected gains of at most {MAX_GAIN:g} in magnitude")
+        run = self._run(frame.run)
+        run.policy = Frame(frame.run, frame.episode, 0, frame.time, frame.values.copy())
+        run.law_episode = -1
+        return self._answer_pending()
+
+    def model(self, frame: Frame) -> list[Send]:
+        """Take a run's reduced models."""
+        run = self._run(frame.run)
+        run.models = [model_rows.unpack(rows.copy(), self._settings.n_a) for rows in frame.values]
+        run.law, run.law_episode = None, -1
+        return self._answer_pending()
+
+    def state(self, frame: Frame) -> list[Send]:
+        """The action that answers a state; the state is kept until what it needs has arrived."""
+        actions = self._actions(frame)
+        if actions is None:
+            self._pending = Frame(
+                frame.run, frame.episode, frame.step, frame.time, frame.values.copy()
+            )
+            self.tally["states that had to wait"] += 1
+            return []
+        self._pending = None
+        self.answered += 1
+        self.episode = frame.episode
+        return [Send(ACTION, Frame(frame.run, frame.episode, frame.step, frame.time, actions))]
+
+    def cost(self, frame: Frame) -> list[Send | ModelFailure]:
+        """At the end of an exploratory episode: reduce and design."""
+        run = self._runs.get(frame.run)
+        start = run.episode_start(frame) if run else None
+        if run is None or start is None or start.values[0, StartColumn.EXCITATION] < 0:
+            return []
+        if run.identified is None:
+            run.identified = self._identify(run, start, frame)
+            run.samples = {}
+        return [run.identified]
+
+    def _run(self, number: int) -> _Run:
+        run = self._runs.setdefault(number, _Run())
+        self._runs.move_to_end(number)
+        if len(self._runs) > MAX_RUNS:
+            self._runs.popitem(last=False)
+        return run
+
+    def _actions(self, frame: Frame) -> np.ndarray | None:
+        run = self._runs.get(frame.run)
+        start = run.episode_start(frame) if run else None
+        if run is None or start is None:
+            return None
+        if len(start.values) != len(frame.values):
+            raise FrameError(
+                f"expected the states of {len(start.values)} environments, got {len(frame.values)}"
+            )
+        if start.values[0, StartColumn.EXCITATION] >= 0:
+            run.samples[frame.step] = frame.values.copy()
+            return np.stack([self._explore(seed, frame.step) for seed in _excitations(start)])
+        if run.law_episode != frame.episode and not self._prepare(run, start):
+            return None
+        assert run.law is not None
+        return run.law.actions(frame.values)
+
+    def _prepare(self, run: _Run, start: Frame) -> bool:
+        """Set the law for the run's episode; False while something has not arrived yet."""
+        policy = run.policy
+        if policy is None or policy.episode != start.episode:
+            return False
+        if self._target is None or not run.models:
+            return False
+        if run.law is None:
+            run.law = ProjectedLaw([model.U for model in run.models], self._target)
+        index = start.values[:, StartColumn.MODEL].astype(np.int64)
+        if len(policy.values) != len(index):
+            raise FrameError(
+                f"expected policies for {len(index)} environments, got {len(policy.values)}"
+            )
+        run.law.set(policy.values, index)
+        run.law_episode = start.episode
+        return True
+
+    def _explore(self, seed: int, step: int) -> np.ndarray:
+        settings = self._settings
+        return excitation(seed, step, settings.n_a, settings.exploration_variance)
+
+    def _identify(self, run: _Run, start: Frame, cost: Frame) -> Send | ModelFailure:
+        def failure(retry: bool, reason: str) -> ModelFailure:
+            return ModelFailure(start.run, start.episode, retry, reason)
+
+        ended = cost.values[:, CostColumn.ENDED]
+        if (ended == VOID).any() or len(ended) != len(start.values):
+            return failure(True, "the exploratory episode is void")
+        if (ended != COMPLETED).any():
+            return failure(
+                False,
+                f"the plant diverged under exploration at step {int(ended.max())}; "
+                "lower exploration_variance",
+            )
+        steps = range(cost.step + 1)
+        if sorted(run.samples) != list(steps):
+            return failure(
+                True,
+                f"the controller holds {len(run.samples)} of the {len(steps)} states "
+                "of the exploratory episode",
+            )
+        if self._target is None:
+            return failure(True, "the plant's target has not arrived")
+        states = np.stack([run.samples[k] for k in steps])
+        try:
+            models = []
+            for env, seed in enumerate(_excitations(start)):
+                actions = np.stack([self._explore(seed, k) for k in steps[:-1]])
+                models.append(design(states[:, env], actions, self._target, self._settings))
+        except ValueError as error:
+            return failure(False, str(error))
+        rows = np.stack([model_rows.pack(model) for model in models])
+        return Send(MODEL_IDENTIFIED, Frame(start.run, start.episode, 0, cost.time, rows))
+
+    def _answer_pending(self) -> list[Send]:
+        return self.state(self._pending) if self._pending is not None else []
+
+
+def _excitations(start: Frame) -> list[int]:
+    return [int(seed) for seed in start.values[:, StartColumn.EXCITATION]]

@@ -1,0 +1,125 @@
+"""DMDc recovers linear systems, is unique, and refuses what it cannot identify."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from controller_node.dmdc import ReducedModel, identify
+
+N_S, N_A, STEPS = 3, 2, 40
+
+
+def linear_system(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((N_S, N_S))
+    A *= 0.95 / np.abs(np.linalg.eigvals(A)).max()
+    return A, rng.standard_normal((N_S, N_A))
+
+
+def trajectory(A: np.ndarray, B: np.ndarray, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    actions = rng.standard_normal((STEPS, N_A))
+    states = [rng.standard_normal(N_S)]
+    for a in actions:
+        states.append(A @ states[-1] + B @ a)
+    return np.array(states), actions
+
+
+@pytest.mark.parametrize("n_z", [N_S, 20, 60])
+def test_recovers_a_linear_system_to_machine_precision(n_z: int) -> None:
+    A, B = linear_system()
+    lift = np.linalg.qr(np.random.default_rng(2).standard_normal((n_z, N_S)))[0]
+    states, actions = trajectory(A, B)
+    model = identify(states @ lift.T, actions, p=N_S + N_A, n_s=N_S)
+    # U spans the columns of the lift, in another basis: T = U^T lift is orthogonal.
+    T = model.U.T @ lift
+    np.testing.assert_allclose(T @ T.T, np.eye(N_S), atol=1e-13)
+    np.testing.assert_allclose(T.T @ model.A @ T, A, atol=1e-12)
+    np.testing.assert_allclose(T.T @ model.B, B, atol=1e-12)
+    np.testing.assert_allclose(model.U.T @ model.U, np.eye(N_S), atol=1e-13)
+    assert (model.n_z, model.n_s, model.n_a) == (n_z, N_S, N_A)
+
+
+def test_is_the_formula_of_the_paper() -> None:
+    rng = np.random.default_rng(3)
+    states, actions = rng.standard_normal((STEPS + 1, 12)), rng.standard_normal((STEPS, N_A))
+    p, n_s = 7, 4
+    model = identify(states, actions, p=p, n_s=n_s)
+    psi, xi, lam_t = np.linalg.svd(np.vstack([states[:-1].T, actions.T]), full_matrices=False)
+    truncated = lam_t[:p].T @ np.diag(1.0 / xi[:p])
+    left = model.U.T @ states[1:].T @ truncated
+    np.testing.assert_allclose(model.A, left @ psi[:12, :p].T @ model.U, atol=1e-12)
+    np.testing.assert_allclose(model.B, left @ psi[12:, :p].T, atol=1e-12)
+
+
+def test_basis_is_unique_and_repeatable() -> None:
+    states, actions = trajectory(*linear_system())
+    first = identify(states, actions, p=5, n_s=N_S)
+    again = identify(states.copy(), actions.copy(), p=5, n_s=N_S)
+    for name in ("A", "B", "U"):
+        assert np.array_equal(getattr(first, name), getattr(again, name))
+    # The opposite trajectory has opposite singular vectors; the sign rule gives the same basis.
+    opposite = identify(-states, -actions, p=5, n_s=N_S)
+    np.testing.assert_allclose(opposite.U, first.U, atol=1e-13)
+    largest = np.abs(first.U).argmax(axis=0)
+    assert (first.U[largest, np.arange(N_S)] > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("p", "n_s", "message"),
+    [
+        (0, 1, "at least 1"),
+        (3, 0, "at least 1"),
+        (23, 3, r"at most min\(n_z \+ n_a, N\) = 22"),
+        (6, 3, "numerical rank of the data, 5"),
+        (5, 4, "numerical rank of the states, 3"),
+        (3, 4, "at most p = 3"),
+    ],
+)
+def test_refuses_more_than_the_trajectory_holds(p: int, n_s: int, message: str) -> None:
+    lift = np.linalg.qr(np.random.default_rng(2).standard_normal((20, N_S)))[0]
+    states, actions = trajectory(*linear_system())
+    with pytest.raises(ValueError, match=message):
+        identify(states @ lift.T, actions, p=p, n_s=n_s)
+
+
+def test_refuses_a_trajectory_shorter_than_p() -> None:
+    states, actions = trajectory(*linear_system())
+    with pytest.raises(ValueError, match="= 4, but p is 5"):
+        identify(states[:5], actions[:4], p=5, n_s=3)
+
+
+def test_refuses_malformed_trajectories() -> None:
+    states, actions = trajectory(*linear_system())
+    with pytest.raises(ValueError, match="40 actions belong to 41 states, but 40"):
+        identify(states[:-1], actions, p=5, n_s=3)
+    with pytest.raises(ValueError, match="non-empty matrix"):
+        identify(states[0], actions, p=5, n_s=3)
+    with pytest.raises(ValueError, match="non-empty matrix"):
+        identify(states[:1], actions[:0], p=5, n_s=3)
+    broken = states.copy()
+    broken[7, 1] = np.nan
+    with pytest.raises(ValueError, match="row 7"):
+        identify(broken, actions, p=5, n_s=3)
+    broken = actions.copy()
+    broken[3, 0] = np.inf
+    with pytest.raises(ValueError, match="actions must be finite, but row 3"):
+        identify(states, broken, p=5, n_s=3)
+
+
+def test_reduced_model_checks_itself_and_is_read_only() -> None:
+    A, B, U = np.eye(2), np.ones((2, 1)), np.eye(5)[:, :2]
+    model = ReducedModel(A=A, B=B, U=U)
+    A[0, 0] = 7.0
+    assert model.A[0, 0] == 1.0
+    with pytest.raises(ValueError, match="read-only"):
+        model.A[0, 0] = 2.0
+    with pytest.raises(ValueError, match=r"needs A of shape \(2, 2\)"):
+        ReducedModel(A=np.eye(3), B=B, U=U)
+    with pytest.raises(ValueError, match="B with 2 rows"):
+        ReducedModel(A=np.eye(2), B=np.ones((3, 1)), U=U)
+    with pytest.raises(ValueError, match="B of a reduced model must be finite"):
+        ReducedModel(A=np.eye(2), B=B * np.nan, U=U)
+    with pytest.raises(ValueError, match="U of a reduced model must be a non-empty matrix"):
+        ReducedModel(A=np.eye(2), B=B, U=np.ones(5))

@@ -1,0 +1,147 @@
+"""The tracking gains solve the Riccati equation, are optimal, and reach the best steady state."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import linalg
+
+from controller_node.dmdc import ReducedModel
+from controller_node.lqt import DesignError, _steady_state_map, track
+
+N_Z, N_S, N_A = 10, 4, 2
+Q_WEIGHT, R_WEIGHT = 1.5, 0.3
+
+
+def model(radius: float = 1.05, seed: int = 0) -> ReducedModel:
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((N_S, N_S))
+    A *= radius / np.abs(np.linalg.eigvals(A)).max()
+    U = np.linalg.qr(rng.standard_normal((N_Z, N_S)))[0]
+    return ReducedModel(A=A, B=rng.standard_normal((N_S, N_A)), U=U)
+
+
+def diagonal_model(eigenvalues: list[float], B: list[list[float]]) -> ReducedModel:
+    return ReducedModel(A=np.diag(eigenvalues), B=np.array(B), U=np.eye(N_Z)[:, : len(eigenvalues)])
+
+
+def total_cost(
+    m: ReducedModel, K_a: np.ndarray, b: np.ndarray, s: np.ndarray, s_r: np.ndarray, steps: int
+) -> float:
+    cost = 0.0
+    for _ in range(steps):
+        a = K_a @ s + b
+        cost += Q_WEIGHT * float((s - s_r) @ (s - s_r)) + R_WEIGHT * float(a @ a)
+        s = m.A @ s + m.B @ a
+    return cost
+
+
+@pytest.mark.parametrize("radius", [0.8, 1.0, 1.3])
+def test_gains_satisfy_the_riccati_equation(radius: float) -> None:
+    m = model(radius)
+    gains = track(m, state_weight=Q_WEIGHT, action_weight=R_WEIGHT)
+    Q, R = Q_WEIGHT * m.U.T @ m.U, R_WEIGHT * np.eye(N_A)
+    closed = m.A + m.B @ gains.K_a
+    assert np.abs(linalg.eigvals(closed)).max() < 1.0
+    # P from the Lyapunov equation of the closed loop, which does not involve the Riccati solver.
+    P = linalg.solve_discrete_lyapunov(closed.T, Q + gains.K_a.T @ R @ gains.K_a)
+    S = R + m.B.T @ P @ m.B
+    residual = Q + m.A.T @ P @ m.A - P - m.A.T @ P @ m.B @ linalg.solve(S, m.B.T @ P @ m.A)
+    assert linalg.norm(residual) < 1e-10 * linalg.norm(P)
+    np.testing.assert_allclose(S @ gains.K_a, -m.B.T @ P @ m.A, atol=1e-9)
+    expected = m.B.T @ linalg.inv(np.eye(N_S) - closed.T) @ Q
+    np.testing.assert_allclose(S @ gains.K_b, expected, atol=1e-9)
+    assert np.array_equal(gains.policy, np.hstack([gains.K_a, gains.K_b]))
+
+
+def test_feedback_minimises_the_cost_and_perturbing_it_never_lowers_it() -> None:
+    m = model()
+    gains = track(m, state_weight=Q_WEIGHT, action_weight=R_WEIGHT)
+    rng = np.random.default_rng(1)
+    s, zero = rng.standard_normal(N_S), np.zeros(N_S)
+    best = total_cost(m, gains.K_a, np.zeros(N_A), s, zero, 400)
+    for scale in (1e-3, 1e-2, 1e-1):
+        for _ in range(20):
+            K_a = gains.K_a + scale * rng.standard_normal(gains.K_a.shape)
+            assert total_cost(m, K_a, np.zeros(N_A), s, zero, 400) > best
+
+
+def test_feedforward_reaches_the_best_steady_state() -> None:
+    m = model()
+    gains = track(m, state_weight=Q_WEIGHT, action_weight=R_WEIGHT)
+    rng = np.random.default_rng(2)
+    s_r = rng.standard_normal(N_S)
+    b = gains.K_b @ s_r
+    s = rng.standard_normal(N_S)
+    for _ in range(500):
+        s = m.A @ s + m.B @ (gains.K_a @ s + b)
+    # min Q|s - s_r|^2 + R|a|^2 over the steady states (I - A) s = B a: its KKT system.
+    E = np.eye(N_S) - m.A
+    kkt = np.block(
+        [
+            [2 * Q_WEIGHT * np.eye(N_S), np.zeros((N_S, N_A)), E.T],
+            [np.zeros((N_A, N_S)), 2 * R_WEIGHT * np.eye(N_A), -m.B.T],
+            [E, -m.B, np.zeros((N_S, N_S))],
+        ]
+    )
+    rhs = np.concatenate([2 * Q_WEIGHT * s_r, np.zeros(N_A + N_S)])
+    best = np.linalg.solve(kkt, rhs)
+    np.testing.assert_allclose(s, best[:N_S], atol=1e-9)
+    np.testing.assert_allclose(gains.K_a @ s + b, best[N_S : N_S + N_A], atol=1e-9)
+    # And from that state on, another constant input never costs less over a long episode.
+    cost = total_cost(m, gains.K_a, b, s, s_r, 400)
+    for _ in range(20):
+        other = b + 1e-2 * rng.standard_normal(N_A)
+        assert total_cost(m, gains.K_a, other, s, s_r, 400) > cost
+
+
+def test_tracks_an_achievable_target_without_error_when_actions_are_cheap() -> None:
+    m = diagonal_model([0.9, 1.02], [[1.0, 0.0], [0.0, 1.0]])
+    gains = track(m, state_weight=1.0, action_weight=1e-10)
+    s_r, s = np.array([0.7, -1.3]), np.zeros(2)
+    for _ in range(200):
+        s = m.A @ s + m.B @ (gains.K_a @ s + gains.K_b @ s_r)
+    np.testing.assert_allclose(s, s_r, atol=1e-6)
+
+
+@pytest.mark.parametrize("eigenvalue", [1.0, -1.0, 1.25])
+def test_refuses_a_mode_that_no_actuator_reaches(eigenvalue: float) -> None:
+    m = diagonal_model([0.5, eigenvalue], [[1.0], [0.0]])
+    with pytest.raises(DesignError, match=f"eigenvalue magnitude {abs(eigenvalue):.6g}"):
+        track(m, state_weight=1.0, action_weight=1.0)
+
+
+def test_refuses_a_complex_pair_that_no_actuator_reaches() -> None:
+    A = np.zeros((3, 3))
+    A[:2, :2] = 1.1 * np.array([[0.6, -0.8], [0.8, 0.6]])
+    A[2, 2] = 0.3
+    m = ReducedModel(A=A, B=np.array([[0.0], [0.0], [1.0]]), U=np.eye(5)[:, :3])
+    with pytest.raises(DesignError, match=r"eigenvalue magnitude 1\.1 "):
+        track(m, state_weight=1.0, action_weight=1.0)
+
+
+def test_accepts_a_stable_mode_that_no_actuator_reaches() -> None:
+    gains = track(diagonal_model([0.99, 1.2], [[0.0], [1.0]]), state_weight=1.0, action_weight=1.0)
+    assert gains.K_a[0, 0] == pytest.approx(0.0, abs=1e-12)
+    assert abs(1.2 + gains.K_a[0, 1]) < 1.0
+
+
+def test_refuses_a_barely_reachable_mode() -> None:
+    m = diagonal_model([0.5, 1.3], [[1.0], [1e-11]])
+    with pytest.raises(DesignError):
+        track(m, state_weight=1.0, action_weight=1.0)
+
+
+def test_refuses_a_closed_loop_without_steady_state() -> None:
+    with pytest.raises(DesignError, match="singular"):
+        _steady_state_map(np.diag([1.0, 0.5]))
+    with pytest.raises(DesignError, match="singular"):
+        _steady_state_map(np.eye(2))
+
+
+@pytest.mark.parametrize("weight", [0.0, -1.0, np.nan, np.inf])
+def test_refuses_weights_that_are_not_positive(weight: float) -> None:
+    with pytest.raises(ValueError, match="state_weight must be positive"):
+        track(model(), state_weight=weight, action_weight=1.0)
+    with pytest.raises(ValueError, match="action_weight must be positive"):
+        track(model(), state_weight=1.0, action_weight=weight)
