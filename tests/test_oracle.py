@@ -1,0 +1,113 @@
+"""Directions, seeds, and the two-point estimate against theory."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tuner_node import oracle
+
+SHAPE = (3, 4)
+
+
+def test_directions_have_unit_norm_and_are_pure() -> None:
+    theta = oracle.unit_direction(5, 7, SHAPE)
+    assert theta.shape == SHAPE
+    assert np.linalg.norm(theta) == pytest.approx(1.0, abs=1e-15)
+    assert np.array_equal(theta, oracle.unit_direction(5, 7, SHAPE))
+    assert not np.array_equal(theta, oracle.unit_direction(5, 8, SHAPE))
+    assert not np.array_equal(theta, oracle.unit_direction(6, 7, SHAPE))
+
+
+def test_directions_are_uniform_on_the_sphere() -> None:
+    draws = np.array([oracle.unit_direction(0, k, SHAPE).ravel() for k in range(4000)])
+    # E[d Theta Theta^T] = I; an entry of the mean has standard error below 1.5 / sqrt(4000).
+    covariance = draws.shape[1] * draws.T @ draws / len(draws)
+    np.testing.assert_allclose(covariance, np.eye(draws.shape[1]), atol=5 * 1.5 / np.sqrt(4000))
+    assert np.abs(draws.mean(axis=0)).max() < 5 / np.sqrt(12 * 4000)
+
+
+@pytest.mark.parametrize("count", [1, 5, 12])
+def test_several_directions_are_orthonormal(count: int) -> None:
+    directions = oracle.orthonormal_directions(2, 9, SHAPE, count).reshape(count, -1)
+    np.testing.assert_allclose(directions @ directions.T, np.eye(count), atol=1e-14)
+
+
+def test_one_of_several_directions_is_the_single_one() -> None:
+    several = oracle.orthonormal_directions(2, 9, SHAPE, 4)
+    assert np.array_equal(several[0], oracle.unit_direction(2, 9, SHAPE))
+
+
+@pytest.mark.parametrize("count", [0, 13])
+def test_refuses_more_directions_than_there_are(count: int) -> None:
+    with pytest.raises(ValueError, match=r"has 1 \.\. 12 directions"):
+        oracle.orthonormal_directions(0, 0, SHAPE, count)
+
+
+def test_field_seeds_fit_a_float_and_are_their_own_stream() -> None:
+    seeds = [oracle.field_seed(1, k) for k in range(200)]
+    assert len(set(seeds)) == 200
+    assert all(0 <= s < 2**53 and int(float(s)) == s for s in seeds)
+    assert max(seeds) > 2**50
+    # Another user of the same seed, with a step instead of a stream, draws something else.
+    shared = np.random.default_rng([1, 0]).integers(2**53)
+    assert oracle.field_seed(1, 0) != shared
+
+
+def test_estimate_and_update_to_the_last_factor() -> None:
+    theta = oracle.unit_direction(0, 0, SHAPE)
+    n_a, n_s, radius = 3, 2, 0.1
+    expected = (n_a * n_s) / radius * (2.5 - 1.25) * theta
+    estimate = oracle.gradient(2.5, 1.25, theta, radius)
+    np.testing.assert_array_equal(estimate, expected)
+    policy = np.arange(12.0).reshape(SHAPE)
+    np.testing.assert_array_equal(oracle.update(policy, estimate, 1e-2), policy - 1e-2 * expected)
+
+
+def quadratic(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    half = rng.standard_normal((12, 12))
+    return half @ half.T, rng.standard_normal(12)
+
+
+def test_mean_estimate_agrees_with_the_finite_difference_gradient() -> None:
+    H, g = quadratic(0)
+    policy = np.random.default_rng(1).standard_normal(SHAPE)
+
+    def cost(pi: np.ndarray) -> float:
+        x = pi.ravel()
+        return float(g @ x + 0.5 * x @ H @ x + 0.1 * np.sum(np.cos(x)))
+
+    h, difference = 1e-5, np.zeros(12)
+    for i in range(12):
+        e = np.zeros(12)
+        e[i] = h
+        step = e.reshape(SHAPE)
+        difference[i] = (cost(policy + step) - cost(policy - step)) / (2 * h)
+
+    radius, count = 1e-2, 20000
+    estimates = np.empty((count, 12))
+    for k in range(count):
+        theta = oracle.unit_direction(3, k, SHAPE)
+        estimates[k] = oracle.gradient(
+            cost(policy + radius * theta), cost(policy - radius * theta), theta, radius
+        ).ravel()
+    error = estimates.mean(axis=0) - difference
+    standard_error = estimates.std(axis=0) / np.sqrt(count)
+    assert (np.abs(error) < 4.5 * standard_error).all()
+    assert np.linalg.norm(error) < 0.05 * np.linalg.norm(difference)
+
+
+def test_all_orthonormal_directions_give_the_gradient_of_a_quadratic_exactly() -> None:
+    H, g = quadratic(4)
+    policy = np.random.default_rng(5).standard_normal(SHAPE)
+
+    def cost(pi: np.ndarray) -> float:
+        return float(g @ pi.ravel() + 0.5 * pi.ravel() @ H @ pi.ravel())
+
+    directions = oracle.orthonormal_directions(6, 0, SHAPE, 12)
+    mean = sum(
+        oracle.gradient(cost(policy + 0.1 * t), cost(policy - 0.1 * t), t, 0.1) for t in directions
+    )
+    exact = (g + H @ policy.ravel()).reshape(SHAPE)
+    np.testing.assert_allclose(np.asarray(mean) / 12, exact, rtol=1e-10, atol=1e-10)

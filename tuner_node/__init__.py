@@ -1,0 +1,1 @@
+"""The tuner: optimisers, the training state machine, and the node that runs episodes."""

@@ -1,0 +1,38 @@
+"""A training from resolved parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner_node.optimizers import OPTIMIZERS, Optimizer
+from tuner_node.training import Training, TrainingSettings
+
+
+def build_training(values: Mapping[str, Any]) -> Training:
+    """The training that the tuner's and the problem's parameters describe."""
+    from_zero = values["start"] == "zero"
+    rate = values["learning_rate_from_zero" if from_zero else "learning_rate"]
+
+    def make_optimizer(policy: NDArray[np.float64], seed: int) -> Optimizer:
+        return OPTIMIZERS[values["optimizer"]](
+            policy,
+            seed=seed,
+            iterations=values["iterations"],
+            learning_rate=rate,
+            smoothing_radius=values["smoothing_radius"],
+        )
+
+    settings = TrainingSettings(
+        n_a=values["n_a"],
+        seed=values["seed"],
+        seeds=values["seeds"],
+        evaluation_fields=values["evaluation_fields"],
+        evaluation_seed=values["evaluation_seed"],
+        start=values["start"],
+        identification_attempts=values["identification_attempts"],
+    )
+    return Training(settings, make_optimizer)

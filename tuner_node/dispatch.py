@@ -1,0 +1,255 @@
+"""Hands the rollouts of a batch to plant and controller pairs as episodes. Pure: no ROS, no clock.
+
+A batch is cut into episodes of at most `max_batch` environments, each goes to a pair that is free,
+and what a pair does not finish (void, silent, or gone) is started again with the same rows under a
+new episode number, on any pair. A rollout's cost does not depend on which episode or pair it ran in,
+so neither does the batch's result. Episode numbers only grow, also across restarts of the tuner
+(`incarnation` is in their upper part): an answer to an earlier tuner's episode is recognised.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loop_interfaces.frames import Frame, FrameError
+from loop_interfaces.protocol import ModelFailure, Send, Tally
+from loop_interfaces.topics import MODEL, POLICY, START, VOID, CostColumn, StartColumn
+from tuner_node.training import Batch, BatchResult
+
+Array = NDArray[np.float64]
+Order = tuple[int, Send]
+"""(pair, message): publish the message in that pair's namespace."""
+EPISODES_PER_INCARNATION = 2**32
+
+
+class DispatchError(RuntimeError):
+    """An episode that cannot be run: attempts used up, or a model that cannot be designed."""
+
+
+@dataclass
+class _Chunk:
+    """A part of the batch: rows first..last; `rows` is where its results go."""
+
+    rows: slice
+    attempts: int = 0
+    costs: Array | None = None
+    models: Array | None = None
+
+    def done(self, exploratory: bool) -> bool:
+        return self.costs is not None and (not exploratory or self.models is not None)
+
+
+@dataclass
+class _Pair:
+    """One plant and its controller: what it works on, and what the network says of it."""
+
+    missing: tuple[str, ...] = ("plant", "controller")
+    chunk: _Chunk | None = None
+    episode: int = -1
+    heard: float = 0.0
+
+
+@dataclass
+class Dispatcher:
+    """Serves one batch at a time. `now` is any monotonic time in s."""
+
+    run: int
+    n_a: int
+    incarnation: int
+    max_batch: int
+    episode_timeout: float
+    max_attempts: int
+    pairs: list[_Pair]
+    tally: Tally = field(default_factory=Tally)
+    notes: list[str] = field(default_factory=list)
+    sim_time: float = 0.0
+    _batch: Batch | None = None
+    _chunks: list[_Chunk] = field(default_factory=list)
+    _waiting: list[_Chunk] = field(default_factory=list)
+    _issued: int = 0
+
+    @staticmethod
+    def create(
+        *,
+        run: int,
+        n_a: int,
+        pairs: int,
+        incarnation: int,
+        max_batch: int,
+        episode_timeout: float,
+        max_attempts: int,
+    ) -> Dispatcher:
+        return Dispatcher(
+            run=run,
+            n_a=n_a,
+            incarnation=incarnation,
+            max_batch=max_batch,
+            episode_timeout=episode_timeout,
+            max_attempts=max_attempts,
+            pairs=[_Pair() for _ in range(pairs)],
+        )
+
+    def assign(self, batch: Batch, now: float) -> list[Order]:
+        """Begin a batch; the previous one must be complete."""
+        count = len(batch.rows)
+        parts = max(-(-count // self.max_batch), min(len(self._present()), count), 1)
+        edges = np.linspace(0, count, parts + 1).astype(int).tolist()
+        self._batch = batch
+        self._chunks = [_Chunk(slice(a, b)) for a, b in itertools.pairwise(edges)]
+        self._waiting = list(self._chunks)
+        return self._hand_out(now)
+
+    def models(self, models: Array) -> list[Order]:
+        """Give every pair the run's reduced models."""
+        frame = Frame(self.run, 0, 0, self.sim_time, models)
+        return [(pair, Send(MODEL, frame)) for pair in range(len(self.pairs))]
+
+    def release(self) -> list[Order]:
+        """Tell every pair that the run is over."""
+        frame = Frame(self.run, 0, 0, self.sim_time, np.empty((0, len(StartColumn))))
+        return [(pair, Send(START, frame)) for pair in range(len(self.pairs))]
+
+    def presence(self, pair: int, missing: Sequence[str], now: float) -> list[Order]:
+        """Learn which nodes of a pair are on the network."""
+        known = self.pairs[pair]
+        gone = bool(missing) and not known.missing
+        known.missing = tuple(missing)
+        if gone and known.chunk and any(not p.missing and not p.chunk for p in self.pairs):
+            self._retry(known, f"pair {pair} lost its {' and '.join(missing)}")
+        return self._hand_out(now)
+
+    def cost(self, pair: int, frame: Frame, now: float) -> list[Order]:
+        """Take an episode's costs. Raises FrameError when their shape is not the episode's."""
+        known = self._answering(pair, frame)
+        if known is None or known.chunk is None or self._batch is None:
+            return []
+        count = known.chunk.rows.stop - known.chunk.rows.start
+        if frame.values.shape != (count, len(CostColumn)):
+            raise FrameError(
+                f"expected costs of shape {(count, len(CostColumn))}, got {frame.values.shape}"
+            )
+        self.sim_time = max(self.sim_time, frame.time)
+        known.heard = now
+        if (frame.values[:, CostColumn.ENDED] == VOID).any():
+            self._retry(
+                known, f"episode {known.episode} is void: no action came from the controller"
+            )
+        else:
+            known.chunk.costs = frame.values.copy()
+            self._release_if_done(known)
+        return self._hand_out(now)
+
+    def model(self, pair: int, frame: Frame, now: float) -> list[Order]:
+        """Take the reduced models of an exploratory episode."""
+        known = self._answering(pair, frame)
+        if known is None or known.chunk is None or self._batch is None:
+            return []
+        count = known.chunk.rows.stop - known.chunk.rows.start
+        if len(frame.values) != count or not self._batch.exploratory:
+            raise FrameError(f"expected {count} models, got {len(frame.values)}")
+        known.heard = now
+        known.chunk.models = frame.values.copy()
+        self._release_if_done(known)
+        return self._hand_out(now)
+
+    def failure(self, pair: int, failure: ModelFailure, now: float) -> list[Order]:
+        """Take the news that an exploratory episode gave no model."""
+        known = self.pairs[pair]
+        if known.chunk is None or (failure.run, failure.episode) != (self.run, known.episode):
+            return []
+        if not failure.retry:
+            raise DispatchError(f"no reduced model: {failure.reason}")
+        self._retry(known, failure.reason)
+        return self._hand_out(now)
+
+    def tick(self, now: float) -> list[Order]:
+        """Start again what has been silent for too long on a pair whose nodes are there."""
+        for number, pair in enumerate(self.pairs):
+            if pair.chunk is None:
+                continue
+            if pair.missing:
+                pair.heard = now  # absent, not silent: the latched topics serve it when it is back
+            elif now - pair.heard > self.episode_timeout:
+                self._retry(
+                    pair,
+                    f"pair {number} was silent for {self.episode_timeout:g} s "
+                    f"in episode {pair.episode}",
+                )
+        return self._hand_out(now)
+
+    def result(self) -> BatchResult | None:
+        """The batch's result once every row has one, in the batch's order."""
+        batch = self._batch
+        if batch is None or not all(chunk.done(batch.exploratory) for chunk in self._chunks):
+            return None
+        self._batch = None
+        costs = np.concatenate([chunk.costs for chunk in self._chunks if chunk.costs is not None])
+        models = [chunk.models for chunk in self._chunks if chunk.models is not None]
+        return BatchResult(costs, np.concatenate(models) if models else None)
+
+    def missing(self) -> list[str]:
+        """Who is not on the network, in words, of pairs that have work."""
+        return [
+            f"{node} of pair {number}" if len(self.pairs) > 1 else node
+            for number, pair in enumerate(self.pairs)
+            for node in pair.missing
+        ]
+
+    def _present(self) -> list[_Pair]:
+        return [pair for pair in self.pairs if not pair.missing]
+
+    def _answering(self, pair: int, frame: Frame) -> _Pair | None:
+        known = self.pairs[pair]
+        if frame.run != self.run:
+            self.tally["answers of another run"] += 1
+            return None
+        if known.chunk is None or frame.episode != known.episode:
+            self.tally["answers of another episode"] += 1
+            return None
+        return known
+
+    def _release_if_done(self, pair: _Pair) -> None:
+        assert pair.chunk is not None and self._batch is not None
+        if pair.chunk.done(self._batch.exploratory):
+            pair.chunk = None
+
+    def _retry(self, pair: _Pair, reason: str) -> None:
+        chunk = pair.chunk
+        assert chunk is not None
+        self.notes.append(f"{reason}; starting it again with the same seeds")
+        self.tally["episodes repeated"] += 1
+        chunk.attempts += 1
+        if chunk.attempts >= self.max_attempts:
+            raise DispatchError(f"gave up after {chunk.attempts} attempts: {reason}")
+        chunk.costs = chunk.models = None
+        pair.chunk = None
+        self._waiting.append(chunk)
+
+    def _hand_out(self, now: float) -> list[Order]:
+        orders: list[Order] = []
+        for number, pair in enumerate(self.pairs):
+            if not self._waiting:
+                break
+            if pair.chunk is None and not pair.missing:
+                orders += self._begin(number, pair, self._waiting.pop(0), now)
+        return orders
+
+    def _begin(self, number: int, pair: _Pair, chunk: _Chunk, now: float) -> list[Order]:
+        assert self._batch is not None
+        self._issued += 1
+        pair.chunk, pair.heard = chunk, now
+        pair.episode = self.incarnation * EPISODES_PER_INCARNATION + self._issued
+
+        def frame(values: Array) -> Frame:
+            return Frame(self.run, pair.episode, 0, self.sim_time, values)
+
+        # The policy first: it is then mostly there when the first state arrives.
+        orders = [(number, Send(START, frame(self._batch.rows[chunk.rows])))]
+        if self._batch.policies is not None:
+            orders.insert(0, (number, Send(POLICY, frame(self._batch.policies[chunk.rows]))))
+        return orders

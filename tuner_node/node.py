@@ -1,0 +1,219 @@
+"""tuner_node: identifies, designs and adapts over topics, as a ROS 2 node.
+
+For each pair of plant and controller, in its namespace:
+Publishes   policy, episode/start, model     Subscribes  episode/cost, model/identified, model/failed
+Messages, order and parameters: docs/interfaces.md. What it does is in tuner_node.session.
+"""
+
+from __future__ import annotations
+
+import secrets
+import sys
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from std_msgs.msg import String
+
+from loop_interfaces.frames import MAX_ID, Frame
+from loop_interfaces.isolation import keep_on_this_machine
+from loop_interfaces.node_loop import ConfigurationError, NodeLoop, Sender, node_main, qos, scoped
+from loop_interfaces.parameters import PROBLEM, TUNER
+from loop_interfaces.protocol import ModelFailure
+from loop_interfaces.ros_parameters import declare, given_parameters
+from loop_interfaces.topics import COST, MODEL, MODEL_FAILED, MODEL_IDENTIFIED, POLICY, START
+from tuner_node.build import build_training
+from tuner_node.dispatch import Dispatcher, DispatchError, Order
+from tuner_node.record import Recorder
+from tuner_node.results import RunIdentity, summarise
+from tuner_node.session import Session
+
+RIVAL_GRACE = 6.0
+"""Seconds a second tuner may be seen before it counts as one: a killed one is seen for 3 s."""
+ABSENCE_REPORT = 5.0
+"""Seconds between two reports of a missing plant or controller."""
+
+
+class TunerNode:
+    """Moves messages between the topics and the session, and keeps the run folder."""
+
+    def __init__(self, node: Node, loop: NodeLoop) -> None:
+        given = given_parameters(node)
+        values = declare(node, [*PROBLEM, *TUNER], given)
+        # The equation's own parameters are the plant's to check; here they only identify the run.
+        values |= {name: value for name, value in given.items() if name.startswith("physical.")}
+        self._node, self._loop, self._log = node, loop, node.get_logger()
+        training = build_training(values)
+        self._recorder: Recorder | None = None
+        identity = RunIdentity(1 + secrets.randbelow(MAX_ID - 1), 0)
+        if values["out"]:
+            self._recorder = Recorder(
+                Path(str(values["out"])),
+                values,
+                training,
+                resume=bool(values["resume"]),
+                warn=self._log.warning,
+            )
+            identity = self._recorder.identity
+        pairs: list[str] = values["pairs"]
+        dispatcher = Dispatcher.create(
+            run=identity.run,
+            n_a=values["n_a"],
+            pairs=len(pairs),
+            incarnation=identity.incarnation,
+            max_batch=values["max_batch"],
+            episode_timeout=values["episode_timeout"],
+            max_attempts=values["max_attempts"],
+        )
+        self._session = Session(training, dispatcher, self._report)
+        self._wire(pairs)
+        self._failure: str | None = None
+        self._absent_since: float | None = None
+        self._absence_reported = float("-inf")
+        self._rival_since: float | None = None
+        self._log.info(f"run {identity.run} of {values['problem']}, seed {values['seed']}")
+
+    def run(self) -> int:
+        """Train to the end; 0 when done, 1 after a failure, 130 when interrupted."""
+        self._perform(self._session.begin(self._loop.now()))
+        reason = self._loop.run(
+            tick=lambda now: None, deadline=lambda: None, housekeeping=self._housekeeping
+        )
+        if self._session.done:
+            return self._finish()
+        self._send(self._session.dispatcher.release())
+        if self._recorder:
+            self._recorder.keep(now=self._loop.now(), force=True)
+        if self._failure:
+            raise ConfigurationError(self._failure)
+        self._log.info(f"stopped by {reason} before the end")
+        return 130
+
+    def _wire(self, pairs: list[str]) -> None:
+        loop = self._loop
+        self._senders: list[dict[str, Sender]] = []
+        self._cost_topics: list[str] = []
+        self._model_topics: list[str] = []
+        session = self._session
+        for number, namespace in enumerate(pairs):
+            self._senders.append(
+                {t.name: loop.sender(t, namespace) for t in (POLICY, START, MODEL)}
+            )
+            cost = loop.receive(COST, self._handler(session.cost, number), namespace)
+            model = loop.receive(MODEL_IDENTIFIED, self._handler(session.model, number), namespace)
+            self._cost_topics.append(cost.topic_name)
+            self._model_topics.append(model.topic_name)
+            self._node.create_subscription(
+                String,
+                scoped(namespace, MODEL_FAILED),
+                partial(self._on_failure, number),
+                qos(MODEL),
+            )
+
+    def _handler(
+        self, handle: Callable[[int, Frame, float], list[Order]], pair: int
+    ) -> Callable[[Frame], None]:
+        return lambda frame: self._guarded(lambda now: handle(pair, frame, now))
+
+    def _on_failure(self, pair: int, message: String) -> None:
+        try:
+            failure = ModelFailure.from_json(message.data)
+        except ValueError as error:
+            self._log.warning(str(error), throttle_duration_sec=1.0)
+            return
+        self._guarded(lambda now: self._session.failure(pair, failure, now))
+
+    def _guarded(self, event: Callable[[float], list[Order]]) -> None:
+        try:
+            self._perform(event(self._loop.now()))
+        except DispatchError as error:
+            self._failure = str(error)
+            self._loop.stop("failure")
+
+    def _perform(self, orders: list[Order]) -> None:
+        self._send(orders)
+        if self._recorder:
+            self._recorder.keep(now=self._loop.now())
+        if self._session.done:
+            self._loop.stop("done")
+
+    def _send(self, orders: list[Order]) -> None:
+        for pair, send in orders:
+            self._senders[pair][send.topic.name].send(send.frame)
+
+    def _housekeeping(self, now: float) -> None:
+        for pair in range(len(self._senders)):
+            missing = [
+                name
+                for name, topic in (
+                    ("plant", self._cost_topics[pair]),
+                    ("controller", self._model_topics[pair]),
+                )
+                if not self._node.count_publishers(topic)
+            ]
+            self._guarded(partial(self._session.presence, pair, missing))
+        self._guarded(self._session.tick)
+        self._report_absence(now)
+        self._refuse_rival(now)
+
+    def _report_absence(self, now: float) -> None:
+        missing = self._session.dispatcher.missing()
+        if not missing:
+            self._absent_since = None
+            return
+        if self._absent_since is None:
+            self._absent_since = now
+        waited = now - self._absent_since
+        if waited > 1.0 and now - self._absence_reported > ABSENCE_REPORT:
+            self._absence_reported = now
+            self._log.warning(f"waiting for {' and '.join(missing)} for {waited:.0f} s")
+
+    def _refuse_rival(self, now: float) -> None:
+        publisher: Publisher = self._senders[0][START.name].publisher
+        if self._node.count_publishers(publisher.topic_name) < 2:
+            self._rival_since = None
+        elif self._rival_since is None:
+            self._rival_since = now
+        elif now - self._rival_since > RIVAL_GRACE and not self._failure:
+            self._failure = (
+                f"another tuner publishes {publisher.topic_name}; "
+                "stop it, or start this one in another namespace or ROS domain"
+            )
+            self._loop.stop("failure")
+
+    def _report(self, row: Mapping[str, Any]) -> None:
+        if self._recorder:
+            self._recorder.note(row)
+        text = ", ".join(
+            f"{k} {v:.6g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()
+        )
+        log = self._log.warning if row.get("event") == "repeated" else self._log.info
+        log(text)
+
+    def _finish(self) -> int:
+        if self._recorder:
+            try:
+                summary = self._recorder.finish({"transport": "topics"})
+            except OSError as error:
+                raise ConfigurationError(f"cannot write the results: {error.strerror}") from error
+        else:
+            summary = summarise(self._session.training)
+        costs = summary["mean_cost"]
+        self._log.info(
+            f"done: cost {costs['none']:.6g} without control, {costs['lqt']:.6g} with LQT, "
+            f"{costs['adapted']:.6g} adapted"
+        )
+        return 0
+
+
+def main(args: list[str] | None = None) -> int:
+    """Console script."""
+    keep_on_this_machine()
+    return node_main("tuner_node", args, TunerNode)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,35 @@
+"""Optimisers of a policy behind one interface: see `tuner_node.optimizers.base`."""
+
+from collections.abc import Callable
+
+from tuner_node.optimizers.base import (
+    Context,
+    Optimizer,
+    Rollout,
+    RolloutResult,
+    Row,
+    State,
+    Trajectory,
+)
+from tuner_node.optimizers.directions import Directions
+from tuner_node.optimizers.gauss_newton import GaussNewton
+from tuner_node.optimizers.two_point import TwoPoint
+
+__all__ = [
+    "OPTIMIZERS",
+    "Context",
+    "Directions",
+    "GaussNewton",
+    "Optimizer",
+    "Rollout",
+    "RolloutResult",
+    "Row",
+    "State",
+    "Trajectory",
+    "TwoPoint",
+]
+
+# The names that parameters and the command line use.
+OPTIMIZERS: dict[str, Callable[..., Optimizer]] = {
+    cls.name: cls for cls in (TwoPoint, Directions, GaussNewton)
+}

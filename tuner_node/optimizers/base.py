@@ -1,0 +1,209 @@
+"""What every optimiser of a policy is: it asks for rollouts, is told their outcome, and holds a
+policy.
+
+    while not optimizer.done:
+        rollouts = optimizer.ask()                # the same until tell
+        row = optimizer.tell([measure(rollout) for rollout in rollouts])
+
+An optimiser runs no rollout and knows no clock, so the same object serves a loop over topics and a
+loop in one process. Its randomness is a pure function of (seed, iteration), and `state` holds
+everything that `restore` needs to go on as if nothing had happened, to the last bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = ["Context", "Optimizer", "Rollout", "RolloutResult", "Row", "State", "Trajectory"]
+
+Array = NDArray[np.float64]
+Row = dict[str, float | int | bool | str]
+State = dict[str, NDArray[np.generic]]
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """One episode of one environment.
+
+    Attributes
+    ----------
+    states : (T, n_z) or (T + 1, n_z) array
+        z_0 .. z_{T-1}, and z_T if it is known.
+    actions : (T, n_a) array
+        a_k, held from z_k to z_{k+1}.
+
+    A diverged episode may be shorter, or end in values that are not finite.
+    """
+
+    states: Array
+    actions: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """An episode that an optimiser wants: this policy, from the field of this seed."""
+
+    policy: Array
+    field_seed: int
+
+
+@dataclass(frozen=True, eq=False)
+class RolloutResult:
+    """The outcome of a rollout.
+
+    Attributes
+    ----------
+    cost : float
+        Mean stage cost; of no meaning if the rollout diverged.
+    diverged : bool
+    trajectory : Trajectory, optional
+        Required by optimisers with `needs_trajectories`.
+    """
+
+    cost: float
+    diverged: bool = False
+    trajectory: Trajectory | None = None
+
+    @property
+    def usable(self) -> bool:
+        """Whether the cost is a finite measurement."""
+        return not self.diverged and bool(np.isfinite(self.cost))
+
+
+@dataclass(frozen=True, eq=False)
+class Context:
+    """What a model-based optimiser knows about the problem.
+
+    Attributes
+    ----------
+    U : (n_z, n_s) array
+        Basis of the projected state.
+    target : (n_z,) array
+        z_r.
+    state_weight, action_weight : float
+        Q = state_weight I, R = action_weight I.
+    horizon : int
+        T, the steps of an episode.
+    exploration : Trajectory
+        The exploratory trajectory that the reduced model was identified from.
+    """
+
+    U: Array
+    target: Array
+    state_weight: float
+    action_weight: float
+    horizon: int
+    exploration: Trajectory
+
+
+class Optimizer(Protocol):
+    """The interface of an optimiser.
+
+    A history row holds JSON numbers, booleans and strings; a cost that is not finite is left out of
+    it. Every row has `iteration` (counted from 1), `rollouts` (told so far, in total) and
+    `diverged` (how many of this iteration's rollouts did).
+    """
+
+    @property
+    def name(self) -> str:
+        """The name that selects this optimiser."""
+        ...
+
+    @property
+    def needs_trajectories(self) -> bool:
+        """Whether results must carry their trajectory."""
+        ...
+
+    @property
+    def policy(self) -> Array:
+        """The current policy, (n_a, 2 n_s); always finite."""
+        ...
+
+    @property
+    def best_policy(self) -> Array:
+        """The policy to use when the training is over."""
+        ...
+
+    @property
+    def iteration(self) -> int:
+        """How many times `tell` was called."""
+        ...
+
+    @property
+    def done(self) -> bool:
+        """Whether there is nothing more to ask."""
+        ...
+
+    def ask(self) -> list[Rollout]:
+        """The rollouts needed next; the same ones on every call until `tell`, none when done."""
+        ...
+
+    def tell(self, results: Sequence[RolloutResult]) -> Row:
+        """Take the results of all rollouts of `ask`, in its order; returns a row of the history."""
+        ...
+
+    def state(self) -> State:
+        """Everything a checkpoint needs: arrays without objects, as `numpy.savez` stores them."""
+        ...
+
+    def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
+        """Go on from a `state` of an optimiser that was constructed with the same arguments."""
+        ...
+
+
+def checked_policy(policy: ArrayLike) -> Array:
+    """A finite copy of shape (n_a, 2 n_s), or a ValueError."""
+    array = np.array(policy, dtype=np.float64, order="C")
+    if array.ndim != 2 or 0 in array.shape or array.shape[1] % 2:
+        raise ValueError(
+            f"a policy [K_a K_b] must have shape (n_a, 2 n_s), but its shape is {array.shape}."
+        )
+    if not np.isfinite(array).all():
+        raise ValueError("a policy must be finite, but there is NaN or infinity in it.")
+    return array
+
+
+def require_positive(**values: float) -> None:
+    """A ValueError that names the first value that is not positive and finite."""
+    for name, value in values.items():
+        if not (np.isfinite(value) and value > 0):
+            raise ValueError(f"{name} must be positive and finite, but it is {value}.")
+
+
+def require_results(results: Sequence[RolloutResult], expected: int) -> None:
+    """A ValueError unless there is one result per rollout that was asked for."""
+    if not expected:
+        raise ValueError(
+            "the optimiser is done and asked for no rollouts; check `done` before `tell`."
+        )
+    if len(results) != expected:
+        raise ValueError(f"tell needs one result per rollout, {expected}, but got {len(results)}.")
+
+
+def require_state(
+    state: Mapping[str, NDArray[np.generic]],
+    own: Mapping[str, NDArray[np.generic]],
+    fixed: Sequence[str],
+) -> None:
+    """A ValueError unless `state` has the keys of `own` and agrees with it in the `fixed` ones."""
+    if set(state) != set(own):
+        raise ValueError(
+            f"a checkpoint of this optimiser holds {sorted(own)}, but this one holds "
+            f"{sorted(state)}."
+        )
+    for key in fixed:
+        if not np.array_equal(state[key], own[key]):
+            raise ValueError(
+                f"the checkpoint was written with {key} = {state[key]}, but this training has "
+                f"{key} = {own[key]}; continue with the same parameters or start anew."
+            )
+    if state["policy"].shape != own["policy"].shape:
+        raise ValueError(
+            f"the policy of the checkpoint has shape {state['policy'].shape}, but this training's "
+            f"has {own['policy'].shape}."
+        )

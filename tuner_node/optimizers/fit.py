@@ -1,0 +1,163 @@
+"""A local model of the plant, fitted to measured trajectories: affine plus quadratic in a few
+modes.
+
+On coordinates x = V^T z, with V = [U, further modes] orthonormal, centred and scaled by their
+spread,
+
+    x_{k+1} - x_k  ~  c + A x_k + B a_k + H(x_k, x_k)
+
+is fitted by weighted ridge regression. The ridge on the quadratic part decides how much of it the
+data must prove; infinity leaves it out. One Gram matrix serves all ridges.
+
+References
+----------
+Peherstorfer, Willcox, "Data-driven operator inference for nonintrusive projection-based model
+reduction", CMAME 306, 2016 (quadratic reduced models from data). Proctor, Brunton, Kutz, SIAM J.
+Appl. Dyn. Syst. 15(1), 2016 (DMDc).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+__all__ = ["LocalModel", "extended_basis", "fit"]
+
+Array = NDArray[np.float64]
+
+# Ridges on the scaled variables, per unit weight: enough to bound directions that the data does not
+# move.
+_LINEAR_RIDGE = 1e-6
+_ACTION_RIDGE = 1e-8
+
+
+@dataclass(frozen=True, eq=False)
+class LocalModel:
+    """x_{k+1} = x_k + c + A (x_k - m) + B a_k + H(x_k - m, x_k - m).
+
+    Attributes
+    ----------
+    centre : (r,) array
+        m.
+    constant : (r,) array
+        c.
+    linear : (r, r) array
+        A.
+    B : (r, n_a) array
+    quadratic : (r, r, r) array
+        H, symmetric in its last two indices.
+    """
+
+    centre: Array
+    constant: Array
+    linear: Array
+    B: Array
+    quadratic: Array
+
+    def step(self, x: Array, a: Array) -> Array:
+        """x_{k+1} of the states x (..., r) and the actions a (..., n_a)."""
+        e = x - self.centre
+        bend = np.einsum("ijl,...j,...l->...i", self.quadratic, e, e)
+        after: Array = x + self.constant + e @ self.linear.T + a @ self.B.T + bend
+        return after
+
+    def jacobians(self, x: Array) -> Array:
+        """The derivatives of `step` by x, (..., r, r), at the states x (..., r)."""
+        r = self.centre.size
+        bend = (x - self.centre) @ self.quadratic.reshape(r * r, r).T
+        jacobians: Array = bend.reshape(*x.shape[:-1], r, r)
+        jacobians *= 2.0
+        jacobians += np.eye(r) + self.linear
+        return jacobians
+
+
+def extended_basis(U: Array, states: Sequence[Array], modes: int) -> Array:
+    """V = [U, leading POD modes of the states outside of U].
+
+    Its shape is (n_z, modes), with fewer columns if the states hold fewer modes.
+    """
+    n_z, n_s = U.shape
+    covariance = np.zeros((n_z, n_z))
+    for z in states:
+        covariance += z.T @ z
+    outside = np.eye(n_z) - U @ U.T
+    values, vectors = linalg.eigh(outside @ covariance @ outside)
+    floor = (
+        n_z * np.finfo(np.float64).eps * max(float(values[-1]), float(np.trace(covariance)) / n_z)
+    )
+    count = min(modes - n_s, n_z - n_s, int(np.count_nonzero(values > floor)))
+    if count <= 0:
+        return U.copy()
+    # Orthogonal to U already; the QR factor removes what rounding left.
+    basis, triangle = linalg.qr(np.hstack([U, vectors[:, ::-1][:, :count]]), mode="economic")
+    signed: Array = basis * np.where(np.diag(triangle) < 0.0, -1.0, 1.0)
+    signed[:, :n_s] = U
+    return signed
+
+
+def fit(
+    x: Array, a: Array, change: Array, weights: Array, ridges: Sequence[float]
+) -> list[LocalModel]:
+    """Fit one model per ridge.
+
+    Parameters
+    ----------
+    x, a, change : (N, r), (N, n_a), (N, r) arrays
+        x_k, a_k and x_{k+1} - x_k, of any number of trajectories.
+    weights : (N,) array
+        Not negative.
+    ridges : sequence of float
+        Ridge of the quadratic part per unit weight; `numpy.inf` for an affine model.
+    """
+    r, n_a = x.shape[1], a.shape[1]
+    share = weights / weights.sum()
+    centre: Array = share @ x
+    spread = _spread(share, x - centre)
+    action_spread = _spread(share, a)
+    e = (x - centre) / spread
+    rows, columns = np.triu_indices(r)
+    features = np.empty((len(x), 1 + r + n_a + rows.size))
+    features[:, 0] = 1.0
+    features[:, 1 : 1 + r] = e
+    features[:, 1 + r : 1 + r + n_a] = a / action_spread
+    np.multiply(e[:, rows], e[:, columns], out=features[:, 1 + r + n_a :])
+    features *= np.sqrt(share)[:, None]
+    gram = features.T @ features
+    moment = features.T @ (change * np.sqrt(share)[:, None])
+
+    models = []
+    affine = 1 + r + n_a
+    for ridge in ridges:
+        size = affine if np.isinf(ridge) else len(gram)
+        penalty = np.full(size, ridge)
+        penalty[0] = 0.0
+        penalty[1 : 1 + r] = _LINEAR_RIDGE
+        penalty[1 + r : affine] = _ACTION_RIDGE
+        matrix = gram[:size, :size].copy()
+        matrix[np.diag_indices(size)] += penalty
+        solution = linalg.solve(matrix, moment[:size], assume_a="pos").T
+        quadratic = np.zeros((r, r, r))
+        if size > affine:
+            half = 0.5 * solution[:, affine:] / (spread[rows] * spread[columns])
+            quadratic[:, rows, columns] += half
+            quadratic[:, columns, rows] += half
+        models.append(
+            LocalModel(
+                centre=centre,
+                constant=solution[:, 0],
+                linear=solution[:, 1 : 1 + r] / spread,
+                B=solution[:, 1 + r : affine] / action_spread,
+                quadratic=quadratic,
+            )
+        )
+    return models
+
+
+def _spread(share: Array, values: Array) -> Array:
+    spread: Array = np.sqrt(share @ (values * values))
+    spread[spread == 0.0] = 1.0
+    return spread

@@ -1,0 +1,295 @@
+"""The next policy to try: fit local models, choose the one that predicts, take a damped
+Gauss-Newton step.
+
+A pure function of the remembered trajectories; see `tuner_node.optimizers.gauss_newton` for the
+method.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+
+from tuner_node.optimizers.base import Array, Context
+from tuner_node.optimizers.fit import LocalModel, extended_basis, fit
+from tuner_node.optimizers.sensitivity import Path, expand, predict_difference
+from tuner_node.optimizers.trajectories import Record
+
+__all__ = ["Proposal", "Proposer"]
+
+# Candidates of the model: ridges of the quadratic part, and forgetting over an episode,
+# exp(-kappa).
+_RIDGES = (1e-3, 1e-2, 1e-1, np.inf)
+_KAPPAS = (0.0, 5.0, 15.0)
+# After an accepted step a simpler choice is good enough within this factor and margin of the best
+# prediction.
+_GOOD_ENOUGH = (1.5, 0.03)
+# A prediction error counts at most this much, relative to the difference it predicts.
+_WORST = 2.0
+# Weight of a rollout in the fit: falls with its age, down to a floor, and with its cost.
+_AGEING = 0.9
+_AGEING_FLOOR = 0.3
+# A comparison with a rollout that costs more than this many times the incumbent is not local.
+_LOCAL = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """A policy to try.
+
+    Attributes
+    ----------
+    policy : (n_a, 2 n_s) array
+    fall : float
+        The fall of the mean stage cost that the quadratic model predicts.
+    ridge, kappa : float
+        The chosen model.
+    mismatch : float
+        Its relative error in predicting measured differences of trajectories.
+    """
+
+    policy: Array
+    fall: float
+    ridge: float
+    kappa: float
+    mismatch: float
+
+
+class Proposer:
+    """Proposes policies for one problem.
+
+    Parameters
+    ----------
+    context : Context
+    policy : (n_a, 2 n_s) array
+        Any policy of the training, for its shape.
+    modes : int
+        Coordinates of the fitted models.
+    """
+
+    def __init__(self, context: Context, policy: Array, modes: int) -> None:
+        U = np.array(context.U, dtype=np.float64)
+        target = np.array(context.target, dtype=np.float64)
+        n_a, columns = policy.shape
+        if U.ndim != 2 or U.shape[1] * 2 != columns:
+            raise ValueError(
+                f"a policy of shape {policy.shape} needs a basis U with {columns // 2} columns, "
+                f"but its shape is {U.shape}."
+            )
+        if target.shape != U.shape[:1]:
+            raise ValueError(
+                f"the target must have shape {U.shape[:1]}, but it has {target.shape}."
+            )
+        states, actions = context.exploration.states, context.exploration.actions
+        if states.shape[1:] != target.shape or actions.shape[1:] != (n_a,):
+            raise ValueError(
+                f"the exploratory trajectory must have states of {target.size} and actions of "
+                f"{n_a} numbers, but the shapes are {states.shape} and {actions.shape}."
+            )
+        if modes < U.shape[1]:
+            raise ValueError(f"modes must be at least n_s = {U.shape[1]}, but it is {modes}.")
+        self.n_z, self.n_s, self.n_a = U.shape[0], U.shape[1], n_a
+        self._U, self._target, self._modes = U, target, modes
+        self._q, self._r = context.state_weight, context.action_weight
+        self._horizon = context.horizon
+        self._exploration = Record(-1, np.zeros_like(policy), np.inf, states, actions)
+        # U^T z_r, as a plain sum like the controller's.
+        self._s_r: Array = np.sum(U * target[:, None], axis=0)
+        self._s_r_square = float(np.sum(self._s_r * self._s_r))
+        # A target outside of U leaves the law without a constant part.
+        self._one = 1.0 if self._s_r_square > 1e-20 * float(np.sum(target * target)) else 0.0
+
+    def theta(self, policy: Array) -> Array:
+        """[K_a b] of a policy, (n_a, n_s + 1)."""
+        b = policy[:, self.n_s :] @ self._s_r
+        return np.column_stack([policy[:, : self.n_s], b])
+
+    def moved(self, policy: Array, step: Array) -> Array:
+        """The policy after a step of theta; K_b moves least among those with the wanted b."""
+        moved = policy.copy()
+        moved[:, : self.n_s] += step[:, : self.n_s]
+        if self._one:
+            moved[:, self.n_s :] += np.outer(step[:, self.n_s], self._s_r / self._s_r_square)
+        return moved
+
+    def propose(
+        self,
+        records: Sequence[Record],
+        incumbents: Sequence[Record],
+        others: Sequence[Record | None],
+        *,
+        damping: float,
+        accepted: bool,
+    ) -> Proposal | None:
+        """The next policy to try, or None if no model gives a finite step.
+
+        Parameters
+        ----------
+        records : sequence of Record
+            All remembered rollouts.
+        incumbents : sequence of Record
+            The rollouts of the incumbent on the fields of the moment.
+        others : sequence of Record or None
+            On the same fields: the candidate that was rejected last, or the previous incumbent.
+        damping : float
+            lambda.
+        accepted : bool
+            Whether the last candidate was accepted.
+        """
+        data = [record for record in (self._exploration, *records) if len(record.states) > 1]
+        V = extended_basis(self._U, [record.states for record in data], self._modes)
+        models = self._fit(data, V, incumbents)
+        policy = incumbents[0].policy
+        K = np.ascontiguousarray(policy[:, : self.n_s])
+        choices = self._choices(models, V, K, incumbents, others, accepted)
+        paths = [self._path(record, V) for record in incumbents if len(record.actions)]
+        for mismatch, ridge, kappa in choices:
+            model = models[_RIDGES.index(ridge)]
+            step, fall = self._step(model, paths, K, V.T @ self._target, kappa, damping)
+            candidate = self.moved(policy, step)
+            if np.isfinite(candidate).all() and np.isfinite(fall):
+                return Proposal(candidate, fall, ridge, kappa, mismatch)
+        return None
+
+    def _fit(
+        self, data: Sequence[Record], V: Array, incumbents: Sequence[Record]
+    ) -> list[LocalModel]:
+        newest = max(record.stamp for record in data)
+        level = float(np.mean([self._mean_cost(record) for record in incumbents]))
+        x, a, change, weights = [], [], [], []
+        for record in data:
+            coordinates = record.states @ V
+            length = min(len(record.actions), len(coordinates) - 1)
+            age = (newest - record.stamp) // len(incumbents)
+            weight = max(_AGEING**age, _AGEING_FLOOR)
+            weight *= min(1.0, level / max(self._mean_cost(record), 1e-300)) ** 2
+            x.append(coordinates[:length])
+            a.append(record.actions[:length])
+            change.append(coordinates[1 : length + 1] - coordinates[:length])
+            weights.append(np.full(length, weight))
+        return fit(
+            np.concatenate(x),
+            np.concatenate(a),
+            np.concatenate(change),
+            np.concatenate(weights),
+            _RIDGES,
+        )
+
+    def _mean_cost(self, record: Record) -> float:
+        length = len(record.actions)
+        error = record.states[:length] - self._target
+        total = self._q * np.sum(error * error) + self._r * np.sum(record.actions * record.actions)
+        return float(total) / max(length, 1)
+
+    def _path(self, record: Record, V: Array) -> Path:
+        length = len(record.actions)
+        x = record.states[:length] @ V
+        return Path(
+            x, record.actions, np.column_stack([x[:, : self.n_s], np.full(length, self._one)])
+        )
+
+    def _choices(
+        self,
+        models: Sequence[LocalModel],
+        V: Array,
+        K: Array,
+        incumbents: Sequence[Record],
+        others: Sequence[Record | None],
+        accepted: bool,
+    ) -> list[tuple[float, float, float]]:
+        """(mismatch, ridge, kappa) of all choices, the one to use first."""
+        errors = self._mismatches(models, V, K, incumbents, others)
+        order = [
+            (float(errors[i, j]), ridge, kappa)
+            for j, kappa in enumerate(_KAPPAS)
+            for i, ridge in enumerate(_RIDGES)
+        ]
+        best = sorted(order, key=lambda choice: choice[0])
+        if not accepted:
+            return best
+        enough = _GOOD_ENOUGH[0] * best[0][0] + _GOOD_ENOUGH[1]
+        first = next(choice for choice in order if choice[0] <= enough)
+        return [first, *best]
+
+    def _mismatches(
+        self,
+        models: Sequence[LocalModel],
+        V: Array,
+        K: Array,
+        incumbents: Sequence[Record],
+        others: Sequence[Record | None],
+    ) -> Array:
+        pairs = []
+        for i, record in enumerate(incumbents):
+            neighbour, other = incumbents[(i + 1) % len(incumbents)], others[i]
+            if neighbour is not record and neighbour.usable and record.usable:
+                pairs.append((record, neighbour))
+            if other is not None and other.cost < _LOCAL * record.cost and record.usable:
+                pairs.append((record, other))
+        errors = np.zeros((len(models), len(_KAPPAS)))
+        if not pairs:
+            return errors
+        first = [self._path(record, V) for record, _ in pairs]
+        second = [self._path(record, V) for _, record in pairs]
+        forcing = np.stack(
+            [
+                path.features @ (self.theta(b.policy) - self.theta(a.policy)).T
+                for path, (a, b) in zip(second, pairs, strict=True)
+            ]
+        )
+        x = np.stack([path.x for path in first])
+        measured = np.stack([path.x for path in second]) - x
+        size = np.maximum(np.sum(measured**2, axis=(1, 2)), 1e-300)
+        gammas = np.exp(-np.array(_KAPPAS) / self._horizon)
+        for i, model in enumerate(models):
+            with np.errstate(over="ignore", invalid="ignore"):
+                predicted = predict_difference(
+                    model.jacobians(x),
+                    model.B,
+                    K,
+                    initial=measured[:, 0],
+                    forcing=forcing,
+                    gammas=gammas,
+                )
+                error = np.sum((predicted - measured) ** 2, axis=(2, 3)) / size
+            error = np.where(np.isfinite(error), np.minimum(error, _WORST), _WORST)
+            errors[i] = error.mean(axis=1)
+        return errors
+
+    def _step(
+        self,
+        model: LocalModel,
+        paths: Sequence[Path],
+        K: Array,
+        target: Array,
+        kappa: float,
+        damping: float,
+    ) -> tuple[Array, float]:
+        n_f = self.n_s + 1
+        p = self.n_a * n_f
+        g, H, features = np.zeros(p), np.zeros((p, p)), np.zeros((n_f, n_f))
+        with np.errstate(over="ignore", invalid="ignore"):
+            for path in paths:
+                expansion = expand(
+                    path,
+                    model.jacobians(path.x),
+                    model.B,
+                    K,
+                    target=target,
+                    state_weight=self._q,
+                    action_weight=self._r,
+                    gamma=float(np.exp(-kappa / self._horizon)),
+                )
+                g += expansion.gradient / len(paths)
+                H += expansion.curvature / len(paths)
+                features += path.features.T @ path.features / (len(path.features) * len(paths))
+        if not (np.isfinite(g).all() and np.isfinite(H).all()):
+            return np.full((self.n_a, n_f), np.nan), np.nan
+        region = 2.0 * self._r * np.kron(np.eye(self.n_a), features)
+        matrix = H + damping * region
+        matrix[np.diag_indices(p)] += 1e-9 * np.trace(H) / p
+        d = -linalg.solve(matrix, g, assume_a="pos")
+        return d.reshape(self.n_a, n_f), float(-(g @ d + 0.5 * d @ H @ d))

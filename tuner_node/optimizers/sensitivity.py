@@ -1,0 +1,151 @@
+"""What a change of the gains does to a trajectory, along a measured trajectory.
+
+The law a = K s + b has the parameters theta = [K b], of shape (n_a, n_s + 1), in row-major order; s
+is the first n_s entries of x = V^T z. Along a measured trajectory, with Jacobians A_k and input
+matrix B of a fitted model, X_k = dx_k/dtheta and G_k = da_k/dtheta follow
+
+    G_k = K X_k[:n_s] + I (x) [s_k; 1]^T,        X_{k+1} = gamma (A_k X_k + B G_k),        X_0 = 0.
+
+gamma <= 1 forgets: it keeps the sensitivities of a model that is unstable where the plant is not
+from growing. The cost itself needs no model. With the measured x_k and a_k its gradient and
+Gauss-Newton curvature are
+
+    g = (2 / T) sum_k (q X_k^T (x_k - V^T z_r) + r G_k^T a_k),     H = (2 / T) sum_k (q X_k^T X_k +
+    r G_k^T G_k).
+
+References
+----------
+Nocedal, Wright, "Numerical Optimization", 2nd ed., chapter 10. Sutton et al. (iterative learning
+control) and Abbeel, Quigley, Ng, "Using inaccurate models in reinforcement learning", ICML 2006
+(measured trajectory, modelled derivative).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Expansion", "Path", "expand", "predict_difference"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """A measured trajectory in reduced coordinates.
+
+    Attributes
+    ----------
+    x : (T, r) array
+        Whose first n_s columns are s.
+    a : (T, n_a) array
+    features : (T, n_s + 1) array
+        [s_k; 1], or [s_k; 0] where the law has no constant part.
+    """
+
+    x: Array
+    a: Array
+    features: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Expansion:
+    """The cost of a trajectory to second order in theta: gradient (p,) and curvature (p, p)."""
+
+    gradient: Array
+    curvature: Array
+
+
+def expand(
+    path: Path,
+    jacobians: Array,
+    B: Array,
+    K: Array,
+    *,
+    target: Array,
+    state_weight: float,
+    action_weight: float,
+    gamma: float,
+) -> Expansion:
+    """Gradient and Gauss-Newton curvature of the mean stage cost along a path.
+
+    Parameters
+    ----------
+    path : Path
+        Measured under the policy whose feedback is `K`.
+    jacobians : (T, r, r) array
+        A_k at the states of the path.
+    B : (r, n_a) array
+        Input matrix of the model.
+    K : (n_a, n_s) array
+        Feedback gains.
+    target : (r,) array
+        V^T z_r.
+    state_weight, action_weight : float
+        q and r.
+    gamma : float
+        Forgetting, in (0, 1].
+    """
+    steps, n_f = path.features.shape
+    r, n_a = B.shape
+    n_s, p = K.shape[1], n_a * n_f
+    X = np.zeros((r, p))
+    stacked = np.empty((steps, r + n_a, p))
+    diagonal = np.arange(n_a)
+    for k in range(steps):
+        G = K @ X[:n_s]
+        G.reshape(n_a, n_a, n_f)[diagonal, diagonal] += path.features[k]
+        stacked[k, :r] = X
+        stacked[k, r:] = G
+        X = gamma * (jacobians[k] @ X + B @ G)
+    stacked[:, :r] *= np.sqrt(state_weight)
+    stacked[:, r:] *= np.sqrt(action_weight)
+    residual = np.hstack(
+        [np.sqrt(state_weight) * (path.x - target), np.sqrt(action_weight) * path.a]
+    )
+    flat = stacked.reshape(steps * (r + n_a), p)
+    return Expansion(
+        gradient=(2.0 / steps) * (residual.reshape(-1) @ flat),
+        curvature=(2.0 / steps) * (flat.T @ flat),
+    )
+
+
+def predict_difference(
+    jacobians: Array, B: Array, K: Array, *, initial: Array, forcing: Array, gammas: Array
+) -> Array:
+    """How far a second trajectory runs from a measured one, to first order.
+
+        delta_{k+1} = gamma ((A_k + B [K 0]) delta_k + B f_k)
+
+    Parameters
+    ----------
+    jacobians : (P, T, r, r) array
+        A_k along the measured trajectories of P pairs.
+    B, K : arrays
+        As in `expand`; K is the feedback of the first trajectory.
+    initial : (P, r) array
+        delta_0.
+    forcing : (P, T, n_a) array
+        f_k = (theta_2 - theta_1) [s_k; 1] along the second trajectory.
+    gammas : (C,) array
+        Values of gamma.
+
+    Returns
+    -------
+    (C, P, T, r) array
+        delta_0 .. delta_{T-1} for every gamma.
+    """
+    pairs, steps, r, _ = jacobians.shape
+    n_s = K.shape[1]
+    closed = jacobians.copy()
+    closed[..., :n_s] += B @ K
+    drive = forcing @ B.T
+    difference = np.empty((gammas.size, pairs, steps, r))
+    delta = np.broadcast_to(initial, (gammas.size, pairs, r)).copy()
+    for k in range(steps):
+        difference[:, :, k] = delta
+        moved = np.einsum("pij,cpj->cpi", closed[:, k], delta) + drive[:, k]
+        delta = gammas[:, None, None] * moved
+    return difference

@@ -1,0 +1,142 @@
+"""The trajectories an optimiser remembers, and how they survive a checkpoint."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner_node.optimizers.base import Array, RolloutResult, State, Trajectory
+
+__all__ = ["Record", "Records"]
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """A rollout that was measured.
+
+    Attributes
+    ----------
+    stamp : int
+        Its number among all rollouts, from 0.
+    policy : (n_a, 2 n_s) array
+    cost : float
+        Mean stage cost; infinite if it diverged.
+    states, actions : (L + 1, n_z) or (L, n_z), and (L, n_a) arrays
+        What can be learned from: all of the episode, or its samples before it ran away.
+    """
+
+    stamp: int
+    policy: Array
+    cost: float
+    states: Array
+    actions: Array
+
+    @property
+    def usable(self) -> bool:
+        """Whether the rollout came to its end."""
+        return bool(np.isfinite(self.cost))
+
+
+class Records:
+    """The last rollouts, and older ones that are still referred to.
+
+    Parameters
+    ----------
+    memory : int
+        How many rollouts to remember.
+    limit : float
+        A diverged rollout counts until a state exceeds this magnitude.
+    """
+
+    def __init__(self, memory: int, limit: float) -> None:
+        self._memory = memory
+        self._limit = limit
+        self._records: dict[int, Record] = {}
+        self.count = 0
+
+    def __getitem__(self, stamp: int) -> Record:
+        return self._records[stamp]
+
+    def all(self) -> list[Record]:
+        """The remembered rollouts, oldest first."""
+        return [self._records[stamp] for stamp in sorted(self._records)]
+
+    def raise_limit(self, states: Array) -> None:
+        """Accept magnitudes up to three times those of a trajectory from the start."""
+        self._limit = max(self._limit, 3.0 * float(np.abs(states).max()))
+
+    def add(self, policy: Array, result: RolloutResult, keep: set[int]) -> Record:
+        """Remember a rollout; `keep` are the stamps that must not be forgotten."""
+        trajectory = result.trajectory
+        if trajectory is None:
+            raise ValueError(
+                "this optimiser learns from trajectories, but a result has none; record the states "
+                "and actions of the rollouts, or choose an optimiser that needs costs only."
+            )
+        states, actions = self._sound(trajectory, result.usable)
+        cost = float(result.cost) if result.usable else float("inf")
+        record = Record(self.count, np.array(policy), cost, states, actions)
+        self._records[record.stamp] = record
+        self.count += 1
+        for stamp in list(self._records):
+            if stamp < self.count - self._memory and stamp not in keep:
+                del self._records[stamp]
+        return record
+
+    def state(self, n_z: int, n_a: int, gains: int) -> State:
+        """The remembered rollouts as arrays; the episodes one after the other."""
+        records = self.all()
+        return {
+            "record_stamps": np.array([r.stamp for r in records], dtype=np.int64),
+            "record_costs": np.array([r.cost for r in records], dtype=np.float64),
+            "record_policies": np.array([r.policy for r in records]).reshape(-1, n_a, gains),
+            "record_lengths": np.array(
+                [(len(r.states), len(r.actions)) for r in records], dtype=np.int64
+            ).reshape(-1, 2),
+            "record_states": np.concatenate([np.empty((0, n_z)), *(r.states for r in records)]),
+            "record_actions": np.concatenate([np.empty((0, n_a)), *(r.actions for r in records)]),
+            "record_count": np.array(self.count),
+            "record_limit": np.array(self._limit),
+        }
+
+    def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
+        """Remember what a `state` remembers."""
+        lengths = state["record_lengths"].astype(np.int64)
+        ends = np.cumsum(lengths, axis=0)
+        records = {}
+        for i, stamp in enumerate(state["record_stamps"].astype(np.int64)):
+            (z_end, a_end), (z_length, a_length) = ends[i], lengths[i]
+            records[int(stamp)] = Record(
+                int(stamp),
+                state["record_policies"][i].astype(np.float64),
+                float(state["record_costs"][i].item()),
+                state["record_states"][z_end - z_length : z_end].astype(np.float64),
+                state["record_actions"][a_end - a_length : a_end].astype(np.float64),
+            )
+        self._records = records
+        self._limit = float(state["record_limit"].item())
+        self.count = int(state["record_count"].item())
+
+    def _sound(self, trajectory: Trajectory, usable: bool) -> tuple[Array, Array]:
+        states = np.array(trajectory.states, dtype=np.float64)
+        actions = np.array(trajectory.actions, dtype=np.float64)
+        if states.ndim != 2 or actions.ndim != 2 or len(states) - len(actions) not in (0, 1):
+            raise ValueError(
+                "a trajectory needs T or T + 1 states for T actions, but the shapes are "
+                f"{states.shape} and {actions.shape}."
+            )
+        if usable:
+            if not (np.isfinite(states).all() and np.isfinite(actions).all()):
+                raise ValueError("a rollout that did not diverge must have a finite trajectory.")
+            return states, actions
+        with np.errstate(invalid="ignore"):
+            bad = ~(np.abs(states).max(axis=1) <= self._limit)
+        # A plant may hold the last state of a diverged environment.
+        bad[1:] |= (states[1:] == states[:-1]).all(axis=1)
+        length = int(np.argmax(bad)) if bad.any() else len(states)
+        finite = np.isfinite(actions).all(axis=1)
+        length = min(length, int(np.argmin(finite)) if not finite.all() else length)
+        return states[:length], actions[: max(length - 1, 0)]

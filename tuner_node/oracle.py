@@ -1,0 +1,94 @@
+"""Perturbations of a policy, the two-point gradient estimate, and the policy update.
+
+For a policy pi = [K_a K_b] of shape (n_a, 2 n_s), a direction Theta with |Theta|_F = 1 and a
+smoothing radius r,
+
+    g = (n_a n_s / r) (J(pi + r Theta) - J(pi - r Theta)) Theta,        pi <- pi - eta g.
+
+Both rollouts start from the same initial field. With d = 2 n_a n_s entries, E[d Theta Theta^T] = I
+for a uniform direction, so g = d (J+ - J-) / (2 r) Theta estimates the gradient of J without bias,
+up to the smoothing.
+
+Every draw is a pure function of (seed, stream, iteration): a training that is interrupted and goes
+on draws what it would have drawn. Sums are elementwise (no BLAS), so that a policy is the same to
+the last bit on every run.
+
+References
+----------
+Zhang, Mowlavi, Benosman, Basar, "Policy Optimization for PDE Control with a Warm Start",
+arXiv:2403.01005.
+Spall, "Introduction to Stochastic Search and Optimization", chapter 7.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["field_seed", "gradient", "orthonormal_directions", "unit_direction", "update"]
+
+Array = NDArray[np.float64]
+
+# Large constants: numpy pads a short seed sequence with zeros, so [seed, stream, 0] would equal the
+# [seed, step] of another user of the same seed if the stream were a small number.
+_DIRECTION_STREAM = 0x5448455441  # "THETA"
+_FIELD_STREAM = 0x4649454C44  # "FIELD"
+# Field seeds travel as float64, which holds every integer below 2^53.
+_SEED_LIMIT = 2**53
+
+
+def unit_direction(seed: int, iteration: int, shape: tuple[int, int]) -> Array:
+    """The direction Theta of an iteration: Gaussian, scaled to Frobenius norm 1."""
+    direction: Array = orthonormal_directions(seed, iteration, shape, 1)[0]
+    return direction
+
+
+def orthonormal_directions(seed: int, iteration: int, shape: tuple[int, int], count: int) -> Array:
+    """Directions of an iteration, orthonormal in the Frobenius inner product.
+
+    The Q factor of a Gaussian matrix, each direction alone uniform on the sphere.
+
+    Parameters
+    ----------
+    seed, iteration : int
+        Not negative.
+    shape : tuple of int
+        (n_a, 2 n_s), the shape of a policy.
+    count : int
+        1 .. n_a 2 n_s.
+
+    Returns
+    -------
+    (count, n_a, 2 n_s) array
+    """
+    size = shape[0] * shape[1]
+    if not 1 <= count <= size:
+        raise ValueError(
+            f"a policy of shape {shape} has 1 .. {size} directions, but {count} were asked for."
+        )
+    rng = np.random.default_rng([seed, _DIRECTION_STREAM, iteration])
+    directions: Array = rng.standard_normal((count, *shape))
+    for i in range(count):
+        # Gram-Schmidt, twice, is orthogonal to rounding.
+        for _ in range(2 if i else 1):
+            for j in range(i):
+                directions[i] -= np.sum(directions[i] * directions[j]) * directions[j]
+            directions[i] /= np.sqrt(np.sum(directions[i] * directions[i]))
+    return directions
+
+
+def field_seed(seed: int, iteration: int) -> int:
+    """The seed of the initial field that the rollouts of an iteration share, in 0 .. 2^53 - 1."""
+    return int(np.random.default_rng([seed, _FIELD_STREAM, iteration]).integers(_SEED_LIMIT))
+
+
+def gradient(cost_plus: float, cost_minus: float, direction: Array, radius: float) -> Array:
+    """The two-point estimate (n_a n_s / r) (J+ - J-) Theta, shape (n_a, 2 n_s)."""
+    n_a, columns = direction.shape
+    estimate: Array = n_a * (columns // 2) / radius * (cost_plus - cost_minus) * direction
+    return estimate
+
+
+def update(policy: Array, estimate: Array, learning_rate: float) -> Array:
+    """The policy after a step, pi - eta g."""
+    return policy - learning_rate * estimate

@@ -1,0 +1,81 @@
+"""Keeps a training's folder up to date: progress lines, checkpoints, results."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from tuner_node import checkpoint
+from tuner_node.results import RunFolder, RunIdentity
+from tuner_node.training import Training
+
+CHECKPOINT_PERIOD = 1.0
+"""Seconds between checkpoints at the least. What a crash loses is computed again, identically."""
+
+
+class Recorder:
+    """Writes what `training` does into the folder `path`.
+
+    A file that cannot be written (full disk) is reported through `warn` and tried again; the
+    training goes on and the previous checkpoint stays.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        parameters: Mapping[str, Any],
+        training: Training,
+        *,
+        resume: bool,
+        warn: Callable[[str], None],
+    ) -> None:
+        self._folder = RunFolder(path)
+        self._training = training
+        self._warn = warn
+        self._saved_at = float("-inf")
+        self._began = time.monotonic()
+        self._changed = False
+        self.identity: RunIdentity
+        if resume:
+            self.identity = self._folder.reopen(parameters)
+            self._restore()
+        else:
+            self.identity = self._folder.create(parameters)
+
+    def note(self, row: Mapping[str, Any]) -> None:
+        """One line of progress, stamped with the time and the iteration."""
+        self._changed = True
+        try:
+            self._folder.note({"time": time.time(), **row})
+        except OSError as error:
+            self._warn(f"cannot write progress to {self._folder.path}: {error.strerror}")
+
+    def keep(self, *, now: float, force: bool = False) -> None:
+        """Write a checkpoint if something changed and the last one is old enough."""
+        if not self._changed or (not force and now - self._saved_at < CHECKPOINT_PERIOD):
+            return
+        self._saved_at = now
+        try:
+            checkpoint.save(self._folder.checkpoint, self._training.state())
+            self._changed = False
+        except OSError as error:
+            self._warn(
+                f"cannot write the checkpoint to {self._folder.path}: {error.strerror}; "
+                "the training goes on, the previous checkpoint stays"
+            )
+
+    def finish(self, extra: Mapping[str, Any]) -> dict[str, Any]:
+        """Write the results of the finished training. Raises OSError if they cannot be written."""
+        self.keep(now=time.monotonic(), force=True)
+        seconds = time.monotonic() - self._began
+        return self._folder.finish(self._training, {"seconds": seconds, **extra})
+
+    def _restore(self) -> None:
+        if not self._folder.checkpoint.exists() and not any(self._folder.path.glob("checkpoint*")):
+            return  # stopped before its first checkpoint: it begins again, identically
+        arrays, warnings = checkpoint.load(self._folder.checkpoint)
+        for warning in warnings:
+            self._warn(f"{warning}; using an older checkpoint")
+        self._training.restore(arrays)

@@ -1,0 +1,181 @@
+"""A training's folder and what is in it.
+
+parameters.yaml    the resolved parameters, in ROS form: what defines the training
+run.json           the run's id on the network and how often its tuner was started
+progress.jsonl     what happened, one JSON object a line, as it happened
+checkpoint         the training's state (tuner_node.checkpoint), and the one before
+policy.npz         policy (S, n_a, 2 n_s), lqt (the same), model rows (S, rows, n_s), seeds (S,)
+result.json        costs, reductions, history, seeds, versions, timing
+logs/              one file a node, when the command line started them
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import secrets
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import metadata
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loop_interfaces.frames import MAX_ID
+from loop_interfaces.parameters import ParameterError, read_yaml, write_yaml
+from tuner_node import checkpoint
+from tuner_node.training import CONTROLLERS, Training
+
+TRANSIENT = ("out", "resume", "pairs", "max_batch", "episode_timeout", "max_attempts")
+"""Parameters that change how a training is carried out, not what comes out of it."""
+
+
+class RunFolderError(ValueError):
+    """The folder cannot be used as asked; the text says why and what to do."""
+
+
+@dataclass(frozen=True)
+class RunIdentity:
+    """run: the id in every frame of this training; incarnation: starts of its tuner so far."""
+
+    run: int
+    incarnation: int
+
+
+class RunFolder:
+    """The files of one training. Writing errors are OSErrors; nothing is left half-written."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.checkpoint = path / "checkpoint"
+
+    def create(self, parameters: Mapping[str, Any]) -> RunIdentity:
+        """Begin a new training here. RunFolderError if the folder holds one or cannot be written."""
+        if (self.path / "parameters.yaml").exists():
+            raise RunFolderError(
+                f"{self.path} already holds a run; choose another folder, "
+                f"or continue it with: pdeloop train --resume {self.path}"
+            )
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            kept = {k: v for k, v in parameters.items() if k not in TRANSIENT}
+            write_yaml(self.path / "parameters.yaml", kept, "resolved parameters of this run")
+            return self._identify(RunIdentity(1 + secrets.randbelow(MAX_ID - 1), 0))
+        except OSError as error:
+            raise RunFolderError(f"cannot write to {self.path}: {error.strerror}") from error
+
+    def reopen(self, parameters: Mapping[str, Any]) -> RunIdentity:
+        """Continue the training here. RunFolderError if there is none, or with other parameters."""
+        self.check_same(parameters)
+        try:
+            known = json.loads((self.path / "run.json").read_text())
+            identity = RunIdentity(int(known["run"]), int(known["incarnation"]) + 1)
+            if not (0 < identity.run < MAX_ID and 0 < identity.incarnation < 2**21):
+                raise ValueError("ids out of range")
+            return self._identify(identity)
+        except (OSError, KeyError, TypeError, ValueError) as error:
+            raise RunFolderError(f"{self.path}/run.json cannot be used: {error}") from error
+
+    def parameters(self) -> dict[str, Any]:
+        """The resolved parameters of the training here."""
+        path = self.path / "parameters.yaml"
+        if not path.is_file():
+            raise RunFolderError(f"no run in {self.path}: there is no parameters.yaml")
+        try:
+            return read_yaml(path)
+        except ParameterError as error:
+            raise RunFolderError(str(error)) from error
+
+    def check_same(self, parameters: Mapping[str, Any]) -> None:
+        """RunFolderError showing every difference between `parameters` and this folder's."""
+        known = self.parameters()
+        now = {k: v for k, v in parameters.items() if k not in TRANSIENT}
+        changes = [
+            f"{name}: {known.get(name)!r} there, {now.get(name)!r} now"
+            for name in sorted({*known, *now})
+            if known.get(name) != now.get(name)
+        ]
+        if changes:
+            raise RunFolderError(
+                f"the run in {self.path} has other parameters ({'; '.join(changes)}); "
+                "continue it with its own, or start a new run in another folder"
+            )
+
+    def note(self, row: Mapping[str, Any]) -> None:
+        """Append one line to progress.jsonl."""
+        with (self.path / "progress.jsonl").open("a") as file:
+            file.write(json.dumps(row) + "\n")
+
+    def finish(self, training: Training, extra: Mapping[str, Any]) -> dict[str, Any]:
+        """Write policy.npz and result.json; returns the latter's content."""
+        summary = summarise(training) | dict(extra) | {"versions": versions()}
+        buffer = BytesIO()
+        np.savez(buffer, **policy_arrays(training))  # type: ignore[arg-type]
+        checkpoint.write_atomically(self.path / "policy.npz", buffer.getvalue())
+        text = json.dumps(summary, indent=1)
+        checkpoint.write_atomically(self.path / "result.json", text.encode())
+        return summary
+
+    def _identify(self, identity: RunIdentity) -> RunIdentity:
+        content = {"run": identity.run, "incarnation": identity.incarnation}
+        checkpoint.write_atomically(self.path / "run.json", json.dumps(content).encode())
+        return identity
+
+
+def policy_arrays(training: Training) -> dict[str, NDArray[Any]]:
+    """The arrays of policy.npz."""
+    assert training.models is not None
+    settings = training.settings
+    return {
+        "policy": training.policies(),
+        "lqt": training.warm_starts(),
+        "model": training.models,
+        "seeds": np.arange(settings.seed, settings.seed + settings.seeds),
+    }
+
+
+def summarise(training: Training) -> dict[str, Any]:
+    """Costs and reductions of a finished training.
+
+    reduction: how far the adapted cost lies below LQT's, as the mean over seeds of the ratios and as
+    the ratio of the means over seeds (each cost already a mean over the evaluation fields).
+    """
+    assert training.evaluation is not None
+    costs = training.evaluation
+    mean = costs.mean(axis=2)
+    none, lqt, adapted = (mean[:, CONTROLLERS.index(name)] for name in CONTROLLERS)
+    return {
+        "costs": {name: mean[:, i].tolist() for i, name in enumerate(CONTROLLERS)},
+        "costs_by_field": {name: costs[:, i].tolist() for i, name in enumerate(CONTROLLERS)},
+        "mean_cost": {"none": none.mean(), "lqt": lqt.mean(), "adapted": adapted.mean()},
+        "reduction": {
+            "mean_of_ratios": float((1 - adapted / lqt).mean()),
+            "ratio_of_means": float(1 - adapted.mean() / lqt.mean()),
+        },
+        "improved": bool((adapted <= lqt).all()),
+        "seed": training.settings.seed,
+        "seeds": training.settings.seeds,
+        "iterations": training.iteration,
+        "history": training.history,
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of what the numbers depend on."""
+    known = {"python": platform.python_version(), "machine": platform.machine()}
+    for name in ("pdeloop", "numpy", "scipy", "numba", "ros-jazzy-rclpy"):
+        try:
+            known[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return known
+
+
+def timestamp() -> str:
+    """Local time for folder names."""
+    return time.strftime("%Y%m%d-%H%M%S") + f"-{os.getpid()}"

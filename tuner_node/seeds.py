@@ -1,0 +1,26 @@
+"""Every random choice of a training is a pure function of (seed, purpose, index).
+
+So a run that was interrupted, restarted, batched or distributed draws what an undisturbed one does.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+
+from loop_interfaces.parameters import MAX_SEED
+
+
+class Purpose(IntEnum):
+    """What a seed is for; the numbers are part of the results' reproducibility."""
+
+    EXPLORATORY_FIELD = 1
+    EXCITATION = 2
+    EVALUATION_FIELD = 3
+
+
+def derive(seed: int, purpose: Purpose, index: int = 0) -> int:
+    """A seed in [0, 2^53) for `purpose`, from NumPy's SeedSequence of (seed, purpose, index)."""
+    words = np.random.SeedSequence([seed, int(purpose), index]).generate_state(1, np.uint64)
+    return int(words[0]) % (MAX_SEED + 1)

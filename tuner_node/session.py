@@ -1,0 +1,73 @@
+"""One training carried out by plant and controller pairs: Training and Dispatcher joined. Pure.
+
+Events of the pairs go in, messages come out; what happens on the way is handed to `report` as
+JSON-able rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from loop_interfaces.frames import Frame
+from loop_interfaces.protocol import ModelFailure
+from tuner_node.dispatch import Dispatcher, Order
+from tuner_node.training import Training
+
+Report = Callable[[Mapping[str, Any]], None]
+
+
+class Session:
+    """Drives a training to its end over a dispatcher."""
+
+    def __init__(self, training: Training, dispatcher: Dispatcher, report: Report) -> None:
+        self.training = training
+        self.dispatcher = dispatcher
+        self._report = report
+        self._phase = ""
+        self.done = False
+
+    def begin(self, now: float) -> list[Order]:
+        """The first messages; after a resume with the models that are already there."""
+        orders: list[Order] = []
+        if self.training.models is not None:
+            orders += self.dispatcher.models(self.training.models)
+        return orders + self._next(now)
+
+    def presence(self, pair: int, missing: Sequence[str], now: float) -> list[Order]:
+        return self._advance(self.dispatcher.presence(pair, missing, now), now)
+
+    def cost(self, pair: int, frame: Frame, now: float) -> list[Order]:
+        return self._advance(self.dispatcher.cost(pair, frame, now), now)
+
+    def model(self, pair: int, frame: Frame, now: float) -> list[Order]:
+        return self._advance(self.dispatcher.model(pair, frame, now), now)
+
+    def failure(self, pair: int, failure: ModelFailure, now: float) -> list[Order]:
+        return self._advance(self.dispatcher.failure(pair, failure, now), now)
+
+    def tick(self, now: float) -> list[Order]:
+        return self._advance(self.dispatcher.tick(now), now)
+
+    def _advance(self, orders: list[Order], now: float) -> list[Order]:
+        for note in self.dispatcher.notes:
+            self._report({"event": "repeated", "reason": note})
+        self.dispatcher.notes.clear()
+        result = self.dispatcher.result()
+        if result is None:
+            return orders
+        for row in self.training.finish(result):
+            self._report(row)
+        if result.models is not None and self.training.models is not None:
+            orders = orders + self.dispatcher.models(self.training.models)
+        return orders + self._next(now)
+
+    def _next(self, now: float) -> list[Order]:
+        batch = self.training.next_batch()
+        if self.training.phase != self._phase:
+            self._phase = self.training.phase
+            self._report({"event": "phase", "phase": self._phase})
+        if batch is None:
+            self.done = True
+            return self.dispatcher.release()
+        return self.dispatcher.assign(batch, now)

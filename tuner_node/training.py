@@ -1,0 +1,312 @@
+"""The training as a state machine: which rollouts it needs next, what it does with their costs.
+
+Phases: identify (one exploratory episode a seed, from which the controller designs the warm start),
+check (a warm start that is no better than no control on the mean field is thrown away, and another
+exploratory episode is drawn), adapt (the optimiser's iterations), evaluate (no control, LQT and the
+adapted policy on the same sampled fields). Pure: it knows neither topics nor time, so over topics
+and in one process it is the same training, to the bit.
+
+Source: Zhang, Mowlavi, Benosman, Basar, arXiv:2403.01005, section IV; the check is ours.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loop_interfaces import model_rows
+from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn
+from tuner_node.optimizers import Optimizer, Rollout, RolloutResult
+from tuner_node.seeds import Purpose, derive
+
+Array = NDArray[np.float64]
+CONTROLLERS = ("none", "lqt", "adapted")
+"""The controllers of the closing evaluation, in the order of its rows."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Rollouts wanted together; any split into episodes gives the same results.
+
+    rows (R, 3): seed, excitation, model of each (`episode/start`); policies (R, n_a, 2 n_s), or
+    None for an exploratory batch, whose result is a model a row instead of a cost.
+    """
+
+    rows: Array
+    policies: Array | None
+
+    @property
+    def exploratory(self) -> bool:
+        return self.policies is None
+
+
+@dataclass(frozen=True)
+class BatchResult:
+    """costs (R, 3): mean, total, ended of each row; models (R, rows, n_s) after exploration."""
+
+    costs: Array
+    models: Array | None = None
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """What defines a training besides the problem; see loop_interfaces.parameters.TUNER."""
+
+    n_a: int
+    seed: int
+    seeds: int
+    evaluation_fields: int
+    evaluation_seed: int
+    start: str
+    identification_attempts: int
+
+
+OptimizerFactory = Callable[[Array, int], Optimizer]
+"""(warm-start policy, seed) -> optimiser."""
+
+
+@dataclass
+class Training:
+    """One training of `seeds` policies side by side.
+
+    Call `next_batch`, run it, `finish` it, until `next_batch` gives None. `finish` returns what
+    happened as JSON-able rows for people and logs.
+    """
+
+    settings: TrainingSettings
+    make_optimizer: OptimizerFactory
+    phase: str = "identify"
+    models: Array | None = None
+    attempts: list[int] = field(default_factory=list)
+    pending: list[int] = field(default_factory=list)
+    optimizers: list[Optimizer] = field(default_factory=list)
+    history: list[dict[str, Any]] = field(default_factory=list)
+    evaluation: Array | None = None
+
+    def __post_init__(self) -> None:
+        self.pending = list(range(self.settings.seeds))
+        self.attempts = [0] * self.settings.seeds
+
+    def next_batch(self) -> Batch | None:
+        """The rollouts wanted now; the same at every call until `finish`. None: all is done."""
+        if self.phase == "identify":
+            seeds, attempts = self._seeds(), self.attempts
+            rows = [
+                [
+                    derive(seeds[m], Purpose.EXPLORATORY_FIELD, attempts[m]),
+                    derive(seeds[m], Purpose.EXCITATION, attempts[m]),
+                    m,
+                ]
+                for m in self.pending
+            ]
+            return Batch(np.array(rows, dtype=np.float64), None)
+        if self.phase == "check":
+            return _batch(self._check_rollouts())
+        if self.phase == "adapt":
+            wanted = [(m, rollout) for m, asked in enumerate(self._asked()) for rollout in asked]
+            return _batch(wanted)
+        if self.phase == "evaluate":
+            return _batch(self._evaluation_rollouts())
+        return None
+
+    def finish(self, result: BatchResult) -> list[dict[str, Any]]:
+        """Take the results of the batch that `next_batch` gave, in its order."""
+        if self.phase == "identify":
+            assert result.models is not None
+            return self._identified(result.models)
+        if self.phase == "check":
+            return self._checked(result)
+        if self.phase == "adapt":
+            return self._tell(result)
+        return self._evaluated(result)
+
+    def policies(self) -> Array:
+        """The adapted policies, (S, n_a, 2 n_s)."""
+        return np.stack([optimizer.best_policy for optimizer in self.optimizers])
+
+    def warm_starts(self) -> Array:
+        """The LQT policies of the models, (S, n_a, 2 n_s)."""
+        assert self.models is not None
+        return np.stack([model_rows.unpack(rows, self.settings.n_a).policy for rows in self.models])
+
+    @property
+    def iteration(self) -> int:
+        """Iterations that every seed has behind it."""
+        return min((optimizer.iteration for optimizer in self.optimizers), default=0)
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Everything a checkpoint must hold, as arrays."""
+        arrays: dict[str, NDArray[Any]] = {
+            "phase": np.array(self.phase),
+            "attempts": np.array(self.attempts),
+            "pending": np.array(self.pending, dtype=np.int64),
+            "history": np.array(json.dumps(self.history)),
+        }
+        if self.models is not None:
+            arrays["models"] = self.models
+        if self.evaluation is not None:
+            arrays["evaluation"] = self.evaluation
+        for m, optimizer in enumerate(self.optimizers):
+            arrays |= {f"optimizer{m}.{key}": value for key, value in optimizer.state().items()}
+        return arrays
+
+    def restore(self, arrays: dict[str, NDArray[Any]]) -> None:
+        """Continue from `state()`."""
+        self.phase = str(arrays["phase"])
+        self.attempts = arrays["attempts"].tolist()
+        self.pending = arrays["pending"].tolist()
+        self.models = arrays.get("models")
+        if self.phase in ("adapt", "evaluate", "done"):
+            self._start_optimizers()
+        for m, optimizer in enumerate(self.optimizers):
+            prefix = f"optimizer{m}."
+            optimizer.restore(
+                {
+                    key.removeprefix(prefix): value
+                    for key, value in arrays.items()
+                    if key.startswith(prefix)
+                }
+            )
+        self.history = json.loads(str(arrays["history"]))
+        self.evaluation = arrays.get("evaluation")
+
+    def _seeds(self) -> list[int]:
+        return [self.settings.seed + s for s in range(self.settings.seeds)]
+
+    def _identified(self, models: Array) -> list[dict[str, Any]]:
+        if self.models is None:
+            if len(models) != self.settings.seeds:
+                raise ValueError(f"expected {self.settings.seeds} models, got {len(models)}")
+            self.models = models.copy()
+        self.models[self.pending] = models
+        rows = []
+        for m, own in zip(self.pending, models, strict=True):
+            A = model_rows.unpack(own, self.settings.n_a).A
+            rows.append(
+                {
+                    "event": "designed",
+                    "seed": self._seeds()[m],
+                    "attempt": self.attempts[m] + 1,
+                    "reduced_order": own.shape[1],
+                    "spectral_radius": float(np.abs(np.linalg.eigvals(A)).max()),
+                }
+            )
+        self.phase = "check"
+        if self.settings.identification_attempts == 1:
+            self._start_adapting()
+        return rows
+
+    def _check_rollouts(self) -> list[tuple[int, Rollout]]:
+        warm = self.warm_starts()
+        return [
+            (m, Rollout(policy, -1))
+            for m in self.pending
+            for policy in (np.zeros_like(warm[m]), warm[m])
+        ]
+
+    def _checked(self, result: BatchResult) -> list[dict[str, Any]]:
+        costs = result.costs.reshape(len(self.pending), 2, len(CostColumn))
+        rows, failed = [], []
+        for m, (none, lqt) in zip(self.pending, costs, strict=True):
+            completed = lqt[CostColumn.ENDED] == COMPLETED
+            good = bool(completed and lqt[CostColumn.MEAN] < none[CostColumn.MEAN])
+            rows.append(
+                {
+                    "event": "checked",
+                    "seed": self._seeds()[m],
+                    "none": float(none[CostColumn.MEAN]),
+                    "lqt": float(lqt[CostColumn.MEAN]),
+                    "accepted": good,
+                }
+            )
+            if not good and self.attempts[m] + 1 < self.settings.identification_attempts:
+                self.attempts[m] += 1
+                failed.append(m)
+        self.pending = failed
+        if failed:
+            self.phase = "identify"
+        else:
+            self._start_adapting()
+        return rows
+
+    def _start_adapting(self) -> None:
+        self.pending = []
+        self._start_optimizers()
+        self._leave_adapt_if_done()
+
+    def _start_optimizers(self) -> None:
+        zero = self.settings.start == "zero"
+        self.optimizers = [
+            self.make_optimizer(np.zeros_like(policy) if zero else policy, seed)
+            for policy, seed in zip(self.warm_starts(), self._seeds(), strict=True)
+        ]
+
+    def _asked(self) -> list[list[Rollout]]:
+        return [[] if optimizer.done else optimizer.ask() for optimizer in self.optimizers]
+
+    def _tell(self, result: BatchResult) -> list[dict[str, Any]]:
+        rows, first = [], 0
+        for seed, optimizer, asked in zip(
+            self._seeds(), self.optimizers, self._asked(), strict=True
+        ):
+            if not asked:
+                continue
+            own = result.costs[first : first + len(asked)]
+            first += len(asked)
+            told = optimizer.tell(
+                [
+                    RolloutResult(
+                        cost=float(cost[CostColumn.MEAN]),
+                        diverged=bool(cost[CostColumn.ENDED] != COMPLETED),
+                        trajectory=None,
+                    )
+                    for cost in own
+                ]
+            )
+            rows.append({"event": "iteration", "seed": seed, **told})
+        self.history += rows
+        self._leave_adapt_if_done()
+        return rows
+
+    def _leave_adapt_if_done(self) -> None:
+        done = all(optimizer.done for optimizer in self.optimizers)
+        self.phase = "evaluate" if done else "adapt"
+
+    def _evaluation_rollouts(self) -> list[tuple[int, Rollout]]:
+        fields = [
+            derive(self.settings.evaluation_seed, Purpose.EVALUATION_FIELD, i)
+            for i in range(self.settings.evaluation_fields)
+        ]
+        adapted, warm = self.policies(), self.warm_starts()
+        return [
+            (m, Rollout(policy, field_seed))
+            for m in range(self.settings.seeds)
+            for policy in (np.zeros_like(warm[m]), warm[m], adapted[m])
+            for field_seed in fields
+        ]
+
+    def _evaluated(self, result: BatchResult) -> list[dict[str, Any]]:
+        settings = self.settings
+        shape = (settings.seeds, len(CONTROLLERS), settings.evaluation_fields)
+        self.evaluation = result.costs[:, CostColumn.MEAN].reshape(shape)
+        self.phase = "done"
+        return [
+            {
+                "event": "evaluated",
+                "seed": seed,
+                **dict(zip(CONTROLLERS, costs.mean(axis=-1).tolist(), strict=True)),
+            }
+            for seed, costs in zip(self._seeds(), self.evaluation, strict=True)
+        ]
+
+
+def _batch(wanted: Sequence[tuple[int, Rollout]]) -> Batch:
+    rows = np.empty((len(wanted), len(StartColumn)))
+    for row, (model, rollout) in zip(rows, wanted, strict=True):
+        row[:] = (rollout.field_seed, -1, model)
+    return Batch(rows, np.stack([rollout.policy for _, rollout in wanted]))
