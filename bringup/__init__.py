@@ -1,0 +1,1 @@
+"""What starts and observes the nodes: command line, supervisor, in-process runner."""

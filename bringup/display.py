@@ -1,0 +1,130 @@
+"""What a person sees of a run: one line an event, a bar while the policy adapts, a summary."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TextIO
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+
+class Display:
+    """Shows progress rows: a live bar on a terminal, plain lines elsewhere."""
+
+    def __init__(self, iterations: int, seeds: int, stream: TextIO | None = None) -> None:
+        self._console = Console(file=stream or sys.stdout, highlight=False, soft_wrap=True)
+        self._total = iterations * seeds
+        self._every = max(1, self._total // 8)
+        self._told = 0
+        self._progress: Progress | None = None
+        self._task: Any = None
+
+    def line(self, text: str) -> None:
+        """One line of text."""
+        self._console.print(text, markup=False)
+
+    def row(self, row: Mapping[str, Any]) -> None:
+        """Show one row of progress.jsonl."""
+        match row.get("event"):
+            case "phase":
+                self._phase(str(row["phase"]))
+            case "designed":
+                self.line(
+                    f"  seed {row['seed']}: reduced model of order {row['reduced_order']}, "
+                    f"spectral radius {row['spectral_radius']:.4f}"
+                )
+            case "checked":
+                verdict = "" if row["accepted"] else "; no better, exploring again"
+                self.line(
+                    f"  seed {row['seed']}: mean field costs {row['none']:.4g} without control, "
+                    f"{row['lqt']:.4g} with LQT{verdict}"
+                )
+            case "iteration":
+                self._iteration(row)
+            case "evaluated":
+                self.line(
+                    f"  seed {row['seed']}: cost {row['none']:.4g} without control, "
+                    f"{row['lqt']:.4g} with LQT, {row['adapted']:.4g} adapted"
+                )
+            case "repeated":
+                self.line(f"  {row['reason']}")
+
+    def close(self) -> None:
+        """Leave the terminal as it was."""
+        if self._progress is not None:
+            self._progress.stop()
+            self._progress = None
+
+    def _phase(self, phase: str) -> None:
+        if phase == "adapt" and self._console.is_terminal:
+            self._progress = Progress(
+                TextColumn("adapt   "),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TextColumn("{task.fields[cost]}"),
+                TimeRemainingColumn(),
+                console=self._console,
+                transient=True,
+            )
+            self._progress.start()
+            self._task = self._progress.add_task("", total=self._total, cost="")
+            return
+        self.close()
+        if phase != "done":
+            self.line(phase)
+
+    def _iteration(self, row: Mapping[str, Any]) -> None:
+        self._told += 1
+        cost = f"cost {row['cost']:.4g}" if "cost" in row else "diverged"
+        if self._progress is not None:
+            self._progress.update(self._task, completed=self._told, cost=cost)
+        elif self._told % self._every == 0 or not row.get("updated", True):
+            self.line(f"  seed {row['seed']}, iteration {row['iteration']}: {cost}")
+
+
+class ProgressFile:
+    """Follows a progress.jsonl that another process appends to."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._position = path.stat().st_size if path.exists() else 0
+        self._rest = b""
+
+    def rows(self) -> list[dict[str, Any]]:
+        """The complete lines since the last call."""
+        try:
+            with self._path.open("rb") as file:
+                file.seek(self._position)
+                new = file.read()
+        except FileNotFoundError:
+            return []
+        self._position += len(new)
+        *lines, self._rest = (self._rest + new).split(b"\n")
+        return [json.loads(line) for line in lines if line]
+
+
+def summary_text(problem: str, summary: Mapping[str, Any], folder: Path) -> str:
+    """The closing words of a run."""
+    costs, reduction = summary["mean_cost"], summary["reduction"]
+    seeds = summary["seeds"]
+    who = f"seed {summary['seed']}"
+    if seeds > 1:
+        who = f"seeds {summary['seed']} to {summary['seed'] + seeds - 1}"
+    percent = 100 * reduction["ratio_of_means"]
+    change = f"{abs(percent):.1f} % {'below' if percent >= 0 else 'above'} LQT"
+    if seeds > 1:
+        change += f"; mean of the seeds' ratios {100 * reduction['mean_of_ratios']:.1f} %"
+    lines = [
+        f"{problem}, {who}: {summary['iterations']} iterations in {summary['seconds']:.1f} s",
+        f"  mean stage cost without control  {costs['none']:.4g}",
+        f"  mean stage cost with LQT         {costs['lqt']:.4g}",
+        f"  mean stage cost after adaptation {costs['adapted']:.4g}   ({change})",
+    ]
+    if not summary["improved"]:
+        lines.append("  the adaptation did not improve on the LQT law for every seed")
+    lines.append(f"  results in {folder}")
+    return "\n".join(lines)

@@ -1,0 +1,139 @@
+"""`pdeloop train`: one training, over topics or in this process, in a folder of its own."""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from bringup.display import Display, ProgressFile, summary_text
+from bringup.domain import own_domain
+from bringup.in_process import LocalPair, train
+from bringup.supervisor import Child, NodeError, Supervisor, node_command
+from loop_interfaces.parameters import TUNER, check
+from loop_interfaces.problem import load_problem
+from pde_sim_node.build import build_equation, build_plant
+from tuner_node.build import build_training
+from tuner_node.record import Recorder
+from tuner_node.results import RunFolder, RunFolderError, timestamp
+
+POLL = 0.05
+"""Seconds between two looks at the nodes."""
+
+
+class Interruption(BaseException):
+    """SIGINT or SIGTERM reached the command line."""
+
+
+def resolve(problem: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters of a new run; ValueError if the problem's plant cannot be built from them."""
+    values = {**load_problem(problem), **check(TUNER, options)}
+    build_plant(values)
+    physical = asdict(build_equation(values))
+    del physical["length"]
+    return {**values, **{f"physical.{name}": value for name, value in physical.items()}}
+
+
+def run_new(problem: str, options: Mapping[str, Any], out: Path | None, in_process: bool) -> int:
+    """Train from the start in a new folder; returns the exit code."""
+    values = resolve(problem, options)
+    folder = out or Path("runs") / f"{values['problem']}-{timestamp()}"
+    RunFolder(folder).create(values)
+    return _run(folder, values, in_process)
+
+
+def run_again(folder: Path, in_process: bool) -> int:
+    """Continue the training in `folder`; returns the exit code."""
+    values = {**check(TUNER, {}), **RunFolder(folder).parameters()}
+    if (folder / "result.json").exists():
+        raise RunFolderError(f"the run in {folder} is complete; there is nothing to continue")
+    return _run(folder, values, in_process)
+
+
+def _run(folder: Path, values: dict[str, Any], in_process: bool) -> int:
+    display = Display(values["iterations"], values["seeds"])
+    started = time.monotonic()
+    try:
+        with _interruptible():
+            if in_process:
+                _train_here(folder, values, display)
+            else:
+                _train_over_topics(folder, display)
+    except Interruption as signal_name:
+        display.close()
+        display.line(
+            f"stopped by {signal_name}; continue with: pdeloop train --resume {folder}"
+            + (" --in-process" if in_process else "")
+        )
+        return 130
+    finally:
+        display.close()
+    summary = json.loads((folder / "result.json").read_text())
+    display.line(summary_text(values["problem"], summary, folder))
+    display.line(f"  {time.monotonic() - started:.1f} s with start-up")
+    return 0
+
+
+def _train_here(folder: Path, values: dict[str, Any], display: Display) -> None:
+    training = build_training(values)
+    recorder = Recorder(folder, values, training, resume=True, warn=display.line)
+
+    def report(row: Mapping[str, Any]) -> None:
+        recorder.note(row)
+        recorder.keep(now=time.monotonic())
+        display.row(row)
+
+    try:
+        train(training, LocalPair(values), report, max_batch=values["max_batch"])
+    finally:
+        recorder.keep(now=time.monotonic(), force=True)
+    recorder.finish({"transport": "in-process"})
+
+
+def _train_over_topics(folder: Path, display: Display) -> None:
+    logs = folder / "logs"
+    logs.mkdir(exist_ok=True)
+    parameters = ["--params-file", str(folder / "parameters.yaml")]
+    own = {"tuner_node": ["-p", f"out:={folder}", "-p", "resume:=true"]}
+    children = [
+        Child(name, node_command(name, *parameters, *own.get(name, [])), logs / f"{name}.log")
+        for name in ("pde_sim_node", "controller_node", "tuner_node")
+    ]
+    progress = ProgressFile(folder / "progress.jsonl")
+    with own_domain() as domain:
+        supervisor = Supervisor(children, "tuner_node", domain, logs, display.line)
+        try:
+            done = False
+            while not done:
+                done = supervisor.poll()
+                for row in progress.rows():
+                    display.row(row)
+                time.sleep(0 if done else POLL)
+        finally:
+            supervisor.stop()
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """SIGINT and SIGTERM raise Interruption within the block, once."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        for other in known:
+            signal.signal(other, signal.SIG_IGN)  # the way out is not interrupted again
+        raise Interruption(signal.Signals(number).name)
+
+    known = {n: signal.signal(n, interrupt) for n in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in known.items():
+            signal.signal(number, handler)
+
+
+__all__ = ["Interruption", "NodeError", "resolve", "run_again", "run_new"]
