@@ -57,7 +57,8 @@ class ControllerNode:
         values = declare(node, CONTROLLER_PARAMETERS, given_parameters(node))
         settings = {k: v for k, v in values.items() if k != "problem"}
         responder = Responder(DesignSettings(**settings))
-        self._node, self._loop = node, loop
+        self._node, self._loop, self._responder = node, loop, responder
+        self._waiting_since = loop.now()
         self._senders = {topic: loop.sender(topic) for topic in (ACTION, MODEL_IDENTIFIED)}
         self._failed = node.create_publisher(String, MODEL_FAILED, qos(MODEL))
         handlers: dict[object, Callable[[Frame], Sequence[Send | ModelFailure]]] = {
@@ -73,8 +74,20 @@ class ControllerNode:
         node.get_logger().info(f"{values['problem']}: order {values['reduced_order']} tracking law")
 
     def run(self) -> int:
-        self._loop.run(tick=lambda now: None, deadline=lambda: None, housekeeping=lambda now: None)
+        self._loop.run(
+            tick=lambda now: None, deadline=lambda: None, housekeeping=self._housekeeping
+        )
         return 0
+
+    def _housekeeping(self, now: float) -> None:
+        lacking = self._responder.waits_for()
+        if not lacking:
+            self._waiting_since = now
+        elif now - self._waiting_since > 2.0:
+            self._node.get_logger().warning(
+                f"a state waits for its action until there is: {', '.join(lacking)}",
+                throttle_duration_sec=5.0,
+            )
 
     def _performer(
         self, handler: Callable[[Frame], Sequence[Send | ModelFailure]]

@@ -136,6 +136,21 @@ class Responder:
             run.samples = {}
         return [run.identified]
 
+    def waits_for(self) -> list[str]:
+        """Topics that the state waiting for its answer still lacks; empty when none waits."""
+        pending = self._pending
+        if pending is None:
+            return []
+        run = self._runs.get(pending.run, _Run())
+        start = run.episode_start(pending)
+        lacking = [] if start else ["episode/start"]
+        lacking += [] if self._target is not None else ["target"]
+        if start and start.values[0, StartColumn.EXCITATION] < 0:
+            lacking += [] if run.models else ["model"]
+            if run.policy is None or run.policy.episode != pending.episode:
+                lacking.append("policy")
+        return lacking
+
     def _run(self, number: int) -> _Run:
         run = self._runs.setdefault(number, _Run())
         self._runs.move_to_end(number)
@@ -152,6 +167,8 @@ class Responder:
             raise FrameError(
                 f"expected the states of {len(start.values)} environments, got {len(frame.values)}"
             )
+        if self._target is None:
+            return None
         if start.values[0, StartColumn.EXCITATION] >= 0:
             run.samples[frame.step] = frame.values.copy()
             return np.stack([self._explore(seed, frame.step) for seed in _excitations(start)])
@@ -163,10 +180,9 @@ class Responder:
     def _prepare(self, run: _Run, start: Frame) -> bool:
         """Set the law for the run's episode; False while something has not arrived yet."""
         policy = run.policy
-        if policy is None or policy.episode != start.episode:
+        if policy is None or policy.episode != start.episode or not run.models:
             return False
-        if self._target is None or not run.models:
-            return False
+        assert self._target is not None
         if run.law is None:
             run.law = ProjectedLaw([model.U for model in run.models], self._target)
         index = start.values[:, StartColumn.MODEL].astype(np.int64)
@@ -202,8 +218,7 @@ class Responder:
                 f"the controller holds {len(run.samples)} of the {len(steps)} states "
                 "of the exploratory episode",
             )
-        if self._target is None:
-            return failure(True, "the plant's target has not arrived")
+        assert self._target is not None  # no state is answered, so none is kept, without it
         states = np.stack([run.samples[k] for k in steps])
         try:
             models = []

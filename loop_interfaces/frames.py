@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -95,12 +96,10 @@ class ArrayCodec:
             raise FrameError(f"expected the axes {self.labels}, got an array of shape {shape}")
         total = math.prod(shape)
         head = bytearray(b"\x00\x01\x00\x00") + struct.pack("<I", len(shape))
-        stride = total
-        for label, size in zip(self.labels, shape, strict=True):
+        for label, size, stride in zip(self.labels, shape, _strides(shape), strict=True):
             text = label.encode() + b"\0"
             head += struct.pack("<I", len(text)) + text
             head += bytes(-(len(head) - 4) % 4) + struct.pack("<II", size, stride)
-            stride = stride // size if size else 0
         head += struct.pack("<II", HEADER, HEADER + total)
         head += bytes(-(len(head) - 4) % 8)
         prefix = bytes(head)
@@ -154,13 +153,10 @@ class ArrayCodec:
             position += length
             shape.append(number())
             strides.append(number())
-        stride = math.prod(shape)
-        if stride > MAX_VALUES:
+        if max(math.prod(shape), *shape) > MAX_VALUES:
             raise FrameError(f"expected at most {MAX_VALUES} values, got a layout of {shape}")
-        for size, given in zip(shape, strides, strict=True):
-            if given != stride:
-                raise FrameError(f"expected row-major strides for {shape}, got {strides}")
-            stride = stride // size if size else 0
+        if strides != _strides(shape):
+            raise FrameError(f"expected row-major strides for {shape}, got {strides}")
         offset, count = number(), number()
         if offset != HEADER:
             raise FrameError(f"expected layout.data_offset {HEADER}, got {offset}")
@@ -173,3 +169,8 @@ class ArrayCodec:
         if not 0 <= len(raw) - position - 8 * count < 4:
             raise FrameError(f"expected {count} numbers after the layout, got another length")
         return tuple(shape), position, order
+
+
+def _strides(shape: Sequence[int]) -> list[int]:
+    """`layout.dim[i].stride`: how many values lie in one block of axis i, as ROS defines it."""
+    return [math.prod(shape[axis:]) for axis in range(len(shape))]

@@ -190,8 +190,10 @@ class TunerNode:
         text = ", ".join(
             f"{k} {v:.6g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()
         )
-        log = self._log.warning if row.get("event") == "repeated" else self._log.info
-        log(text)
+        if row.get("event") == "repeated":
+            self._log.warning(text)
+        else:
+            self._log.info(text)
 
     def _finish(self) -> int:
         if self._recorder:

@@ -32,6 +32,8 @@ _WORST = 2.0
 # Weight of a rollout in the fit: falls with its age, down to a floor, and with its cost.
 _AGEING = 0.9
 _AGEING_FLOOR = 0.3
+# Share of the trust region that bounds all gains alike, relative to the one in input energy.
+_ISOTROPY = 1.0
 # A comparison with a rollout that costs more than this many times the incumbent is not local.
 _LOCAL = 3.0
 
@@ -288,6 +290,9 @@ class Proposer:
                 features += path.features.T @ path.features / (len(path.features) * len(paths))
         if not (np.isfinite(g).all() and np.isfinite(H).all()):
             return np.full((self.n_a, n_f), np.nan), np.nan
+        # Directions that the rollouts hardly excite would otherwise take gains of any size, and the
+        # closed loop leaves the range of the linearisation through them.
+        features[np.diag_indices(n_f)] += _ISOTROPY * np.trace(features) / n_f
         region = 2.0 * self._r * np.kron(np.eye(self.n_a), features)
         matrix = H + damping * region
         matrix[np.diag_indices(p)] += 1e-9 * np.trace(H) / p

@@ -1,0 +1,34 @@
+"""Shared by the tests: processes of a loop, and a watch on what they leave behind."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.loop_harness import Processes, processes
+
+
+@pytest.fixture(autouse=True)
+def _own_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The user's ROS settings do not reach the tests."""
+    for name in ("ROS_DOMAIN_ID", "FASTRTPS_DEFAULT_PROFILES_FILE", "PDELOOP_NETWORK"):
+        monkeypatch.delenv(name, raising=False)
+
+
+def shared_memory() -> set[str]:
+    """Fast DDS's files in shared memory."""
+    folder = Path("/dev/shm")
+    names = {path.name for path in folder.iterdir()}
+    return {name for name in names if "fastrtps" in name or "fastdds" in name}
+
+
+@pytest.fixture
+def loop(tmp_path: Path) -> Iterator[Processes]:
+    """Processes on a ROS domain of their own; none of them and no shared memory may remain."""
+    before = shared_memory()
+    with processes(tmp_path) as running:
+        yield running
+    assert running.left_behind() == []
+    assert shared_memory() <= before

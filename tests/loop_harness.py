@@ -1,0 +1,124 @@
+"""Real nodes in real processes on a ROS domain of their own, with a limit on every wait."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from bringup.domain import own_domain
+from loop_interfaces.isolation import loopback_environment
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def until(condition: Callable[[], object], limit: float, what: str) -> None:
+    """Wait until `condition()`; AssertionError naming `what` after `limit` seconds."""
+    deadline = time.monotonic() + limit
+    while not condition():
+        assert time.monotonic() < deadline, f"no {what} within {limit} s"
+        time.sleep(0.02)
+
+
+class Processes:
+    """The processes of one test. All are gone when it is over."""
+
+    def __init__(self, folder: Path, domain: int) -> None:
+        self.folder = folder
+        self.environment = {
+            **os.environ,
+            **loopback_environment(),
+            "ROS_DOMAIN_ID": str(domain),
+            "ROS_LOG_DIR": str(folder / "ros_logs"),
+            "PYTHONPATH": str(ROOT),
+        }
+        self._alive: list[subprocess.Popen[bytes]] = []
+        self._count = 0
+
+    def start(self, *command: str, name: str = "") -> subprocess.Popen[bytes]:
+        """Run `python COMMAND...` with its output in a file (see `output`)."""
+        self._count += 1
+        path = self.folder / f"{self._count:02d}-{name or Path(command[-1]).name}.log"
+        with path.open("wb") as log:
+            process = subprocess.Popen(
+                [sys.executable, *command],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=self.environment,
+                cwd=self.folder,
+                start_new_session=True,
+            )
+        process.log = path  # type: ignore[attr-defined]
+        self._alive.append(process)
+        return process
+
+    def node(self, name: str, *ros_arguments: str) -> subprocess.Popen[bytes]:
+        """Start one of our nodes."""
+        return self.start("-m", f"{name}.node", "--ros-args", *ros_arguments, name=name)
+
+    def pdeloop(self, *arguments: str) -> subprocess.Popen[bytes]:
+        """Start the command line."""
+        return self.start("-m", "bringup.cli", *arguments, name="pdeloop")
+
+    def output(self, process: subprocess.Popen[bytes]) -> str:
+        text: str = process.log.read_text(errors="replace")  # type: ignore[attr-defined]
+        return text
+
+    def wait(self, process: subprocess.Popen[bytes], limit: float, code: int = 0) -> str:
+        """Wait for the end of `process`, which must come with exit code `code`; its output."""
+        try:
+            got = process.wait(limit)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(f"still running after {limit} s:\n{self.everything()}") from None
+        assert got == code, f"exit code {got}, expected {code}:\n{self.everything()}"
+        return self.output(process)
+
+    def everything(self) -> str:
+        """What every process printed."""
+        return "\n".join(f"== {p.args}\n{self.output(p)[-3000:]}" for p in self._alive)
+
+    def left_behind(self) -> list[int]:
+        """Processes of this test that still run, also those its children started."""
+        mark = f"ROS_LOG_DIR={self.environment['ROS_LOG_DIR']}".encode()
+        inside = f"ROS_LOG_DIR={self.folder}".encode()
+        found = []
+        for entry in Path("/proc").glob("[0-9]*"):
+            with contextlib.suppress(OSError):
+                environment = (entry / "environ").read_bytes()
+                zombie = (entry / "stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
+                if (mark in environment or inside in environment) and not zombie:
+                    found.append(int(entry.name))
+        return found
+
+    def stop(self) -> None:
+        """SIGINT, then SIGKILL, to all and to whatever they started."""
+        for number, patience in ((signal.SIGINT, 3.0), (signal.SIGKILL, 3.0)):
+            for process in self._alive:
+                if process.poll() is None:
+                    with contextlib.suppress(ProcessLookupError):
+                        os.killpg(process.pid, number)
+                        os.killpg(process.pid, signal.SIGCONT)
+            deadline = time.monotonic() + patience
+            for process in self._alive:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(max(0.0, deadline - time.monotonic()))
+        for pid in self.left_behind():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+
+
+@contextlib.contextmanager
+def processes(folder: Path) -> Iterator[Processes]:
+    """The processes of one test in a domain that nobody else uses."""
+    with own_domain() as domain:
+        running = Processes(folder, domain)
+        try:
+            yield running
+        finally:
+            running.stop()

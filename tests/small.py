@@ -1,0 +1,33 @@
+"""The small problem of the tests: its parameters, and a training of it in this process."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bringup.in_process import LocalPair, train
+from bringup.training_run import resolve
+from tuner_node.build import build_training
+from tuner_node.training import Training
+
+SMALL = Path(__file__).parent / "data" / "small.yaml"
+
+
+def parameters(**options: Any) -> dict[str, Any]:
+    """The resolved parameters of a training of the small problem; any of them can be replaced."""
+    tuner = {k: v for k, v in options.items() if k in ("seed", "seeds", "iterations", "start")}
+    return {**resolve(str(SMALL), tuner), **options}
+
+
+def train_here(values: dict[str, Any], **how: Any) -> Training:
+    """A finished training in this process."""
+    training = build_training(values)
+    train(training, LocalPair(values), lambda row: None, **how)
+    return training
+
+
+def same_bits(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two float64 arrays agree in shape and in every bit."""
+    return a.shape == b.shape and a.tobytes() == b.tobytes()

@@ -1,0 +1,158 @@
+"""The dispatcher: whatever pairs do, every row of a batch gets its own result, once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from loop_interfaces.frames import Frame, FrameError
+from loop_interfaces.protocol import ModelFailure
+from loop_interfaces.topics import COMPLETED, POLICY, START, VOID
+from tuner_node.dispatch import Dispatcher, DispatchError
+from tuner_node.training import Batch
+
+RUN = 42
+
+
+def dispatcher(pairs: int = 1, **settings) -> Dispatcher:
+    defaults = {"max_batch": 4, "episode_timeout": 10.0, "max_attempts": 3, "incarnation": 1}
+    made = Dispatcher.create(run=RUN, n_a=2, pairs=pairs, **{**defaults, **settings})
+    for pair in range(pairs):
+        made.presence(pair, (), 0.0)
+    return made
+
+
+def batch(count: int) -> Batch:
+    rows = np.column_stack([np.arange(count), np.full(count, -1), np.zeros(count)]).astype(float)
+    return Batch(rows, np.arange(count, dtype=float)[:, None, None] * np.ones((1, 2, 4)))
+
+
+def starts(orders):
+    return [(pair, send.frame) for pair, send in orders if send.topic is START]
+
+
+def costs_of(frame: Frame) -> Frame:
+    """What a plant answers here: a cost that tells which row it belongs to."""
+    values = np.column_stack(
+        [frame.values[:, 0] ** 2, frame.values[:, 0], np.full(len(frame.values), COMPLETED)]
+    )
+    return Frame(frame.run, frame.episode, 30, 1.0, values.astype(float))
+
+
+def void_of(frame: Frame) -> Frame:
+    values = np.tile([0.0, 0.0, VOID], (len(frame.values), 1))
+    return Frame(frame.run, frame.episode, 3, 1.0, values)
+
+
+@pytest.mark.parametrize("pairs", [1, 2, 3, 5])
+@pytest.mark.parametrize("count", [1, 3, 4, 11])
+def test_any_number_of_pairs_and_any_order_of_arrival_gives_the_batch_in_order(pairs, count):
+    rng = np.random.default_rng(pairs * 100 + count)
+    served = dispatcher(pairs)
+    open_episodes = starts(served.assign(batch(count), 0.0))
+    while open_episodes:
+        pair, frame = open_episodes.pop(int(rng.integers(len(open_episodes))))
+        assert len(frame.values) <= 4
+        answer = void_of(frame) if rng.random() < 0.2 else costs_of(frame)
+        try:
+            open_episodes += starts(served.cost(pair, answer, 0.0))
+        except DispatchError:
+            pytest.fail("three voids in a row are not in this seed")
+    result = served.result()
+    assert result is not None
+    assert result.costs[:, 0].tolist() == [i**2 for i in range(count)]
+    assert served.result() is None
+
+
+def test_the_policy_goes_out_before_the_start_and_with_its_rows():
+    served = dispatcher()
+    orders = served.assign(batch(2), 0.0)
+    assert [send.topic for _, send in orders] == [POLICY, START]
+    policy, start = (send.frame for _, send in orders)
+    assert policy.episode == start.episode == 2**32 + 1
+    assert policy.values[:, 0, 0].tolist() == start.values[:, 0].tolist()
+
+
+def test_answers_of_other_runs_episodes_and_shapes_change_nothing():
+    served = dispatcher()
+    ((_, start),) = starts(served.assign(batch(2), 0.0))
+    good = costs_of(start)
+    assert served.cost(0, Frame(RUN + 1, good.episode, 30, 0.0, good.values), 0.0) == []
+    assert served.cost(0, Frame(RUN, good.episode - 1, 30, 0.0, good.values), 0.0) == []
+    with pytest.raises(FrameError, match="costs of shape"):
+        served.cost(0, Frame(RUN, good.episode, 30, 0.0, good.values[:1]), 0.0)
+    assert served.result() is None
+    served.cost(0, good, 0.0)
+    assert served.result() is not None
+    assert sum(served.tally.values()) == 2
+
+
+def test_a_void_episode_is_repeated_under_a_new_number_and_given_up_at_last():
+    served = dispatcher()
+    ((_, first),) = starts(served.assign(batch(1), 0.0))
+    ((_, second),) = starts(served.cost(0, void_of(first), 0.0))
+    assert second.episode == first.episode + 1
+    assert np.array_equal(second.values, first.values)
+    assert served.cost(0, costs_of(first), 0.0) == []  # the void one is over
+    ((_, third),) = starts(served.cost(0, void_of(second), 0.0))
+    with pytest.raises(DispatchError, match="gave up after 3 attempts"):
+        served.cost(0, void_of(third), 0.0)
+
+
+def test_nothing_is_handed_to_an_absent_pair_and_a_silent_one_is_repeated():
+    served = Dispatcher.create(
+        run=RUN,
+        n_a=2,
+        pairs=1,
+        incarnation=0,
+        max_batch=4,
+        episode_timeout=10.0,
+        max_attempts=3,
+    )
+    assert served.assign(batch(1), 0.0) == []
+    assert served.missing() == ["plant", "controller"]
+    assert served.presence(0, ("controller",), 1.0) == []
+    ((_, first),) = starts(served.presence(0, (), 2.0))
+    assert served.tick(11.9) == []
+    ((_, second),) = starts(served.tick(12.1))
+    assert second.episode == first.episode + 1
+
+
+def test_an_absent_pair_is_waited_for_when_it_is_the_only_one():
+    served = dispatcher()
+    ((_, start),) = starts(served.assign(batch(1), 0.0))
+    served.presence(0, ("plant",), 1.0)
+    assert served.tick(1000.0) == []
+    served.presence(0, (), 1001.0)
+    served.cost(0, costs_of(start), 1002.0)
+    assert served.result() is not None
+
+
+def test_the_work_of_a_pair_that_died_goes_to_a_free_one():
+    served = dispatcher(pairs=2)
+    ((pair, start),) = starts(served.assign(batch(1), 0.0))
+    ((other, again),) = starts(served.presence(pair, ("plant",), 1.0))
+    assert other != pair
+    assert np.array_equal(again.values, start.values)
+    assert served.cost(pair, costs_of(start), 2.0) == []  # the dead one's late answer
+    served.cost(other, costs_of(again), 3.0)
+    assert served.result() is not None
+
+
+def test_an_exploratory_episode_is_done_with_its_model_and_fails_with_its_reason():
+    served = dispatcher()
+    exploratory = Batch(np.array([[1.0, 2.0, 0.0]]), None)
+    ((_, start),) = starts(served.assign(exploratory, 0.0))
+    served.cost(0, costs_of(start), 0.0)
+    assert served.result() is None
+    ((_, again),) = starts(
+        served.failure(0, ModelFailure(RUN, start.episode, True, "a state was lost"), 0.0)
+    )
+    served.cost(0, costs_of(again), 0.0)
+    served.model(0, Frame(RUN, again.episode, 0, 0.0, np.ones((1, 9, 2))), 0.0)
+    result = served.result()
+    assert result is not None
+    assert result.models is not None
+    ((_, last),) = starts(served.assign(exploratory, 0.0))
+    with pytest.raises(DispatchError, match="no reduced model: p is too large"):
+        served.failure(0, ModelFailure(RUN, last.episode, False, "p is too large"), 0.0)

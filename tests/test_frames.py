@@ -1,0 +1,105 @@
+"""The wire: our CDR bytes are those of ROS, and nothing but the interface is accepted."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import pytest
+from rclpy.serialization import deserialize_message, serialize_message
+from std_msgs.msg import Float64MultiArray, MultiArrayDimension
+
+from loop_interfaces.frames import MAX_ID, ArrayCodec, Frame, FrameError
+from loop_interfaces.topics import ARRAYS
+
+
+def message(labels: tuple[str, ...], frame: Frame) -> Float64MultiArray:
+    """The frame as a ROS user would write it."""
+    result = Float64MultiArray()
+    shape = frame.values.shape
+    for axis, (label, size) in enumerate(zip(labels, shape, strict=True)):
+        stride = int(np.prod(shape[axis:]))
+        result.layout.dim.append(MultiArrayDimension(label=label, size=size, stride=stride))
+    result.layout.data_offset = 4
+    head = [float(frame.run), float(frame.episode), float(frame.step), frame.time]
+    result.data = head + frame.values.ravel().tolist()
+    return result
+
+
+def frame_of(shape: tuple[int, ...]) -> Frame:
+    values = np.random.default_rng(0).standard_normal(shape)
+    return Frame(run=MAX_ID - 1, episode=2**32 + 7, step=299, time=12.25, values=values)
+
+
+@pytest.mark.parametrize("topic", ARRAYS, ids=lambda topic: topic.name)
+def test_our_bytes_are_read_by_ros_and_ros_bytes_by_us(topic):
+    for size in (0, 1, 3, 128):
+        frame = frame_of((size, 5, 7)[: len(topic.labels)])
+        codec = ArrayCodec(topic.labels)
+        expected = message(topic.labels, frame)
+        assert deserialize_message(codec.encode(frame), Float64MultiArray) == expected
+        for raw in (serialize_message(expected), codec.encode(frame), codec.encode(frame)):
+            back = codec.decode(raw)
+            assert (back.run, back.episode, back.step) == (frame.run, frame.episode, frame.step)
+            assert back.time == frame.time
+            assert back.values.shape == frame.values.shape
+            assert back.values.tobytes() == frame.values.tobytes()
+
+
+def test_big_endian_bytes_are_read():
+    little = ArrayCodec(("x",)).encode(Frame(1, 2, 3, 0.5, np.array([1.5, -2.5])))
+    label = struct.pack(">I", 2) + b"x\0" + b"\0\0"
+    head = b"\0\0\0\0" + struct.pack(">I", 1) + label + struct.pack(">IIII", 2, 2, 4, 6)
+    head += bytes(-(len(head) - 4) % 8)
+    big = head + struct.pack(">6d", 1, 2, 3, 0.5, 1.5, -2.5)
+    assert len(big) == len(little)
+    frame = ArrayCodec(("x",)).decode(big)
+    assert (frame.run, frame.episode, frame.step, frame.time) == (1, 2, 3, 0.5)
+    assert frame.values.tolist() == [1.5, -2.5]
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda m: m.layout.dim.pop(), "axes"),
+        (lambda m: setattr(m.layout.dim[0], "label", "row"), "labelled 'env'"),
+        (lambda m: setattr(m.layout.dim[0], "size", 3), "strides|numbers"),
+        (lambda m: setattr(m.layout.dim[1], "stride", 1), "strides"),
+        (lambda m: setattr(m.layout.dim[0], "size", 2**31), "at most"),
+        (lambda m: setattr(m.layout, "data_offset", 0), "data_offset"),
+        (lambda m: m.data.append(1.0), "numbers"),
+        (lambda m: m.data.__setitem__(5, float("nan")), "NaN"),
+        (lambda m: m.data.__setitem__(5, float("inf")), "NaN or infinity"),
+        (lambda m: m.data.__setitem__(0, -1.0), "run"),
+        (lambda m: m.data.__setitem__(1, 0.5), "episode"),
+        (lambda m: m.data.__setitem__(2, 2.0**53), "step"),
+    ],
+)
+def test_what_is_not_the_interface_is_refused(change, expected):
+    labels = ("env", "x")
+    bad = message(labels, frame_of((2, 4)))
+    change(bad)
+    with pytest.raises(FrameError, match=expected):
+        ArrayCodec(labels).decode(serialize_message(bad))
+
+
+def test_random_and_truncated_bytes_raise_frame_errors_only():
+    rng = np.random.default_rng(1)
+    codec = ArrayCodec(("env", "x"))
+    good = codec.encode(frame_of((2, 4)))
+    assert codec.decode(good).step == 299  # so that the fast path is armed
+    cases = [good[:n] for n in range(len(good))]
+    cases += [rng.bytes(int(rng.integers(0, 200))) for _ in range(2000)]
+    for _ in range(2000):
+        mutated = bytearray(good)
+        for position in rng.integers(0, 48, size=3):
+            mutated[position] = int(rng.integers(256))
+        cases.append(bytes(mutated))
+    refused = 0
+    for raw in cases:
+        try:
+            codec.decode(raw)
+        except FrameError:
+            refused += 1
+    assert refused > 3000
+    assert codec.decode(good).values.shape == (2, 4)

@@ -1,0 +1,65 @@
+"""The rules of the house: layers point downwards, and pure modules never see ROS."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+NODES = ("pde_sim_node", "controller_node", "tuner_node")
+WITH_ROS = {"node.py", "node_loop.py", "ros_parameters.py"}
+"""Files that may import rclpy or messages."""
+ROS = ("rclpy", "std_msgs", "std_srvs", "rosgraph_msgs", "rcl_interfaces", "diagnostic_msgs")
+
+
+def sources(*packages: str) -> list[Path]:
+    return [path for package in packages for path in sorted((ROOT / package).rglob("*.py"))]
+
+
+def imports(path: Path) -> set[str]:
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            found.add(node.module)
+    return found
+
+
+def tops(path: Path) -> set[str]:
+    return {name.split(".")[0] for name in imports(path)}
+
+
+@pytest.mark.parametrize("node", NODES)
+def test_no_node_imports_another_node_or_what_starts_it(node):
+    others = {"bringup", *NODES} - {node}
+    for path in sources(node):
+        assert not tops(path) & others, path
+
+
+def test_what_is_shared_imports_no_node():
+    for path in sources("loop_interfaces"):
+        assert not tops(path) & {"bringup", *NODES}, path
+
+
+def test_only_the_named_files_import_ros():
+    for path in sources("loop_interfaces", *NODES, "bringup"):
+        if path.name not in WITH_ROS:
+            assert not tops(path) & set(ROS), path
+
+
+def test_the_loop_runs_in_one_process_without_ros():
+    program = (
+        "import sys\n"
+        f"for name in {ROS!r}: sys.modules[name] = None\n"
+        "from tests.small import parameters, train_here\n"
+        "print(train_here(parameters(iterations=1)).policies().shape)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
+    assert done.stdout.strip() == "(1, 4, 8)", done.stderr

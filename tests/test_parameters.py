@@ -1,0 +1,106 @@
+"""Parameters: every refusal names the parameter, the value and the range."""
+
+from __future__ import annotations
+
+import pytest
+
+from loop_interfaces.parameters import (
+    PROBLEM,
+    Spec,
+    check,
+    check_names,
+    read_yaml,
+    table,
+    write_yaml,
+)
+from loop_interfaces.parameters import ParameterError as Refused
+from loop_interfaces.problem import load_problem, shipped_problems
+from pde_sim_node.build import build_plant
+
+SPECS = {spec.name: spec for spec in table()}
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("n_z", 7, "'n_z' is 7; expected an even whole number from 8 to 65536"),
+        ("n_z", 64.0, "'n_z' is 64.0; expected an even whole number"),
+        ("n_a", True, "'n_a' is True; expected a whole number from 1 to 1024"),
+        ("length", 0.0, "'length' is 0.0; expected a number above 0"),
+        ("length", float("nan"), "'length' is nan; expected a number above 0"),
+        ("sample_time", "fast", "'sample_time' is 'fast'; expected a number above 0"),
+        ("actuator_width", 1.5, "'actuator_width' is 1.5; expected a number above 0, at most 1"),
+        ("start", "lqg", "'start' is 'lqg'; expected one of lqt, zero"),
+        ("seed", -1, "'seed' is -1; expected a whole number from 0"),
+        ("pairs", "a", "'pairs' is 'a'; expected a list of texts"),
+    ],
+)
+def test_a_bad_value_is_refused_with_name_value_and_range(name, value, words):
+    with pytest.raises(Refused) as refusal:
+        SPECS[name].check(value)
+    assert words in str(refusal.value)
+
+
+def test_defaults_are_within_their_own_ranges():
+    for spec in table():
+        assert spec.check(spec.default) == spec.default
+        assert spec.description
+        assert spec.range
+
+
+def test_a_whole_number_serves_where_a_number_is_expected():
+    value = Spec("x", 1.0, "").check(2)
+    assert value == 2.0
+    assert isinstance(value, float)
+
+
+def test_an_unknown_name_is_refused_with_the_nearest_known_one():
+    with pytest.raises(Refused, match="'learning_rat'; did you mean 'learning_rate'"):
+        check_names(["learning_rat"], SPECS)
+
+
+@pytest.mark.parametrize("name", ["burgers", "allen-cahn", "kdv"])
+def test_shipped_problems_load_and_build(name):
+    values = load_problem(name)
+    plant = build_plant(values)
+    assert plant.n_z == values["n_z"]
+    assert plant.supports.shape == (values["n_z"], values["n_a"])
+    assert set(shipped_problems()) == {"burgers", "allen-cahn", "kdv"}
+
+
+def test_written_parameters_read_back(tmp_path):
+    values = check(PROBLEM, {}) | {"physical.viscosity": 1e-4}
+    write_yaml(tmp_path / "p.yaml", values)
+    assert read_yaml(tmp_path / "p.yaml") == values
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("n_z: 3", "not a ROS parameter file"),
+        ("/**: {ros__parameters: [1]}", "not a ROS parameter file"),
+        ("a: [", "not valid YAML"),
+        ("", "not a ROS parameter file"),
+        ("/**: {ros__parameters: {n_zz: 3}}", "unknown parameter 'n_zz'; did you mean 'n_z'"),
+        ("/**: {ros__parameters: {n_z: odd}}", "'n_z' is 'odd'"),
+        ("/**: {ros__parameters: {physical: {viscosity: thick}}}", "'physical.viscosity'"),
+        ("x: !!python/object/apply:os.system ['true']", "not valid YAML"),
+    ],
+)
+def test_a_bad_problem_file_is_one_clear_sentence(tmp_path, text, words):
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    with pytest.raises(Refused) as refusal:
+        load_problem(str(path))
+    assert words in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+def test_an_unknown_problem_lists_the_known_ones():
+    with pytest.raises(Refused, match="'burger'; expected one of allen-cahn, burgers, kdv"):
+        load_problem("burger")
+
+
+def test_an_equation_file_is_found_beside_its_yaml(tmp_path):
+    (tmp_path / "mine.yaml").write_text("/**: {ros__parameters: {equation: 'heat.py:Heat'}}")
+    assert load_problem(str(tmp_path / "mine.yaml"))["equation"] == f"{tmp_path}/heat.py:Heat"

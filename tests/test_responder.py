@@ -1,0 +1,170 @@
+"""The controller's protocol: answers are pure, and what is missing is said, never guessed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bringup.in_process import LocalPair
+from controller_node.identification import DesignSettings
+from controller_node.policy import excitation
+from controller_node.responder import Responder
+from loop_interfaces import model_rows
+from loop_interfaces.frames import Frame, FrameError
+from loop_interfaces.protocol import ModelFailure
+from loop_interfaces.topics import ACTION, COMPLETED, MODEL_IDENTIFIED
+from pde_sim_node.build import build_plant
+from tests.small import parameters, same_bits
+from tuner_node.training import Batch
+
+RUN = 5
+SETTINGS = DesignSettings(
+    n_a=4,
+    dmdc_rank=8,
+    reduced_order=4,
+    state_weight=1.0,
+    action_weight=1.0,
+    exploration_variance=0.1,
+)
+PLANT = build_plant(parameters())
+TARGET = Frame(0, 0, 0, 0.0, PLANT.target)
+
+
+def start(episode: int, *rows: tuple[float, float, float], run: int = RUN) -> Frame:
+    return Frame(run, episode, 0, 0.0, np.array(rows, dtype=float).reshape(-1, 3))
+
+
+def models() -> np.ndarray:
+    found = LocalPair(parameters()).run(Batch(np.array([(1.0, 2.0, 0.0)]), None)).models
+    assert found is not None
+    return found
+
+
+def explore(responder: Responder, episode: int, excitation_seed: int = 2, lose: int = -1):
+    """Drive an exploratory episode; the state of step `lose` never reaches the controller."""
+    responder.start(start(episode, (1, excitation_seed, 0)))
+    states = PLANT.reset(np.array([1]))
+    for k in range(PLANT.horizon + 1):
+        if k != lose:
+            (send,) = responder.state(Frame(RUN, episode, k, 0.0, states))
+            expected = excitation(excitation_seed, k, 4, 0.1)
+            assert same_bits(send.frame.values[0], expected)
+        if k < PLANT.horizon:
+            states = PLANT.step(excitation(excitation_seed, k, 4, 0.1)[np.newaxis])
+    costs = np.array([[1.0, 30.0, COMPLETED]])
+    return responder.cost(Frame(RUN, episode, PLANT.horizon, 1.0, costs))
+
+
+def test_exploration_gives_the_model_of_the_same_trajectory_in_process():
+    responder = Responder(SETTINGS)
+    responder.target(TARGET)
+    (send,) = explore(responder, 1)
+    assert send.topic is MODEL_IDENTIFIED
+    assert same_bits(send.frame.values, models())
+    (again,) = responder.cost(Frame(RUN, 1, 30, 1.0, np.array([[1.0, 30.0, COMPLETED]])))
+    assert same_bits(again.frame.values, send.frame.values)
+
+
+def test_a_lost_sample_asks_for_the_episode_again_and_the_repeat_gives_the_model():
+    responder = Responder(SETTINGS)
+    responder.target(TARGET)
+    (failure,) = explore(responder, 1, lose=7)
+    assert isinstance(failure, ModelFailure)
+    assert failure.retry
+    assert "30 of the 31 states" in failure.reason
+    assert ModelFailure.from_json(failure.to_json()) == failure
+    (send,) = explore(responder, 2)
+    assert same_bits(send.frame.values, models())
+
+
+def test_data_that_allow_no_model_are_a_failure_with_the_reason():
+    responder = Responder(DesignSettings(4, 36, 4, 1.0, 1.0, 0.1))
+    responder.target(TARGET)
+    (failure,) = explore(responder, 1)
+    assert not failure.retry
+    assert "p must be at most" in failure.reason
+
+
+def test_the_law_is_answered_whatever_the_order_in_which_its_parts_arrive():
+    rows = models()
+    policy = model_rows.unpack(rows[0], 4).policy
+    state = Frame(RUN, 3, 0, 0.0, PLANT.reset(np.array([1, 2])).copy())
+    parts = {
+        "start": start(3, (1, -1, 0), (2, -1, 0)),
+        "policy": Frame(RUN, 3, 0, 0.0, np.stack([policy, 0 * policy])),
+        "model": Frame(RUN, 0, 0, 0.0, rows),
+        "target": TARGET,
+        "state": state,
+    }
+    answers = []
+    for order in (
+        ("start", "policy", "model", "target", "state"),
+        ("state", "target", "model", "policy", "start"),
+        ("model", "state", "start", "target", "policy"),
+    ):
+        responder = Responder(SETTINGS)
+        sends = [send for name in order for send in getattr(responder, name)(parts[name])]
+        assert [send.topic for send in sends] == [ACTION]
+        answers.append(sends[0].frame)
+        (again,) = responder.state(state)
+        assert same_bits(again.frame.values, answers[0].values)
+    assert all(same_bits(a.values, answers[0].values) for a in answers)
+    s = model_rows.unpack(rows[0], 4)
+    expected = s.K_a @ (s.U.T @ state.values[0]) + s.K_b @ (s.U.T @ PLANT.target)
+    assert np.allclose(answers[0].values[0], expected, rtol=1e-12, atol=1e-13)
+    assert (answers[0].values[1] == 0).all()
+
+
+def test_a_state_of_another_episode_or_run_is_not_answered():
+    responder = Responder(SETTINGS)
+    responder.target(TARGET)
+    responder.start(start(1, (1, 9, 0)))
+    state = PLANT.reset(np.array([1]))
+    assert responder.state(Frame(RUN, 2, 0, 0.0, state)) == []
+    assert responder.state(Frame(RUN + 1, 1, 0, 0.0, state)) == []
+    assert len(responder.state(Frame(RUN, 1, 0, 0.0, state))) == 1
+
+
+def test_two_runs_are_answered_side_by_side_and_forgotten_when_released():
+    responder = Responder(SETTINGS)
+    responder.target(TARGET)
+    state = PLANT.reset(np.array([1])).copy()
+    responder.start(start(1, (1, 9, 0)))
+    responder.start(start(1, (1, 10, 0), run=6))
+    (a,) = responder.state(Frame(RUN, 1, 0, 0.0, state))
+    (b,) = responder.state(Frame(6, 1, 0, 0.0, state))
+    assert not np.array_equal(a.frame.values, b.frame.values)
+    responder.start(start(0, run=6))
+    assert responder.state(Frame(6, 1, 0, 0.0, state)) == []
+    assert len(responder.state(Frame(RUN, 1, 0, 0.0, state))) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "frame", "words"),
+    [
+        ("start", start(1, (1, 2, 0), (1, -1, 0)), "all environments of an episode to explore"),
+        ("start", start(1, (1, -1, -1)), "model indices"),
+        ("start", Frame(RUN, 1, 0, 0.0, np.zeros((2, 2))), "rows of 3"),
+        ("policy", Frame(RUN, 1, 0, 0.0, np.zeros((1, 3, 8))), "4 actuators"),
+        ("policy", Frame(RUN, 1, 0, 0.0, np.full((1, 4, 8), 1e12)), "at most 1e"),
+        ("model", Frame(RUN, 0, 0, 0.0, np.zeros((1, 9, 4))), "leaves"),
+    ],
+)
+def test_malformed_messages_are_refused(name, frame, words):
+    with pytest.raises(ValueError, match=words):
+        getattr(Responder(SETTINGS), name)(frame)
+
+
+def test_a_policy_that_does_not_fit_the_episode_is_refused_and_a_good_one_serves_later():
+    responder = Responder(SETTINGS)
+    rows = models()
+    policy = model_rows.unpack(rows[0], 4).policy
+    responder.target(TARGET)
+    responder.model(Frame(RUN, 0, 0, 0.0, rows))
+    responder.start(start(1, (1, -1, 0)))
+    responder.policy(Frame(RUN, 1, 0, 0.0, np.stack([policy, policy])))
+    state = Frame(RUN, 1, 0, 0.0, PLANT.reset(np.array([1])).copy())
+    with pytest.raises(FrameError, match="policies for 1 environments, got 2"):
+        responder.state(state)
+    responder.policy(Frame(RUN, 1, 0, 0.0, policy[np.newaxis]))
+    assert len(responder.state(state)) == 1

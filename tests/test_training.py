@@ -1,0 +1,120 @@
+"""One seed, one policy: in any batch, after any interruption, and never anything but finite."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bringup.in_process import LocalPair
+from loop_interfaces.topics import COMPLETED
+from tests.small import parameters, same_bits, train_here
+from tuner_node import checkpoint
+from tuner_node.build import build_training
+from tuner_node.training import BatchResult
+
+
+def test_a_seed_has_one_policy_alone_and_beside_others_and_however_episodes_are_cut():
+    together = train_here(parameters(seeds=3, iterations=4))
+    for offset in range(3):
+        alone = train_here(parameters(seed=offset, iterations=4))
+        assert same_bits(alone.policies()[0], together.policies()[offset])
+        assert same_bits(alone.evaluation[0], together.evaluation[offset])
+    cut = train_here(parameters(seeds=3, iterations=4), max_batch=1)
+    assert same_bits(cut.policies(), together.policies())
+    assert cut.history == together.history
+
+
+def test_training_moves_the_policy_and_zero_starts_from_zero():
+    trained = train_here(parameters(iterations=3))
+    assert not np.array_equal(trained.policies(), trained.warm_starts())
+    zero = build_training(parameters(iterations=3, start="zero"))
+    pair = LocalPair(parameters())
+    while zero.phase != "adapt":
+        result = pair.run(zero.next_batch())
+        zero.finish(result)
+        if result.models is not None:
+            pair.use_models(zero.models)
+    assert (zero.policies() == 0).all()
+    plus, minus = zero.next_batch().policies
+    assert np.allclose(plus, -minus)
+    assert np.isclose(np.linalg.norm(plus), 0.1)
+
+
+@pytest.mark.parametrize("stop_after", [0, 1, 2, 3, 5, 6])
+def test_a_checkpoint_at_any_batch_continues_to_the_same_policy(tmp_path, stop_after):
+    values = parameters(seeds=2, iterations=4)
+    undisturbed = train_here(values)
+    first, pair = build_training(values), LocalPair(values)
+    for _ in range(stop_after):
+        result = pair.run(first.next_batch())
+        first.finish(result)
+        if result.models is not None:
+            pair.use_models(first.models)
+    checkpoint.save(tmp_path / "checkpoint", first.state())
+    arrays, warnings = checkpoint.load(tmp_path / "checkpoint")
+    assert warnings == []
+    second = build_training(values)
+    second.restore(arrays)
+    fresh_pair = LocalPair(values)
+    if second.models is not None:
+        fresh_pair.use_models(second.models)
+    while (batch := second.next_batch()) is not None:
+        result = fresh_pair.run(batch)
+        second.finish(result)
+        if result.models is not None:
+            fresh_pair.use_models(second.models)
+    assert same_bits(second.policies(), undisturbed.policies())
+    assert second.history == undisturbed.history
+
+
+def test_a_bad_warm_start_is_identified_again_and_only_that_one():
+    values = parameters(seeds=2, iterations=1)
+    training, pair = build_training(values), LocalPair(values)
+    first = training.next_batch()
+    training.finish(pair.run(first))
+    pair.use_models(training.models)
+    kept = training.models[0].copy()
+    check = pair.run(training.next_batch())
+    check.costs[3, 0] = check.costs[2, 0] + 1.0  # the second seed's LQT law loses to no control
+    rows = training.finish(check)
+    assert [row["accepted"] for row in rows] == [True, False]
+    again = training.next_batch()
+    assert again.exploratory
+    assert again.rows[:, 2].tolist() == [1.0]
+    assert not np.array_equal(again.rows[0, :2], first.rows[1, :2])
+    training.finish(pair.run(again))
+    assert same_bits(training.models[0], kept)
+
+
+def test_a_diverged_rollout_never_reaches_the_policy():
+    values = parameters(iterations=4)
+    training, pair = build_training(values), LocalPair(values)
+    while training.phase != "adapt":
+        result = pair.run(training.next_batch())
+        training.finish(result)
+        if result.models is not None:
+            pair.use_models(training.models)
+    before = training.policies()
+    diverged = BatchResult(np.array([[1e9, 3e10, 7.0], [2.0, 60.0, COMPLETED]]))
+    (row,) = training.finish(diverged)
+    assert row["diverged"] == 1
+    assert not row["updated"]
+    assert same_bits(training.policies(), before)
+    while (batch := training.next_batch()) is not None:
+        training.finish(pair.run(batch))
+    assert np.isfinite(training.policies()).all()
+
+
+def test_damaged_checkpoints_are_passed_over_or_refused(tmp_path):
+    path = tmp_path / "checkpoint"
+    checkpoint.save(path, {"a": np.arange(3)})
+    checkpoint.save(path, {"a": np.arange(4)})
+    good = path.read_bytes()
+    for damaged in (good[:-1], good[:40], b"", b"PK\3\4" + good, good[:-9] + b"X" + good[-8:]):
+        path.write_bytes(damaged)
+        arrays, warnings = checkpoint.load(path)
+        assert arrays["a"].tolist() == [0, 1, 2]
+        assert len(warnings) == 1
+    checkpoint.previous(path).unlink()
+    with pytest.raises(checkpoint.CheckpointError, match="no usable checkpoint"):
+        checkpoint.load(path)

@@ -1,0 +1,203 @@
+"""The loop over real topics, in real processes: the same training as in one process, to the bit."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import signal
+import time
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loop_interfaces.parameters import write_yaml
+from tests.loop_harness import Processes, until
+from tests.small import SMALL, parameters, same_bits, train_here
+from tuner_node.training import Training
+
+pytestmark = pytest.mark.topics
+LIMIT = 60.0
+"""Seconds a whole small training may take, start-up on a busy machine included."""
+NODES = ("pde_sim_node", "controller_node", "tuner_node")
+
+
+@cache
+def in_process(seed: int = 0, iterations: int = 20, seeds: int = 1) -> Training:
+    return train_here(parameters(seed=seed, iterations=iterations, seeds=seeds))
+
+
+def assert_same_training(folder: Path, expected: Training) -> None:
+    """The run in `folder` has the policy, the model and the costs of `expected`, bit for bit."""
+    with np.load(folder / "policy.npz") as arrays:
+        assert same_bits(arrays["model"], expected.models)
+        assert same_bits(arrays["policy"], expected.policies())
+    result = json.loads((folder / "result.json").read_text())
+    costs = np.array([result["costs_by_field"][name] for name in ("none", "lqt", "adapted")])
+    assert same_bits(costs.transpose(1, 0, 2).copy(), expected.evaluation)
+
+
+def tuner_arguments(out: Path, **options: object) -> list[str]:
+    values = {"iterations": 20, "out": out, **options}
+    return [word for name, value in values.items() for word in ("-p", f"{name}:={value}")]
+
+
+@pytest.mark.parametrize("order", list(itertools.permutations(NODES))[::2], ids="-".join)
+def test_nodes_started_in_any_order_find_each_other_and_train(loop: Processes, tmp_path, order):
+    started = {}
+    for name in order:
+        own = tuner_arguments(tmp_path / "run") if name == "tuner_node" else []
+        started[name] = loop.node(name, "--params-file", str(SMALL), *own)
+        time.sleep(0.3)
+    loop.wait(started["tuner_node"], LIMIT)
+    assert_same_training(tmp_path / "run", in_process())
+    for name in ("pde_sim_node", "controller_node"):
+        started[name].send_signal(signal.SIGTERM)
+        loop.wait(started[name], 5.0)
+
+
+def test_the_command_line_trains_over_topics_as_in_one_process(loop: Processes, tmp_path):
+    arguments = ("train", str(SMALL), "--iterations", "6", "--seeds", "2", "--seed", "3")
+    over_topics = loop.pdeloop(*arguments, "--out", str(tmp_path / "a"))
+    text = loop.wait(over_topics, LIMIT)
+    here = loop.pdeloop(*arguments, "--out", str(tmp_path / "b"), "--in-process")
+    loop.wait(here, LIMIT)
+    for run in ("a", "b"):
+        assert_same_training(tmp_path / run, in_process(seed=3, iterations=6, seeds=2))
+    assert "mean stage cost after adaptation" in text
+    assert f"results in {tmp_path / 'a'}" in text
+
+
+def test_two_loops_in_two_namespaces_do_not_meet(loop: Processes, tmp_path):
+    tuners = []
+    for seed, namespace in enumerate(("/left", "/right/inner")):
+        where = ("-r", f"__ns:={namespace}", "--params-file", str(SMALL))
+        loop.node("pde_sim_node", *where, "-p", "publish_clock:=false")
+        loop.node("controller_node", *where)
+        out = tuner_arguments(tmp_path / str(seed), seed=seed)
+        tuners.append(loop.node("tuner_node", *where, *out))
+    for seed, tuner in enumerate(tuners):
+        loop.wait(tuner, LIMIT)
+        assert_same_training(tmp_path / str(seed), in_process(seed=seed))
+
+
+def test_one_tuner_is_served_by_several_pairs_with_the_same_result(loop: Processes, tmp_path):
+    for pair in ("a", "b"):
+        where = ("-r", f"__ns:=/{pair}", "--params-file", str(SMALL))
+        loop.node("pde_sim_node", *where, "-p", "publish_clock:=false")
+        loop.node("controller_node", *where)
+    tuner = loop.node(
+        "tuner_node",
+        "--params-file",
+        str(SMALL),
+        *tuner_arguments(tmp_path / "run", seeds=2, max_batch=3, pairs="['a','b']"),
+    )
+    loop.wait(tuner, LIMIT)
+    assert_same_training(tmp_path / "run", in_process(seeds=2))
+
+
+def iterations_done(folder: Path) -> int:
+    path = folder / "progress.jsonl"
+    return path.read_text().count('"iteration"') if path.exists() else 0
+
+
+def test_nodes_restarted_between_and_within_episodes_change_nothing(loop: Processes, tmp_path):
+    iterations = 150
+    running = {
+        name: loop.node(name, "--params-file", str(SMALL))
+        for name in ("pde_sim_node", "controller_node")
+    }
+    out = tmp_path / "run"
+    tuner = loop.node(
+        "tuner_node", "--params-file", str(SMALL), *tuner_arguments(out, iterations=iterations)
+    )
+    for count, name in ((15, "controller_node"), (45, "pde_sim_node"), (75, "controller_node")):
+        until(lambda n=count: iterations_done(out) >= n, LIMIT, f"iteration {count}")
+        running[name].send_signal(signal.SIGKILL)
+        running[name].wait()
+        running[name] = loop.node(name, "--params-file", str(SMALL))
+    until(lambda: iterations_done(out) >= 105, LIMIT, "iteration 105")
+    tuner.send_signal(signal.SIGKILL)
+    tuner.wait()
+    tuner = loop.node(
+        "tuner_node",
+        "--params-file",
+        str(SMALL),
+        *tuner_arguments(out, iterations=iterations, resume="true"),
+    )
+    loop.wait(tuner, LIMIT)
+    assert_same_training(out, in_process(iterations=iterations))
+
+
+@pytest.mark.parametrize("transport", [[], ["--in-process"]], ids=["topics", "in-process"])
+def test_ctrl_c_ends_everything_and_the_run_continues(loop: Processes, tmp_path, transport):
+    out = tmp_path / "run"
+    iterations = 2000 if transport else 400
+    options = ("--iterations", str(iterations), "--out", str(out))
+    run = loop.pdeloop("train", str(SMALL), *options, *transport)
+    until(lambda: iterations_done(out) >= 30, LIMIT, "iteration 30")
+    interrupted = time.monotonic()
+    run.send_signal(signal.SIGINT)
+    text = loop.wait(run, 10.0, code=130)
+    assert time.monotonic() - interrupted < 2.0
+    until(lambda: loop.left_behind() == [], 1.0, "end of all nodes")
+    assert iterations_done(out) < iterations
+    assert f"continue with: pdeloop train --resume {out}" in text
+    again = loop.pdeloop("train", "--resume", str(out), *transport)
+    loop.wait(again, LIMIT)
+    assert_same_training(out, in_process(iterations=iterations))
+
+
+def test_a_rollout_that_diverges_is_marked_and_the_training_goes_on(loop: Processes, tmp_path):
+    # A bound just above the initial fields: what the perturbed policies do exceeds it now and then.
+    values = {k: v for k, v in parameters().items() if k not in ("seed", "seeds", "iterations")}
+    problem = {k: v for k, v in values.items() if k in DIVERGING or k.startswith("physical.")}
+    path = tmp_path / "tight.yaml"
+    write_yaml(path, {**problem, "divergence_bound": 1.1, "smoothing_radius": 5.0})
+    out = tmp_path / "run"
+    run = loop.pdeloop("train", str(path), "--iterations", "12", "--out", str(out))
+    loop.wait(run, LIMIT)
+    result = json.loads((out / "result.json").read_text())
+    assert sum(row["diverged"] for row in result["history"]) > 0
+    with np.load(out / "policy.npz") as arrays:
+        assert np.isfinite(arrays["policy"]).all()
+
+
+DIVERGING = {
+    "problem", "equation", "length", "n_z", "n_a", "actuator_width", "sample_time",
+    "integration_time", "horizon", "dmdc_rank", "reduced_order", "exploration_variance",
+    "learning_rate",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("node", "parameter", "words"),
+    [
+        ("pde_sim_node", "n_z:=7", "'n_z' is 7; expected an even whole number from 8 to 65536"),
+        ("pde_sim_node", "n_z:=many", "'n_z' is 'many'; expected an even whole number"),
+        ("pde_sim_node", "actuator_width:=0.5", "width * n_a must not exceed 1"),
+        ("pde_sim_node", "integration_time:=0.003", "whole multiple"),
+        ("pde_sim_node", "equation:=navier", "navier"),
+        ("pde_sim_node", "physical.viscosity:=-1.0", "'physical.viscosity' is -1.0; expected"),
+        ("pde_sim_node", "n_zz:=8", "unknown parameter 'n_zz'; did you mean 'n_z'"),
+        ("controller_node", "dmdc_rank:=0", "'dmdc_rank' is 0; expected a whole number from 1"),
+        ("tuner_node", "iterations:=0", "'iterations' is 0; expected a whole number from 1"),
+        ("tuner_node", "start:=lqg", "'start' is 'lqg'; expected one of lqt, zero"),
+        ("tuner_node", "smoothing_radius:=-0.1", "'smoothing_radius' is -0.1; expected"),
+    ],
+)
+def test_a_node_refuses_a_bad_parameter_in_one_line(loop: Processes, node, parameter, words):
+    text = loop.wait(loop.node(node, "-p", parameter), 20.0, code=1)
+    (line,) = text.strip().splitlines()
+    assert line.startswith(f"{node}: ")
+    assert words in line
+
+
+def test_a_model_that_cannot_be_designed_stops_the_run_with_the_reason(loop: Processes, tmp_path):
+    path = tmp_path / "rank.yaml"
+    path.write_text(SMALL.read_text().replace("dmdc_rank: 8", "dmdc_rank: 36"))
+    run = loop.pdeloop("train", str(path), "--out", str(tmp_path / "run"))
+    text = loop.wait(run, LIMIT, code=1)
+    assert "no reduced model: p must be at most" in text.splitlines()[-1]
+    assert "Traceback" not in text
