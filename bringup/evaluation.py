@@ -40,7 +40,7 @@ def evaluate(folder: Path, *, fields: int, seed: int, mean_field: bool) -> dict[
     for m in range(len(policies)):
         for policy in (np.zeros_like(warm[m]), warm[m], policies[m]):
             for field_seed in field_seeds:
-                rows.append((field_seed, -1, m))
+                rows.append((field_seed, -1, 0, m))
                 gains.append(policy)
     pair = LocalPair(values)
     pair.use_models(models)

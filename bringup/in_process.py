@@ -16,7 +16,7 @@ from controller_node.identification import DesignSettings, design
 from controller_node.policy import ProjectedLaw, excitation
 from loop_interfaces import model_rows
 from loop_interfaces.topics import COMPLETED, StartColumn
-from pde_sim_node.build import build_plant
+from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.plant import Plant
 from tuner_node.training import Batch, BatchResult, Training
 
@@ -29,13 +29,13 @@ class LocalPair:
 
     def __init__(self, values: Mapping[str, Any], plant: Plant | None = None) -> None:
         self.plant = plant or build_plant(values)
+        self._fingerprint = fingerprint(values)
         self._settings = DesignSettings(
             n_a=values["n_a"],
             dmdc_rank=values["dmdc_rank"],
             reduced_order=values["reduced_order"],
             state_weight=values["state_weight"],
             action_weight=values["action_weight"],
-            exploration_variance=values["exploration_variance"],
         )
         self._law: ProjectedLaw | None = None
 
@@ -59,20 +59,21 @@ class LocalPair:
         return BatchResult(
             np.concatenate([part.costs for part in parts]),
             np.concatenate(models) if models else None,
+            self._fingerprint,
         )
 
     def _episode(self, batch: Batch) -> BatchResult:
         plant, settings = self.plant, self._settings
         states = plant.reset(batch.rows[:, StartColumn.SEED].astype(np.int64))
-        excitations = [int(seed) for seed in batch.rows[:, StartColumn.EXCITATION]]
+        columns = batch.rows[:, [StartColumn.EXCITATION, StartColumn.VARIANCE]]
+        excitations = [(int(seed), float(variance)) for seed, variance in columns]
         history, actions_taken = [states.copy()], []
         if not batch.exploratory:
             assert self._law is not None and batch.policies is not None
             self._law.set(batch.policies, batch.rows[:, StartColumn.MODEL].astype(np.int64))
         for k in range(plant.horizon):
             if batch.exploratory:
-                variance = settings.exploration_variance
-                actions = np.stack([excitation(s, k, settings.n_a, variance) for s in excitations])
+                actions = np.stack([excitation(s, k, settings.n_a, v) for s, v in excitations])
                 actions_taken.append(actions)
             else:
                 assert self._law is not None

@@ -14,14 +14,13 @@ from loop_interfaces.model_rows import ModelRows
 
 @dataclass(frozen=True)
 class DesignSettings:
-    """p, n_s of the DMDc, the weights of the stage cost and the exploration variance."""
+    """Actuators, p and n_s of the DMDc, and the weights of the stage cost."""
 
     n_a: int
     dmdc_rank: int
     reduced_order: int
     state_weight: float
     action_weight: float
-    exploration_variance: float
 
 
 def design(

@@ -44,7 +44,6 @@ CONTROLLER_PARAMETERS = tuple(
         "reduced_order",
         "state_weight",
         "action_weight",
-        "exploration_variance",
     )
 )
 """The problem parameters that concern the controller."""

@@ -9,7 +9,7 @@ exploratory episode: if it missed some, it says so and the episode is run again.
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -44,7 +44,8 @@ class _Run:
     models: list[model_rows.ModelRows] = field(default_factory=list)
     law: ProjectedLaw | None = None
     law_episode: int = -1
-    samples: dict[int, np.ndarray] = field(default_factory=dict)
+    samples: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)
+    """States of an exploratory episode, by (plant, step)."""
     identified: Send | ModelFailure | None = None
 
     def episode_start(self, frame: Frame) -> Frame | None:
@@ -84,11 +85,14 @@ class Responder:
         exploring = rows[:, StartColumn.EXCITATION] >= 0
         if exploring.any() and not exploring.all():
             raise FrameError("expected all environments of an episode to explore, or none")
-        if (rows[:, StartColumn.MODEL] < 0).any() or (rows != np.floor(rows)).any():
+        whole = rows[:, [StartColumn.EXCITATION, StartColumn.MODEL]]
+        if (rows[:, StartColumn.MODEL] < 0).any() or (whole != np.floor(whole)).any():
             raise FrameError("expected seeds and model indices that are whole numbers")
+        if (rows[:, StartColumn.VARIANCE] < 0).any():
+            raise FrameError("expected exploration variances of at least 0")
         run = self._run(frame.run)
         if run.episode_start(frame) is None:
-            run.start = Frame(frame.run, frame.episode, 0, frame.time, rows.copy())
+            run.start = replace(frame, values=rows.copy())
             run.samples, run.identified, run.law_episode = {}, None, -1
         return self._answer_pending()
 
@@ -100,7 +104,7 @@ class Responder:
         if frame.values.size and np.abs(frame.values).max() > MAX_GAIN:
             raise FrameError(f"expected gains of at most {MAX_GAIN:g} in magnitude")
         run = self._run(frame.run)
-        run.policy = Frame(frame.run, frame.episode, 0, frame.time, frame.values.copy())
+        run.policy = replace(frame, values=frame.values.copy())
         run.law_episode = -1
         return self._answer_pending()
 
@@ -115,15 +119,13 @@ class Responder:
         """The action that answers a state; the state is kept until what it needs has arrived."""
         actions = self._actions(frame)
         if actions is None:
-            self._pending = Frame(
-                frame.run, frame.episode, frame.step, frame.time, frame.values.copy()
-            )
+            self._pending = replace(frame, values=frame.values.copy())
             self.tally["states that had to wait"] += 1
             return []
         self._pending = None
         self.answered += 1
         self.episode = frame.episode
-        return [Send(ACTION, Frame(frame.run, frame.episode, frame.step, frame.time, actions))]
+        return [Send(ACTION, replace(frame, values=actions))]
 
     def cost(self, frame: Frame) -> list[Send | ModelFailure]:
         """At the end of an exploratory episode: reduce and design."""
@@ -170,8 +172,8 @@ class Responder:
         if self._target is None:
             return None
         if start.values[0, StartColumn.EXCITATION] >= 0:
-            run.samples[frame.step] = frame.values.copy()
-            return np.stack([self._explore(seed, frame.step) for seed in _excitations(start)])
+            run.samples[frame.plant, frame.step] = frame.values.copy()
+            return np.stack([self._explore(*how, frame.step) for how in _excitations(start)])
         if run.law_episode != frame.episode and not self._prepare(run, start):
             return None
         assert run.law is not None
@@ -194,9 +196,8 @@ class Responder:
         run.law_episode = start.episode
         return True
 
-    def _explore(self, seed: int, step: int) -> np.ndarray:
-        settings = self._settings
-        return excitation(seed, step, settings.n_a, settings.exploration_variance)
+    def _explore(self, seed: int, variance: float, step: int) -> np.ndarray:
+        return excitation(seed, step, self._settings.n_a, variance)
 
     def _identify(self, run: _Run, start: Frame, cost: Frame) -> Send | ModelFailure:
         def failure(retry: bool, reason: str) -> ModelFailure:
@@ -212,27 +213,30 @@ class Responder:
                 "lower exploration_variance",
             )
         steps = range(cost.step + 1)
-        if sorted(run.samples) != list(steps):
+        held = {step: z for (plant, step), z in run.samples.items() if plant == cost.plant}
+        if sorted(held) != list(steps):
             return failure(
                 True,
-                f"the controller holds {len(run.samples)} of the {len(steps)} states "
+                f"the controller holds {len(held)} of the {len(steps)} states "
                 "of the exploratory episode",
             )
         assert self._target is not None  # no state is answered, so none is kept, without it
-        states = np.stack([run.samples[k] for k in steps])
+        states = np.stack([held[k] for k in steps])
         try:
             models = []
-            for env, seed in enumerate(_excitations(start)):
-                actions = np.stack([self._explore(seed, k) for k in steps[:-1]])
+            for env, how in enumerate(_excitations(start)):
+                actions = np.stack([self._explore(*how, k) for k in steps[:-1]])
                 models.append(design(states[:, env], actions, self._target, self._settings))
         except ValueError as error:
             return failure(False, str(error))
         rows = np.stack([model_rows.pack(model) for model in models])
-        return Send(MODEL_IDENTIFIED, Frame(start.run, start.episode, 0, cost.time, rows))
+        return Send(MODEL_IDENTIFIED, replace(cost, step=0, values=rows))
 
     def _answer_pending(self) -> list[Send]:
         return self.state(self._pending) if self._pending is not None else []
 
 
-def _excitations(start: Frame) -> list[int]:
-    return [int(seed) for seed in start.values[:, StartColumn.EXCITATION]]
+def _excitations(start: Frame) -> list[tuple[int, float]]:
+    """Seed and variance of every environment's exploratory actions."""
+    columns = start.values[:, [StartColumn.EXCITATION, StartColumn.VARIANCE]]
+    return [(int(seed), float(variance)) for seed, variance in columns]

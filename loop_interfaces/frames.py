@@ -1,15 +1,16 @@
-"""The array on the wire: std_msgs/Float64MultiArray with a four-number header, as CDR bytes.
+"""The array on the wire: std_msgs/Float64MultiArray with a five-number header, as CDR bytes.
 
 Every array of the loop travels as one `Float64MultiArray` whose `layout.dim` is labelled and filled
-in, whose `layout.data_offset` is 4 and whose `data` is
+in, whose `layout.data_offset` is 5 and whose `data` is
 
-    [run, episode, step, time, values...]        (values in row-major order of the dims)
+    [run, episode, step, time, plant, values...]      (values in row-major order of the dims)
 
-`run`, `episode` and `step` are whole numbers below 2^53 (exact in float64), `time` is simulated
-time in seconds. The bytes are the plain CDR encoding of the message (OMG CDR 1.0, as used by every
-ROS 2 middleware), so a node that uses ordinary message objects reads and writes the same thing;
-encoding them here once, with a prefix that depends only on the shape, keeps per-element Python out
-of the hot path.
+`run`, `episode`, `step` and `plant` are whole numbers below 2^53 (exact in float64), `time` is
+simulated time in seconds. `plant` is a fingerprint of the plant's parameters: an action carries
+that of the state it answers, so two different plants on one topic are never mixed up. The bytes are
+the plain CDR encoding of the message (OMG CDR 1.0, as every ROS 2 middleware uses it), so a node
+with ordinary message objects reads and writes the same thing; encoding them here once, with a
+prefix that depends only on the shape, keeps per-element Python out of the hot path.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-HEADER = 4
-"""Numbers in front of the values: run, episode, step, time."""
+HEADER = 5
+"""Numbers in front of the values: run, episode, step, time, plant."""
 MAX_ID = 2**53
 """Ids are whole numbers below this: the largest range a float64 holds exactly."""
 MAX_VALUES = 2**24
@@ -38,7 +39,7 @@ class FrameError(ValueError):
 class Frame:
     """One array of the loop with its header.
 
-    run, episode, step: whole numbers in [0, 2^53); time: simulated time (s);
+    run, episode, step, plant: whole numbers in [0, 2^53); time: simulated time (s);
     values: float64, one axis per label of its topic.
     """
 
@@ -47,6 +48,7 @@ class Frame:
     step: int
     time: float
     values: NDArray[np.float64]
+    plant: int = 0
 
 
 class ArrayCodec:
@@ -71,6 +73,7 @@ class ArrayCodec:
         data[1] = frame.episode
         data[2] = frame.step
         data[3] = frame.time
+        data[4] = frame.plant
         data[HEADER:] = values.reshape(-1)
         return bytes(buffer)
 
@@ -84,12 +87,12 @@ class ArrayCodec:
         head = numbers[:HEADER].tolist()
         if not np.isfinite(numbers).all():
             raise FrameError("expected finite numbers, got NaN or infinity")
-        for name, number in zip(("run", "episode", "step"), head, strict=False):
+        run, episode, step, time, plant = head
+        for name, number in (("run", run), ("episode", episode), ("step", step), ("plant", plant)):
             if not (0 <= number < MAX_ID and number == math.floor(number)):
                 raise FrameError(f"expected {name} to be a whole number in [0, 2^53), got {number}")
-        return Frame(
-            int(head[0]), int(head[1]), int(head[2]), head[3], numbers[HEADER:].reshape(shape)
-        )
+        values = numbers[HEADER:].reshape(shape)
+        return Frame(int(run), int(episode), int(step), time, values, int(plant))
 
     def _template(self, shape: tuple[int, ...]) -> tuple[bytearray, NDArray[np.float64], bytes]:
         if len(shape) != len(self.labels):

@@ -31,7 +31,9 @@ class StartColumn(IntEnum):
     """Seed of the initial field (>= 0: drawn from the initial distribution; -1: its mean)."""
     EXCITATION = 1
     """Seed of the exploratory actions (>= 0), or -1: the policy acts."""
-    MODEL = 2
+    VARIANCE = 2
+    """Variance of each exploratory action; 0 where the policy acts."""
+    MODEL = 3
     """Index of the reduced model the environment's policy belongs to."""
 
 
@@ -50,7 +52,7 @@ COMPLETED = -1
 VOID = -2
 
 # Latched: a node that restarts in the middle of an episode must learn of it without asking.
-START = Topic("episode/start", ("env", "seed_excitation_model"), latched=True)
+START = Topic("episode/start", ("env", "seed_excitation_variance_model"), latched=True)
 POLICY = Topic("policy", ("env", "actuator", "gain"), latched=True)
 COST = Topic("episode/cost", ("env", "mean_total_ended"), latched=True)
 MODEL = Topic("model", ("model", "row", "mode"), latched=True)

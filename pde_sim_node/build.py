@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
+import inspect
+import json
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import asdict, fields
 from typing import Any
 
+from loop_interfaces.frames import MAX_ID
 from pde_sim_node.equations import Equation, load_equation
 from pde_sim_node.plant import Plant
 
@@ -25,6 +29,31 @@ def build_equation(values: Mapping[str, Any]) -> Equation:
                 f"unknown parameter 'physical.{name}' of {kind.name}; known: {', '.join(known)}"
             )
     return kind(length=values["length"], **physical)
+
+
+def fingerprint(values: Mapping[str, Any]) -> int:
+    """A number in [1, 2^53) that two plants share only if they are the same plant.
+
+    It covers everything the plant's states and costs depend on, the equation's source included.
+    """
+    equation = build_equation(values)
+    content = {spec: values[spec] for spec in _PLANT_VALUES} | asdict(equation)
+    source = inspect.getsource(type(equation))
+    digest = hashlib.sha256(json.dumps([content, source], sort_keys=True).encode()).digest()
+    return 1 + int.from_bytes(digest[:8], "big") % (MAX_ID - 1)
+
+
+_PLANT_VALUES = (
+    "n_z",
+    "n_a",
+    "actuator_width",
+    "sample_time",
+    "integration_time",
+    "horizon",
+    "state_weight",
+    "action_weight",
+    "divergence_bound",
+)
 
 
 def build_plant(values: Mapping[str, Any]) -> Plant:

@@ -13,27 +13,30 @@ import numpy as np
 
 from loop_interfaces.frames import MAX_VALUES, Frame, FrameError
 from loop_interfaces.protocol import Send, Tally
-from loop_interfaces.topics import COMPLETED, COST, STATE, TARGET, VOID, StartColumn
+from loop_interfaces.topics import COMPLETED, COST, STATE, TARGET, VOID, StartColumn, Topic
 from pde_sim_node.plant import Plant
 
 
 class Lockstep:
     """One plant serving the episodes of one run at a time.
 
-    plant: what is stepped; sample_time (s): simulated time per step; action_timeout (s),
-    max_repeats, run_hold (s): see loop_interfaces.parameters. `now` is any monotonic time in s.
+    plant: what is stepped; fingerprint: of its parameters (see build.fingerprint); sample_time (s):
+    simulated time per step; action_timeout (s), max_repeats, run_hold (s): see
+    loop_interfaces.parameters. `now` is any monotonic time in s.
     """
 
     def __init__(
         self,
         plant: Plant,
         *,
+        fingerprint: int = 0,
         sample_time: float,
         action_timeout: float,
         max_repeats: int,
         run_hold: float,
     ) -> None:
         self._plant = plant
+        self._fingerprint = fingerprint
         self._sample_time = sample_time
         self._action_timeout = action_timeout
         self._max_repeats = max_repeats
@@ -71,7 +74,7 @@ class Lockstep:
 
     def announcement(self) -> Send:
         """The target z_r, sent once at the start and latched."""
-        return Send(TARGET, Frame(0, 0, 0, 0.0, self._plant.target))
+        return Send(TARGET, Frame(0, 0, 0, 0.0, self._plant.target, self._fingerprint))
 
     def start(self, frame: Frame, now: float) -> list[Send]:
         """Begin an episode, or answer again for one that is known.
@@ -116,6 +119,9 @@ class Lockstep:
         if not self._active or frame.run != self.run or frame.episode != self.episode:
             self.tally["actions of another episode"] += 1
             return []
+        if frame.plant != self._fingerprint:
+            self.tally["actions for another plant"] += 1
+            return []
         if frame.step != plant.step_index:
             self.tally["actions of another step"] += 1
             return []
@@ -144,9 +150,7 @@ class Lockstep:
         return [self._reply]
 
     def _publish_state(self, states: np.ndarray, now: float) -> list[Send]:
-        self._reply = Send(
-            STATE, Frame(self.run, self.episode, self._plant.step_index, self.time, states)
-        )
+        self._reply = self._stamped(STATE, states)
         self._repeats = 0
         self._deadline = now + self._action_timeout
         return [self._reply]
@@ -158,22 +162,26 @@ class Lockstep:
             ended = np.full(self._plant.batch, VOID)
             self.tally["episodes void"] += 1
         values = np.column_stack([costs.mean, costs.total, ended.astype(np.float64)])
-        self._reply = Send(
-            COST, Frame(self.run, self.episode, self._plant.step_index, self.time, values)
-        )
+        self._reply = self._stamped(COST, values)
         self._active, self._deadline = False, None
         self.episodes_total += not void
         return self._reply
+
+    def _stamped(self, topic: Topic, values: np.ndarray) -> Send:
+        step = self._plant.step_index
+        frame = Frame(self.run, self.episode, step, self.time, values, self._fingerprint)
+        return Send(topic, frame)
 
     def _check_rows(self, frame: Frame) -> np.ndarray:
         rows = frame.values
         if rows.shape[1] != len(StartColumn):
             raise FrameError(
-                f"expected rows of {len(StartColumn)} numbers (seed, excitation, model), "
-                f"got {rows.shape[1]}"
+                f"expected rows of {len(StartColumn)} numbers "
+                f"(seed, excitation, variance, model), got {rows.shape[1]}"
             )
         if rows.shape[0] * max(self._plant.n_z, self._plant.n_a) > MAX_VALUES:
             raise FrameError(f"{rows.shape[0]} environments are more than one message can hold")
-        if rows.size and (rows.min() < -1 or (rows != np.floor(rows)).any()):
+        seeds = rows[:, StartColumn.SEED]
+        if len(rows) and (seeds.min() < -1 or (seeds != np.floor(seeds)).any()):
             raise FrameError("expected seeds that are whole numbers of at least -1")
         return rows

@@ -21,7 +21,7 @@ from loop_interfaces.parameters import PLANT, PROBLEM, Spec
 from loop_interfaces.protocol import Send
 from loop_interfaces.ros_parameters import declare, given_parameters
 from loop_interfaces.topics import ACTION, COST, START, STATE, TARGET
-from pde_sim_node.build import build_plant
+from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.equations import load_equation
 from pde_sim_node.lockstep import Lockstep
 
@@ -63,6 +63,7 @@ class PlantNode:
         plant = build_plant(values)
         self._lockstep = Lockstep(
             plant,
+            fingerprint=fingerprint(values),
             sample_time=values["sample_time"],
             action_timeout=values["action_timeout"],
             max_repeats=values["max_repeats"],

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -23,7 +25,9 @@ def dispatcher(pairs: int = 1, **settings) -> Dispatcher:
 
 
 def batch(count: int) -> Batch:
-    rows = np.column_stack([np.arange(count), np.full(count, -1), np.zeros(count)]).astype(float)
+    rows = np.column_stack(
+        [np.arange(count), np.full(count, -1), np.zeros(count), np.zeros(count)]
+    ).astype(float)
     return Batch(rows, np.arange(count, dtype=float)[:, None, None] * np.ones((1, 2, 4)))
 
 
@@ -141,7 +145,7 @@ def test_the_work_of_a_pair_that_died_goes_to_a_free_one():
 
 def test_an_exploratory_episode_is_done_with_its_model_and_fails_with_its_reason():
     served = dispatcher()
-    exploratory = Batch(np.array([[1.0, 2.0, 0.0]]), None)
+    exploratory = Batch(np.array([[1.0, 2.0, 0.1, 0.0]]), None)
     ((_, start),) = starts(served.assign(exploratory, 0.0))
     served.cost(0, costs_of(start), 0.0)
     assert served.result() is None
@@ -156,3 +160,16 @@ def test_an_exploratory_episode_is_done_with_its_model_and_fails_with_its_reason
     ((_, last),) = starts(served.assign(exploratory, 0.0))
     with pytest.raises(DispatchError, match="no reduced model: p is too large"):
         served.failure(0, ModelFailure(RUN, last.episode, False, "p is too large"), 0.0)
+
+
+def test_costs_of_a_plant_with_other_parameters_are_refused():
+    served = dispatcher()
+    ((_, first),) = starts(served.assign(batch(1), 0.0))
+    served.cost(0, replace(costs_of(first), plant=5), 0.0)
+    assert served.result().plant == 5
+    ((_, second),) = starts(served.assign(batch(1), 0.0))
+    with pytest.raises(FrameError, match="other parameters"):
+        served.cost(0, replace(costs_of(second), plant=6), 0.0)
+    assert served.result() is None
+    served.cost(0, replace(costs_of(second), plant=5), 0.0)
+    assert served.result() is not None

@@ -20,15 +20,16 @@ def message(labels: tuple[str, ...], frame: Frame) -> Float64MultiArray:
     for axis, (label, size) in enumerate(zip(labels, shape, strict=True)):
         stride = int(np.prod(shape[axis:]))
         result.layout.dim.append(MultiArrayDimension(label=label, size=size, stride=stride))
-    result.layout.data_offset = 4
+    result.layout.data_offset = 5
     head = [float(frame.run), float(frame.episode), float(frame.step), frame.time]
+    head.append(float(frame.plant))
     result.data = head + frame.values.ravel().tolist()
     return result
 
 
 def frame_of(shape: tuple[int, ...]) -> Frame:
     values = np.random.default_rng(0).standard_normal(shape)
-    return Frame(run=MAX_ID - 1, episode=2**32 + 7, step=299, time=12.25, values=values)
+    return Frame(run=MAX_ID - 1, episode=2**32 + 7, step=299, time=12.25, values=values, plant=31)
 
 
 @pytest.mark.parametrize("topic", ARRAYS, ids=lambda topic: topic.name)
@@ -41,17 +42,17 @@ def test_our_bytes_are_read_by_ros_and_ros_bytes_by_us(topic):
         for raw in (serialize_message(expected), codec.encode(frame), codec.encode(frame)):
             back = codec.decode(raw)
             assert (back.run, back.episode, back.step) == (frame.run, frame.episode, frame.step)
-            assert back.time == frame.time
+            assert (back.time, back.plant) == (frame.time, frame.plant)
             assert back.values.shape == frame.values.shape
             assert back.values.tobytes() == frame.values.tobytes()
 
 
 def test_big_endian_bytes_are_read():
-    little = ArrayCodec(("x",)).encode(Frame(1, 2, 3, 0.5, np.array([1.5, -2.5])))
+    little = ArrayCodec(("x",)).encode(Frame(1, 2, 3, 0.5, np.array([1.5, -2.5]), 9))
     label = struct.pack(">I", 2) + b"x\0" + b"\0\0"
-    head = b"\0\0\0\0" + struct.pack(">I", 1) + label + struct.pack(">IIII", 2, 2, 4, 6)
+    head = b"\0\0\0\0" + struct.pack(">I", 1) + label + struct.pack(">IIII", 2, 2, 5, 7)
     head += bytes(-(len(head) - 4) % 8)
-    big = head + struct.pack(">6d", 1, 2, 3, 0.5, 1.5, -2.5)
+    big = head + struct.pack(">7d", 1, 2, 3, 0.5, 9, 1.5, -2.5)
     assert len(big) == len(little)
     frame = ArrayCodec(("x",)).decode(big)
     assert (frame.run, frame.episode, frame.step, frame.time) == (1, 2, 3, 0.5)
@@ -66,13 +67,14 @@ def test_big_endian_bytes_are_read():
         (lambda m: setattr(m.layout.dim[0], "size", 3), "strides|numbers"),
         (lambda m: setattr(m.layout.dim[1], "stride", 1), "strides"),
         (lambda m: setattr(m.layout.dim[0], "size", 2**31), "at most"),
-        (lambda m: setattr(m.layout, "data_offset", 0), "data_offset"),
+        (lambda m: setattr(m.layout, "data_offset", 4), "data_offset"),
         (lambda m: m.data.append(1.0), "numbers"),
-        (lambda m: m.data.__setitem__(5, float("nan")), "NaN"),
-        (lambda m: m.data.__setitem__(5, float("inf")), "NaN or infinity"),
+        (lambda m: m.data.__setitem__(6, float("nan")), "NaN"),
+        (lambda m: m.data.__setitem__(6, float("inf")), "NaN or infinity"),
         (lambda m: m.data.__setitem__(0, -1.0), "run"),
         (lambda m: m.data.__setitem__(1, 0.5), "episode"),
         (lambda m: m.data.__setitem__(2, 2.0**53), "step"),
+        (lambda m: m.data.__setitem__(4, -7.0), "plant"),
     ],
 )
 def test_what_is_not_the_interface_is_refused(change, expected):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -12,24 +14,30 @@ from pde_sim_node.lockstep import Lockstep
 from tests.small import parameters
 
 RUN = 11
+PLANT = 77
 SEEDS = (3, 4)
 
 
 def plant_protocol(**overrides) -> Lockstep:
     values = parameters(**overrides)
     return Lockstep(
-        build_plant(values), sample_time=0.05, action_timeout=0.1, max_repeats=3, run_hold=10.0
+        build_plant(values),
+        fingerprint=PLANT,
+        sample_time=0.05,
+        action_timeout=0.1,
+        max_repeats=3,
+        run_hold=10.0,
     )
 
 
 def start(episode: int, seeds=SEEDS, run: int = RUN) -> Frame:
-    rows = np.array([(seed, -1.0, 0.0) for seed in seeds], dtype=float).reshape(-1, 3)
+    rows = np.array([(seed, -1.0, 0.0, 0.0) for seed in seeds], dtype=float).reshape(-1, 4)
     return Frame(run, episode, 0, 0.0, rows)
 
 
 def answer(state: Frame, scale: float = 0.1) -> Frame:
     actions = scale * state.values[:, :4]
-    return Frame(state.run, state.episode, state.step, state.time, actions)
+    return replace(state, values=actions)
 
 
 def run_episode(protocol: Lockstep, episode: int, now: float = 0.0, disturb=None) -> list[Frame]:
@@ -63,15 +71,15 @@ def test_foreign_late_repeated_and_malformed_messages_change_no_number():
     def disturb(protocol, state, now):
         wrong = answer(state, scale=7.0)
         for bad in (
-            Frame(99, wrong.episode, wrong.step, 0.0, wrong.values),
-            Frame(RUN, wrong.episode + 1, wrong.step, 0.0, wrong.values),
-            Frame(RUN, wrong.episode, wrong.step + 1, 0.0, wrong.values),
-            Frame(RUN, wrong.episode, max(wrong.step - 1, 0), 0.0, wrong.values),
+            replace(wrong, run=99),
+            replace(wrong, episode=wrong.episode + 1),
+            replace(wrong, step=wrong.step + 1),
+            replace(wrong, step=wrong.step - 1),
+            replace(wrong, plant=PLANT + 1),
         ):
-            if (bad.run, bad.episode, bad.step) != (RUN, wrong.episode, wrong.step):
-                assert protocol.action(bad, now) == []
+            assert protocol.action(bad, now) == []
         with pytest.raises(FrameError, match="expected an action of shape"):
-            protocol.action(Frame(RUN, wrong.episode, wrong.step, 0.0, wrong.values[:1]), now)
+            protocol.action(replace(wrong, values=wrong.values[:1]), now)
         with pytest.raises(FrameError, match="has this plant"):
             protocol.start(start(1, run=99), now)
         with pytest.raises(FrameError, match="other seeds"):
@@ -126,7 +134,7 @@ def test_a_run_holds_the_plant_until_it_ends_or_falls_silent():
     assert protocol.start(start(1, run=13), 21.1)[0].frame.run == 13
 
 
-@pytest.mark.parametrize("rows", [[[0.5, -1, 0]], [[-2, -1, 0]], [[1, -1]]])
+@pytest.mark.parametrize("rows", [[[0.5, -1, 0, 0]], [[-2, -1, 0, 0]], [[1, -1]]])
 def test_malformed_seed_lists_are_refused_and_leave_the_plant_as_it_was(rows):
     protocol = plant_protocol()
     (state,) = protocol.start(start(1), 0.0)

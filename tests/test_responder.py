@@ -24,25 +24,24 @@ SETTINGS = DesignSettings(
     reduced_order=4,
     state_weight=1.0,
     action_weight=1.0,
-    exploration_variance=0.1,
 )
 PLANT = build_plant(parameters())
 TARGET = Frame(0, 0, 0, 0.0, PLANT.target)
 
 
-def start(episode: int, *rows: tuple[float, float, float], run: int = RUN) -> Frame:
-    return Frame(run, episode, 0, 0.0, np.array(rows, dtype=float).reshape(-1, 3))
+def start(episode: int, *rows: tuple[float, ...], run: int = RUN) -> Frame:
+    return Frame(run, episode, 0, 0.0, np.array(rows, dtype=float).reshape(-1, 4))
 
 
 def models() -> np.ndarray:
-    found = LocalPair(parameters()).run(Batch(np.array([(1.0, 2.0, 0.0)]), None)).models
+    found = LocalPair(parameters()).run(Batch(np.array([(1.0, 2.0, 0.1, 0.0)]), None)).models
     assert found is not None
     return found
 
 
 def explore(responder: Responder, episode: int, excitation_seed: int = 2, lose: int = -1):
     """Drive an exploratory episode; the state of step `lose` never reaches the controller."""
-    responder.start(start(episode, (1, excitation_seed, 0)))
+    responder.start(start(episode, (1, excitation_seed, 0.1, 0)))
     states = PLANT.reset(np.array([1]))
     for k in range(PLANT.horizon + 1):
         if k != lose:
@@ -78,7 +77,7 @@ def test_a_lost_sample_asks_for_the_episode_again_and_the_repeat_gives_the_model
 
 
 def test_data_that_allow_no_model_are_a_failure_with_the_reason():
-    responder = Responder(DesignSettings(4, 36, 4, 1.0, 1.0, 0.1))
+    responder = Responder(DesignSettings(4, 36, 4, 1.0, 1.0))
     responder.target(TARGET)
     (failure,) = explore(responder, 1)
     assert not failure.retry
@@ -90,7 +89,7 @@ def test_the_law_is_answered_whatever_the_order_in_which_its_parts_arrive():
     policy = model_rows.unpack(rows[0], 4).policy
     state = Frame(RUN, 3, 0, 0.0, PLANT.reset(np.array([1, 2])).copy())
     parts = {
-        "start": start(3, (1, -1, 0), (2, -1, 0)),
+        "start": start(3, (1, -1, 0, 0), (2, -1, 0, 0)),
         "policy": Frame(RUN, 3, 0, 0.0, np.stack([policy, 0 * policy])),
         "model": Frame(RUN, 0, 0, 0.0, rows),
         "target": TARGET,
@@ -115,10 +114,22 @@ def test_the_law_is_answered_whatever_the_order_in_which_its_parts_arrive():
     assert (answers[0].values[1] == 0).all()
 
 
+def test_states_of_two_plants_are_not_mixed_into_one_model():
+    responder = Responder(SETTINGS)
+    responder.target(TARGET)
+    responder.start(start(1, (1, 2, 0.1, 0)))
+    stranger = np.random.default_rng(0).standard_normal((1, 32))
+    for k in range(31):
+        (send,) = responder.state(Frame(RUN, 1, k, 0.0, stranger, plant=9))
+        assert send.frame.plant == 9
+    (send,) = explore(responder, 1)
+    assert same_bits(send.frame.values, models())
+
+
 def test_a_state_of_another_episode_or_run_is_not_answered():
     responder = Responder(SETTINGS)
     responder.target(TARGET)
-    responder.start(start(1, (1, 9, 0)))
+    responder.start(start(1, (1, 9, 0.1, 0)))
     state = PLANT.reset(np.array([1]))
     assert responder.state(Frame(RUN, 2, 0, 0.0, state)) == []
     assert responder.state(Frame(RUN + 1, 1, 0, 0.0, state)) == []
@@ -129,8 +140,8 @@ def test_two_runs_are_answered_side_by_side_and_forgotten_when_released():
     responder = Responder(SETTINGS)
     responder.target(TARGET)
     state = PLANT.reset(np.array([1])).copy()
-    responder.start(start(1, (1, 9, 0)))
-    responder.start(start(1, (1, 10, 0), run=6))
+    responder.start(start(1, (1, 9, 0.1, 0)))
+    responder.start(start(1, (1, 10, 0.1, 0), run=6))
     (a,) = responder.state(Frame(RUN, 1, 0, 0.0, state))
     (b,) = responder.state(Frame(6, 1, 0, 0.0, state))
     assert not np.array_equal(a.frame.values, b.frame.values)
@@ -142,9 +153,14 @@ def test_two_runs_are_answered_side_by_side_and_forgotten_when_released():
 @pytest.mark.parametrize(
     ("name", "frame", "words"),
     [
-        ("start", start(1, (1, 2, 0), (1, -1, 0)), "all environments of an episode to explore"),
-        ("start", start(1, (1, -1, -1)), "model indices"),
-        ("start", Frame(RUN, 1, 0, 0.0, np.zeros((2, 2))), "rows of 3"),
+        (
+            "start",
+            start(1, (1, 2, 0.1, 0), (1, -1, 0, 0)),
+            "all environments of an episode to explore",
+        ),
+        ("start", start(1, (1, -1, 0, -1)), "model indices"),
+        ("start", start(1, (1, 2, -0.1, 0)), "variances"),
+        ("start", Frame(RUN, 1, 0, 0.0, np.zeros((2, 2))), "rows of 4"),
         ("policy", Frame(RUN, 1, 0, 0.0, np.zeros((1, 3, 8))), "4 actuators"),
         ("policy", Frame(RUN, 1, 0, 0.0, np.full((1, 4, 8), 1e12)), "at most 1e"),
         ("model", Frame(RUN, 0, 0, 0.0, np.zeros((1, 9, 4))), "leaves"),
@@ -161,7 +177,7 @@ def test_a_policy_that_does_not_fit_the_episode_is_refused_and_a_good_one_serves
     policy = model_rows.unpack(rows[0], 4).policy
     responder.target(TARGET)
     responder.model(Frame(RUN, 0, 0, 0.0, rows))
-    responder.start(start(1, (1, -1, 0)))
+    responder.start(start(1, (1, -1, 0, 0)))
     responder.policy(Frame(RUN, 1, 0, 0.0, np.stack([policy, policy])))
     state = Frame(RUN, 1, 0, 0.0, PLANT.reset(np.array([1])).copy())
     with pytest.raises(FrameError, match="policies for 1 environments, got 2"):

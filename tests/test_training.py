@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bringup.in_process import LocalPair
-from loop_interfaces.topics import COMPLETED
+from loop_interfaces.topics import COMPLETED, StartColumn
 from tests.small import parameters, same_bits, train_here
 from tuner_node import checkpoint
 from tuner_node.build import build_training
@@ -80,7 +80,7 @@ def test_a_bad_warm_start_is_identified_again_and_only_that_one():
     assert [row["accepted"] for row in rows] == [True, False]
     again = training.next_batch()
     assert again.exploratory
-    assert again.rows[:, 2].tolist() == [1.0]
+    assert again.rows[:, StartColumn.MODEL].tolist() == [1.0]
     assert not np.array_equal(again.rows[0, :2], first.rows[1, :2])
     training.finish(pair.run(again))
     assert same_bits(training.models[0], kept)

@@ -33,6 +33,7 @@ def build_training(values: Mapping[str, Any]) -> Training:
         evaluation_fields=values["evaluation_fields"],
         evaluation_seed=values["evaluation_seed"],
         start=values["start"],
+        exploration_variance=values["exploration_variance"],
         identification_attempts=values["identification_attempts"],
     )
     return Training(settings, make_optimizer)

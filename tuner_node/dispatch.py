@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import ModelFailure, Send, Tally
 from loop_interfaces.topics import MODEL, POLICY, START, VOID, CostColumn, StartColumn
-from tuner_node.training import Batch, BatchResult
+from tuner_node.training import UNKNOWN_PLANT, Batch, BatchResult
 
 Array = NDArray[np.float64]
 Order = tuple[int, Send]
@@ -56,7 +56,10 @@ class _Pair:
 
 @dataclass
 class Dispatcher:
-    """Serves one batch at a time. `now` is any monotonic time in s."""
+    """Serves one batch at a time. `now` is any monotonic time in s.
+
+    plant: fingerprint of the plant that this run is about; that of the first cost, if not known.
+    """
 
     run: int
     n_a: int
@@ -68,6 +71,7 @@ class Dispatcher:
     tally: Tally = field(default_factory=Tally)
     notes: list[str] = field(default_factory=list)
     sim_time: float = 0.0
+    plant: int = UNKNOWN_PLANT
     _batch: Batch | None = None
     _chunks: list[_Chunk] = field(default_factory=list)
     _waiting: list[_Chunk] = field(default_factory=list)
@@ -83,6 +87,7 @@ class Dispatcher:
         max_batch: int,
         episode_timeout: float,
         max_attempts: int,
+        plant: int = UNKNOWN_PLANT,
     ) -> Dispatcher:
         return Dispatcher(
             run=run,
@@ -91,6 +96,7 @@ class Dispatcher:
             max_batch=max_batch,
             episode_timeout=episode_timeout,
             max_attempts=max_attempts,
+            plant=plant,
             pairs=[_Pair() for _ in range(pairs)],
         )
 
@@ -133,6 +139,13 @@ class Dispatcher:
             raise FrameError(
                 f"expected costs of shape {(count, len(CostColumn))}, got {frame.values.shape}"
             )
+        if self.plant == UNKNOWN_PLANT:
+            self.plant = frame.plant
+        if frame.plant != self.plant:
+            raise FrameError(
+                f"the cost of episode {frame.episode} comes from a plant with other parameters "
+                f"(fingerprint {frame.plant}) than this run's ({self.plant}); stop that plant"
+            )
         self.sim_time = max(self.sim_time, frame.time)
         known.heard = now
         if (frame.values[:, CostColumn.ENDED] == VOID).any():
@@ -152,6 +165,8 @@ class Dispatcher:
         count = known.chunk.rows.stop - known.chunk.rows.start
         if len(frame.values) != count or not self._batch.exploratory:
             raise FrameError(f"expected {count} models, got {len(frame.values)}")
+        if self.plant not in (UNKNOWN_PLANT, frame.plant):
+            raise FrameError(f"expected a model of plant {self.plant}, got one of {frame.plant}")
         known.heard = now
         known.chunk.models = frame.values.copy()
         self._release_if_done(known)
@@ -190,7 +205,7 @@ class Dispatcher:
         self._batch = None
         costs = np.concatenate([chunk.costs for chunk in self._chunks if chunk.costs is not None])
         models = [chunk.models for chunk in self._chunks if chunk.models is not None]
-        return BatchResult(costs, np.concatenate(models) if models else None)
+        return BatchResult(costs, np.concatenate(models) if models else None, self.plant)
 
     def missing(self) -> list[str]:
         """Who is not on the network, in words, of pairs that have work."""

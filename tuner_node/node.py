@@ -67,6 +67,7 @@ class TunerNode:
             max_batch=values["max_batch"],
             episode_timeout=values["episode_timeout"],
             max_attempts=values["max_attempts"],
+            plant=training.plant,
         )
         self._session = Session(training, dispatcher, self._report)
         self._wire(pairs)

@@ -25,6 +25,8 @@ from tuner_node.optimizers import Optimizer, Rollout, RolloutResult
 from tuner_node.seeds import Purpose, derive
 
 Array = NDArray[np.float64]
+UNKNOWN_PLANT = -1
+"""The plant's fingerprint before the first cost."""
 CONTROLLERS = ("none", "lqt", "adapted")
 """The controllers of the closing evaluation, in the order of its rows."""
 
@@ -33,7 +35,7 @@ CONTROLLERS = ("none", "lqt", "adapted")
 class Batch:
     """Rollouts wanted together; any split into episodes gives the same results.
 
-    rows (R, 3): seed, excitation, model of each (`episode/start`); policies (R, n_a, 2 n_s), or
+    rows (R, 4): the columns of `episode/start`; policies (R, n_a, 2 n_s), or
     None for an exploratory batch, whose result is a model a row instead of a cost.
     """
 
@@ -47,10 +49,15 @@ class Batch:
 
 @dataclass(frozen=True)
 class BatchResult:
-    """costs (R, 3): mean, total, ended of each row; models (R, rows, n_s) after exploration."""
+    """Results of a batch.
+
+    costs (R, 3): mean, total, ended of each row; models (R, rows, n_s) after exploration;
+    plant: fingerprint of the plant.
+    """
 
     costs: Array
     models: Array | None = None
+    plant: int = UNKNOWN_PLANT
 
 
 @dataclass(frozen=True)
@@ -63,6 +70,7 @@ class TrainingSettings:
     evaluation_fields: int
     evaluation_seed: int
     start: str
+    exploration_variance: float
     identification_attempts: int
 
 
@@ -87,6 +95,7 @@ class Training:
     optimizers: list[Optimizer] = field(default_factory=list)
     history: list[dict[str, Any]] = field(default_factory=list)
     evaluation: Array | None = None
+    plant: int = UNKNOWN_PLANT
 
     def __post_init__(self) -> None:
         self.pending = list(range(self.settings.seeds))
@@ -100,6 +109,7 @@ class Training:
                 [
                     derive(seeds[m], Purpose.EXPLORATORY_FIELD, attempts[m]),
                     derive(seeds[m], Purpose.EXCITATION, attempts[m]),
+                    self.settings.exploration_variance,
                     m,
                 ]
                 for m in self.pending
@@ -116,6 +126,7 @@ class Training:
 
     def finish(self, result: BatchResult) -> list[dict[str, Any]]:
         """Take the results of the batch that `next_batch` gave, in its order."""
+        self.plant = result.plant
         if self.phase == "identify":
             assert result.models is not None
             return self._identified(result.models)
@@ -143,6 +154,7 @@ class Training:
         """Everything a checkpoint must hold, as arrays."""
         arrays: dict[str, NDArray[Any]] = {
             "phase": np.array(self.phase),
+            "plant": np.array(self.plant),
             "attempts": np.array(self.attempts),
             "pending": np.array(self.pending, dtype=np.int64),
             "history": np.array(json.dumps(self.history)),
@@ -158,6 +170,7 @@ class Training:
     def restore(self, arrays: dict[str, NDArray[Any]]) -> None:
         """Continue from `state()`."""
         self.phase = str(arrays["phase"])
+        self.plant = int(arrays["plant"])
         self.attempts = arrays["attempts"].tolist()
         self.pending = arrays["pending"].tolist()
         self.models = arrays.get("models")
@@ -308,5 +321,5 @@ class Training:
 def _batch(wanted: Sequence[tuple[int, Rollout]]) -> Batch:
     rows = np.empty((len(wanted), len(StartColumn)))
     for row, (model, rollout) in zip(rows, wanted, strict=True):
-        row[:] = (rollout.field_seed, -1, model)
+        row[:] = (rollout.field_seed, -1, 0.0, model)
     return Batch(rows, np.stack([rollout.policy for _, rollout in wanted]))
