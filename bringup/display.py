@@ -40,7 +40,7 @@ class Display:
             case "checked":
                 verdict = "" if row["accepted"] else "; no better, exploring again"
                 self.line(
-                    f"  seed {row['seed']}: mean field costs {row['none']:.4g} without control, "
+                    f"  seed {row['seed']}: a rollout costs {row['none']:.4g} without control, "
                     f"{row['lqt']:.4g} with LQT{verdict}"
                 )
             case "iteration":

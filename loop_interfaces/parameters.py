@@ -184,8 +184,8 @@ TUNER = (
     Spec(
         "identification_attempts",
         10,
-        "exploratory episodes a seed may use until its LQT law beats no control on the mean "
-        "field; 1: take the first, unchecked, as the paper does",
+        "exploratory episodes a seed may use until its LQT law beats no control on four "
+        "sampled fields; 1: take the first, unchecked, as the paper does",
         1,
         1000,
     ),

@@ -18,6 +18,7 @@ class Purpose(IntEnum):
     EXPLORATORY_FIELD = 1
     EXCITATION = 2
     EVALUATION_FIELD = 3
+    CHECK_FIELD = 4
 
 
 def derive(seed: int, purpose: Purpose, index: int = 0) -> int:

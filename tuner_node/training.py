@@ -1,7 +1,7 @@
 """The training as a state machine: which rollouts it needs next, what it does with their costs.
 
 Phases: identify (one exploratory episode a seed, from which the controller designs the warm start),
-check (a warm start that is no better than no control on the mean field is thrown away, and another
+check (a warm start that is no better than no control on a few fields is thrown away, and another
 exploratory episode is drawn), adapt (the optimiser's iterations), evaluate (no control, LQT and the
 adapted policy on the same sampled fields). Pure: it knows neither topics nor time, so over topics
 and in one process it is the same training, to the bit.
@@ -27,6 +27,8 @@ from tuner_node.seeds import Purpose, derive
 Array = NDArray[np.float64]
 UNKNOWN_PLANT = -1
 """The plant's fingerprint before the first cost."""
+CHECK_FIELDS = 4
+"""Sampled fields on which a warm start must beat no control."""
 CONTROLLERS = ("none", "lqt", "adapted")
 """The controllers of the closing evaluation, in the order of its rows."""
 
@@ -217,23 +219,25 @@ class Training:
     def _check_rollouts(self) -> list[tuple[int, Rollout]]:
         warm = self.warm_starts()
         return [
-            (m, Rollout(policy, -1))
+            (m, Rollout(policy, derive(self._seeds()[m], Purpose.CHECK_FIELD, i)))
             for m in self.pending
             for policy in (np.zeros_like(warm[m]), warm[m])
+            for i in range(CHECK_FIELDS)
         ]
 
     def _checked(self, result: BatchResult) -> list[dict[str, Any]]:
-        costs = result.costs.reshape(len(self.pending), 2, len(CostColumn))
+        costs = result.costs.reshape(len(self.pending), 2, CHECK_FIELDS, len(CostColumn))
         rows, failed = [], []
         for m, (none, lqt) in zip(self.pending, costs, strict=True):
-            completed = lqt[CostColumn.ENDED] == COMPLETED
-            good = bool(completed and lqt[CostColumn.MEAN] < none[CostColumn.MEAN])
+            none_cost, lqt_cost = (c[:, CostColumn.MEAN].mean() for c in (none, lqt))
+            completed = (lqt[:, CostColumn.ENDED] == COMPLETED).all()
+            good = bool(completed and lqt_cost < none_cost)
             rows.append(
                 {
                     "event": "checked",
                     "seed": self._seeds()[m],
-                    "none": float(none[CostColumn.MEAN]),
-                    "lqt": float(lqt[CostColumn.MEAN]),
+                    "none": float(none_cost),
+                    "lqt": float(lqt_cost),
                     "accepted": good,
                 }
             )
