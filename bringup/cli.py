@@ -134,7 +134,7 @@ def _train(options: argparse.Namespace) -> int:
 
 
 def _evaluate(options: argparse.Namespace) -> int:
-    from bringup.evaluation import evaluate, table
+    from bringup.evaluation import as_text, evaluate
 
     spec = _DEFAULTS["evaluation_fields"]
     spec.check(options.fields)
@@ -142,7 +142,7 @@ def _evaluate(options: argparse.Namespace) -> int:
     costs = evaluate(
         options.folder, fields=options.fields, seed=options.seed, mean_field=options.mean_field
     )
-    print(json.dumps(costs) if options.json else table(costs))
+    print(json.dumps(costs) if options.json else as_text(costs))
     return 0
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from bringup.in_process import LocalPair
-from loop_interfaces.parameters import TUNER, check
+from loop_interfaces.parameters import check, table
 from loop_interfaces.topics import CostColumn
 from pde_sim_node.plant import DIVERGED_COST
 from tuner_node.results import RunFolder, RunFolderError
@@ -23,10 +23,10 @@ def evaluate(folder: Path, *, fields: int, seed: int, mean_field: bool) -> dict[
     fields, seed: how many initial fields are drawn, from which seed; mean_field: use the mean of the
     initial distribution instead. Returns {controller: (training seeds, fields) nested lists}.
     """
-    values = {**check(TUNER, {}), **RunFolder(folder).parameters()}
+    values = {**check(table(), {}), **RunFolder(folder).parameters()}
     path = folder / "policy.npz"
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             policies, warm, models = arrays["policy"], arrays["lqt"], arrays["model"]
     except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
         raise RunFolderError(
@@ -49,7 +49,7 @@ def evaluate(folder: Path, *, fields: int, seed: int, mean_field: bool) -> dict[
     return {name: costs[:, i].tolist() for i, name in enumerate(CONTROLLERS)}
 
 
-def table(costs: dict[str, Any]) -> str:
+def as_text(costs: dict[str, Any]) -> str:
     """The costs as text: mean and standard deviation over fields and seeds."""
     lines = [
         f"{'controller':<12}{'mean cost':>12}{'std':>12}{'best':>12}{'worst':>12}{'diverged':>10}"

@@ -16,8 +16,8 @@ from bringup.display import Display, ProgressFile, summary_text
 from bringup.domain import own_domain
 from bringup.in_process import LocalPair, train
 from bringup.supervisor import Child, NodeError, Supervisor, node_command
-from loop_interfaces.parameters import TUNER, check
-from loop_interfaces.problem import load_problem
+from loop_interfaces.parameters import check, table
+from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_equation, build_plant
 from tuner_node.build import build_training
 from tuner_node.record import Recorder
@@ -33,7 +33,7 @@ class Interruption(BaseException):
 
 def resolve(problem: str, options: Mapping[str, Any]) -> dict[str, Any]:
     """The parameters of a new run; ValueError if the problem's plant cannot be built from them."""
-    values = {**load_problem(problem), **check(TUNER, options)}
+    values = load_parameters(problem, options)
     build_plant(values)
     physical = asdict(build_equation(values))
     del physical["length"]
@@ -50,7 +50,7 @@ def run_new(problem: str, options: Mapping[str, Any], out: Path | None, in_proce
 
 def run_again(folder: Path, in_process: bool) -> int:
     """Continue the training in `folder`; returns the exit code."""
-    values = {**check(TUNER, {}), **RunFolder(folder).parameters()}
+    values = {**check(table(), {}), **RunFolder(folder).parameters()}
     if (folder / "result.json").exists():
         raise RunFolderError(f"the run in {folder} is complete; there is nothing to continue")
     return _run(folder, values, in_process)

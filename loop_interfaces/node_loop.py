@@ -37,7 +37,7 @@ HOUSEKEEPING = 0.05
 """Seconds between two rounds of the executor and of the node's slow duties."""
 
 
-class _OutsideExecutor(CallbackGroup):
+class OutsideExecutor(CallbackGroup):
     """Entities of this group are never taken by an executor."""
 
     def can_execute(self, entity: Any) -> bool:
@@ -89,9 +89,9 @@ class _Receiver:
         self.subscription: Subscription = node.create_subscription(
             Float64MultiArray,
             scoped(namespace, topic.name),
-            lambda _: None,  # never called: see _OutsideExecutor
+            lambda _: None,  # never called: see OutsideExecutor
             qos(topic),
-            callback_group=_OutsideExecutor(),
+            callback_group=OutsideExecutor(),
             raw=True,
         )
 

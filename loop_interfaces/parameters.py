@@ -222,16 +222,30 @@ TUNER = (
         choices=("two_point", "directions"),
     ),
     Spec(
+        "recorder",
+        "none",
+        "none: run without one; start: begin when a recorder is ready, go on if it stops; "
+        "required: stop if it stops",
+        choices=("none", "start", "required"),
+    ),
+    Spec(
         "pairs",
         [""],
         "namespaces of the plant and controller pairs that serve this tuner, relative to its own",
     ),
 )
 
+RECORDER = (
+    Spec("bag", "", "new folder of the bag; empty: bags/ and the time"),
+    Spec("bag_storage", "mcap", "format of the bag", choices=("mcap", "sqlite3")),
+    Spec("bag_per_episode", False, "one bag an episode instead of one for all"),
+    Spec("record_clock", True, "record /clock, too"),
+)
+
 
 def table() -> tuple[Spec, ...]:
-    """Every parameter of the three nodes."""
-    return (*PROBLEM, *PLANT, *TUNER)
+    """Every parameter of the nodes."""
+    return (*PROBLEM, *PLANT, *TUNER, *RECORDER)
 
 
 def check_names(names: Iterable[str], known: Iterable[str]) -> None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import sysconfig
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from loop_interfaces.parameters import PROBLEM, ParameterError, check, check_names, read_yaml
+from loop_interfaces.parameters import ParameterError, check, check_names, read_yaml, table
 
 
 def config_folder() -> Path:
@@ -38,26 +39,27 @@ def find_problem(name: str) -> Path:
     )
 
 
-def load_problem(name: str) -> dict[str, Any]:
-    """The checked parameters of a problem, `physical.*` included as given.
+def load_parameters(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """The checked parameters of all nodes: a problem's file, then `options`, then the defaults.
 
-    A relative file of an equation ('file.py:Class') is taken relative to the YAML file.
+    `physical.*` are included as given; a relative file of an equation ('file.py:Class') is taken
+    relative to the YAML file.
     """
     path = find_problem(name)
-    given = read_yaml(path)
-    check_names(given, [spec.name for spec in PROBLEM])
-    return {**resolve(given), "equation": _equation_path(str(given.get("equation", "")), path)}
+    given = {**read_yaml(path), **options}
+    check_names(given, [spec.name for spec in table()])
+    given["equation"] = _equation_path(str(given.get("equation", "")), path)
+    return {**check(table(), given), **_physical(given)}
 
 
-def resolve(given: dict[str, Any]) -> dict[str, Any]:
-    """Checked problem parameters with defaults filled in, and the given `physical.*`."""
+def _physical(given: Mapping[str, Any]) -> dict[str, float]:
     physical: dict[str, float] = {}
     for name, value in given.items():
         if name.startswith("physical."):
             if isinstance(value, bool) or not isinstance(value, (int, float)):
                 raise ParameterError(f"parameter '{name}' is {value!r}; expected a number")
             physical[name] = float(value)
-    return {**check(PROBLEM, given), **physical}
+    return physical
 
 
 def _equation_path(equation: str, yaml_file: Path) -> str:

@@ -1,4 +1,4 @@
-"""Declares the parameters of loop_interfaces.parameters on a node."""
+"""Declares the parameters of loop_interfaces.parameters on a node, and reads another node's."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ from collections.abc import Iterable
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.node import Node
+from rclpy.parameter import parameter_value_to_python
 
 from loop_interfaces.parameters import ParameterError, Spec, check_names, table
 
@@ -55,4 +57,46 @@ def descriptor(spec: Spec) -> ParameterDescriptor:
     return result
 
 
-__all__ = ["ParameterError", "declare", "descriptor", "given_parameters"]
+class RemoteParameters:
+    """Asks another node for its parameters, through the services that every ROS node has.
+
+    name: the node's full name; values: what it said, None before. Call `poll` from time to time.
+
+    The answer also proves that the other process knows every endpoint this node had before: its
+    discovery hears of our endpoints in their order, and it cannot answer before it has heard of the
+    reader of the answer.
+    """
+
+    def __init__(self, node: Node, name: str) -> None:
+        self.values: dict[str, Any] | None = None
+        self._node = node
+        self._list = node.create_client(ListParameters, f"{name}/list_parameters")
+        self._get = node.create_client(GetParameters, f"{name}/get_parameters")
+        self._future: Any = None
+        self._names: list[str] | None = None
+
+    def poll(self) -> None:
+        """Go on with what can be gone on with; never waits."""
+        if self.values is not None:
+            return
+        if self._future is None:
+            if self._names is None and self._list.service_is_ready():
+                self._future = self._list.call_async(ListParameters.Request())
+            elif self._names is not None and self._get.service_is_ready():
+                self._future = self._get.call_async(GetParameters.Request(names=self._names))
+        elif self._future.done():
+            answer, self._future = self._future.result(), None
+            if self._names is None:
+                self._names = list(answer.result.names)
+                return
+            values = [parameter_value_to_python(value) for value in answer.values]
+            self.values = dict(zip(self._names, values, strict=True))
+            self.close()
+
+    def close(self) -> None:
+        """Drop the clients."""
+        for client in (self._list, self._get):
+            self._node.destroy_client(client)
+
+
+__all__ = ["ParameterError", "RemoteParameters", "declare", "descriptor", "given_parameters"]

@@ -66,4 +66,7 @@ ACTION = Topic("action", ("env", "actuator"), latched=False)
 MODEL_FAILED = "model/failed"
 """std_msgs/String, latched: why an identification gave no model (JSON, see docs/interfaces.md)."""
 
+RECORDER_STATUS = "recorder/status"
+"""std_msgs/String, latched: a recorder that is matched with the whole loop says so here (JSON)."""
+
 ARRAYS = (START, STATE, ACTION, POLICY, COST, MODEL_IDENTIFIED, MODEL, TARGET)

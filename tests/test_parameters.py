@@ -14,7 +14,7 @@ from loop_interfaces.parameters import (
     write_yaml,
 )
 from loop_interfaces.parameters import ParameterError as Refused
-from loop_interfaces.problem import load_problem, shipped_problems
+from loop_interfaces.problem import load_parameters, shipped_problems
 from pde_sim_node.build import build_plant
 
 SPECS = {spec.name: spec for spec in table()}
@@ -61,7 +61,7 @@ def test_an_unknown_name_is_refused_with_the_nearest_known_one():
 
 @pytest.mark.parametrize("name", ["burgers", "allen-cahn", "kdv"])
 def test_shipped_problems_load_and_build(name):
-    values = load_problem(name)
+    values = load_parameters(name, {})
     plant = build_plant(values)
     assert plant.n_z == values["n_z"]
     assert plant.supports.shape == (values["n_z"], values["n_a"])
@@ -91,16 +91,18 @@ def test_a_bad_problem_file_is_one_clear_sentence(tmp_path, text, words):
     path = tmp_path / "mine.yaml"
     path.write_text(text)
     with pytest.raises(Refused) as refusal:
-        load_problem(str(path))
+        load_parameters(str(path), {})
     assert words in str(refusal.value)
     assert "\n" not in str(refusal.value)
 
 
 def test_an_unknown_problem_lists_the_known_ones():
     with pytest.raises(Refused, match="'burger'; expected one of allen-cahn, burgers, kdv"):
-        load_problem("burger")
+        load_parameters("burger", {})
 
 
 def test_an_equation_file_is_found_beside_its_yaml(tmp_path):
     (tmp_path / "mine.yaml").write_text("/**: {ros__parameters: {equation: 'heat.py:Heat'}}")
-    assert load_problem(str(tmp_path / "mine.yaml"))["equation"] == f"{tmp_path}/heat.py:Heat"
+    assert (
+        load_parameters(str(tmp_path / "mine.yaml"), {})["equation"] == f"{tmp_path}/heat.py:Heat"
+    )

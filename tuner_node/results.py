@@ -27,11 +27,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.frames import MAX_ID
-from loop_interfaces.parameters import ParameterError, read_yaml, write_yaml
+from loop_interfaces.parameters import PLANT, RECORDER, ParameterError, read_yaml, write_yaml
 from tuner_node import checkpoint
 from tuner_node.training import CONTROLLERS, Training
 
-TRANSIENT = ("out", "resume", "pairs", "max_batch", "episode_timeout", "max_attempts")
+TRANSIENT = (
+    *("out", "resume", "pairs", "max_batch", "episode_timeout", "max_attempts", "recorder"),
+    *(spec.name for spec in (*PLANT, *RECORDER)),
+)
 """Parameters that change how a training is carried out, not what comes out of it."""
 
 
@@ -63,21 +66,24 @@ class RunFolder:
             )
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            kept = {k: v for k, v in parameters.items() if k not in TRANSIENT}
+            kept = {k: v for k, v in parameters.items() if k not in ("out", "resume")}
             write_yaml(self.path / "parameters.yaml", kept, "resolved parameters of this run")
-            return self._identify(RunIdentity(1 + secrets.randbelow(MAX_ID - 1), 0))
+            return self._identify(RunIdentity(1 + secrets.randbelow(MAX_ID - 1), 0), parameters)
         except OSError as error:
             raise RunFolderError(f"cannot write to {self.path}: {error.strerror}") from error
 
     def reopen(self, parameters: Mapping[str, Any]) -> RunIdentity:
         """Continue the training here. RunFolderError if there is none, or with other parameters."""
-        self.check_same(parameters)
+        self.parameters()
         try:
             known = json.loads((self.path / "run.json").read_text())
+            self._check_same(known["parameters"], parameters)
             identity = RunIdentity(int(known["run"]), int(known["incarnation"]) + 1)
             if not (0 < identity.run < MAX_ID and 0 < identity.incarnation < 2**21):
                 raise ValueError("ids out of range")
-            return self._identify(identity)
+            return self._identify(identity, known["parameters"])
+        except RunFolderError:
+            raise
         except (OSError, KeyError, TypeError, ValueError) as error:
             raise RunFolderError(f"{self.path}/run.json cannot be used: {error}") from error
 
@@ -91,13 +97,11 @@ class RunFolder:
         except ParameterError as error:
             raise RunFolderError(str(error)) from error
 
-    def check_same(self, parameters: Mapping[str, Any]) -> None:
-        """RunFolderError showing every difference between `parameters` and this folder's."""
-        known = self.parameters()
-        now = {k: v for k, v in parameters.items() if k not in TRANSIENT}
+    def _check_same(self, known: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+        """RunFolderError showing every difference that would change the results."""
         changes = [
             f"{name}: {known.get(name)!r} there, {now.get(name)!r} now"
-            for name in sorted({*known, *now})
+            for name in sorted({*known, *now} - set(TRANSIENT))
             if known.get(name) != now.get(name)
         ]
         if changes:
@@ -121,8 +125,12 @@ class RunFolder:
         checkpoint.write_atomically(self.path / "result.json", text.encode())
         return summary
 
-    def _identify(self, identity: RunIdentity) -> RunIdentity:
-        content = {"run": identity.run, "incarnation": identity.incarnation}
+    def _identify(self, identity: RunIdentity, parameters: Mapping[str, Any]) -> RunIdentity:
+        content = {
+            "run": identity.run,
+            "incarnation": identity.incarnation,
+            "parameters": {k: v for k, v in parameters.items() if k not in TRANSIENT},
+        }
         checkpoint.write_atomically(self.path / "run.json", json.dumps(content).encode())
         return identity
 

@@ -1,0 +1,131 @@
+"""The command line: every error is one clear line and a non-zero exit, and nothing is half-done."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bringup.cli import main
+from tests.small import SMALL, parameters, same_bits, train_here
+from tuner_node import checkpoint
+
+
+def error_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """The one line on stderr of a command that must fail."""
+    assert main(arguments) == 1
+    captured = capsys.readouterr()
+    (line,) = captured.err.strip().splitlines()
+    assert line.startswith("pdeloop: ")
+    return line
+
+
+def train(out: Path, *more: str, problem: Path = SMALL) -> int:
+    return main(
+        ["train", str(problem), "--in-process", "--iterations", "2", "--out", str(out), *more]
+    )
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("n_z: 32", "n_z: 33", "'n_z' is 33; expected an even whole number"),
+        ("integration_time: 0.005", "integration_time: 0.003", "whole multiple"),
+        ("actuator_width: 0.2", "actuator_width: 0.3", "must not exceed 1"),
+        ("equation: burgers", "equation: stokes", "stokes"),
+        ("viscosity: 1.0e-2", "viscosity: -1.0", "viscosity"),
+        ("viscosity: 1.0e-2", "density: 1.0", "unknown parameter 'physical.density'"),
+        ("dmdc_rank: 8", "dmdc_rank: 36", "p must be at most"),
+        ("horizon: 30", "horizon: 0", "'horizon' is 0; expected"),
+        ("n_a: 4", "n_aa: 4", "did you mean 'n_a'"),
+    ],
+)
+def test_a_bad_problem_is_refused(tmp_path, capsys, old, new, words):
+    path = tmp_path / "bad.yaml"
+    assert old in SMALL.read_text()
+    path.write_text(SMALL.read_text().replace(old, new))
+    assert words in error_of(
+        capsys, "train", str(path), "--in-process", "--out", str(tmp_path / "o")
+    )
+    assert not (tmp_path / "o" / "result.json").exists()
+
+
+def test_unknown_problems_and_missing_arguments_say_what_is_expected(tmp_path, capsys):
+    assert "unknown problem 'stokes'; expected one of" in error_of(capsys, "train", "stokes")
+    assert "no problem given" in error_of(capsys, "train")
+    assert "no problem file at" in error_of(capsys, "train", str(tmp_path / "no.yaml"))
+    assert "'iterations' is 0" in error_of(capsys, "train", "burgers", "--iterations", "0")
+    assert "no run in" in error_of(capsys, "evaluate", str(tmp_path))
+    assert "no run in" in error_of(capsys, "train", "--resume", str(tmp_path))
+    with pytest.raises(SystemExit) as usage:
+        main(["train", "burgers", "--start", "lqg"])
+    assert usage.value.code == 2
+
+
+def test_a_folder_that_holds_a_run_is_left_as_it_was(tmp_path, capsys):
+    out = tmp_path / "run"
+    assert train(out) == 0
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    capsys.readouterr()
+    line = error_of(capsys, "train", str(SMALL), "--in-process", "--out", str(out))
+    assert f"{out} already holds a run" in line
+    assert "is complete" in error_of(capsys, "train", "--resume", str(out))
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+
+
+def test_an_unwritable_folder_is_refused(tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    line = error_of(capsys, "train", str(SMALL), "--out", str(tmp_path / "file" / "run"))
+    assert "cannot write to" in line
+
+
+def test_the_result_folder_reproduces_the_run(tmp_path, capsys):
+    out = tmp_path / "run"
+    assert train(out, "--seeds", "2", "--start", "zero") == 0
+    assert f"results in {out}" in capsys.readouterr().out
+    expected = train_here(parameters(seeds=2, iterations=2, start="zero"))
+    with np.load(out / "policy.npz", allow_pickle=False) as arrays:
+        assert same_bits(arrays["policy"], expected.policies())
+    result = json.loads((out / "result.json").read_text())
+    assert len(result["history"]) == 4
+    again = tmp_path / "again"
+    assert main(["train", str(out / "parameters.yaml"), "--in-process", "--out", str(again)]) == 0
+    assert (again / "policy.npz").read_bytes() == (out / "policy.npz").read_bytes()
+    capsys.readouterr()
+    assert main(["evaluate", str(out), "--json"]) == 0
+    costs = json.loads(capsys.readouterr().out)
+    assert costs["adapted"] == result["costs_by_field"]["adapted"]
+    assert main(["evaluate", str(out), "--mean-field"]) == 0
+    assert "adapted" in capsys.readouterr().out
+
+
+def test_resuming_with_changed_parameters_shows_the_difference(tmp_path, capsys):
+    out = tmp_path / "run"
+    assert train(out) == 0
+    (out / "result.json").unlink()
+    text = (out / "parameters.yaml").read_text()
+    assert main(["train", "--resume", str(out), "--in-process"]) == 0
+    (out / "result.json").unlink()
+    (out / "parameters.yaml").write_text(text.replace("seed: 0", "seed: 5", 1))
+    line = error_of(capsys, "train", "--resume", str(out), "--in-process")
+    assert "has other parameters (seed: 0 there, 5 now)" in line
+
+
+def test_damaged_run_files_are_one_clear_line(tmp_path, capsys):
+    out = tmp_path / "run"
+    assert train(out) == 0
+    (out / "result.json").unlink()
+    for path in (out / "checkpoint", checkpoint.previous(out / "checkpoint")):
+        path.write_bytes(path.read_bytes()[:-20])
+    capsys.readouterr()
+    assert "no usable checkpoint" in error_of(capsys, "train", "--resume", str(out), "--in-process")
+    (out / "policy.npz").write_bytes(b"PK\3\4nonsense")
+    assert "policy.npz cannot be read" in error_of(capsys, "evaluate", str(out))
+
+
+def test_problems_lists_the_shipped_ones(capsys):
+    assert main(["problems"]) == 0
+    text = capsys.readouterr().out
+    assert all(name in text for name in ("burgers", "allen-cahn", "kdv"))
