@@ -19,6 +19,7 @@ Proctor, Brunton, Kutz, "Dynamic Mode Decomposition with Control", SIAM J. Appl.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
 from threadpoolctl import threadpool_limits
 
-__all__ = ["ReducedModel", "identify"]
+__all__ = ["ReducedModel", "identify", "identify_from"]
 
 Array = NDArray[np.float64]
 
@@ -107,14 +108,30 @@ def identify(states: ArrayLike, actions: ArrayLike, *, p: int, n_s: int) -> Redu
         Shapes that do not fit, NaN or infinity, or more directions asked for than the trajectory
         holds.
     """
-    z, a = _matrix("states", states), _matrix("actions", actions)
+    return identify_from([(states, actions)], p=p, n_s=n_s)
+
+
+def identify_from(
+    trajectories: Sequence[tuple[ArrayLike, ArrayLike]], *, p: int, n_s: int
+) -> ReducedModel:
+    """Identify a reduced model from several trajectories (states, actions) of one plant.
+
+    As `identify`, with the steps of all trajectories as columns beside each other.
+    """
+    befores, afters, inputs = [], [], []
+    for states, actions in trajectories:
+        z, own = _matrix("states", states), _matrix("actions", actions)
+        if z.shape[0] != len(own) + 1:
+            raise ValueError(
+                f"{len(own)} actions belong to {len(own) + 1} states, but {z.shape[0]} states were "
+                "given; pass the states from before the first action to after the last."
+            )
+        befores.append(z[:-1])
+        afters.append(z[1:])
+        inputs.append(own)
+    before, following, a = (np.concatenate(parts) for parts in (befores, afters, inputs))
     steps, n_a = a.shape
-    n_z = z.shape[1]
-    if z.shape[0] != steps + 1:
-        raise ValueError(
-            f"{steps} actions belong to {steps + 1} states, but {z.shape[0]} states were given; "
-            "pass the states from before the first action to after the last."
-        )
+    n_z = before.shape[1]
     if n_s < 1 or p < 1:
         raise ValueError(f"p and n_s must be at least 1, but p is {p} and n_s is {n_s}.")
     largest = min(n_z + n_a, steps)
@@ -131,8 +148,8 @@ def identify(states: ArrayLike, actions: ArrayLike, *, p: int, n_s: int) -> Redu
 
     # One thread: a threaded LAPACK rounds differently for another number of threads.
     with threadpool_limits(limits=1):
-        after = z[1:].T
-        psi, xi, lam_t = linalg.svd(np.vstack([z[:-1].T, a.T]), full_matrices=False)
+        after = following.T
+        psi, xi, lam_t = linalg.svd(np.vstack([before.T, a.T]), full_matrices=False)
         rank = _numerical_rank(xi, n_z + n_a, steps)
         if p > rank:
             raise ValueError(

@@ -4,12 +4,12 @@ Every equation has the form, on the periodic interval [0, L) and in Fourier spac
 
     d/dt F[u](k) = L(k) F[u](k) + m(k) F[g(u)](k) + F[sum_j Phi_j a_j](k)
 
-with F the Fourier transform in x, ``L`` the stiff linear operator (integrated exactly), ``g`` a pointwise nonlinear
-function (evaluated on a dealiased grid), ``m`` a multiplier that carries derivatives and constants, and the last term
-the forcing through the actuators' supports.
+with F the Fourier transform in x, ``L`` the stiff linear operator (integrated exactly), ``g`` a
+pointwise nonlinear function (evaluated on a dealiased grid), ``m`` a multiplier that carries
+derivatives and constants, and the last term the forcing through the actuators' supports.
 
-Adding a PDE is adding one class like those below, here or in a file of your own, and naming that class
-``path/to/file.py:ClassName`` where the name of an equation is expected (see `load_equation`).
+Adding a PDE is adding one class like those below, here or in a file of your own, and naming that
+class ``path/to/file.py:ClassName`` where the name of an equation is expected (see `load_equation`).
 """
 
 import hashlib
@@ -40,13 +40,13 @@ __all__ = [
 ]
 
 Field = NDArray[np.float64]
-Spectrum = NDArray[np.float64] | NDArray[np.complex128]
+Spectrum = NDArray[np.inexact[Any]]
 
 
 def parameter(
     default: float, description: str, minimum: float, maximum: float, unit: str = "1"
 ) -> Any:
-    """Declare one parameter of an equation: a dataclass field with its range (ends included) and unit."""
+    """Declare one parameter: a dataclass field with its range (ends included) and unit."""
     return field(
         default=default,
         metadata={
@@ -62,13 +62,15 @@ def parameter(
 class Equation(ABC):
     """A PDE on [0, L), split into a linear and a nonlinear part.
 
-    The dataclass fields are the parameters a user may set; each carries ``description``, ``minimum``, ``maximum`` and
-    ``unit`` in its metadata (see `parameter`) and is checked on construction.
+    The dataclass fields are the parameters a user may set; each carries ``description``,
+    ``minimum``, ``maximum`` and ``unit`` in its metadata (see `parameter`) and is checked on
+    construction.
 
     Raises
     ------
     ValueError
-        A parameter is not a finite number, lies outside its range, or a ``..._min`` exceeds its ``..._max``.
+        A parameter is not a finite number, lies outside its range, or a ``..._min`` exceeds its
+        ``..._max``.
     """
 
     name: ClassVar[str]
@@ -81,14 +83,16 @@ class Equation(ABC):
     def __post_init__(self) -> None:
         values: dict[str, float] = {}
         for item in fields(self):
-            value, low, high = getattr(self, item.name), item.metadata["minimum"], item.metadata["maximum"]
+            value = getattr(self, item.name)
+            low = item.metadata.get("minimum", -math.inf)
+            high = item.metadata.get("maximum", math.inf)
             if isinstance(value, bool) or not isinstance(value, int | float | np.number):
                 raise ValueError(f"{item.name} of {self.name} must be a number, got {value!r}")
-            if not low <= value <= high:
+            if not (low <= value <= high and math.isfinite(value)):
                 raise ValueError(
                     f"{item.name} of {self.name} must lie between {low:g} and {high:g}, got {value!r}"
                 )
-            values[item.name] = value
+            values[item.name] = float(value)
         for lower, value in values.items():
             upper = lower.removesuffix("_min") + "_max"
             if lower.endswith("_min") and upper in values and value > values[upper]:
@@ -118,7 +122,7 @@ class Equation(ABC):
     @staticmethod
     @abstractmethod
     def nonlinearity(u: float) -> float:
-        """g(u) at one grid point: a scalar function that Numba can compile, without parameters of its own."""
+        """g(u) at one grid point: a function of u alone that Numba can compile."""
 
     @abstractmethod
     def initial_field(self, x: Field, rng: np.random.Generator | None) -> Field:
@@ -148,7 +152,7 @@ def draw(rng: np.random.Generator | None, low: float, high: float) -> float:
 
 def sech(y: Field) -> Field:
     """1/cosh(y), without overflow for large arguments."""
-    decay = np.exp(-np.abs(y))
+    decay: Field = np.exp(-np.abs(y))
     return 2 * decay / (1 + decay * decay)
 
 
@@ -156,8 +160,10 @@ def sech(y: Field) -> Field:
 class Burgers(Equation):
     """Viscous Burgers equation, u_t + u u_x - nu u_xx = a.
 
-    Split as L = -nu k^2, g(u) = u^2, m = -i k/2. Initial field A sech((x - L/2)/b), target A_r cos(2 pi x/L).
-    Shocks form at time ~ 1/max|u_x| and have width ~ nu; below about 3 grid points per width the field oscillates.
+    Split as L = -nu k^2, g(u) = u^2, m = -i k/2. Initial field A sech((x - L/2)/b), target
+    A_r cos(2 pi x/L).
+    Shocks form at time ~ 1/max|u_x| and have width ~ nu; below about 3 grid points per width the
+    field oscillates.
 
     Source: arXiv:2403.01005, problem 1.
     """
@@ -200,8 +206,9 @@ class Burgers(Equation):
 class AllenCahn(Equation):
     """Allen-Cahn equation, u_t - nu^2 u_xx + V (u^3 - u) = a.
 
-    Split as L = V - nu^2 k^2, g(u) = u^3, m = -V. Initial field c + (x - L/2)^2 cos(2 pi (x - L/2)/L), target
-    -A_r cos(2 pi x/L). Unforced fields settle at the stable states -1 and +1 with fronts of width ~ nu/sqrt(V).
+    Split as L = V - nu^2 k^2, g(u) = u^3, m = -V. Initial field c + (x - L/2)^2 cos(2 pi (x -
+    L/2)/L), target -A_r cos(2 pi x/L). Unforced fields settle at the stable states -1 and +1 with
+    fronts of width ~ nu/sqrt(V).
 
     Source: arXiv:2403.01005, problem 2.
     """
@@ -239,8 +246,9 @@ class AllenCahn(Equation):
 class KortewegDeVries(Equation):
     """Korteweg-de Vries equation, u_t + u_xxx - 6 u u_x = a.
 
-    Split as L = i k^3, g(u) = u^2, m = 3 i k. The initial field -(alpha/2) sech^2(sqrt(alpha)/2 (x - L/2)) is, on a
-    long domain, the exact soliton moving with speed alpha to +x. Target A_r sin(2 pi x/L).
+    Split as L = i k^3, g(u) = u^2, m = 3 i k. The initial field -(alpha/2) sech^2(sqrt(alpha)/2
+    (x - L/2)) is, on a long domain, the exact soliton moving with speed alpha to +x. Target
+    A_r sin(2 pi x/L).
 
     Source: arXiv:2403.01005, problem 3.
     """
@@ -249,7 +257,9 @@ class KortewegDeVries(Equation):
     order: ClassVar[float] = 3.0
 
     length: float = parameter(20.0, "length L of the periodic domain", 1e-3, 1e6, "length")
-    alpha_min: float = parameter(1.0, "smallest speed alpha of the soliton", 0.0, 1e2, "length/time")
+    alpha_min: float = parameter(
+        1.0, "smallest speed alpha of the soliton", 0.0, 1e2, "length/time"
+    )
     alpha_max: float = parameter(3.0, "largest speed alpha of the soliton", 0.0, 1e2, "length/time")
     target_amplitude: float = parameter(1.0, "amplitude A_r of the target", -1e2, 1e2)
 
@@ -317,28 +327,28 @@ def load_module(dotted: str) -> ModuleType:
     try:
         return importlib.import_module(dotted)
     except Exception as error:
-        raise ValueError(f"the module {dotted!r} of an equation cannot be imported: {error}") from error
+        raise ValueError(f"the equation module {dotted!r} cannot be imported: {error}") from error
 
 
 def load_file(path: Path) -> ModuleType:
     """Execute a file as a module, once for each content: an edited file is a new module."""
     if not path.is_file():
-        raise ValueError(f"the file {str(path)!r} of an equation does not exist")
+        raise ValueError(f"the equation file {str(path)!r} does not exist")
     path = path.resolve()
-    # Numba keys its cache by the module's name: a name made of path and content is the same in the next process, and
-    # another one after an edit.
+    # Numba keys its cache by the module's name: a name made of path and content is the same in the
+    # next process, and another one after an edit.
     digest = hashlib.sha256(str(path).encode() + b"\0" + path.read_bytes()).hexdigest()[:16]
     module_name = f"equation_{path.stem}_{digest}"
     if module_name in sys.modules:
         return sys.modules[module_name]
     spec = importlib.util.spec_from_file_location(module_name, path)
     if spec is None or spec.loader is None:
-        raise ValueError(f"the file {str(path)!r} of an equation cannot be read as Python")
+        raise ValueError(f"the equation file {str(path)!r} cannot be read as Python")
     module = importlib.util.module_from_spec(spec)
     sys.modules[module_name] = module
     try:
         spec.loader.exec_module(module)
     except Exception as error:
         del sys.modules[module_name]
-        raise ValueError(f"the file {str(path)!r} of an equation cannot be executed: {error}") from error
+        raise ValueError(f"the equation file {str(path)!r} cannot be executed: {error}") from error
     return module

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .equations import Equation
-from .etdrk4 import Integrator
+from .integrator import Integrator
+from .kernel import all_finite
 from .supports import indicator_supports
 
 __all__ = ["DIVERGED_COST", "MEAN_FIELD", "EpisodeCosts", "Plant"]
@@ -41,9 +42,10 @@ class EpisodeCosts:
 class Plant:
     """M environments of one equation, advanced in lock-step.
 
-    u_t = F(u, u_x, ...) + sum_j Phi_j(x) a_j(t) on the grid x_i = i L / n_z, with the action held over a sampling
-    time: z_{k+1} = f(z_k, a_k). The result for an environment is the same to the last bit whatever the number of
-    environments, its place among them, the threads and the process.
+    u_t = F(u, u_x, ...) + sum_j Phi_j(x) a_j(t) on the grid x_i = i L / n_z, with the action held
+    over a sampling time: z_{k+1} = f(z_k, a_k), pseudo-spectral in space and ETDRK4 in time. The
+    result for an environment is the same to the last bit whatever the number of environments, its
+    place among them, the threads and the process. One thread may use a plant at a time.
 
     Parameters
     ----------
@@ -64,7 +66,8 @@ class Plant:
     state_weight, action_weight
         Q = state_weight I and R = action_weight I of the stage cost (z - z_r)'Q(z - z_r) + a'R a.
     divergence_bound
-        An environment whose new state is not finite or exceeds this magnitude anywhere has diverged.
+        An environment whose new state is not finite or exceeds this magnitude anywhere has
+        diverged.
 
     Attributes
     ----------
@@ -97,7 +100,8 @@ class Plant:
         action_weight: float,
         divergence_bound: float = 1e3,
     ) -> None:
-        self.n_z, self.n_a, self.horizon = whole("n_z", n_z, 8), whole("n_a", n_a, 1), whole("horizon", horizon, 1)
+        self.n_z, self.n_a = whole("n_z", n_z, 8), whole("n_a", n_a, 1)
+        self.horizon = whole("horizon", horizon, 1)
         if n_z % 2:
             raise ValueError(f"n_z must be even, got {n_z}: take {n_z + 1}")
         self.equation = equation
@@ -111,17 +115,21 @@ class Plant:
         self.target = checked_field("target", equation.target(self.x), n_z)
         self._integrator = Integrator(
             equation,
-            n_z=n_z,
             supports=self.supports,
-            integration_time=integration_time,
-            steps=internal_steps(sample_time, integration_time),
+            target=self.target,
+            integration_time=self.integration_time,
+            steps=internal_steps(self.sample_time, self.integration_time),
+            state_weight=self.state_weight,
+            action_weight=self.action_weight,
+            bound=self.divergence_bound,
         )
-        self.compiled_in_seconds = 0.0
+        self.compiled_in_seconds = self._integrator.compiled_in_seconds
         self._allocate(0)
 
     def _allocate(self, batch: int) -> None:
         self.batch, self.step_index = batch, 0
         self.states = np.zeros((batch, self.n_z))
+        self._actions = np.zeros((batch, self.n_a))
         self._total = np.zeros(batch)
         self._diverged_step = np.full(batch, -1, dtype=np.int64)
 
@@ -131,8 +139,8 @@ class Plant:
         Parameters
         ----------
         seeds : (M,) int
-            One seed for each environment: 0 or more draws the initial field from its distribution, equal seeds
-            giving equal fields; -1 is the mean field.
+            One seed for each environment: 0 or more draws the initial field from its distribution,
+            equal seeds giving equal fields; -1 is the mean field.
 
         Returns
         -------
@@ -151,7 +159,9 @@ class Plant:
                 f"got shape {seeds.shape} of {seeds.dtype}"
             )
         if seeds.min() < MEAN_FIELD:
-            raise ValueError(f"seeds must be 0 or more, or -1 for the mean field, got {seeds.min()}")
+            raise ValueError(
+                f"seeds must be 0 or more, or -1 for the mean field, got {seeds.min()}"
+            )
         drawn = [self._initial_field(int(seed)) for seed in seeds]
         if self.batch != seeds.size:
             self._allocate(seeds.size)
@@ -190,37 +200,53 @@ class Plant:
             raise RuntimeError("no episode has begun: call reset(seeds) before step(actions)")
         if self.step_index >= self.horizon:
             raise RuntimeError(f"the episode is over after {self.horizon} steps: call reset(seeds)")
-        actions = np.asarray(actions, dtype=np.float64)
-        if actions.shape != (self.batch, self.n_a):
-            raise ValueError(f"actions must have shape {(self.batch, self.n_a)}, got {actions.shape}")
-        if not np.isfinite(actions).all():
-            raise ValueError("actions must be finite, got NaN or infinity")
-        costs = self.stage_costs(self.states, actions)
-        new = self.f(self.states, actions)
-        for i in range(self.batch):
-            if self._diverged_step[i] < 0:
-                self._total[i] += costs[i]
-                if np.all(np.abs(new[i]) <= self.divergence_bound) and np.isfinite(self._total[i]):
-                    self.states[i] = new[i]
-                else:
-                    self._diverged_step[i] = self.step_index
+        self._hold(actions)
+        self._integrator.step(
+            self.states, self._actions, self._total, self._diverged_step, self.step_index
+        )
         self.step_index += 1
         return self.states
 
-    def f(self, states: NDArray[np.float64], actions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """z_{k+1} of the states (M, n_z) under the actions (M, n_a): a pure function, whatever the episode does."""
-        return self._integrator.advance(states, actions)
-
-    def stage_costs(self, states: NDArray[np.float64], actions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """l_k of the states (M, n_z) and the actions (M, n_a): (M,)."""
-        with np.errstate(all="ignore"):
-            return np.array(
-                [
-                    self.state_weight * float(np.sum((z - self.target) ** 2))
-                    + self.action_weight * float(np.sum(a**2))
-                    for z, a in zip(states, actions, strict=True)
-                ]
+    def _hold(self, actions: NDArray[np.float64]) -> None:
+        if np.shape(actions) != (self.batch, self.n_a):
+            raise ValueError(
+                f"actions must have shape {(self.batch, self.n_a)}, got {np.shape(actions)}"
             )
+        self._actions[:] = actions
+        if not all_finite(self._actions):
+            raise ValueError("actions must be finite, got NaN or infinity")
+
+    def evaluate(
+        self, states: NDArray[np.float64], actions: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """z_{k+1} = f(z_k, a_k) and l_k of any states and actions, whatever the episode does.
+
+        The same arithmetic as `step`, to the last bit, so that a recorded trajectory can be
+        verified sample by sample. A state whose successor would have diverged is returned as it is.
+
+        Parameters
+        ----------
+        states : (M, n_z)
+            z_k.
+        actions : (M, n_a)
+            a_k.
+
+        Returns
+        -------
+        (M, n_z), (M,)
+            New arrays: the states z_{k+1} and the stage costs l_k.
+        """
+        new = np.array(states, dtype=np.float64, order="C")
+        held = np.array(actions, dtype=np.float64, order="C")
+        batch = len(new)
+        if new.shape != (batch, self.n_z) or held.shape != (batch, self.n_a):
+            raise ValueError(
+                f"states and actions must have shapes (M, {self.n_z}) and (M, {self.n_a}), "
+                f"got {new.shape} and {held.shape}"
+            )
+        costs, diverged_step = np.zeros(batch), np.full(batch, -1, dtype=np.int64)
+        self._integrator.step(new, held, costs, diverged_step, 0)
+        return new, costs
 
     def episode_costs(self) -> EpisodeCosts:
         """The costs of the episode so far."""
@@ -247,7 +273,7 @@ def positive(name: str, value: float) -> float:
 
 
 def internal_steps(sample_time: float, integration_time: float) -> int:
-    """How many internal steps make a sampling time; rounded, as 0.01 // 0.00001 is 999 in floating point."""
+    """Internal steps of a sampling time; by rounding, as 0.01 // 0.00001 is 999."""
     ratio = sample_time / integration_time
     steps = round(ratio)
     if steps < 1 or abs(ratio - steps) > 1e-9 * ratio:

@@ -9,8 +9,8 @@ __all__ = ["indicator_supports"]
 def indicator_supports(n_z: int, n_a: int, width: float) -> NDArray[np.float64]:
     """Phi_j(x_i) of n_a equally spaced actuators, (n_z, n_a), entries 0 or 1.
 
-    With w = width n_z and s = n_z // n_a, support j is 1 on the grid indices int(c - w/2) <= i < int(c + w/2) around
-    its centre c = int((j + 0.5) s), which is the convention of controlgym.
+    With w = width n_z and s = n_z // n_a, support j is 1 on the grid indices
+    int(c - w/2) <= i < int(c + w/2) around its centre c = int((j + 0.5) s): controlgym's convention.
 
     Parameters
     ----------
@@ -24,7 +24,8 @@ def indicator_supports(n_z: int, n_a: int, width: float) -> NDArray[np.float64]:
     Raises
     ------
     ValueError
-        The supports would together be wider than the domain, one holds no grid point, or one leaves the grid.
+        The supports would together be wider than the domain, one holds no grid point, or one leaves
+        the grid.
     """
     if not width > 0:
         raise ValueError(f"width must be positive, got {width!r}")
@@ -42,8 +43,9 @@ def indicator_supports(n_z: int, n_a: int, width: float) -> NDArray[np.float64]:
         left, right = int(centre - half), int(centre + half)
         if not 0 <= left < right <= n_z:
             raise ValueError(
-                f"width {width:g} gives actuator {j} no grid point of its own at n_z = {n_z} and n_a = {n_a}: "
-                f"take a width between {2 / n_z:g} and {1 / n_a:g}"
+                f"width {width:g} gives actuator {j} no grid point of its own "
+                f"at n_z = {n_z} and n_a = {n_a}: "
+                "take fewer actuators or more grid points"
             )
         supports[left:right, j] = 1.0
     return supports

@@ -1,0 +1,194 @@
+"""The equations: parameters, fields, operators, and equations from elsewhere."""
+
+import sys
+from dataclasses import FrozenInstanceError, fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pde_sim_node.equations import (
+    EQUATIONS,
+    AllenCahn,
+    Burgers,
+    Equation,
+    KortewegDeVries,
+    load_equation,
+)
+
+ALL = pytest.mark.parametrize("kind", EQUATIONS.values(), ids=EQUATIONS.keys())
+
+
+def grid(equation: Equation, n_z: int = 128) -> np.ndarray:
+    return equation.length * np.arange(n_z) / n_z
+
+
+@ALL
+def test_every_parameter_is_described_and_its_default_in_range(kind: type[Equation]) -> None:
+    for item in fields(kind):
+        assert item.metadata["description"]
+        assert item.metadata["unit"]
+        assert item.metadata["minimum"] <= item.default <= item.metadata["maximum"]
+    with pytest.raises(FrozenInstanceError):
+        kind().length = 2.0
+
+
+@ALL
+def test_a_mean_field_and_seeded_fields(kind: type[Equation]) -> None:
+    equation = kind()
+    x = grid(equation)
+    mean = equation.initial_field(x, None)
+    assert mean.shape == x.shape
+    assert equation.target(x).shape == x.shape
+    one, same, other = (equation.initial_field(x, np.random.default_rng(s)) for s in (1, 1, 2))
+    assert np.array_equal(one, same)
+    assert not np.array_equal(one, other)
+    assert not np.array_equal(one, mean)
+
+
+def test_initial_fields_and_targets_are_those_of_the_method() -> None:
+    x = grid(Burgers())
+    np.testing.assert_allclose(Burgers().initial_field(x, None), 1 / np.cosh((x - 0.5) / 0.05))
+    np.testing.assert_allclose(Burgers().target(x), 0.1 * np.cos(2 * np.pi * x))
+    x = grid(AllenCahn())
+    mean = (x - 1) ** 2 * np.cos(np.pi * (x - 1))
+    np.testing.assert_allclose(AllenCahn().initial_field(x, None), mean, atol=1e-15)
+    np.testing.assert_allclose(AllenCahn().target(x), -np.cos(np.pi * x))
+    x = grid(KortewegDeVries())
+    soliton = -1 / np.cosh(np.sqrt(2) / 2 * (x - 10)) ** 2
+    np.testing.assert_allclose(KortewegDeVries().initial_field(x, None), soliton, rtol=1e-12)
+    np.testing.assert_allclose(KortewegDeVries().target(x), np.sin(np.pi * x / 10))
+
+
+def test_random_parameters_stay_in_their_ranges() -> None:
+    x = np.array([1.0])  # where Allen-Cahn's field is its offset
+    offsets = [AllenCahn().initial_field(x, np.random.default_rng(s))[0] for s in range(200)]
+    assert -0.1 <= min(offsets) < -0.08
+    assert 0.08 < max(offsets) <= 0.1
+
+
+def test_a_wide_domain_does_not_overflow() -> None:
+    field = Burgers(length=1e4).initial_field(np.linspace(0, 1e4, 64), None)
+    assert np.isfinite(field).all()
+
+
+@ALL
+def test_the_operators_give_the_time_derivative(kind: type[Equation]) -> None:
+    """L, m and g together are the right-hand side, worked out by hand for u = 0.3 + sin(2 pi x/L)."""
+    equation = kind()
+    n_z, w = 64, 2 * np.pi / equation.length
+    x = grid(equation, n_z)
+    u, u_x = 0.3 + np.sin(w * x), w * np.cos(w * x)
+    k = w * np.arange(n_z // 2 + 1)
+    g = np.array([equation.nonlinearity(value) for value in u])
+    got = np.fft.irfft(
+        equation.linear_operator(k) * np.fft.rfft(u) + equation.multiplier(k) * np.fft.rfft(g)
+    )
+    if isinstance(equation, Burgers):
+        expected = -u * u_x - equation.viscosity * w**2 * np.sin(w * x)
+    elif isinstance(equation, AllenCahn):
+        expected = -(equation.diffusivity**2) * w**2 * np.sin(w * x) - equation.potential * (
+            u**3 - u
+        )
+    else:
+        expected = w**3 * np.cos(w * x) + 6 * u * u_x
+    np.testing.assert_allclose(got, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"viscosity": -1.0}, "viscosity of burgers must lie between 0 and 1000, got -1.0"),
+        ({"viscosity": float("nan")}, "viscosity of burgers must lie between"),
+        ({"length": float("inf")}, "length of burgers must lie between"),
+        ({"length": 0.0}, "length of burgers must lie between"),
+        ({"viscosity": "high"}, "viscosity of burgers must be a number, got 'high'"),
+        ({"amplitude_min": 2.0}, "amplitude_min of burgers must not exceed amplitude_max"),
+    ],
+)
+def test_a_parameter_out_of_range_is_refused(values: dict, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        Burgers(**values)
+
+
+HEAT = """
+from dataclasses import dataclass
+import numpy as np
+from pde_sim_node.equations import Equation, parameter
+
+@dataclass(frozen=True, kw_only=True)
+class Heat(Equation):
+    name = "heat"
+    order = 2.0
+    conductivity: float = parameter(0.1, "conductivity", 0.0, 10.0)
+
+    def linear_operator(self, k):
+        return -self.conductivity * k**2
+
+    def multiplier(self, k):
+        return np.ones_like(k)
+
+    @staticmethod
+    def nonlinearity(u):
+        return 0.0 * u
+
+    def initial_field(self, x, rng):
+        return np.sin(2 * np.pi * x / self.length)
+
+    def target(self, x):
+        return np.zeros_like(x)
+
+class Unfinished(Equation):
+    pass
+
+NUMBER = 3
+"""
+
+
+@pytest.fixture
+def heat(tmp_path: Path) -> Path:
+    path = tmp_path / "heat.py"
+    path.write_text(HEAT)
+    return path
+
+
+def test_an_equation_is_found_by_name_file_or_module(
+    heat: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert load_equation("kdv") is KortewegDeVries
+    assert load_equation("pde_sim_node.equations:Burgers") is Burgers
+    kind = load_equation(f"{heat}:Heat")
+    assert issubclass(kind, Equation)
+    assert kind.name == "heat"
+    assert load_equation(f"{heat}:Heat") is kind
+    monkeypatch.chdir(heat.parent)
+    assert load_equation("heat.py:Heat") is kind
+
+
+def test_an_edited_file_is_loaded_anew(heat: Path) -> None:
+    before = load_equation(f"{heat}:Heat")
+    heat.write_text(HEAT.replace("0.1", "0.2"))
+    after = load_equation(f"{heat}:Heat")
+    assert (before().conductivity, after().conductivity) == (0.1, 0.2)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("wave", "unknown equation 'wave': give one of burgers, allen-cahn, kdv"),
+        ("", "unknown equation ''"),
+        ("{heat}:Cold", "there is no 'Cold'"),
+        ("{heat}:NUMBER", "NUMBER must be a subclass of Equation"),
+        ("{heat}:Unfinished", "Unfinished does not define initial_field"),
+        ("{heat}.py:Heat", "does not exist"),
+        ("no.such.module:Heat", "the equation module 'no.such.module' cannot be imported"),
+        ("{broken}:Heat", "cannot be executed"),
+    ],
+)
+def test_a_name_that_leads_nowhere_is_refused(heat: Path, name: str, words: str) -> None:
+    broken = heat.with_name("broken.py")
+    broken.write_text("1 / 0")
+    modules = set(sys.modules)
+    with pytest.raises(ValueError, match=words):
+        load_equation(name.format(heat=heat, broken=broken))
+    assert not any("broken" in module for module in set(sys.modules) - modules)
