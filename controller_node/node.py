@@ -31,6 +31,7 @@ from loop_interfaces.topics import (
     START,
     STATE,
     TARGET,
+    WRITER_DEPTH,
 )
 
 CONTROLLER_PARAMETERS = tuple(
@@ -59,7 +60,7 @@ class ControllerNode:
         self._node, self._loop, self._responder = node, loop, responder
         self._waiting_since = loop.now()
         self._senders = {topic: loop.sender(topic) for topic in (ACTION, MODEL_IDENTIFIED)}
-        self._failed = node.create_publisher(String, MODEL_FAILED, qos(MODEL))
+        self._failed = node.create_publisher(String, MODEL_FAILED, qos(MODEL, WRITER_DEPTH))
         handlers: dict[object, Callable[[Frame], Sequence[Send | ModelFailure]]] = {
             STATE: responder.state,
             TARGET: responder.target,
@@ -97,7 +98,9 @@ class ControllerNode:
                     self._senders[send.topic].send(send.frame)
                 else:
                     self._failed.publish(String(data=send.to_json()))
-                    self._node.get_logger().error(f"no reduced model: {send.reason}")
+                    self._node.get_logger().error(
+                        f"no reduced model: {send.reason}", throttle_duration_sec=1.0
+                    )
 
         return perform
 

@@ -9,7 +9,9 @@ exploratory episode: if it missed some, it says so and the episode is run again.
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -31,8 +33,9 @@ MAX_GAIN = 1e9
 """Largest gain accepted: with fields below the divergence bound no action can overflow."""
 
 
-MAX_RUNS = 4
-"""Runs whose messages are kept apart; the least recently heard one is forgotten first."""
+MAX_KEPT = 8
+"""Runs, and plants, whose messages are kept apart. The longest unheard one is forgotten first, but
+never the one that was answered last: a flood of strangers cannot push it out."""
 
 
 @dataclass
@@ -42,8 +45,8 @@ class _Run:
     start: Frame | None = None
     policy: Frame | None = None
     models: list[model_rows.ModelRows] = field(default_factory=list)
-    law: ProjectedLaw | None = None
-    law_episode: int = -1
+    laws: dict[int, tuple[ProjectedLaw, int]] = field(default_factory=dict)
+    """The law for each plant, and the episode it is set for."""
     samples: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)
     """States of an exploratory episode, by (plant, step)."""
     identified: Send | ModelFailure | None = None
@@ -59,22 +62,24 @@ class Responder:
 
     def __init__(self, settings: DesignSettings) -> None:
         self._settings = settings
-        self._target: np.ndarray | None = None
+        self._targets: OrderedDict[int, np.ndarray] = OrderedDict()
         self._runs: OrderedDict[int, _Run] = OrderedDict()
+        self._served = (-1, -1)
+        """Run and plant of the last answer."""
         self._pending: Frame | None = None
         self.tally = Tally()
         self.answered = 0
         self.episode = -1
 
     def target(self, frame: Frame) -> list[Send]:
-        """Take the plant's target z_r."""
-        if self._target is None or not np.array_equal(self._target, frame.values):
-            self._target = frame.values.copy()
-            for run in self._runs.values():
-                run.law, run.law_episode = None, -1
+        """Take the target z_r of a plant."""
+        self._targets[frame.plant] = frame.values.copy()
+        _forget(self._targets, frame.plant, self._served[1])
+        for run in self._runs.values():
+            run.laws.pop(frame.plant, None)
         return self._answer_pending()
 
-    def start(self, frame: Frame) -> list[Send]:
+    def start(self, frame: Frame) -> Sequence[Send | ModelFailure]:
         """Learn of an episode: who explores, which model each environment uses."""
         rows = frame.values
         if rows.shape[1] != len(StartColumn):
@@ -93,7 +98,9 @@ class Responder:
         run = self._run(frame.run)
         if run.episode_start(frame) is None:
             run.start = replace(frame, values=rows.copy())
-            run.samples, run.identified, run.law_episode = {}, None, -1
+            run.samples, run.identified = {}, None
+        elif run.identified is not None:
+            return [run.identified]  # asked again: what was answered may have been lost
         return self._answer_pending()
 
     def policy(self, frame: Frame) -> list[Send]:
@@ -105,14 +112,14 @@ class Responder:
             raise FrameError(f"expected gains of at most {MAX_GAIN:g} in magnitude")
         run = self._run(frame.run)
         run.policy = replace(frame, values=frame.values.copy())
-        run.law_episode = -1
+        run.laws = {plant: (law, -1) for plant, (law, _) in run.laws.items()}
         return self._answer_pending()
 
     def model(self, frame: Frame) -> list[Send]:
         """Take a run's reduced models."""
         run = self._run(frame.run)
         run.models = [model_rows.unpack(rows.copy(), self._settings.n_a) for rows in frame.values]
-        run.law, run.law_episode = None, -1
+        run.laws = {}
         return self._answer_pending()
 
     def state(self, frame: Frame) -> list[Send]:
@@ -123,6 +130,7 @@ class Responder:
             self.tally["states that had to wait"] += 1
             return []
         self._pending = None
+        self._served = (frame.run, frame.plant)
         self.answered += 1
         self.episode = frame.episode
         return [Send(ACTION, replace(frame, values=actions))]
@@ -146,7 +154,7 @@ class Responder:
         run = self._runs.get(pending.run, _Run())
         start = run.episode_start(pending)
         lacking = [] if start else ["episode/start"]
-        lacking += [] if self._target is not None else ["target"]
+        lacking += [] if pending.plant in self._targets else ["target"]
         if start and start.values[0, StartColumn.EXCITATION] < 0:
             lacking += [] if run.models else ["model"]
             if run.policy is None or run.policy.episode != pending.episode:
@@ -155,9 +163,7 @@ class Responder:
 
     def _run(self, number: int) -> _Run:
         run = self._runs.setdefault(number, _Run())
-        self._runs.move_to_end(number)
-        if len(self._runs) > MAX_RUNS:
-            self._runs.popitem(last=False)
+        _forget(self._runs, number, self._served[0])
         return run
 
     def _actions(self, frame: Frame) -> np.ndarray | None:
@@ -169,32 +175,37 @@ class Responder:
             raise FrameError(
                 f"expected the states of {len(start.values)} environments, got {len(frame.values)}"
             )
-        if self._target is None:
+        target = self._targets.get(frame.plant)
+        if target is None:
             return None
         if start.values[0, StartColumn.EXCITATION] >= 0:
             run.samples[frame.plant, frame.step] = frame.values.copy()
             return np.stack([self._explore(*how, frame.step) for how in _excitations(start)])
-        if run.law_episode != frame.episode and not self._prepare(run, start):
-            return None
-        assert run.law is not None
-        return run.law.actions(frame.values)
+        law, episode = run.laws.get(frame.plant, (None, -1))
+        if law is None or episode != frame.episode:
+            law = self._prepare(run, start, law, target)
+            if law is None:
+                return None
+            run.laws[frame.plant] = (law, frame.episode)
+        return law.actions(frame.values)
 
-    def _prepare(self, run: _Run, start: Frame) -> bool:
-        """Set the law for the run's episode; False while something has not arrived yet."""
+    @staticmethod
+    def _prepare(
+        run: _Run, start: Frame, law: ProjectedLaw | None, target: np.ndarray
+    ) -> ProjectedLaw | None:
+        """The law set for the run's episode; None while something has not arrived yet."""
         policy = run.policy
         if policy is None or policy.episode != start.episode or not run.models:
-            return False
-        assert self._target is not None
-        if run.law is None:
-            run.law = ProjectedLaw([model.U for model in run.models], self._target)
+            return None
+        if law is None:
+            law = ProjectedLaw([model.U for model in run.models], target)
         index = start.values[:, StartColumn.MODEL].astype(np.int64)
         if len(policy.values) != len(index):
             raise FrameError(
                 f"expected policies for {len(index)} environments, got {len(policy.values)}"
             )
-        run.law.set(policy.values, index)
-        run.law_episode = start.episode
-        return True
+        law.set(policy.values, index)
+        return law
 
     def _explore(self, seed: int, variance: float, step: int) -> np.ndarray:
         return excitation(seed, step, self._settings.n_a, variance)
@@ -220,13 +231,15 @@ class Responder:
                 f"the controller holds {len(held)} of the {len(steps)} states "
                 "of the exploratory episode",
             )
-        assert self._target is not None  # no state is answered, so none is kept, without it
+        target = self._targets.get(cost.plant)
+        if target is None:  # as none of its states was answered, somebody else did
+            return failure(True, "the plant's target has not arrived")
         states = np.stack([held[k] for k in steps])
         try:
             models = []
             for env, how in enumerate(_excitations(start)):
                 actions = np.stack([self._explore(*how, k) for k in steps[:-1]])
-                models.append(design(states[:, env], actions, self._target, self._settings))
+                models.append(design(states[:, env], actions, target, self._settings))
         except ValueError as error:
             return failure(False, str(error))
         rows = np.stack([model_rows.pack(model) for model in models])
@@ -240,3 +253,10 @@ def _excitations(start: Frame) -> list[tuple[int, float]]:
     """Seed and variance of every environment's exploratory actions."""
     columns = start.values[:, [StartColumn.EXCITATION, StartColumn.VARIANCE]]
     return [(int(seed), float(variance)) for seed, variance in columns]
+
+
+def _forget(kept: OrderedDict[int, Any], newest: int, protected: int) -> None:
+    """Keep MAX_KEPT entries: `newest`, `protected`, and the most recently heard others."""
+    kept.move_to_end(newest)
+    if len(kept) > MAX_KEPT:
+        del kept[next(key for key in kept if key not in (newest, protected))]

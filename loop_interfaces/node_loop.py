@@ -31,7 +31,7 @@ from rclpy.utilities import try_shutdown
 from std_msgs.msg import Float64MultiArray
 
 from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.topics import Topic
+from loop_interfaces.topics import READER_DEPTH, WRITER_DEPTH, Topic
 
 HOUSEKEEPING = 0.05
 """Seconds between two rounds of the executor and of the node's slow duties."""
@@ -50,13 +50,16 @@ class OutsideExecutor(CallbackGroup):
         return None
 
 
-def qos(topic: Topic, depth: int | None = None) -> QoSProfile:
-    """The quality of service of a topic; always reliable, so that only a dying peer loses data."""
+def qos(topic: Topic, depth: int) -> QoSProfile:
+    """The quality of service of a topic; always reliable, so that only a dying peer loses data.
+
+    depth: WRITER_DEPTH or READER_DEPTH, or more for a recorder.
+    """
     return QoSProfile(
         reliability=ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if topic.latched else DurabilityPolicy.VOLATILE,
         history=HistoryPolicy.KEEP_LAST,
-        depth=depth or topic.depth,
+        depth=depth,
     )
 
 
@@ -71,7 +74,7 @@ class Sender:
     def __init__(self, node: Node, topic: Topic, namespace: str = "") -> None:
         self._codec = ArrayCodec(topic.labels)
         self.publisher: Publisher = node.create_publisher(
-            Float64MultiArray, scoped(namespace, topic.name), qos(topic)
+            Float64MultiArray, scoped(namespace, topic.name), qos(topic, WRITER_DEPTH)
         )
 
     def send(self, frame: Frame) -> None:
@@ -90,7 +93,7 @@ class _Receiver:
             Float64MultiArray,
             scoped(namespace, topic.name),
             lambda _: None,  # never called: see OutsideExecutor
-            qos(topic),
+            qos(topic, READER_DEPTH),
             callback_group=OutsideExecutor(),
             raw=True,
         )
@@ -134,6 +137,11 @@ class NodeLoop:
         """Leave `run` after the present event."""
         self._stop_reason = reason
 
+    @property
+    def stopped(self) -> bool:
+        """Whether `stop` was called or ROS was shut down."""
+        return self._stop_reason is not None or not self.node.context.ok()
+
     def run(
         self,
         *,
@@ -152,7 +160,7 @@ class NodeLoop:
         handles = [receiver.subscription.handle for receiver in self._receivers]
         by_pointer = {r.subscription.handle.pointer: r for r in self._receivers}
         next_round = time.monotonic()
-        while self._stop_reason is None and context.ok():
+        while not self.stopped:
             now = time.monotonic()
             if now >= next_round:
                 self._executor.spin_once(timeout_sec=0)

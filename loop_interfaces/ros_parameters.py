@@ -72,6 +72,7 @@ class RemoteParameters:
         self._node = node
         self._list = node.create_client(ListParameters, f"{name}/list_parameters")
         self._get = node.create_client(GetParameters, f"{name}/get_parameters")
+        self._clients = [self._list, self._get]
         self._future: Any = None
         self._names: list[str] | None = None
 
@@ -95,8 +96,8 @@ class RemoteParameters:
 
     def close(self) -> None:
         """Drop the clients."""
-        for client in (self._list, self._get):
-            self._node.destroy_client(client)
+        while self._clients:
+            self._node.destroy_client(self._clients.pop())
 
 
 __all__ = ["ParameterError", "RemoteParameters", "declare", "descriptor", "given_parameters"]

@@ -14,14 +14,13 @@ from enum import IntEnum
 class Topic:
     """One topic of arrays.
 
-    name: relative topic name; labels: names of the axes; latched: transient local with depth 1, so
-    that a node which starts late or again receives the last one; depth: history of the reader.
+    name: relative topic name; labels: names of the axes; latched: transient local, so that a node
+    which starts late or again receives the last one.
     """
 
     name: str
     labels: tuple[str, ...]
     latched: bool
-    depth: int = 1
 
 
 class StartColumn(IntEnum):
@@ -47,6 +46,11 @@ class CostColumn(IntEnum):
     ENDED = 2
     """-1: completed; k >= 0: diverged at step k (J is 1e9); -2: void, not a cost."""
 
+
+WRITER_DEPTH = 1
+"""Only the newest sample has a meaning; what was lost is sent again by the protocol."""
+READER_DEPTH = 8
+"""A message of ours must not be pushed out by one of a node that should not be there."""
 
 COMPLETED = -1
 VOID = -2

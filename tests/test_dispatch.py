@@ -117,7 +117,10 @@ def test_nothing_is_handed_to_an_absent_pair_and_a_silent_one_is_repeated():
     assert served.missing() == ["plant", "controller"]
     assert served.presence(0, ("controller",), 1.0) == []
     ((_, first),) = starts(served.presence(0, (), 2.0))
-    assert served.tick(11.9) == []
+    assert served.tick(3.9) == []
+    ((_, asked_again),) = starts(served.tick(4.1))  # a lost message costs two seconds
+    assert asked_again.episode == first.episode
+    assert served.tick(4.2) == []
     ((_, second),) = starts(served.tick(12.1))
     assert second.episode == first.episode + 1
 

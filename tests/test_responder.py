@@ -117,6 +117,7 @@ def test_the_law_is_answered_whatever_the_order_in_which_its_parts_arrive():
 def test_states_of_two_plants_are_not_mixed_into_one_model():
     responder = Responder(SETTINGS)
     responder.target(TARGET)
+    responder.target(Frame(0, 0, 0, 0.0, PLANT.target, plant=9))
     responder.start(start(1, (1, 2, 0.1, 0)))
     stranger = np.random.default_rng(0).standard_normal((1, 32))
     for k in range(31):
@@ -124,6 +125,19 @@ def test_states_of_two_plants_are_not_mixed_into_one_model():
         assert send.frame.plant == 9
     (send,) = explore(responder, 1)
     assert same_bits(send.frame.values, models())
+
+
+def test_a_flood_of_strangers_does_not_push_out_the_run_that_is_served():
+    responder = Responder(SETTINGS)
+    responder.target(TARGET)
+    responder.start(start(1, (1, 9, 0.1, 0)))
+    state = Frame(RUN, 1, 0, 0.0, PLANT.reset(np.array([1])).copy())
+    (before,) = responder.state(state)
+    for stranger in range(100, 200):
+        responder.start(start(1, (1, 9, 0.1, 0), run=stranger))
+        responder.target(Frame(0, 0, 0, 0.0, np.ones(2), plant=stranger))
+    (after,) = responder.state(state)
+    assert same_bits(after.frame.values, before.frame.values)
 
 
 def test_a_state_of_another_episode_or_run_is_not_answered():

@@ -75,7 +75,9 @@ def test_a_bad_warm_start_is_identified_again_and_only_that_one():
     pair.use_models(training.models)
     kept = training.models[0].copy()
     check = pair.run(training.next_batch())
-    check.costs[12:, 0] = check.costs[8:12, 0] + 1.0  # the second seed's LQT law loses to no control
+    check.costs[12:, 0] = (
+        check.costs[8:12, 0] + 1.0
+    )  # the second seed's LQT law loses to no control
     rows = training.finish(check)
     assert [row["accepted"] for row in rows] == [True, False]
     again = training.next_batch()

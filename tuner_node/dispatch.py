@@ -25,6 +25,8 @@ Array = NDArray[np.float64]
 Order = tuple[int, Send]
 """(pair, message): publish the message in that pair's namespace."""
 EPISODES_PER_INCARNATION = 2**32
+ASK_AGAIN = 2.0
+"""Seconds without an answer after which an episode's policy and start are sent once more."""
 
 
 class DispatchError(RuntimeError):
@@ -52,6 +54,7 @@ class _Pair:
     chunk: _Chunk | None = None
     episode: int = -1
     heard: float = 0.0
+    sent: float = 0.0
 
 
 @dataclass
@@ -73,6 +76,7 @@ class Dispatcher:
     sim_time: float = 0.0
     plant: int = UNKNOWN_PLANT
     _batch: Batch | None = None
+    _models: Frame | None = None
     _chunks: list[_Chunk] = field(default_factory=list)
     _waiting: list[_Chunk] = field(default_factory=list)
     _issued: int = 0
@@ -112,7 +116,7 @@ class Dispatcher:
 
     def models(self, models: Array) -> list[Order]:
         """Give every pair the run's reduced models."""
-        frame = Frame(self.run, 0, 0, self.sim_time, models)
+        frame = self._models = Frame(self.run, 0, 0, self.sim_time, models)
         return [(pair, Send(MODEL, frame)) for pair in range(len(self.pairs))]
 
     def release(self) -> list[Order]:
@@ -183,7 +187,11 @@ class Dispatcher:
         return self._hand_out(now)
 
     def tick(self, now: float) -> list[Order]:
-        """Start again what has been silent for too long on a pair whose nodes are there."""
+        """Ask again for what is not answered; start again what has been silent for too long.
+
+        A pair that is at work ignores being asked again, one that was done answers again.
+        """
+        orders: list[Order] = []
         for number, pair in enumerate(self.pairs):
             if pair.chunk is None:
                 continue
@@ -195,7 +203,11 @@ class Dispatcher:
                     f"pair {number} was silent for {self.episode_timeout:g} s "
                     f"in episode {pair.episode}",
                 )
-        return self._hand_out(now)
+            elif now - pair.sent > ASK_AGAIN:
+                if self._models is not None:
+                    orders.append((number, Send(MODEL, self._models)))
+                orders += self._ask(number, pair, now)
+        return orders + self._hand_out(now)
 
     def result(self) -> BatchResult | None:
         """The batch's result once every row has one, in the batch's order."""
@@ -255,10 +267,15 @@ class Dispatcher:
         return orders
 
     def _begin(self, number: int, pair: _Pair, chunk: _Chunk, now: float) -> list[Order]:
-        assert self._batch is not None
         self._issued += 1
         pair.chunk, pair.heard = chunk, now
         pair.episode = self.incarnation * EPISODES_PER_INCARNATION + self._issued
+        return self._ask(number, pair, now)
+
+    def _ask(self, number: int, pair: _Pair, now: float) -> list[Order]:
+        chunk = pair.chunk
+        assert self._batch is not None and chunk is not None
+        pair.sent = now
 
         def frame(values: Array) -> Frame:
             return Frame(self.run, pair.episode, 0, self.sim_time, values)

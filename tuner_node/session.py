@@ -26,6 +26,8 @@ class Session:
         self._report = report
         self._phase = ""
         self.done = False
+        self.established = False
+        """Whether a pair has served this session: then it is the newcomer who has to go."""
 
     def begin(self, now: float) -> list[Order]:
         """The first messages; after a resume with the models that are already there."""
@@ -56,6 +58,7 @@ class Session:
         result = self.dispatcher.result()
         if result is None:
             return orders
+        self.established = True
         for row in self.training.finish(result):
             self._report(row)
         if result.models is not None and self.training.models is not None:

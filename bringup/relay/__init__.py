@@ -1,0 +1,1 @@
+"""A relay that loses, repeats, delays and reorders messages on purpose."""

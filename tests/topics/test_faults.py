@@ -1,0 +1,303 @@
+"""Whatever happens to processes and messages on the way, the training ends with one policy."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.loop_harness import Processes, until
+from tests.small import SMALL
+from tests.topics.test_loop import (
+    LIMIT,
+    assert_same_training,
+    in_process,
+    iterations_done,
+    tuner_arguments,
+)
+
+pytestmark = pytest.mark.topics
+PARAMETERS = ("--params-file", str(SMALL))
+
+
+def start_pair(loop: Processes, **plant: object) -> dict[str, subprocess.Popen[bytes]]:
+    own = [word for name, value in plant.items() for word in ("-p", f"{name}:={value}")]
+    return {
+        "plant": loop.node("pde_sim_node", *PARAMETERS, *own),
+        "controller": loop.node("controller_node", *PARAMETERS),
+    }
+
+
+def start_tuner(loop: Processes, out: Path, **options: object) -> subprocess.Popen[bytes]:
+    return loop.node("tuner_node", *PARAMETERS, *tuner_arguments(out, **options))
+
+
+@pytest.mark.parametrize(
+    "faults",
+    [
+        {"loss": 0.05},
+        {"duplicate": 0.5},
+        {"delay": 0.02},
+        {"loss": 0.03, "duplicate": 0.2, "delay": 0.01},
+    ],
+    ids=lambda faults: "-".join(faults),
+)
+def test_lost_repeated_delayed_and_reordered_messages_change_nothing(loop, tmp_path, faults):
+    loop.node("pde_sim_node", *PARAMETERS, "-r", "state:=state_sent", "-p", "action_timeout:=0.02")
+    loop.node("controller_node", *PARAMETERS, "-r", "action:=action_sent")
+    arguments = [word for name, value in faults.items() for word in ("-p", f"{name}:={value}")]
+    relay = loop.start("-m", "bringup.relay.node", "--ros-args", *arguments, name="relay")
+    tuner = start_tuner(loop, tmp_path / "run", iterations=8)
+    loop.wait(tuner, LIMIT)
+    assert_same_training(tmp_path / "run", in_process(iterations=8))
+    relay.send_signal(signal.SIGINT)
+    text = loop.wait(relay, 5.0)
+    if "loss" in faults:
+        assert " 0 lost" not in text
+    if "duplicate" in faults:
+        assert " 0 duplicated" not in text
+
+
+@pytest.mark.parametrize("victim", ["plant", "controller", "tuner"])
+def test_a_stopped_process_that_goes_on_later_changes_nothing(loop, tmp_path, victim):
+    # Stopped for longer than the action timeout, the void limit and the DDS lease of 3 s.
+    running = start_pair(loop, max_repeats=20)
+    out = tmp_path / "run"
+    running["tuner"] = start_tuner(loop, out, iterations=100)
+    until(lambda: iterations_done(out) >= 20, LIMIT, "iteration 20")
+    running[victim].send_signal(signal.SIGSTOP)
+    time.sleep(4.0)
+    running[victim].send_signal(signal.SIGCONT)
+    loop.wait(running["tuner"], LIMIT)
+    assert_same_training(out, in_process(iterations=100))
+
+
+def test_the_supervisor_restarts_what_dies_and_says_so(loop, tmp_path):
+    out = tmp_path / "run"
+    run = loop.pdeloop("train", str(SMALL), "--iterations", "150", "--out", str(out))
+    for count, name in ((10, "pde_sim_node"), (40, "controller_node"), (70, "tuner_node")):
+        until(lambda n=count: iterations_done(out) >= n, LIMIT, f"iteration {count}")
+        (pid,) = [pid for pid in loop.left_behind() if f"{name}.node" in command_of(pid)]
+        os.kill(pid, signal.SIGKILL)
+    text = loop.wait(run, LIMIT)
+    assert_same_training(out, in_process(iterations=150))
+    for name in ("pde_sim_node", "controller_node", "tuner_node"):
+        assert f"{name} was killed by SIGKILL; starting it again" in text
+
+
+def test_everything_dies_at_once_and_the_run_continues(loop, tmp_path):
+    out = tmp_path / "run"
+    run = loop.pdeloop("train", str(SMALL), "--iterations", "150", "--out", str(out))
+    for count in (20, 70):
+        until(lambda n=count: iterations_done(out) >= n, LIMIT, f"iteration {count}")
+        os.kill(run.pid, signal.SIGKILL)  # its children die with it
+        until(lambda: loop.left_behind() == [], 3.0, "end of the killed supervisor's nodes")
+        run.wait()
+        run = loop.pdeloop("train", "--resume", str(out))
+    loop.wait(run, LIMIT)
+    assert_same_training(out, in_process(iterations=150))
+
+
+def test_a_node_that_keeps_dying_is_given_up_with_its_last_words(loop, tmp_path):
+    out = tmp_path / "run"
+    run = loop.pdeloop("train", str(SMALL), "--iterations", "100000", "--out", str(out))
+    killed: set[int] = set()
+    deadline = time.monotonic() + LIMIT
+    while run.poll() is None:
+        assert time.monotonic() < deadline, "the supervisor goes on forever"
+        for pid in set(loop.left_behind()) - killed:
+            if "controller_node.node" in command_of(pid):
+                os.kill(pid, signal.SIGKILL)
+                killed.add(pid)
+        time.sleep(0.05)
+    text = loop.wait(run, 5.0, code=1)
+    assert "controller_node was killed by SIGKILL for the 6th time" in text
+    assert len(killed) == 6
+
+
+def command_of(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()
+    except OSError:
+        return ""
+
+
+def test_a_second_tuner_is_refused_and_the_first_one_unharmed(loop, tmp_path):
+    start_pair(loop)
+    out = tmp_path / "run"
+    first = start_tuner(loop, out, iterations=1500)
+    until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
+    second = start_tuner(loop, tmp_path / "second", seed=9)
+    text = loop.wait(second, 20.0, code=1)
+    assert "another tuner publishes /episode/start" in text.strip().splitlines()[-1]
+    loop.wait(first, LIMIT)
+    assert_same_training(out, in_process(iterations=1500))
+    assert iterations_done(tmp_path / "second") == 0
+
+
+def test_a_second_plant_with_other_parameters_never_mixes_in(loop, tmp_path):
+    start_pair(loop)
+    out = tmp_path / "run"
+    tuner = start_tuner(loop, out, iterations=800)
+    until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
+    loop.node("pde_sim_node", *PARAMETERS, "-p", "physical.viscosity:=0.02")
+    text = loop.wait(tuner, LIMIT)
+    assert_same_training(out, in_process(iterations=800))
+    assert "plant with other parameters" in text
+
+
+def test_a_new_run_is_not_disturbed_by_what_an_earlier_one_left_latched(loop, tmp_path):
+    start_pair(loop)
+    first = start_tuner(loop, tmp_path / "first", iterations=400)
+    until(lambda: iterations_done(tmp_path / "first") >= 5, LIMIT, "iteration 5")
+    first.send_signal(signal.SIGSTOP)  # its start, policy and model stay on the network
+    time.sleep(0.2)
+    first.send_signal(signal.SIGINT)
+    first.send_signal(signal.SIGCONT)
+    loop.wait(first, 5.0, code=130)
+    second = start_tuner(loop, tmp_path / "second", seed=1)
+    loop.wait(second, LIMIT)
+    assert_same_training(tmp_path / "second", in_process(seed=1))
+
+
+def fill(disk: Path) -> None:
+    """Write until nothing more fits."""
+    with (disk / "filler").open("wb", buffering=0) as file, suppress(OSError):
+        while True:
+            file.write(b"x" * 4096)
+
+
+@contextmanager
+def small_disk(folder: Path) -> Iterator[Path]:
+    """A real file system of 8 MiB."""
+    folder.mkdir()
+    subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(folder)], check=True, timeout=10
+    )
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "-l", str(folder)], check=True, timeout=10)
+
+
+def test_a_full_disk_is_reported_and_the_training_goes_on(loop, tmp_path):
+    start_pair(loop)
+    with small_disk(tmp_path / "disk") as disk:
+        out = disk / "run"
+        tuner = start_tuner(loop, out, iterations=1200)
+        until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
+        fill(disk)
+        until(lambda: "cannot write the checkpoint" in loop.output(tuner), LIMIT, "warning")
+        (disk / "filler").unlink()
+        loop.wait(tuner, LIMIT)
+        kept = shutil.copytree(out, tmp_path / "kept")
+    assert_same_training(kept, in_process(iterations=1200))
+
+
+def test_a_full_disk_at_the_end_is_an_error_and_the_run_continues_later(loop, tmp_path):
+    with small_disk(tmp_path / "disk") as disk:
+        out = disk / "run"
+        options = ("--iterations", "2000", "--out", str(out))
+        run = loop.pdeloop("train", str(SMALL), "--in-process", *options)
+        until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
+        fill(disk)
+        text = loop.wait(run, LIMIT, code=1)
+        assert "No space left on device" in text.strip().splitlines()[-1]
+        assert "Traceback" not in text
+        (disk / "filler").unlink()
+        loop.wait(loop.pdeloop("train", "--resume", str(out), "--in-process"), LIMIT)
+        kept = shutil.copytree(out, tmp_path / "kept")
+    assert_same_training(kept, in_process(iterations=2000))
+
+
+def test_a_truncated_checkpoint_falls_back_to_the_one_before(loop, tmp_path):
+    out = tmp_path / "run"
+    options = ("--iterations", "3000", "--out", str(out))
+    run = loop.pdeloop("train", str(SMALL), "--in-process", *options)
+    until(lambda: (out / "checkpoint.previous").exists(), LIMIT, "second checkpoint")
+    run.send_signal(signal.SIGKILL)
+    run.wait()
+    (out / "checkpoint.new").unlink(missing_ok=True)
+    path = out / "checkpoint"
+    path.write_bytes(path.read_bytes()[:-7])
+    text = loop.wait(loop.pdeloop("train", "--resume", str(out), "--in-process"), LIMIT)
+    assert "is damaged: its checksum does not match; using an older checkpoint" in text
+    assert_same_training(out, in_process(iterations=3000))
+
+
+def garbage(rng: np.random.Generator, good: bytes) -> bytes:
+    kind = rng.integers(4)
+    if kind == 0:
+        return rng.bytes(int(rng.integers(1, 400)))
+    mutated = bytearray(good)
+    if kind == 1:  # a huge layout
+        mutated[20:24] = b"\xff\xff\xff\x7f"
+    elif kind == 2:
+        for position in rng.integers(0, len(mutated), size=8):
+            mutated[position] = int(rng.integers(256))
+    else:
+        mutated = mutated[: int(rng.integers(4, len(mutated)))]
+    return bytes(mutated)
+
+
+FLOOD = """
+import sys, time
+import numpy as np, rclpy
+from std_msgs.msg import Float64MultiArray
+from loop_interfaces.frames import ArrayCodec, Frame
+from loop_interfaces.node_loop import qos
+from loop_interfaces.topics import ARRAYS
+from tests.topics.test_faults import garbage
+rclpy.init()
+node = rclpy.create_node("flood")
+rng = np.random.default_rng(0)
+lines = []
+for topic in ARRAYS:
+    shape = (2, 4, 8)[: len(topic.labels)]
+    good = ArrayCodec(topic.labels).encode(Frame(1, 2, 3, 0.5, np.ones(shape)))
+    lines.append((node.create_publisher(Float64MultiArray, topic.name, qos(topic, 1)), good))
+sent, end = 0, time.monotonic() + 6.0
+while time.monotonic() < end:
+    for publisher, good in lines:
+        publisher.publish(garbage(rng, good) if rng.random() < 0.9 else good)
+        sent += 1
+    time.sleep(0.001)
+print(sent, flush=True)
+"""
+
+
+def resident(process: subprocess.Popen[bytes]) -> int:
+    """Resident memory in kB."""
+    for line in Path(f"/proc/{process.pid}/status").read_text().splitlines():
+        if line.startswith("VmRSS"):
+            return int(line.split()[1])
+    raise AssertionError("no VmRSS")
+
+
+def test_a_flood_of_garbage_on_every_topic_changes_nothing(loop, tmp_path):
+    running = start_pair(loop)
+    out = tmp_path / "run"
+    running["tuner"] = start_tuner(loop, out, iterations=1500)
+    until(lambda: iterations_done(out) >= 50, LIMIT, "iteration 50")
+    before = {name: resident(process) for name, process in running.items()}
+    flood = loop.start("-c", FLOOD, name="flood")
+    sent = int(loop.wait(flood, 30.0).strip().splitlines()[-1])
+    assert sent > 5000
+    after = {name: resident(process) for name, process in running.items()}
+    until(lambda: running["tuner"].poll() is not None, LIMIT, "end of the training")
+    loop.wait(running["tuner"], LIMIT)
+    assert_same_training(out, in_process(iterations=1500))
+    for name in running:
+        assert after[name] - before[name] < 20_000, f"{name} grew from {before} to {after} kB"
+    reports = loop.output(running["plant"]).count("refused")
+    assert 1 <= reports <= 12  # at most one a second
+    assert json.loads((out / "result.json").read_text())["iterations"] == 1500
