@@ -38,7 +38,11 @@ class Display:
                     f"spectral radius {row['spectral_radius']:.4f}"
                 )
             case "checked":
-                verdict = "" if row["accepted"] else "; no better, exploring again"
+                verdict = "" if row["accepted"] else "; no better"
+                if row["again"]:
+                    verdict += ", exploring again"
+                elif not row["accepted"]:
+                    verdict += ", and no attempts are left: a poor warm start"
                 self.line(
                     f"  seed {row['seed']}: a rollout costs {row['none']:.4g} without control, "
                     f"{row['lqt']:.4g} with LQT{verdict}"
@@ -115,14 +119,22 @@ def summary_text(problem: str, summary: Mapping[str, Any], folder: Path) -> str:
     if seeds > 1:
         who = f"seeds {summary['seed']} to {summary['seed'] + seeds - 1}"
     percent = 100 * reduction["ratio_of_means"]
-    change = f"{abs(percent):.1f} % {'below' if percent >= 0 else 'above'} LQT"
+    change = f"   ({abs(percent):.1f} % {'below' if percent >= 0 else 'above'} LQT"
     if seeds > 1:
         change += f"; mean of the seeds' ratios {100 * reduction['mean_of_ratios']:.1f} %"
+    diverged, rollouts = summary["diverged"], summary["evaluation_rollouts"]
+
+    def cost(name: str) -> str:
+        if diverged[name]:
+            return f"diverged in {diverged[name]} of {rollouts} rollouts"
+        return f"{costs[name]:.4g}" + (f"{change})" if comparable and name == "adapted" else "")
+
+    comparable = not diverged["lqt"] and not diverged["adapted"]
     lines = [
         f"{problem}, {who}: {summary['iterations']} iterations in {summary['seconds']:.1f} s",
-        f"  mean stage cost without control  {costs['none']:.4g}",
-        f"  mean stage cost with LQT         {costs['lqt']:.4g}",
-        f"  mean stage cost after adaptation {costs['adapted']:.4g}   ({change})",
+        f"  mean stage cost without control  {cost('none')}",
+        f"  mean stage cost with LQT         {cost('lqt')}",
+        f"  mean stage cost after adaptation {cost('adapted')}",
     ]
     if not summary["improved"]:
         lines.append("  the adaptation did not improve on the LQT law for every seed")

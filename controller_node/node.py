@@ -57,7 +57,17 @@ class ControllerNode:
         values = declare(node, CONTROLLER_PARAMETERS, given_parameters(node))
         settings = {k: v for k, v in values.items() if k != "problem"}
         responder = Responder(DesignSettings(**settings))
-        self._node, self._loop, self._responder = node, loop, responder
+        self._responder = responder
+        self._wire(node, loop)
+        node.get_logger().info(f"{values['problem']}: order {values['reduced_order']} tracking law")
+
+    def join(self, node: Node, loop: NodeLoop) -> None:
+        declare(node, CONTROLLER_PARAMETERS, given_parameters(node))
+        self._wire(node, loop)
+
+    def _wire(self, node: Node, loop: NodeLoop) -> None:
+        responder = self._responder
+        self._node, self._loop = node, loop
         self._waiting_since = loop.now()
         self._senders = {topic: loop.sender(topic) for topic in (ACTION, MODEL_IDENTIFIED)}
         self._failed = node.create_publisher(String, MODEL_FAILED, qos(MODEL, WRITER_DEPTH))
@@ -71,7 +81,6 @@ class ControllerNode:
         }
         for topic in (STATE, TARGET, START, POLICY, MODEL, COST):
             loop.receive(topic, self._performer(handlers[topic]))
-        node.get_logger().info(f"{values['problem']}: order {values['reduced_order']} tracking law")
 
     def run(self) -> int:
         self._loop.run(

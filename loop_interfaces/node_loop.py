@@ -27,7 +27,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
-from rclpy.utilities import try_shutdown
+from rclpy.utilities import remove_ros_args, try_shutdown
 from std_msgs.msg import Float64MultiArray
 
 from loop_interfaces.frames import ArrayCodec, Frame
@@ -35,6 +35,11 @@ from loop_interfaces.topics import READER_DEPTH, WRITER_DEPTH, Topic
 
 HOUSEKEEPING = 0.05
 """Seconds between two rounds of the executor and of the node's slow duties."""
+SUSPENDED = 2.0
+"""Seconds without being scheduled after which a process takes its peers to have dropped it.
+
+The DDS lease is 3 s: peers that stop hearing a participant forget it, while it does not know and
+does not introduce itself again. Joining as a new participant is the way back."""
 
 
 class OutsideExecutor(CallbackGroup):
@@ -111,8 +116,11 @@ class NodeLoop:
         self.refused: Counter[str] = Counter()
         self._receivers: list[_Receiver] = []
         self._stop_reason: str | None = None
+        self.suspended = False
+        """Whether `run` ended because the process had been suspended (SIGSTOP, a frozen machine)."""
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
+        self._last_reason = ""
         self._reported = 0
         self._report_at = 0.0
 
@@ -160,9 +168,15 @@ class NodeLoop:
         handles = [receiver.subscription.handle for receiver in self._receivers]
         by_pointer = {r.subscription.handle.pointer: r for r in self._receivers}
         next_round = time.monotonic()
+        last_round, cpu = next_round, time.process_time()
         while not self.stopped:
             now = time.monotonic()
             if now >= next_round:
+                gap, worked = now - last_round, time.process_time() - cpu
+                if gap > SUSPENDED and worked < gap / 2:
+                    self.suspended = True
+                    return "suspended"
+                last_round, cpu = now, cpu + worked
                 self._executor.spin_once(timeout_sec=0)
                 housekeeping(now)
                 self._report(now)
@@ -187,16 +201,17 @@ class NodeLoop:
         try:
             receiver.callback(receiver.codec.decode(taken[0]))
         except ValueError as error:
-            self.refused[f"{receiver.subscription.topic_name}: {error}"[:300]] += 1
+            self._last_reason = f"{receiver.subscription.topic_name}: {error}"[:300]
+            self.refused[self._last_reason] += 1
             if len(self.refused) > 1000:  # a flood with ever new reasons must not grow memory
                 self.refused = Counter({"others": sum(self.refused.values())})
 
     def _report(self, now: float) -> None:
         total = sum(self.refused.values())
         if total > self._reported and now >= self._report_at:
-            reason = next(reversed(self.refused))
             self.node.get_logger().warning(
-                f"refused {total - self._reported} message(s); the last new reason: {reason}"
+                f"refused {total - self._reported} message(s), the last one because: "
+                f"{self._last_reason}"
             )
             self._reported = total
             self._report_at = now + 1.0
@@ -234,28 +249,57 @@ def ros_node(name: str, args: list[str] | None) -> Iterator[tuple[Node, NodeLoop
 
 
 class NodeBody(Protocol):
-    """What a node does: constructed with its parameters and topics, then run."""
+    """What a node does: made with its parameters and topics, then run."""
+
+    def join(self, node: Node, loop: NodeLoop) -> None:
+        """Declare the parameters and wire the topics on a new `node`; what was learnt stays."""
 
     def run(self) -> int:
-        """Work until the loop stops; returns the exit code."""
+        """Work until the loop stops; returns the exit code, of no meaning if it was suspended."""
 
 
 def node_main(name: str, args: list[str] | None, make: Callable[[Node, NodeLoop], NodeBody]) -> int:
     """The `main` of a node: makes its body, runs it and returns the exit code.
 
-    1 with one line on stderr when the node cannot start as it was asked to: a ConfigurationError,
+    A process that was suspended for long joins again, as a new participant. 1 with one line on
+    stderr when the node cannot start as it was asked to: a ConfigurationError,
     or a ValueError while it is made (a parameter out of range, a plant that cannot be built).
     """
     try:
-        with ros_node(name, args) as (node, loop):
-            try:
-                body = make(node, loop)
-            except ValueError as error:
-                raise ConfigurationError(str(error)) from error
-            return body.run()
+        _refuse_other_words(name, args)
+        body: NodeBody | None = None
+        while True:
+            with ros_node(name, args) as (node, loop):
+                try:
+                    if body is None:
+                        body = make(node, loop)
+                    else:
+                        body.join(node, loop)
+                        node.get_logger().warning("was suspended; joined the network again")
+                except ValueError as error:
+                    raise ConfigurationError(str(error)) from error
+                code = body.run()
+                if not loop.suspended:
+                    return code
     except ConfigurationError as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 1
+
+
+def _refuse_other_words(name: str, args: list[str] | None) -> None:
+    """Words that are not ROS arguments would be ignored in silence; `--help` among them."""
+    words = remove_ros_args(args)[1:] if args is None else remove_ros_args(args)
+    if any(word in ("-h", "--help") for word in words):
+        print(
+            f"usage: {name} [--ros-args -p PARAMETER:=VALUE ... --params-file FILE -r __ns:=/NAME]"
+            "\n\nParameters, topics and what the node does: docs/interfaces.md;"
+            " with ROS tools: ros2 param describe."
+        )
+        raise SystemExit(0)
+    if words:
+        raise ConfigurationError(
+            f"unexpected argument '{words[0]}'; parameters are given as --ros-args -p NAME:=VALUE"
+        )
 
 
 def _first_line(error: Exception) -> str:

@@ -57,11 +57,11 @@ class Spec:
         if self.positive:
             text += " above 0"
         elif self.minimum is not None and self.maximum is not None:
-            return f"{text} from {self.minimum:g} to {self.maximum:g}"
+            return f"{text} from {_plain(self.minimum)} to {_plain(self.maximum)}"
         elif self.minimum is not None:
-            text += f" of at least {self.minimum:g}"
+            text += f" of at least {_plain(self.minimum)}"
         if self.maximum is not None:
-            text += f", at most {self.maximum:g}"
+            text += f", at most {_plain(self.maximum)}"
         return text
 
     def check(self, value: Any) -> Value:
@@ -93,6 +93,12 @@ class Spec:
             if isinstance(value, int) and value % self.multiple_of:
                 return None
         return value
+
+
+def _plain(number: float) -> str:
+    """A bound as people write it: 1000000, not 1e+06."""
+    whole = float(number).is_integer() and abs(number) < 1e17
+    return str(int(number)) if whole else f"{number:g}"
 
 
 MAX_SEED = 2**53 - 1

@@ -6,11 +6,11 @@ Messages, order and parameters: docs/interfaces.md. The protocol is pde_sim_node
 
 from __future__ import annotations
 
+import struct
 import sys
 from dataclasses import fields
 from typing import Any
 
-import rclpy.time
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
@@ -54,6 +54,9 @@ PLANT_PARAMETERS = tuple(
 )
 """The problem parameters that concern the plant."""
 
+_CLOCK = struct.Struct("<BBHiI")
+"""The CDR bytes of a rosgraph_msgs/Clock: encoding, seconds, nanoseconds."""
+
 
 class PlantNode:
     """Moves messages between the topics and the lock-step protocol."""
@@ -69,17 +72,23 @@ class PlantNode:
             max_repeats=values["max_repeats"],
             run_hold=values["run_hold"],
         )
-        self._node, self._loop = node, loop
-        self._senders = {topic: loop.sender(topic) for topic in (STATE, COST, TARGET)}
-        self._clock = node.create_publisher(Clock, "/clock", 1) if values["publish_clock"] else None
-        self._clock_wanted = False
-        loop.receive(START, self._on_start)
-        loop.receive(ACTION, self._on_action)
-        self._send([self._lockstep.announcement()])
+        self._wire(node, loop, publish_clock=values["publish_clock"])
         node.get_logger().info(
             f"{values['problem']}: {plant.n_z} points, {plant.n_a} actuators, "
             f"{plant.horizon} steps of {values['sample_time']:g} s"
         )
+
+    def join(self, node: Node, loop: NodeLoop) -> None:
+        self._wire(node, loop, publish_clock=declare_parameters(node)["publish_clock"])
+
+    def _wire(self, node: Node, loop: NodeLoop, *, publish_clock: bool) -> None:
+        self._node, self._loop = node, loop
+        self._senders = {topic: loop.sender(topic) for topic in (STATE, COST, TARGET)}
+        self._clock = node.create_publisher(Clock, "/clock", 1) if publish_clock else None
+        self._clock_wanted = False
+        loop.receive(START, self._on_start)
+        loop.receive(ACTION, self._on_action)
+        self._send([self._lockstep.announcement()])
 
     def run(self) -> int:
         lockstep = self._lockstep
@@ -100,8 +109,8 @@ class PlantNode:
         for send in sends:
             self._senders[send.topic].send(send.frame)
             if self._clock_wanted and self._clock is not None and send.topic is STATE:
-                seconds = rclpy.time.Time(nanoseconds=round(send.frame.time * 1e9))
-                self._clock.publish(Clock(clock=seconds.to_msg()))
+                nanoseconds = round(send.frame.time * 1e9)
+                self._clock.publish(_CLOCK.pack(0, 1, 0, *divmod(nanoseconds, 10**9)))
 
     def _housekeeping(self, now: float) -> None:
         self._clock_wanted = self._clock is not None and self._clock.get_subscription_count() > 0

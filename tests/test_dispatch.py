@@ -146,6 +146,19 @@ def test_the_work_of_a_pair_that_died_goes_to_a_free_one():
     assert served.result() is not None
 
 
+def test_the_work_of_a_pair_that_died_while_all_were_busy_goes_to_the_first_free_one():
+    served = dispatcher(pairs=2)
+    (left, right) = starts(served.assign(batch(2), 0.0))
+    assert served.presence(left[0], ("plant", "controller"), 1.0) == []
+    ((pair, again),) = starts(served.cost(right[0], costs_of(right[1]), 2.0))
+    assert pair == right[0]
+    assert np.array_equal(again.values, left[1].values)
+    served.cost(pair, costs_of(again), 3.0)
+    result = served.result()
+    assert result is not None
+    assert result.costs[:, 0].tolist() == [0.0, 1.0]
+
+
 def test_an_exploratory_episode_is_done_with_its_model_and_fails_with_its_reason():
     served = dispatcher()
     exploratory = Batch(np.array([[1.0, 2.0, 0.1, 0.0]]), None)

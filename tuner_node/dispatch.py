@@ -127,10 +127,7 @@ class Dispatcher:
     def presence(self, pair: int, missing: Sequence[str], now: float) -> list[Order]:
         """Learn which nodes of a pair are on the network."""
         known = self.pairs[pair]
-        gone = bool(missing) and not known.missing
         known.missing = tuple(missing)
-        if gone and known.chunk and any(not p.missing and not p.chunk for p in self.pairs):
-            self._retry(known, f"pair {pair} lost its {' and '.join(missing)}")
         return self._hand_out(now)
 
     def cost(self, pair: int, frame: Frame, now: float) -> list[Order]:
@@ -204,10 +201,13 @@ class Dispatcher:
                     f"in episode {pair.episode}",
                 )
             elif now - pair.sent > ASK_AGAIN:
-                if self._models is not None:
-                    orders.append((number, Send(MODEL, self._models)))
                 orders += self._ask(number, pair, now)
         return orders + self._hand_out(now)
+
+    def ask_again(self, now: float) -> list[Order]:
+        """Everything that is under way, once more."""
+        busy = [(number, pair) for number, pair in enumerate(self.pairs) if pair.chunk]
+        return [order for number, pair in busy for order in self._ask(number, pair, now)]
 
     def result(self) -> BatchResult | None:
         """The batch's result once every row has one, in the batch's order."""
@@ -260,19 +260,35 @@ class Dispatcher:
     def _hand_out(self, now: float) -> list[Order]:
         orders: list[Order] = []
         for number, pair in enumerate(self.pairs):
+            if pair.chunk is not None or pair.missing:
+                continue
             if not self._waiting:
-                break
-            if pair.chunk is None and not pair.missing:
+                self._take_from_the_absent()
+            if self._waiting:
                 orders += self._begin(number, pair, self._waiting.pop(0), now)
         return orders
+
+    def _take_from_the_absent(self) -> None:
+        """Let go of an absent pair's episode, for a pair that is free to run it."""
+        for number, pair in enumerate(self.pairs):
+            if pair.missing and pair.chunk is not None:
+                self.notes.append(
+                    f"pair {number} lost its {' and '.join(pair.missing)} in episode "
+                    f"{pair.episode}; another pair starts it again with the same seeds"
+                )
+                self.tally["episodes taken over"] += 1
+                pair.chunk.costs = pair.chunk.models = None
+                self._waiting.append(pair.chunk)
+                pair.chunk = None
+                return
 
     def _begin(self, number: int, pair: _Pair, chunk: _Chunk, now: float) -> list[Order]:
         self._issued += 1
         pair.chunk, pair.heard = chunk, now
         pair.episode = self.incarnation * EPISODES_PER_INCARNATION + self._issued
-        return self._ask(number, pair, now)
+        return self._ask(number, pair, now, again=False)
 
-    def _ask(self, number: int, pair: _Pair, now: float) -> list[Order]:
+    def _ask(self, number: int, pair: _Pair, now: float, *, again: bool = True) -> list[Order]:
         chunk = pair.chunk
         assert self._batch is not None and chunk is not None
         pair.sent = now
@@ -281,7 +297,8 @@ class Dispatcher:
             return Frame(self.run, pair.episode, 0, self.sim_time, values)
 
         # The policy first: it is then mostly there when the first state arrives.
-        orders = [(number, Send(START, frame(self._batch.rows[chunk.rows])))]
+        sends = [Send(MODEL, self._models)] if again and self._models is not None else []
         if self._batch.policies is not None:
-            orders.insert(0, (number, Send(POLICY, frame(self._batch.policies[chunk.rows]))))
-        return orders
+            sends.append(Send(POLICY, frame(self._batch.policies[chunk.rows])))
+        sends.append(Send(START, frame(self._batch.rows[chunk.rows])))
+        return [(number, send) for send in sends]

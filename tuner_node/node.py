@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from std_msgs.msg import String
 
 from loop_interfaces.frames import MAX_ID, Frame
@@ -24,7 +23,16 @@ from loop_interfaces.node_loop import ConfigurationError, NodeLoop, Sender, node
 from loop_interfaces.parameters import PROBLEM, TUNER
 from loop_interfaces.protocol import ModelFailure
 from loop_interfaces.ros_parameters import declare, given_parameters
-from loop_interfaces.topics import COST, MODEL, MODEL_FAILED, MODEL_IDENTIFIED, POLICY, START
+from loop_interfaces.topics import (
+    COST,
+    MODEL,
+    MODEL_FAILED,
+    MODEL_IDENTIFIED,
+    POLICY,
+    READER_DEPTH,
+    RECORDER_STATUS,
+    START,
+)
 from tuner_node.build import build_training
 from tuner_node.dispatch import Dispatcher, DispatchError, Order
 from tuner_node.record import Recorder
@@ -37,15 +45,20 @@ ABSENCE_REPORT = 5.0
 """Seconds between two reports of a missing plant or controller."""
 
 
+def declare_parameters(node: Node) -> dict[str, Any]:
+    """The tuner's parameters, and the problem's, which together define the training."""
+    given = given_parameters(node)
+    values = declare(node, [*PROBLEM, *TUNER], given)
+    # The equation's own parameters are the plant's to check; here they only identify the run.
+    return values | {name: value for name, value in given.items() if name.startswith("physical.")}
+
+
 class TunerNode:
     """Moves messages between the topics and the session, and keeps the run folder."""
 
     def __init__(self, node: Node, loop: NodeLoop) -> None:
-        given = given_parameters(node)
-        values = declare(node, [*PROBLEM, *TUNER], given)
-        # The equation's own parameters are the plant's to check; here they only identify the run.
-        values |= {name: value for name, value in given.items() if name.startswith("physical.")}
-        self._node, self._loop, self._log = node, loop, node.get_logger()
+        values = declare_parameters(node)
+        self._log = node.get_logger()
         training = build_training(values)
         self._recorder: Recorder | None = None
         identity = RunIdentity(1 + secrets.randbelow(MAX_ID - 1), 0)
@@ -70,7 +83,10 @@ class TunerNode:
             plant=training.plant,
         )
         self._session = Session(training, dispatcher, self._report)
-        self._wire(pairs)
+        self._pairs = pairs
+        self._wire(node, loop)
+        self._recording = str(values["recorder"])
+        self._recorder_seen = self._recording == "none"
         self._failure: str | None = None
         self._absent_since: float | None = None
         self._absence_reported = float("-inf")
@@ -83,6 +99,8 @@ class TunerNode:
         reason = self._loop.run(
             tick=lambda now: None, deadline=lambda: None, housekeeping=self._housekeeping
         )
+        if self._loop.suspended:
+            return 0
         if self._session.done:
             return self._finish()
         self._send(self._session.dispatcher.release())
@@ -93,13 +111,17 @@ class TunerNode:
         self._log.info(f"stopped by {reason} before the end")
         return 130
 
-    def _wire(self, pairs: list[str]) -> None:
-        loop = self._loop
+    def join(self, node: Node, loop: NodeLoop) -> None:
+        declare_parameters(node)
+        self._wire(node, loop)
+
+    def _wire(self, node: Node, loop: NodeLoop) -> None:
+        self._node, self._loop, self._log = node, loop, node.get_logger()
         self._senders: list[dict[str, Sender]] = []
         self._cost_topics: list[str] = []
         self._model_topics: list[str] = []
         session = self._session
-        for number, namespace in enumerate(pairs):
+        for number, namespace in enumerate(self._pairs):
             self._senders.append(
                 {t.name: loop.sender(t, namespace) for t in (POLICY, START, MODEL)}
             )
@@ -111,7 +133,7 @@ class TunerNode:
                 String,
                 scoped(namespace, MODEL_FAILED),
                 partial(self._on_failure, number),
-                qos(MODEL),
+                qos(MODEL, READER_DEPTH),
             )
 
     def _handler(
@@ -146,6 +168,7 @@ class TunerNode:
             self._senders[pair][send.topic.name].send(send.frame)
 
     def _housekeeping(self, now: float) -> None:
+        absent = self._absent_recorder()
         for pair in range(len(self._senders)):
             missing = [
                 name
@@ -154,11 +177,25 @@ class TunerNode:
                     ("controller", self._model_topics[pair]),
                 )
                 if not self._node.count_publishers(topic)
-            ]
+            ] + absent
             self._guarded(partial(self._session.presence, pair, missing))
         self._guarded(self._session.tick)
         self._report_absence(now)
         self._refuse_rival(now)
+
+    def _absent_recorder(self) -> list[str]:
+        """The recorder, as long as the first episode waits for it; stops if it is required."""
+        if self._recording == "none" or (self._recorder_seen and self._recording == "start"):
+            return []
+        there = self._node.count_publishers(self._node.resolve_topic_name(RECORDER_STATUS)) > 0
+        if self._recorder_seen and not there and not self._failure:
+            self._failure = (
+                "the recorder is gone, and this training is required to be recorded; "
+                "it can be continued from its folder with resume:=true"
+            )
+            self._loop.stop("failure")
+        self._recorder_seen |= there
+        return [] if self._recorder_seen else ["recorder"]
 
     def _report_absence(self, now: float) -> None:
         missing = self._session.dispatcher.missing()
@@ -173,16 +210,21 @@ class TunerNode:
             self._log.warning(f"waiting for {' and '.join(missing)} for {waited:.0f} s")
 
     def _refuse_rival(self, now: float) -> None:
-        publisher: Publisher = self._senders[0][START.name].publisher
-        if self._node.count_publishers(publisher.topic_name) < 2:
+        topics = [senders[START.name].publisher.topic_name for senders in self._senders]
+        shared = [topic for topic in topics if self._node.count_publishers(topic) > 1]
+        if not shared:
             self._rival_since = None
         elif self._rival_since is None:
             self._rival_since = now
         elif now - self._rival_since > RIVAL_GRACE and not self._failure:
-            self._failure = (
-                f"another tuner publishes {publisher.topic_name}; "
-                "stop it, or start this one in another namespace or ROS domain"
-            )
+            found = f"another tuner publishes {shared[0]}; "
+            if self._session.established:
+                self._log.warning(
+                    f"{found}the plant serves this run, and refuses the other",
+                    throttle_duration_sec=10.0,
+                )
+                return
+            self._failure = f"{found}stop it, or start this one in another namespace or ROS domain"
             self._loop.stop("failure")
 
     def _report(self, row: Mapping[str, Any]) -> None:

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from loop_interfaces.frames import MAX_ID
 from loop_interfaces.parameters import PLANT, RECORDER, ParameterError, read_yaml, write_yaml
+from loop_interfaces.topics import COMPLETED
 from tuner_node import checkpoint
 from tuner_node.training import CONTROLLERS, Training
 
@@ -153,7 +154,8 @@ def summarise(training: Training) -> dict[str, Any]:
     reduction: how far the adapted cost lies below LQT's, as the mean over seeds of the ratios and as
     the ratio of the means over seeds (each cost already a mean over the evaluation fields).
     """
-    assert training.evaluation is not None
+    assert training.evaluation is not None and training.ended is not None
+    diverged = (training.ended != COMPLETED).sum(axis=(0, 2))
     costs = training.evaluation
     mean = costs.mean(axis=2)
     none, lqt, adapted = (mean[:, CONTROLLERS.index(name)] for name in CONTROLLERS)
@@ -166,6 +168,8 @@ def summarise(training: Training) -> dict[str, Any]:
             "ratio_of_means": float(1 - adapted.mean() / lqt.mean()),
         },
         "improved": bool((adapted <= lqt).all()),
+        "evaluation_rollouts": int(costs[:, 0].size),
+        "diverged": dict(zip(CONTROLLERS, diverged.tolist(), strict=True)),
         "seed": training.settings.seed,
         "seeds": training.settings.seeds,
         "iterations": training.iteration,

@@ -30,7 +30,12 @@ class Session:
         """Whether a pair has served this session: then it is the newcomer who has to go."""
 
     def begin(self, now: float) -> list[Order]:
-        """The first messages; after a resume with the models that are already there."""
+        """The first messages; after a resume with the models that are already there.
+
+        Called again when the network was joined again: what is under way is asked for once more.
+        """
+        if self._phase:
+            return self.dispatcher.ask_again(now)
         orders: list[Order] = []
         if self.training.models is not None:
             orders += self.dispatcher.models(self.training.models)

@@ -97,6 +97,9 @@ class Training:
     optimizers: list[Optimizer] = field(default_factory=list)
     history: list[dict[str, Any]] = field(default_factory=list)
     evaluation: Array | None = None
+    """Mean stage costs of the closing evaluation, (S, controllers, fields)."""
+    ended: Array | None = None
+    """How those rollouts ended (see CostColumn.ENDED), of the same shape."""
     plant: int = UNKNOWN_PLANT
 
     def __post_init__(self) -> None:
@@ -163,8 +166,8 @@ class Training:
         }
         if self.models is not None:
             arrays["models"] = self.models
-        if self.evaluation is not None:
-            arrays["evaluation"] = self.evaluation
+        if self.evaluation is not None and self.ended is not None:
+            arrays |= {"evaluation": self.evaluation, "ended": self.ended}
         for m, optimizer in enumerate(self.optimizers):
             arrays |= {f"optimizer{m}.{key}": value for key, value in optimizer.state().items()}
         return arrays
@@ -189,6 +192,7 @@ class Training:
             )
         self.history = json.loads(str(arrays["history"]))
         self.evaluation = arrays.get("evaluation")
+        self.ended = arrays.get("ended")
 
     def _seeds(self) -> list[int]:
         return [self.settings.seed + s for s in range(self.settings.seeds)]
@@ -227,7 +231,8 @@ class Training:
 
     def _checked(self, result: BatchResult) -> list[dict[str, Any]]:
         costs = result.costs.reshape(len(self.pending), 2, CHECK_FIELDS, len(CostColumn))
-        rows, failed = [], []
+        rows: list[dict[str, Any]] = []
+        failed = []
         for m, (none, lqt) in zip(self.pending, costs, strict=True):
             none_cost, lqt_cost = (c[:, CostColumn.MEAN].mean() for c in (none, lqt))
             completed = (lqt[:, CostColumn.ENDED] == COMPLETED).all()
@@ -241,7 +246,9 @@ class Training:
                     "accepted": good,
                 }
             )
-            if not good and self.attempts[m] + 1 < self.settings.identification_attempts:
+            again = not good and self.attempts[m] + 1 < self.settings.identification_attempts
+            rows[-1]["again"] = again
+            if again:
                 self.attempts[m] += 1
                 failed.append(m)
         self.pending = failed
@@ -311,6 +318,7 @@ class Training:
         settings = self.settings
         shape = (settings.seeds, len(CONTROLLERS), settings.evaluation_fields)
         self.evaluation = result.costs[:, CostColumn.MEAN].reshape(shape)
+        self.ended = result.costs[:, CostColumn.ENDED].reshape(shape)
         self.phase = "done"
         return [
             {

@@ -36,6 +36,13 @@ class RelayNode:
         given = {name: value.value for name, value in node._parameter_overrides.items()}
         values = declare(node, PARAMETERS, given)
         faults = Faults(values["loss"], values["duplicate"], values["delay"])
+        self._faults, self._seed = faults, values["seed"]
+        self._wire(node, loop)
+
+    def join(self, node: Node, loop: NodeLoop) -> None:
+        self._wire(node, loop)
+
+    def _wire(self, node: Node, loop: NodeLoop) -> None:
         self._node, self._loop = node, loop
         self._lines = []
         for number, topic in enumerate((STATE, ACTION)):
@@ -43,7 +50,7 @@ class RelayNode:
                 Float64MultiArray, f"{topic.name}_sent", lambda _: None, qos(topic, 100), raw=True
             )
             publisher = node.create_publisher(Float64MultiArray, topic.name, qos(topic, 1))
-            line = FaultyLine(faults, np.random.default_rng([values["seed"], number]))
+            line = FaultyLine(self._faults, np.random.default_rng([self._seed, number]))
             self._lines.append((subscription, publisher, line))
 
     def run(self) -> int:

@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 
 # Ridges on the scaled variables, per unit weight: enough to bound directions that the data does not
 # move.
-_LINEAR_RIDGE = 1e-6
+_LINEAR_RIDGE = 1e-5
 _ACTION_RIDGE = 1e-8
 
 
@@ -142,7 +142,7 @@ def fit(
         solution = linalg.solve(matrix, moment[:size], assume_a="pos").T
         quadratic = np.zeros((r, r, r))
         if size > affine:
-            half = 0.5 * solution[:, affine:] / (spread[rows] * spread[columns])
+            half = 0.5 * solution[:, affine:] / spread**2
             quadratic[:, rows, columns] += half
             quadratic[:, columns, rows] += half
         models.append(
@@ -157,7 +157,8 @@ def fit(
     return models
 
 
-def _spread(share: Array, values: Array) -> Array:
-    spread: Array = np.sqrt(share @ (values * values))
-    spread[spread == 0.0] = 1.0
-    return spread
+def _spread(share: Array, values: Array) -> float:
+    """One scale for all coordinates, so that the ridge holds small modes back more than large
+    ones."""
+    square = float(np.mean(share @ (values * values)))
+    return float(np.sqrt(square)) if square > 0.0 else 1.0

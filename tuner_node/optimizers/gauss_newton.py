@@ -52,7 +52,7 @@ from tuner_node.optimizers.trajectories import Record, Records
 
 __all__ = ["GaussNewton"]
 
-_DAMPING = (1e-4, 10.0, 100.0)  # smallest, first, largest after a rejection
+_DAMPING = (1e-4, 1.0, 100.0)  # smallest, first, largest after a rejection
 _ABORT = 1.05
 _MEMORY = 40
 _NONE = -1
@@ -91,7 +91,7 @@ class GaussNewton:
         iterations: int,
         context: Context,
         fields: int = 3,
-        modes: int = 24,
+        modes: int = 32,
         learning_rate: float | None = None,
         smoothing_radius: float | None = None,
     ) -> None:
@@ -280,4 +280,4 @@ class GaussNewton:
         row["predicted_fall"] = proposal.fall
         row["mismatch"] = proposal.mismatch
         row["kappa"] = proposal.kappa
-        row["ridge"] = "affine" if np.isinf(proposal.ridge) else f"{proposal.ridge:g}"
+        row["models"] = proposal.models

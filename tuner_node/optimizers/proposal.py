@@ -22,18 +22,23 @@ __all__ = ["Proposal", "Proposer"]
 
 # Candidates of the model: ridges of the quadratic part, and forgetting over an episode,
 # exp(-kappa).
-_RIDGES = (1e-3, 1e-2, 1e-1, np.inf)
+_RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
 _KAPPAS = (0.0, 5.0, 15.0)
 # After an accepted step a simpler choice is good enough within this factor and margin of the best
 # prediction.
-_GOOD_ENOUGH = (1.5, 0.03)
+_ENOUGH = (1.5, 0.03)
+# Models are averaged whose error is within this factor and margin of the best, and within this of
+# it.
+_ALIKE = (3.0, 0.03, 0.15)
+# A step that predicts less than this share of the cost is not worth its rollouts: the next choice.
+_LEAST_FALL = 1e-3
 # A prediction error counts at most this much, relative to the difference it predicts.
 _WORST = 2.0
 # Weight of a rollout in the fit: falls with its age, down to a floor, and with its cost.
 _AGEING = 0.9
 _AGEING_FLOOR = 0.3
 # Share of the trust region that bounds all gains alike, relative to the one in input energy.
-_ISOTROPY = 1.0
+_ISOTROPY = 0.3
 # A comparison with a rollout that costs more than this many times the incumbent is not local.
 _LOCAL = 3.0
 
@@ -47,15 +52,17 @@ class Proposal:
     policy : (n_a, 2 n_s) array
     fall : float
         The fall of the mean stage cost that the quadratic model predicts.
-    ridge, kappa : float
-        The chosen model.
+    models : int
+        How many models were averaged.
+    kappa : float
+        Forgetting.
     mismatch : float
-        Its relative error in predicting measured differences of trajectories.
+        Their smallest relative error in predicting measured differences of trajectories.
     """
 
     policy: Array
     fall: float
-    ridge: float
+    models: int
     kappa: float
     mismatch: float
 
@@ -146,21 +153,28 @@ class Proposer:
         models = self._fit(data, V, incumbents)
         policy = incumbents[0].policy
         K = np.ascontiguousarray(policy[:, : self.n_s])
-        choices = self._choices(models, V, K, incumbents, others, accepted)
+        errors = self._mismatches(models, V, K, incumbents, others)
         paths = [self._path(record, V) for record in incumbents if len(record.actions)]
-        for mismatch, ridge, kappa in choices:
-            model = models[_RIDGES.index(ridge)]
-            step, fall = self._step(model, paths, K, V.T @ self._target, kappa, damping)
+        least = _LEAST_FALL * self._level(incumbents)
+        proposal = None
+        for kappa, chosen in self._choices(errors, accepted):
+            ensemble = [models[i] for i in chosen]
+            step, fall = self._step(ensemble, paths, K, V.T @ self._target, kappa, damping)
             candidate = self.moved(policy, step)
-            if np.isfinite(candidate).all() and np.isfinite(fall):
-                return Proposal(candidate, fall, ridge, kappa, mismatch)
-        return None
+            if not (np.isfinite(candidate).all() and np.isfinite(fall)):
+                continue
+            if proposal is None or fall > proposal.fall:
+                mismatch = float(errors[chosen, _KAPPAS.index(kappa)].min())
+                proposal = Proposal(candidate, fall, len(ensemble), kappa, mismatch)
+            if fall >= least:
+                break
+        return proposal
 
     def _fit(
         self, data: Sequence[Record], V: Array, incumbents: Sequence[Record]
     ) -> list[LocalModel]:
         newest = max(record.stamp for record in data)
-        level = float(np.mean([self._mean_cost(record) for record in incumbents]))
+        level = self._level(incumbents)
         x, a, change, weights = [], [], [], []
         for record in data:
             coordinates = record.states @ V
@@ -180,6 +194,9 @@ class Proposer:
             _RIDGES,
         )
 
+    def _level(self, incumbents: Sequence[Record]) -> float:
+        return float(np.mean([self._mean_cost(record) for record in incumbents]))
+
     def _mean_cost(self, record: Record) -> float:
         length = len(record.actions)
         error = record.states[:length] - self._target
@@ -193,28 +210,17 @@ class Proposer:
             x, record.actions, np.column_stack([x[:, : self.n_s], np.full(length, self._one)])
         )
 
-    def _choices(
-        self,
-        models: Sequence[LocalModel],
-        V: Array,
-        K: Array,
-        incumbents: Sequence[Record],
-        others: Sequence[Record | None],
-        accepted: bool,
-    ) -> list[tuple[float, float, float]]:
-        """(mismatch, ridge, kappa) of all choices, the one to use first."""
-        errors = self._mismatches(models, V, K, incumbents, others)
-        order = [
-            (float(errors[i, j]), ridge, kappa)
-            for j, kappa in enumerate(_KAPPAS)
-            for i, ridge in enumerate(_RIDGES)
+    def _choices(self, errors: Array, accepted: bool) -> list[tuple[float, list[int]]]:
+        """Forgetting and the models to average over, the choice to use first."""
+        best = errors.min(axis=0)
+        order = [int(j) for j in np.argsort(best, kind="stable")]
+        if accepted:
+            first = int(np.argmax(best <= _ENOUGH[0] * best.min() + _ENOUGH[1]))
+            order = [first, *order]
+        alike = np.minimum(_ALIKE[0] * best + _ALIKE[1], best + _ALIKE[2])
+        return [
+            (_KAPPAS[j], [int(i) for i in np.flatnonzero(errors[:, j] <= alike[j])]) for j in order
         ]
-        best = sorted(order, key=lambda choice: choice[0])
-        if not accepted:
-            return best
-        enough = _GOOD_ENOUGH[0] * best[0][0] + _GOOD_ENOUGH[1]
-        first = next(choice for choice in order if choice[0] <= enough)
-        return [first, *best]
 
     def _mismatches(
         self,
@@ -263,7 +269,7 @@ class Proposer:
 
     def _step(
         self,
-        model: LocalModel,
+        models: Sequence[LocalModel],
         paths: Sequence[Path],
         K: Array,
         target: Array,
@@ -275,18 +281,20 @@ class Proposer:
         g, H, features = np.zeros(p), np.zeros((p, p)), np.zeros((n_f, n_f))
         with np.errstate(over="ignore", invalid="ignore"):
             for path in paths:
-                expansion = expand(
-                    path,
-                    model.jacobians(path.x),
-                    model.B,
-                    K,
-                    target=target,
-                    state_weight=self._q,
-                    action_weight=self._r,
-                    gamma=float(np.exp(-kappa / self._horizon)),
-                )
-                g += expansion.gradient / len(paths)
-                H += expansion.curvature / len(paths)
+                share = 1.0 / (len(paths) * len(models))
+                for model in models:
+                    expansion = expand(
+                        path,
+                        model.jacobians(path.x),
+                        model.B,
+                        K,
+                        target=target,
+                        state_weight=self._q,
+                        action_weight=self._r,
+                        gamma=float(np.exp(-kappa / self._horizon)),
+                    )
+                    g += share * expansion.gradient
+                    H += share * expansion.curvature
                 features += path.features.T @ path.features / (len(path.features) * len(paths))
         if not (np.isfinite(g).all() and np.isfinite(H).all()):
             return np.full((self.n_a, n_f), np.nan), np.nan
