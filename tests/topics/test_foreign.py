@@ -1,0 +1,107 @@
+"""What the documents say is enough: their examples are taken from the pages and run as they stand."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.linalg import solve_discrete_are
+
+from bringup.cli import main
+from loop_interfaces.model_rows import unpack
+from loop_interfaces.parameters import table
+from tests.loop_harness import ROOT, Processes
+from tests.topics.test_loop import LIMIT
+from tuner_node.seeds import Purpose, derive
+
+pytestmark = pytest.mark.topics
+INTERFACES = (ROOT / "docs" / "interfaces.md").read_text()
+README = (ROOT / "README.md").read_text()
+
+
+def code_block(page: str, language: str, mark: str) -> str:
+    """The code block of `page` in `language` that contains `mark`."""
+    blocks = re.findall(rf"```{language}\n(.*?)```", page, flags=re.DOTALL)
+    (block,) = [block for block in blocks if mark in block]
+    return str(block)
+
+
+def documented_command(mark: str) -> list[str]:
+    """The ROS arguments of the documented shell line that starts with `mark`."""
+    block = code_block(INTERFACES, "sh", "python linear_plant.py").replace("\\\n", " ")
+    (line,) = [line for line in block.splitlines() if line.startswith(mark)]
+    return line.split("--ros-args")[1].split()
+
+
+def test_a_linear_plant_written_from_the_interface_page_is_identified_and_tuned(
+    loop: Processes, tmp_path: Path
+) -> None:
+    source = code_block(INTERFACES, "python", "class LinearPlant")
+    assert "pdeloop" not in re.sub(r'"""[^"]*"""', "", source)
+    assert not re.search(r"import (loop_interfaces|pde_sim_node|controller_node|bringup)", source)
+    (tmp_path / "linear_plant.py").write_text(source)
+    space: dict[str, np.ndarray] = {"__name__": "linear_plant"}
+    exec(compile(source.split("VOLATILE =")[0], "linear_plant", "exec"), space)
+    A, B, target = (np.asarray(space[name]) for name in ("A", "B", "TARGET"))
+
+    loop.start(str(tmp_path / "linear_plant.py"), name="linear_plant")
+    loop.node("controller_node", *documented_command("controller_node"))
+    out = tmp_path / "run"
+    tuner = loop.node("tuner_node", *documented_command("tuner_node"), "-p", f"out:={out}")
+    text = loop.wait(tuner, LIMIT)
+
+    # Identified: in the plant's own coordinates the reduced model is the plant.
+    with np.load(out / "policy.npz") as arrays:
+        rows, lqt, adapted = arrays["model"][0], arrays["lqt"][0], arrays["policy"][0]
+    model = unpack(rows, n_a=2)
+    assert np.allclose(model.U @ model.A @ model.U.T, A, atol=1e-9)
+    assert np.allclose(model.U @ model.B, B, atol=1e-9)
+    assert np.allclose(model.s_r, model.U.T @ target)
+
+    # Designed: the feedback is that of the Riccati equation of the true plant.
+    P = solve_discrete_are(A, B, np.eye(3), np.eye(2))
+    K = -np.linalg.solve(np.eye(2) + B.T @ P @ B, B.T @ P @ A)
+    assert np.allclose(model.K_a @ model.U.T, K, atol=1e-8)
+    K_b = np.linalg.solve(
+        np.eye(2) + B.T @ P @ B, B.T @ np.linalg.solve(np.eye(3) - (A + B @ K).T, target)
+    )
+    assert np.allclose(model.K_b @ model.s_r, K_b, atol=1e-8)
+
+    # Tuned: the costs that came over the topics are those of the policies on the plant.
+    def cost(policy: np.ndarray) -> float:
+        costs = []
+        for i in range(10):
+            seed = derive(0, Purpose.EVALUATION_FIELD, i)
+            z = np.array([1.0, 0, 0]) + 0.1 * np.random.default_rng(seed).normal(size=3)
+            total = 0.0
+            for _ in range(50):
+                a = policy @ np.concatenate([model.U.T @ z, model.s_r])
+                total += float((z - target) @ (z - target) + a @ a)
+                z = A @ z + B @ a
+            costs.append(total / 50)
+        return float(np.mean(costs))
+
+    found = re.search(
+        r"done: cost ([\d.]+) without control, ([\d.]+) with LQT, ([\d.]+) adapted", text
+    )
+    assert found
+    expected = (cost(0 * lqt), cost(lqt), cost(adapted))
+    assert np.allclose([float(number) for number in found.groups()], expected, rtol=1e-5)
+    assert not np.array_equal(lqt, adapted)
+    assert found.group() in INTERFACES
+
+
+def test_the_readmes_own_pde_trains(tmp_path, capsys):
+    (tmp_path / "fisher.py").write_text(code_block(README, "python", "class FisherKpp"))
+    (tmp_path / "fisher.yaml").write_text(code_block(README, "yaml", "fisher.py:FisherKpp"))
+    out = tmp_path / "run"
+    assert main(["train", str(tmp_path / "fisher.yaml"), "--in-process", "--out", str(out)]) == 0
+    (line,) = re.findall(r"seed 0: cost .*LQT, .* adapted", capsys.readouterr().out)
+    assert line in README
+
+
+def test_every_parameter_is_on_the_interface_page():
+    for spec in table():
+        assert f"| `{spec.name}` |" in INTERFACES, spec.name
