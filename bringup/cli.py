@@ -39,6 +39,10 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     _add_train(commands)
     _add_evaluate(commands)
+    _add_bag(commands)
+    _add_identify(commands)
+    _add_reproduce(commands)
+    _add_report(commands)
     problems = commands.add_parser(
         "problems",
         help="list the shipped problems",
@@ -87,6 +91,20 @@ def _add_train(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     train.add_argument(
         "--resume", type=Path, metavar="DIR", help="continue the interrupted run in DIR"
     )
+    train.add_argument(
+        "--record", action="store_true", help="record all topics to a rosbag2 bag in the folder"
+    )
+    train.add_argument(
+        "--bag-storage", choices=("mcap", "sqlite3"), help="format of the bag [mcap]"
+    )
+    train.add_argument(
+        "--bag-per-episode", action="store_true", help="one bag an episode instead of one"
+    )
+    train.add_argument(
+        "--record-or-stop",
+        action="store_true",
+        help="as --record, and stop the training if the recording fails",
+    )
     train.set_defaults(command=_train)
 
 
@@ -113,9 +131,101 @@ def _add_evaluate(commands: argparse._SubParsersAction[argparse.ArgumentParser])
     evaluate.set_defaults(command=_evaluate)
 
 
-def _train(options: argparse.Namespace) -> int:
-    from bringup.training_run import run_again, run_new
+def _add_bag(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    bag = commands.add_parser(
+        "bag", help="look into a recorded bag, verify it, recover it", description=_BAG
+    )
+    actions = bag.add_subparsers(required=True, metavar="ACTION")
+    for name, command, text in (
+        ("info", _bag_info, "topics and episodes of a bag"),
+        ("verify", _bag_verify, "recompute states, actions, costs, models and policies"),
+        ("recover", _bag_recover, "make an ordinary bag of an unfinished one"),
+    ):
+        action = actions.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
+        action.add_argument("bag", type=Path, metavar="BAG", help="folder of a bag or of a run")
+        action.set_defaults(command=command)
+        if name == "info":
+            action.add_argument("--json", action="store_true", help="print JSON")
+        if name == "verify":
+            action.add_argument(
+                "--parameters", type=Path, metavar="FILE", help="instead of those in the bag"
+            )
+        if name == "recover":
+            action.add_argument("--out", type=Path, metavar="DIR", help="[BAG-recovered]")
 
+
+def _add_identify(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    identify = commands.add_parser(
+        "identify",
+        help="reduced model from recorded episodes",
+        description="Identify a reduced model by DMDc from the exploratory episodes of a bag (all "
+        "episodes if none is), of this plant or a foreign one, and design LQ-tracking gains.",
+        epilog="example: pdeloop identify --bag runs/lab/bag --rank 8 --order 4 --out model.npz",
+    )
+    add = identify.add_argument
+    add("--bag", type=Path, metavar="BAG", required=True, help="folder of a bag or of a run")
+    add("--rank", type=int, metavar="P", help="p of the DMDc regression [that of the run]")
+    add("--order", type=int, metavar="NS", help="order n_s of the model [that of the run]")
+    add("--episode", type=int, metavar="N", help="only this episode")
+    add("--environment", type=int, metavar="M", help="only this environment of each episode")
+    add("--state-weight", type=float, metavar="Q", help="q of Q = q I [that of the run, or 1]")
+    add("--action-weight", type=float, metavar="R", help="r of R = r I [that of the run, or 1]")
+    add("--out", type=Path, metavar="FILE", help="write A, B, U, K_a, K_b, s_r to this .npz")
+    identify.set_defaults(command=_identify)
+
+
+def _add_reproduce(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    reproduce = commands.add_parser(
+        "reproduce",
+        help="the paper's experiment: four controllers, several seeds, a table",
+        description="For each problem and seed: no control, LQT, LQT-PO and pure PO, with the cost "
+        "of every iteration's policy on the evaluation fields. Ctrl-C interrupts; --out DIR of an "
+        "interrupted reproduction continues it.",
+        epilog="example: pdeloop reproduce burgers kdv --seeds 6 --out runs/paper",
+    )
+    add = reproduce.add_argument
+    add("problems", nargs="*", metavar="PROBLEM", help="shipped names or YAML files [the paper's]")
+    add("--seeds", type=int, metavar="N", help="trainings of each problem, side by side [6]")
+    add("--iterations", type=int, metavar="N", help="iterations of the adapt phase [40]")
+    add("--seed", type=int, metavar="S", help="the first seed [0]")
+    add(
+        "--identification-attempts",
+        type=int,
+        metavar="N",
+        help="exploratory episodes a seed may use until LQT beats no control; 1: the first, "
+        f"unchecked, as in the paper [{_DEFAULTS['identification_attempts'].default}]",
+    )
+    add("--processes", type=int, metavar="N", help="jobs at the same time [one a core]")
+    add("--out", type=Path, metavar="DIR", help="folder of the results [runs/reproduce-TIME]")
+    reproduce.set_defaults(command=_reproduce)
+
+
+def _add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    report = commands.add_parser(
+        "report",
+        help="figures and an HTML page of a run or a reproduction",
+        description="Figures for a paper (PNG and SVG) and one HTML page that needs no network.",
+        epilog="example: pdeloop report runs/paper",
+    )
+    report.add_argument(
+        "folder", type=Path, metavar="DIR", help="folder of a finished run or reproduction"
+    )
+    report.add_argument("--out", type=Path, metavar="DIR", help="[DIR/report]")
+    report.set_defaults(command=_report)
+
+
+_BAG = "Look into a bag that --record or recorder_node wrote, verify it, or recover it."
+
+
+def _train(options: argparse.Namespace) -> int:
+    from bringup.training_run import Recording, run_again, run_new
+
+    recording = None
+    if options.record or options.record_or_stop:
+        storage = options.bag_storage or "mcap"
+        recording = Recording(storage, options.bag_per_episode, options.record_or_stop)
+    elif options.bag_storage or options.bag_per_episode:
+        raise ParameterError("--bag-storage and --bag-per-episode go with --record")
     names = ("iterations", "seed", "seeds", "start", "optimizer")
     given = {n: getattr(options, n) for n in names if getattr(options, n) is not None}
     if options.resume is not None:
@@ -124,13 +234,13 @@ def _train(options: argparse.Namespace) -> int:
                 "--resume continues a run with its own parameters; "
                 "give it alone (or with --in-process)"
             )
-        return run_again(options.resume, options.in_process)
+        return run_again(options.resume, options.in_process, recording)
     if options.problem is None:
         raise ParameterError(
             f"no problem given; expected one of {', '.join(shipped_problems())}, a YAML file, "
             "or --resume DIR"
         )
-    return run_new(options.problem, given, options.out, options.in_process)
+    return run_new(options.problem, given, options.out, options.in_process, recording)
 
 
 def _evaluate(options: argparse.Namespace) -> int:
@@ -143,6 +253,66 @@ def _evaluate(options: argparse.Namespace) -> int:
         options.folder, fields=options.fields, seed=options.seed, mean_field=options.mean_field
     )
     print(json.dumps(costs) if options.json else as_text(costs))
+    return 0
+
+
+def _bag_info(options: argparse.Namespace) -> int:
+    from bringup.bag_tools import describe, info_text
+
+    content = describe(options.bag)
+    print(json.dumps(content) if options.json else info_text(content))
+    return 0
+
+
+def _bag_verify(options: argparse.Namespace) -> int:
+    from bringup.bag_verify import verify
+
+    report = verify(options.bag, options.parameters)
+    print(report.text())
+    return 1 if report.count else 0
+
+
+def _bag_recover(options: argparse.Namespace) -> int:
+    from bringup.bag_tools import recover
+
+    path, messages = recover(options.bag, options.out)
+    print(f"{messages} messages in {path}")
+    return 0
+
+
+def _identify(options: argparse.Namespace) -> int:
+    from bringup.offline_identification import identify, save
+
+    found = identify(
+        options.bag,
+        rank=options.rank,
+        order=options.order,
+        episode=options.episode,
+        environment=options.environment,
+        weights=(options.state_weight, options.action_weight),
+    )
+    print(found.text())
+    if options.out is not None:
+        save(found, options.out)
+        print(f"  written to {options.out}")
+    return 0
+
+
+def _reproduce(options: argparse.Namespace) -> int:
+    from bringup.reproduce import reproduce
+
+    names = ("seeds", "iterations", "seed", "identification_attempts")
+    given = {n: getattr(options, n) for n in names if getattr(options, n) is not None}
+    for name, value in given.items():
+        _DEFAULTS[name].check(value)
+    return reproduce(options.problems, given, options.out, options.processes)
+
+
+def _report(options: argparse.Namespace) -> int:
+    from bringup.report import report
+
+    page = report(options.folder, options.out)
+    print(f"report in {page}")
     return 0
 
 

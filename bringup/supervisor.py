@@ -30,7 +30,10 @@ class NodeError(RuntimeError):
 
 @dataclass
 class Child:
-    """One node: how it is started and how its life went."""
+    """One node: how it is started and how its life went.
+
+    optional: when it ends for another reason than a refusal, the others go on without it.
+    """
 
     name: str
     arguments: Sequence[str]
@@ -40,6 +43,8 @@ class Child:
     restarts: int = 0
     started: float = 0.0
     due: float | None = 0.0
+    optional: bool = False
+    ended: bool = False
 
     def last_words(self) -> str:
         """The last line of the node's log."""
@@ -127,6 +132,10 @@ class Supervisor:
         child.process = None
         if code == REFUSED:
             raise NodeError(child.last_words() or f"{child.name} {how}; see {child.log}")
+        if child.optional:
+            child.ended = True
+            self.tell(f"{child.name} {how}; {child.last_words()}")
+            return
         child.deaths = 1 if now - child.started > STEADY else child.deaths + 1
         if child.deaths > len(BACK_OFF):
             raise NodeError(

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import signal
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -16,7 +17,7 @@ from bringup.display import Display, ProgressFile, summary_text
 from bringup.domain import own_domain
 from bringup.in_process import LocalPair, train
 from bringup.supervisor import Child, NodeError, Supervisor, node_command
-from loop_interfaces.parameters import check, table
+from loop_interfaces.parameters import ParameterError, check, table
 from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_equation, build_plant
 from tuner_node.build import build_training
@@ -40,31 +41,55 @@ def resolve(problem: str, options: Mapping[str, Any]) -> dict[str, Any]:
     return {**values, **{f"physical.{name}": value for name, value in physical.items()}}
 
 
-def run_new(problem: str, options: Mapping[str, Any], out: Path | None, in_process: bool) -> int:
+@dataclass(frozen=True)
+class Recording:
+    """How a run is recorded; required: it stops if the recorder does."""
+
+    storage: str = "mcap"
+    bag_per_episode: bool = False
+    required: bool = False
+
+
+def run_new(
+    problem: str,
+    options: Mapping[str, Any],
+    out: Path | None,
+    in_process: bool,
+    recording: Recording | None = None,
+) -> int:
     """Train from the start in a new folder; returns the exit code."""
+    _check_recording(in_process, recording)
     values = resolve(problem, options)
     folder = out or Path("runs") / f"{values['problem']}-{timestamp()}"
     RunFolder(folder).create(values)
-    return _run(folder, values, in_process)
+    return _run(folder, values, in_process, recording)
 
 
-def run_again(folder: Path, in_process: bool) -> int:
+def run_again(folder: Path, in_process: bool, recording: Recording | None = None) -> int:
     """Continue the training in `folder`; returns the exit code."""
+    _check_recording(in_process, recording)
     values = {**check(table(), {}), **RunFolder(folder).parameters()}
     if (folder / "result.json").exists():
         raise RunFolderError(f"the run in {folder} is complete; there is nothing to continue")
-    return _run(folder, values, in_process)
+    return _run(folder, values, in_process, recording)
 
 
-def _run(folder: Path, values: dict[str, Any], in_process: bool) -> int:
+def _check_recording(in_process: bool, recording: Recording | None) -> None:
+    if in_process and recording is not None:
+        raise ParameterError("--record records topics; leave out --in-process")
+
+
+def _run(
+    folder: Path, values: dict[str, Any], in_process: bool, recording: Recording | None
+) -> int:
     display = Display(values["iterations"], values["seeds"])
     started = time.monotonic()
     try:
-        with _interruptible():
+        with interruptible():
             if in_process:
                 _train_here(folder, values, display)
             else:
-                _train_over_topics(folder, display)
+                _train_over_topics(folder, display, recording)
     except Interruption as signal_name:
         display.close()
         display.line(
@@ -93,34 +118,77 @@ def _train_here(folder: Path, values: dict[str, Any], display: Display) -> None:
         train(training, LocalPair(values), report, max_batch=values["max_batch"])
     finally:
         recorder.keep(now=time.monotonic(), force=True)
-    recorder.finish({"transport": "in-process"})
+    try:
+        recorder.finish({"transport": "in-process"})
+    except OSError as error:
+        raise RunFolderError(
+            f"cannot write the results to {folder}: {error.strerror}; make room and "
+            f"continue with: pdeloop train --resume {folder} --in-process"
+        ) from error
 
 
-def _train_over_topics(folder: Path, display: Display) -> None:
+def _train_over_topics(folder: Path, display: Display, recording: Recording | None) -> None:
     logs = folder / "logs"
     logs.mkdir(exist_ok=True)
     parameters = ["--params-file", str(folder / "parameters.yaml")]
-    own = {"tuner_node": ["-p", f"out:={folder}", "-p", "resume:=true"]}
-    children = [
-        Child(name, node_command(name, *parameters, *own.get(name, [])), logs / f"{name}.log")
-        for name in ("pde_sim_node", "controller_node", "tuner_node")
-    ]
+    own = {"tuner_node": [f"out:={folder}", "resume:=true"], "recorder_node": []}
+    names = ["pde_sim_node", "controller_node", "tuner_node"]
+    if recording is not None:
+        bag = _unused(folder / "bag")
+        names.insert(0, "recorder_node")
+        own["recorder_node"] = [
+            f"bag:={bag}",
+            f"bag_storage:={recording.storage}",
+            f"bag_per_episode:={str(recording.bag_per_episode).lower()}",
+        ]
+        own["tuner_node"].append(f"recorder:={'required' if recording.required else 'start'}")
+    children = {
+        name: Child(
+            name,
+            node_command(name, *parameters, *(w for v in own.get(name, []) for w in ("-p", v))),
+            logs / f"{name}.log",
+            optional=name == "recorder_node",
+        )
+        for name in names
+    }
+    recorder = children.get("recorder_node")
     progress = ProgressFile(folder / "progress.jsonl")
+    begun = False
     with own_domain() as domain:
-        supervisor = Supervisor(children, "tuner_node", domain, logs, display.line)
+        supervisor = Supervisor(list(children.values()), "tuner_node", domain, logs, display.line)
         try:
             done = False
             while not done:
                 done = supervisor.poll()
                 for row in progress.rows():
                     display.row(row)
+                    begun |= row.get("event") != "phase"
+                if recorder is not None and recorder.ended and not done:
+                    if not begun:
+                        raise NodeError(f"nothing can be recorded: {recorder.last_words()}")
+                    _go_on_unrecorded(children["tuner_node"])
                 time.sleep(0 if done else POLL)
         finally:
             supervisor.stop()
+    if recorder is not None:
+        display.line(f"  recorded in {bag}" + (", not to the end" if recorder.ended else ""))
+
+
+def _go_on_unrecorded(tuner: Child) -> None:
+    """A tuner that is started again must not wait for a recorder that has ended."""
+    tuner.arguments = [
+        word.replace("recorder:=start", "recorder:=none") for word in tuner.arguments
+    ]
+
+
+def _unused(path: Path) -> Path:
+    """`path`, or the first of path-2, path-3, ... that does not exist."""
+    numbered = (path.with_name(f"{path.name}-{n}") for n in itertools.count(2))
+    return next(p for p in itertools.chain([path], numbered) if not p.exists())
 
 
 @contextmanager
-def _interruptible() -> Iterator[None]:
+def interruptible() -> Iterator[None]:
     """SIGINT and SIGTERM raise Interruption within the block, once."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
@@ -136,4 +204,12 @@ def _interruptible() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-__all__ = ["Interruption", "NodeError", "resolve", "run_again", "run_new"]
+__all__ = [
+    "Interruption",
+    "NodeError",
+    "Recording",
+    "interruptible",
+    "resolve",
+    "run_again",
+    "run_new",
+]

@@ -1,0 +1,309 @@
+"""`pdeloop bag verify`: everything in a bag that can be computed again, is, and compared bit by bit.
+
+Of every complete episode: the initial fields from the seeds, the actions from states, policies and
+models (or from the excitation's seed), each z_{k+1} from z_k and a_k, the cost from states and
+actions, the reduced model from an exploratory episode. Of the run: every policy from the costs
+before it, by running the tuner's own training on the recorded costs.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bringup.bag_reader import Bag, RecordedEpisode
+from controller_node.identification import DesignSettings, design
+from controller_node.policy import ProjectedLaw, excitation
+from loop_interfaces import model_rows
+from loop_interfaces.parameters import check, read_yaml, table
+from loop_interfaces.topics import COMPLETED, VOID, CostColumn, StartColumn
+from pde_sim_node.build import build_plant, fingerprint
+from pde_sim_node.plant import DIVERGED_COST
+from tuner_node.build import build_training
+from tuner_node.training import Batch, BatchResult
+
+Array = NDArray[np.float64]
+SHOWN = 5
+"""Differences that are described; the others are only counted."""
+
+
+@dataclass
+class Report:
+    """What was compared, and what differs."""
+
+    bag: str
+    episodes: int = 0
+    compared: Counter[str] = field(default_factory=Counter)
+    differences: list[str] = field(default_factory=list)
+    count: int = 0
+    incomplete: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def differs(self, text: str) -> None:
+        """Note a difference."""
+        self.count += 1
+        if len(self.differences) < SHOWN:
+            self.differences.append(text)
+
+    def compare(self, what: str, where: str, recorded: Array, again: Array) -> bool:
+        """Count a comparison of two arrays and note the first entry that differs."""
+        self.compared[what] += len(recorded)
+        if recorded.shape != again.shape:
+            self.differs(f"{where}: recorded shape {recorded.shape}, recomputed {again.shape}")
+            return False
+        a = np.ascontiguousarray(recorded).view(np.uint64)
+        b = np.ascontiguousarray(again).view(np.uint64)
+        if np.array_equal(a, b):
+            return True
+        index = tuple(int(i) for i in np.argwhere(a != b)[0])
+        self.differs(
+            f"{where}, entry {list(index)}: recorded {float(recorded[index])!r}, "
+            f"recomputed {float(again[index])!r}"
+        )
+        return False
+
+    def text(self) -> str:
+        """The report for people."""
+        lines = [f"{self.bag}: {self.episodes} episodes"]
+        if self.compared:
+            parts = ", ".join(f"{n} {what}" for what, n in self.compared.items())
+            lines.append(f"  recomputed {parts}")
+        lines += [f"  {note}" for note in self.notes]
+        lines += [f"  incomplete: {text}" for text in self.incomplete[:SHOWN]]
+        if len(self.incomplete) > SHOWN:
+            lines.append(f"  and {len(self.incomplete) - SHOWN} more incomplete episodes")
+        if self.differences:
+            lines.append(f"  {self.count} differences; the first: {self.differences[0]}")
+            lines += [f"    {text}" for text in self.differences[1:]]
+        elif self.compared:
+            lines.append("  no difference, to the bit")
+        return "\n".join(lines)
+
+
+def verify(path: Path, parameters: Path | None) -> Report:
+    """Recompute what is in the bag at `path`.
+
+    parameters: a parameter file to use instead of what the bag says.
+    """
+    bag = Bag(path)
+    report = Report(str(bag.path))
+    known = bag.parameters()
+    given = None if parameters is None else read_yaml(parameters)
+    runs: dict[int, _Run] = {}
+    for episode in bag.episodes():
+        report.episodes += 1
+        number = episode.key[1]
+        if number not in runs:
+            values = given if given is not None else known.get(number)
+            runs[number] = _Run(number, values, report)
+        runs[number].episode(episode)
+    for run in runs.values():
+        run.finish()
+    if not report.episodes:
+        report.notes.append("no episode of the loop is in this bag")
+    return report
+
+
+class _Run:
+    """The episodes of one run, and what they must be."""
+
+    def __init__(self, number: int, values: Mapping[str, Any] | None, report: Report) -> None:
+        self._report = report
+        self._results: dict[bytes, tuple[Array, Array | None, int]] = {}
+        self._rows: list[tuple[bytes, RecordedEpisode, int]] = []
+        self._values: dict[str, Any] | None = None
+        if values is None:
+            report.notes.append(
+                f"run {number}: its parameters are not in the bag, so nothing is recomputed "
+                "(give them with --parameters FILE)"
+            )
+            return
+        self._values = {**check(table(), {}), **values}
+        self._plant = build_plant(self._values)
+        self._fingerprint = fingerprint(self._values)
+        names = ("n_a", "dmdc_rank", "reduced_order", "state_weight", "action_weight")
+        self._settings = DesignSettings(**{name: self._values[name] for name in names})
+
+    def episode(self, episode: RecordedEpisode) -> None:
+        """Check one episode."""
+        report, where = self._report, f"episode {episode.number}"
+        for text in episode.contradictions:
+            report.differs(f"{where}: {text}")
+        missing = episode.missing
+        void = episode.cost is not None and bool(
+            (episode.cost.values[:, CostColumn.ENDED] == VOID).any()
+        )
+        if missing:
+            report.incomplete.append(f"{where} lacks {', '.join(missing)}")
+        if self._values is None or episode.start is None or episode.cost is None or void:
+            return
+        if episode.cost.plant != self._fingerprint:
+            report.differs(
+                f"{where}: recorded with another plant (fingerprint {episode.cost.plant}, "
+                f"these parameters give {self._fingerprint})"
+            )
+            return
+        self._keep(episode, where)
+        if not missing:
+            self._trajectory(episode, where)
+
+    def finish(self) -> None:
+        """Replay the training on the recorded costs."""
+        if self._values is None or not self._rows:
+            return
+        training = build_training(self._values)
+        used: set[bytes] = set()
+        report = self._report
+        while (batch := training.next_batch()) is not None:
+            keys = _keys(batch.rows, batch.policies)
+            if absent := [i for i, key in enumerate(keys) if key not in self._results]:
+                self._explain(batch, absent[0], used, training.iteration)
+                return
+            used.update(keys)
+            results = [self._results[key] for key in keys]
+            models = [m for _, m, _ in results if m is not None]
+            if batch.exploratory and len(models) < len(keys):
+                report.notes.append("a model is missing, so the training is not followed further")
+                return
+            if batch.policies is not None:
+                report.compared["policies"] += len(keys)
+            costs = np.stack([cost for cost, _, _ in results])
+            training.finish(
+                BatchResult(costs, np.stack(models) if models else None, self._fingerprint)
+            )
+        unused = [episode for key, episode, _ in self._rows if key not in used]
+        if unused:
+            self._report.differs(
+                f"episode {unused[0].number} is none of those that the training asks for"
+            )
+
+    def _keep(self, episode: RecordedEpisode, where: str) -> None:
+        """Note what each rollout of the episode gave, for the replay of the training."""
+        assert episode.start is not None and episode.cost is not None
+        if not episode.exploratory and episode.policy is None:
+            self._report.incomplete.append(f"{where} lacks its policies")
+            return
+        if episode.exploratory and episode.model is None:
+            return
+        policies = None if episode.policy is None else episode.policy.values
+        for i, key in enumerate(_keys(episode.start.values, policies)):
+            model = episode.model.values[i] if episode.model is not None else None
+            cost = episode.cost.values[i]
+            self._rows.append((key, episode, i))
+            if key not in self._results:
+                self._results[key] = (cost, model, episode.number)
+                continue
+            before, _, number = self._results[key]
+            self._report.compare(
+                "repeated rollouts", f"cost of {where}, repeating episode {number}", cost, before
+            )
+
+    def _trajectory(self, episode: RecordedEpisode, where: str) -> None:
+        assert episode.start is not None and episode.cost is not None
+        report, plant = self._report, self._plant
+        states, actions = episode.trajectory()
+        steps, count = actions.shape[:2]
+        rows = episode.start.values
+        if states.shape[1:] != (len(rows), plant.n_z) or actions.shape[2] != plant.n_a:
+            report.differs(f"{where}: states and actions do not have the plant's shape")
+            return
+        initial = plant.reset(rows[:, StartColumn.SEED].astype(np.int64)).copy()
+        report.compare("initial fields", f"z_0 of {where}", states[0], initial)
+        self._actions(episode, where, states, actions)
+
+        ended = episode.cost.values[:, CostColumn.ENDED]
+        alive = np.arange(steps)[:, None] < np.where(ended == COMPLETED, steps, ended + 1)
+        flat = (steps * count, -1)
+        again, stage = plant.evaluate(states[:-1].reshape(flat), actions.reshape(flat))
+        again = np.where(alive[..., None], again.reshape(states[1:].shape), states[:-1])
+        for k in range(steps):
+            where_k = f"z_{k + 1} of {where}"
+            if not report.compare("steps", where_k, states[k + 1], again[k]):
+                break
+        total = np.zeros(count)
+        for costs, live in zip(stage.reshape(steps, count), alive, strict=True):
+            total[live] += costs[live]
+        mean = total / steps
+        diverged = ended != COMPLETED
+        total[diverged], mean[diverged] = DIVERGED_COST * plant.horizon, DIVERGED_COST
+        table_again = np.column_stack([mean, total, ended])
+        report.compare("costs", f"cost of {where}", episode.cost.values, table_again)
+        if episode.exploratory and episode.model is not None and not diverged.any():
+            self._models(episode, where, states, actions)
+
+    def _actions(self, episode: RecordedEpisode, where: str, states: Array, actions: Array) -> None:
+        assert episode.start is not None
+        report, rows, n_a = self._report, episode.start.values, self._plant.n_a
+        law = None
+        if not episode.exploratory:
+            if episode.policy is None or episode.bases is None:
+                return
+            models = [model_rows.unpack(own, n_a) for own in episode.bases.values]
+            law = ProjectedLaw([model.U for model in models], self._plant.target)
+            law.set(episode.policy.values, rows[:, StartColumn.MODEL].astype(np.int64))
+        columns = rows[:, [StartColumn.EXCITATION, StartColumn.VARIANCE]]
+        for k, recorded in enumerate(actions):
+            if law is not None:
+                again = law.actions(states[k])
+            else:
+                again = np.stack([excitation(int(s), k, n_a, float(v)) for s, v in columns])
+            if not report.compare("actions", f"a_{k} of {where}", recorded, again):
+                return
+
+    def _models(self, episode: RecordedEpisode, where: str, states: Array, actions: Array) -> None:
+        assert episode.model is not None
+        for env, recorded in enumerate(episode.model.values):
+            own = design(states[:, env], actions[:, env], self._plant.target, self._settings)
+            text = f"model of {where}, environment {env}"
+            self._report.compare("rows of models", text, recorded, model_rows.pack(own))
+
+    def _explain(self, batch: Batch, index: int, used: set[bytes], iteration: int) -> None:
+        """Say why the training wants a rollout that is not in the bag."""
+        report = self._report
+        left = [(e, i) for key, e, i in self._rows if key not in used]
+        if not left:
+            report.notes.append(
+                f"the bag ends after iteration {iteration}; up to there the training was followed"
+            )
+            return
+        row = batch.rows[index]
+        for episode, i in left:
+            assert episode.start is not None
+            if batch.policies is None or episode.policy is None:
+                continue
+            if np.array_equal(episode.start.values[i], row):
+                report.compare(
+                    "policies",
+                    f"policy of episode {episode.number}, environment {i}, "
+                    f"after iteration {iteration}",
+                    episode.policy.values[i],
+                    batch.policies[index],
+                )
+                return
+        if self._report.incomplete:
+            report.notes.append(
+                f"an episode after iteration {iteration} is not in the bag, "
+                "so the training is not followed further"
+            )
+            return
+        report.differs(
+            f"after iteration {iteration} the training asks for a rollout from seed "
+            f"{int(row[StartColumn.SEED])}, which is not in the bag; "
+            f"episode {left[0][0].number} has another one"
+        )
+
+
+def _keys(rows: Array, policies: Array | None) -> list[bytes]:
+    """What identifies each rollout: its seeds, its model and its policy, bit by bit."""
+    if policies is None:
+        return [row.tobytes() for row in np.ascontiguousarray(rows)]
+    return [
+        np.ascontiguousarray(row).tobytes() + np.ascontiguousarray(policy).tobytes()
+        for row, policy in zip(rows, policies, strict=True)
+    ]

@@ -1,0 +1,1 @@
+"""The recorder: real rosbag2 bags of the loop's topics, with an index of the episodes in them."""

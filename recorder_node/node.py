@@ -1,0 +1,301 @@
+"""recorder_node: writes the loop's topics to a rosbag2 bag, as a ROS 2 node.
+
+Subscribes  every topic of the loop in its namespace (and of `pairs`), /clock
+Publishes   recorder/status (std_msgs/String, latched; from when nothing can be missed any more)
+It takes serialised bytes in batches, off the loop's path. What is written: recorder_node.recording.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Float64MultiArray, String
+
+from loop_interfaces.isolation import keep_on_this_machine
+from loop_interfaces.node_loop import (
+    ConfigurationError,
+    NodeLoop,
+    OutsideExecutor,
+    node_main,
+    scoped,
+)
+from loop_interfaces.parameters import RECORDER, TUNER, table
+from loop_interfaces.ros_parameters import RemoteParameters, declare, given_parameters
+from loop_interfaces.topics import ACTION, RECORDER_STATUS, START, STATE
+from recorder_node.bag import BagError
+from recorder_node.recording import (
+    ARRAY_TYPE,
+    CLOCK_TYPE,
+    TEXT_TYPE,
+    Recording,
+    Source,
+    clock,
+    sources,
+)
+
+RECORDING_FAILED = 3
+"""Exit code when writing fails later on; 1 is a recording that cannot begin."""
+DRAIN = 0.02
+"""Seconds between two batches: often enough for the depth below, seldom enough to cost little."""
+FLUSH = 0.5
+"""Seconds of recording that a SIGKILL may lose at the most."""
+DEPTH = 4000
+"""Samples a reader keeps: most of a second of the fastest loop, should this process be held up."""
+NAMELESS = "_NODE_NAME_UNKNOWN_"
+"""What the graph says of an endpoint whose node it has not heard of yet."""
+PATIENCE = 3.0
+"""Seconds in which a node is expected to answer a request for its parameters."""
+REPORT = 1.0
+"""Seconds between two messages on recorder/status."""
+QUIET = 0.1
+"""At the end: seconds without a message after which nothing more is on its way."""
+_TYPES = {ARRAY_TYPE: Float64MultiArray, TEXT_TYPE: String, CLOCK_TYPE: Clock}
+
+STATUS_QOS = QoSProfile(
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1,
+)
+"""Latched: a tuner that starts later learns of the recorder, too."""
+
+
+def reader_qos(source: Source) -> QoSProfile:
+    """Reliable for what is latched. Best effort for states and actions: their writers keep one
+    sample, so a lost one could not be sent again, and acknowledgements would slow the loop.
+    """
+    latched = source.channel.latched
+    return QoSProfile(
+        reliability=ReliabilityPolicy.RELIABLE if latched else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        history=HistoryPolicy.KEEP_LAST,
+        depth=DEPTH,
+    )
+
+
+@dataclass
+class _Peer:
+    """A process that publishes a topic of the loop, and since when we know of it."""
+
+    since: float
+    name: str = ""
+    parameters: RemoteParameters | None = None
+
+    def matched(self, now: float) -> bool:
+        """Whether it knows of our readers; one without parameter services counts in the end."""
+        answered = self.parameters is not None and self.parameters.values is not None
+        return answered or now - self.since > PATIENCE
+
+
+class Peers:
+    """The nodes of the loop: whether they know of our readers, and their parameters.
+
+    required: full names of topics that somebody must publish; others: whose publishers, if there
+    are any, are asked, too.
+    """
+
+    def __init__(self, node: Node, required: list[str], others: list[str]) -> None:
+        self._node, self._required, self._topics = node, required, [*others, *required]
+        self._peers: dict[bytes, _Peer] = {}
+        self._lacking = list(required)
+        self._told: object = None
+
+    def look(self, now: float) -> None:
+        """Look at the graph, ask who is new, take answers."""
+        seen: set[bytes] = set()
+        self._lacking = []
+        for topic in self._topics:
+            found = self._node.get_publishers_info_by_topic(topic)
+            if topic in self._required and not found:
+                self._lacking.append(topic)
+            for endpoint in found:
+                # The first 12 bytes of an endpoint's id are its process's.
+                process = bytes(endpoint.endpoint_gid)[:12]
+                seen.add(process)
+                peer = self._peers.setdefault(process, _Peer(now))
+                if not peer.name and endpoint.node_name != NAMELESS:
+                    peer.name = f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
+                    peer.parameters = RemoteParameters(self._node, peer.name)
+        for process in set(self._peers) - seen:
+            self._drop(process)
+        for peer in self._peers.values():
+            if peer.parameters is not None:
+                peer.parameters.poll()
+
+    def all_matched(self, now: float) -> bool:
+        """Whether every required topic has a publisher, and all of them know of us."""
+        return not self._lacking and all(peer.matched(now) for peer in self._peers.values())
+
+    def changed(self, run: int) -> bool:
+        """Whether `parameters` may have changed since the last call with the same run."""
+        answered = [
+            p for p, peer in self._peers.items() if peer.parameters and peer.parameters.values
+        ]
+        changed, self._told = (run, answered) != self._told, (run, answered)
+        return changed
+
+    def parameters(self) -> dict[str, object]:
+        """The loop's parameters, as far as its nodes told them; of a node started again the new."""
+        known = {spec.name for spec in table()}
+        answers = [peer.parameters.values for peer in self._peers.values() if peer.parameters]
+        return {
+            name: value
+            for values in answers
+            for name, value in (values or {}).items()
+            if name in known or name.startswith("physical.")
+        }
+
+    def _drop(self, process: bytes) -> None:
+        peer = self._peers.pop(process)
+        if peer.parameters is not None:
+            peer.parameters.close()
+
+
+def _declare(node: Node) -> dict[str, Any]:
+    pairs = [spec for spec in TUNER if spec.name == "pairs"]
+    return declare(node, [*RECORDER, *pairs], given_parameters(node))
+
+
+class RecorderNode:
+    """Moves serialised messages from the topics into the recording."""
+
+    def __init__(self, node: Node, loop: NodeLoop) -> None:
+        values = _declare(node)
+        names: list[str] = values["pairs"]
+        self._namespaces = [
+            node.resolve_topic_name(scoped(name, "state")).removesuffix("state") for name in names
+        ]
+        what = [source for namespace in self._namespaces for source in sources(namespace)]
+        what += [clock()] if values["record_clock"] else []
+        folder = str(values["bag"]) or time.strftime("bags/%Y%m%d-%H%M%S")
+        self._recording = Recording(
+            Path(folder),
+            what,
+            storage=values["bag_storage"],
+            bag_per_episode=values["bag_per_episode"],
+        )
+        self._what = what
+        self._flush_at = self._report_at = 0.0
+        self._wire(node, loop)
+        self._log.info(f"recording to {self._recording.path} ({values['bag_storage']})")
+
+    def join(self, node: Node, loop: NodeLoop) -> None:
+        """Go on with the same bag on a new node; what was missed shows as incomplete episodes."""
+        _declare(node)
+        self._wire(node, loop)
+
+    def _wire(self, node: Node, loop: NodeLoop) -> None:
+        self._node, self._loop, self._log = node, loop, node.get_logger()
+        self._subscriptions = [(source, self._subscribe(source)) for source in self._what]
+        self._peers = Peers(
+            node,
+            required=[f"{n}{topic.name}" for n in self._namespaces for topic in (STATE, ACTION)],
+            others=[node.resolve_topic_name(START.name)],
+        )
+        self._status: Publisher | None = None
+
+    def run(self) -> int:
+        """Record until a signal comes; 0, or RECORDING_FAILED when the disk refuses."""
+        recording = self._recording
+        try:
+            self._loop.run(tick=self._tick, deadline=lambda: 0.0, housekeeping=self._housekeeping)
+            if self._loop.suspended:
+                return 0
+            deadline = time.monotonic() + 1.0
+            quiet_at = time.monotonic() + QUIET
+            while time.monotonic() < min(quiet_at, deadline):
+                time.sleep(DRAIN)
+                if self._drain():
+                    quiet_at = time.monotonic() + QUIET
+            recording.close()
+        except BagError as error:
+            print(f"recorder_node: {error}", file=sys.stderr)
+            return RECORDING_FAILED
+        self._log.info(
+            f"{recording.messages} messages of {recording.episodes} episodes in {recording.path}, "
+            f"{recording.incomplete} of them incomplete"
+        )
+        return 0
+
+    def _subscribe(self, source: Source) -> Subscription:
+        return self._node.create_subscription(
+            _TYPES[source.channel.type],
+            source.channel.topic,
+            lambda _: None,  # never called: see OutsideExecutor
+            reader_qos(source),
+            callback_group=OutsideExecutor(),
+            raw=True,
+        )
+
+    def _tick(self, now: float) -> None:
+        time.sleep(DRAIN)
+        self._drain()
+        if now >= self._flush_at:
+            self._flush_at = now + FLUSH
+            self._recording.flush(time.time_ns())
+
+    def _drain(self) -> int:
+        """Record what has come in, in the order of arrival."""
+        taken: list[tuple[int, int, Source, bytes]] = []
+        for source, subscription in self._subscriptions:
+            message_type, handle = _TYPES[source.channel.type], subscription.handle
+            for _ in range(DEPTH):
+                got = handle.take_message(message_type, True)
+                if got is None:
+                    break
+                raw, info = got
+                taken.append((info["received_timestamp"], len(taken), source, raw))
+        taken.sort(key=lambda item: item[:2])
+        for when, _, source, raw in taken:
+            self._recording.take(source, when, raw)
+        return len(taken)
+
+    def _housekeeping(self, now: float) -> None:
+        self._peers.look(now)
+        run = self._recording.run
+        if run and self._peers.changed(run):
+            self._recording.note(run, self._peers.parameters())
+        if self._status is None and self._peers.all_matched(now):
+            self._status = self._node.create_publisher(String, RECORDER_STATUS, STATUS_QOS)
+            self._log.info("matched with all publishers of the loop")
+        if self._status is not None and now >= self._report_at:
+            self._report_at = now + REPORT
+            self._status.publish(String(data=self._status_text()))
+
+    def _status_text(self) -> str:
+        recording = self._recording
+        return json.dumps(
+            {
+                "bag": str(recording.path.resolve()),
+                "messages": recording.messages,
+                "episodes": recording.episodes,
+                "incomplete": recording.incomplete,
+            }
+        )
+
+
+def _make(node: Node, loop: NodeLoop) -> RecorderNode:
+    try:
+        return RecorderNode(node, loop)
+    except BagError as error:
+        raise ConfigurationError(str(error)) from error
+
+
+def main(args: list[str] | None = None) -> int:
+    """Console script."""
+    keep_on_this_machine()
+    return node_main("recorder_node", args, _make)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
