@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ipaddress
 import os
+import re
+from pathlib import Path
 
 from loop_interfaces.problem import config_folder
 
@@ -17,9 +20,54 @@ def loopback_environment() -> dict[str, str]:
     """
     if os.environ.get(PROFILE) or os.environ.get(NETWORK) == "1":
         return {}
-    return {PROFILE: str(config_folder() / "fastdds_loopback.xml")}
+    return {PROFILE: str(_loopback_profile())}
 
 
 def keep_on_this_machine() -> None:
     """Apply `loopback_environment` to this process; call before ROS is initialised."""
     os.environ.update(loopback_environment())
+
+
+def is_confined() -> bool:
+    """Whether this process was told to keep its traffic on this machine."""
+    return os.environ.get(PROFILE) == str(_loopback_profile())
+
+
+def outside_sockets() -> list[str]:
+    """Addresses of this process's UDP sockets that reach beyond the loopback interface.
+
+    Fast DDS only logs a profile that it cannot read and goes on with its defaults, which send to
+    every interface: so look at what it has opened. Multicast addresses are groups that were joined,
+    on the interface of the profile, and count as inside.
+    """
+    own = set()
+    for entry in Path("/proc/self/fd").iterdir():
+        try:
+            target = str(entry.readlink())
+        except OSError:
+            continue
+        if match := re.fullmatch(r"socket:\[(\d+)\]", target):
+            own.add(match.group(1))
+    outside = []
+    for table in ("udp", "udp6"):
+        try:
+            lines = Path(f"/proc/self/net/{table}").read_text().splitlines()[1:]
+        except OSError:
+            continue
+        for line in lines:
+            columns = line.split()
+            address = _address(columns[1].split(":")[0])
+            if columns[9] in own and not (address.is_loopback or address.is_multicast):
+                outside.append(str(address))
+    return outside
+
+
+def _loopback_profile() -> Path:
+    return config_folder() / "fastdds_loopback.xml"
+
+
+def _address(hexadecimal: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
+    """An address as /proc/net writes it: words of four bytes, each in the machine's order."""
+    raw = bytes.fromhex(hexadecimal)
+    words = b"".join(raw[i : i + 4][::-1] for i in range(0, len(raw), 4))
+    return ipaddress.ip_address(words)

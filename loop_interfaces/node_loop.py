@@ -10,6 +10,7 @@ executor never runs, so both can share one node and ROS tools see one node.
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import sys
 import time
@@ -31,6 +32,7 @@ from rclpy.utilities import remove_ros_args, try_shutdown
 from std_msgs.msg import Float64MultiArray
 
 from loop_interfaces.frames import ArrayCodec, Frame
+from loop_interfaces.isolation import PROFILE, is_confined, outside_sockets
 from loop_interfaces.topics import READER_DEPTH, WRITER_DEPTH, Topic
 
 HOUSEKEEPING = 0.05
@@ -234,6 +236,11 @@ def ros_node(name: str, args: list[str] | None) -> Iterator[tuple[Node, NodeLoop
             node = Node(name, start_parameter_services=True)
         except Exception as error:
             raise ConfigurationError(_first_line(error)) from error
+        if is_confined() and (outside := outside_sockets()):
+            raise ConfigurationError(
+                f"the Fast DDS profile {os.environ[PROFILE]} did not take effect (UDP sockets at "
+                f"{', '.join(outside)}); expected the loopback interface only, or PDELOOP_NETWORK=1"
+            )
         loop = NodeLoop(node)
 
         def stop(number: int, frame: FrameType | None) -> None:

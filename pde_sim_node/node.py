@@ -64,6 +64,8 @@ class PlantNode:
     def __init__(self, node: Node, loop: NodeLoop) -> None:
         values = declare_parameters(node)
         plant = build_plant(values)
+        if plant.compiled_in_seconds > 0.0:
+            node.get_logger().info(f"compiled the kernel in {plant.compiled_in_seconds:.1f} s")
         self._lockstep = Lockstep(
             plant,
             fingerprint=fingerprint(values),

@@ -1,0 +1,94 @@
+"""By default nothing of a run leaves the machine, and two runs on it do not meet."""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from bringup.domain import DomainError, own_domain
+from loop_interfaces.isolation import NETWORK, PROFILE, loopback_environment, outside_sockets
+from loop_interfaces.problem import config_folder
+from tests.loop_harness import ROOT, Processes, until
+
+pytestmark = pytest.mark.topics
+
+
+def udp_addresses(pid: int) -> set[str]:
+    """Local addresses (hexadecimal) of the UDP sockets of a process."""
+    inodes = set()
+    for entry in Path(f"/proc/{pid}/fd").iterdir():
+        target = str(entry.readlink())
+        if target.startswith("socket:["):
+            inodes.add(target[8:-1])
+    lines = Path(f"/proc/{pid}/net/udp").read_text().splitlines()[1:]
+    return {line.split()[1].split(":")[0] for line in lines if line.split()[9] in inodes}
+
+
+def test_a_nodes_sockets_are_on_loopback_only(loop: Processes):
+    node = loop.node("controller_node")
+    until(lambda: "tracking law" in loop.output(node), 20.0, "start of the node")
+    assert udp_addresses(node.pid) <= {"0100007F", "0100FFEF"}  # 127.0.0.1, 239.255.0.1
+    assert "0100007F" in udp_addresses(node.pid)
+
+
+def test_a_profile_without_effect_is_noticed_and_refused(loop: Processes, tmp_path):
+    # The node's own copy of the configuration is damaged; Fast DDS would only log that. It runs in
+    # a network namespace without any interface, so that its defaults reach nobody.
+    sources = tmp_path / "copy"
+    for folder in ("loop_interfaces", "controller_node", "config"):
+        shutil.copytree(ROOT / folder, sources / folder)
+    (sources / "config" / "fastdds_loopback.xml").write_text("<dds>broken")
+    environment = {**loop.environment, "PYTHONPATH": str(sources)}
+    del environment[PROFILE]
+    done = subprocess.run(
+        ["unshare", "-n", sys.executable, "-m", "controller_node.node"],
+        env=environment,
+        cwd=sources,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert "did not take effect" in done.stderr.strip().splitlines()[-1]
+
+
+def test_a_socket_on_every_interface_counts_as_outside():
+    before = outside_sockets()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as inside:
+        inside.bind(("127.0.0.1", 0))
+        assert outside_sockets() == before
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as outside:
+            outside.bind(("0.0.0.0", 0))
+            assert outside_sockets() == [*before, "0.0.0.0"]
+
+
+def test_the_user_opens_the_network_on_purpose(monkeypatch):
+    expected = {PROFILE: str(config_folder() / "fastdds_loopback.xml")}
+    assert loopback_environment() == expected
+    monkeypatch.setenv(NETWORK, "1")
+    assert loopback_environment() == {}
+    monkeypatch.setenv(NETWORK, "0")
+    monkeypatch.setenv(PROFILE, "/my/profile.xml")
+    assert loopback_environment() == {}
+
+
+def test_every_run_has_a_domain_of_its_own_unless_the_user_sets_one(monkeypatch):
+    with own_domain() as first, own_domain() as second:
+        assert first != second
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as busy:
+            taken = next(d for d in range(1, 101) if d not in (first, second))
+            busy.bind(("127.0.0.1", 7410 + 250 * taken))
+            for _ in range(5):
+                with own_domain() as third:
+                    assert third not in (first, second, taken)
+    monkeypatch.setenv("ROS_DOMAIN_ID", "7")
+    with own_domain() as chosen:
+        assert chosen == 7
+    monkeypatch.setenv("ROS_DOMAIN_ID", "many")
+    with pytest.raises(DomainError, match="'many'; expected a whole number"), own_domain():
+        pass
