@@ -117,6 +117,11 @@ def test_damaged_checkpoints_are_passed_over_or_refused(tmp_path):
         arrays, warnings = checkpoint.load(path)
         assert arrays["a"].tolist() == [0, 1, 2]
         assert len(warnings) == 1
+    # The damaged one is not kept in place of the good one before it.
+    checkpoint.save(path, {"a": np.arange(5)})
+    path.write_bytes(good[:40])
+    assert checkpoint.load(path)[0]["a"].tolist() == [0, 1, 2]
+    path.write_bytes(good[:40])
     checkpoint.previous(path).unlink()
     with pytest.raises(checkpoint.CheckpointError, match="no usable checkpoint"):
         checkpoint.load(path)

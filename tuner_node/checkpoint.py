@@ -7,6 +7,7 @@ that a file damaged later can be passed over.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import os
@@ -70,7 +71,8 @@ def save(path: Path, arrays: Arrays) -> None:
 def load(path: Path) -> tuple[dict[str, NDArray[Any]], list[str]]:
     """The newest good checkpoint at `path` and warnings about what was passed over.
 
-    Raises CheckpointError when neither the file nor its predecessor is whole.
+    What is damaged is set aside as `checkpoint*.damaged`, so that the next `save` cannot take it for
+    the checkpoint to keep. Raises CheckpointError when neither the file nor its predecessor is whole.
     """
     warnings: list[str] = []
     for candidate in (path.with_name(path.name + ".new"), path, previous(path)):
@@ -80,6 +82,8 @@ def load(path: Path) -> tuple[dict[str, NDArray[Any]], list[str]]:
             return _read(candidate), warnings
         except CheckpointError as error:
             warnings.append(str(error))
+            with contextlib.suppress(OSError):
+                candidate.replace(candidate.with_name(candidate.name + ".damaged"))
     detail = "; ".join(warnings) if warnings else f"{path} does not exist"
     raise CheckpointError(f"no usable checkpoint: {detail}")
 

@@ -139,7 +139,7 @@ def fit(
         penalty[1 + r : affine] = _ACTION_RIDGE
         matrix = gram[:size, :size].copy()
         matrix[np.diag_indices(size)] += penalty
-        solution = linalg.solve(matrix, moment[:size], assume_a="pos").T
+        solution = linalg.cho_solve(linalg.cho_factor(matrix), moment[:size]).T
         quadratic = np.zeros((r, r, r))
         if size > affine:
             half = 0.5 * solution[:, affine:] / spread**2
@@ -159,6 +159,7 @@ def fit(
 
 def _spread(share: Array, values: Array) -> float:
     """One scale for all coordinates, so that the ridge holds small modes back more than large
-    ones."""
+    ones.
+    """
     square = float(np.mean(share @ (values * values)))
     return float(np.sqrt(square)) if square > 0.0 else 1.0

@@ -4,26 +4,18 @@ The cost is a sum of squares of measured quantities; only its sensitivity to the
 model, and that is fitted to the rollouts as they come in. So a model error bends the direction of a
 step, never the cost, and every step is judged by rollouts.
 
-The law is a = K_a s + b with s = U^T z and theta = [K_a b], n_a (n_s + 1) numbers: K_b acts only
-through b = K_b s_r, and any b is again of that form, so the result is an ordinary policy [K_a K_b].
-An iteration
+The law is a = K_a s + b with s = U^T z and theta = [K_a b]: K_b acts only through b = K_b s_r. An
+iteration
 
-1. fits local models to the remembered trajectories (`fit`) and chooses the one, and the forgetting
-gamma, that
-   predict measured differences of trajectories (`sensitivity`),
-2. solves (H + lambda D) d = -g with the Gauss-Newton curvature H and a trust region in input
-energy,
-   D = 2 r I (x) mean [s; 1][s; 1]^T,
+1. fits local models to the remembered trajectories (`fit`) and keeps those that predict measured
+   differences of trajectories (`selection`),
+2. solves (H + lambda D) d = -g with the averaged Gauss-Newton curvature (`sensitivity`),
 3. rolls out theta + d on the M fields of the moment, one by one, giving up as soon as the mean is
-clearly above the
-   incumbent's, accepts it if the mean over all fields fell, and adapts lambda,
+   clearly above the incumbent's, accepts it if the mean over all fields fell, and adapts lambda,
+   An incumbent that diverges is halved instead,
 4. after an acceptance replaces the oldest field, so that the policy does not fit M fields.
 
-References
-----------
-Nocedal, Wright, "Numerical Optimization", 2nd ed., chapters 4 and 10 (Levenberg-Marquardt). Abbeel,
-Quigley, Ng, "Using inaccurate models in reinforcement learning", ICML 2006. The control problem:
-Zhang, Mowlavi, Benosman, Basar, arXiv:2403.01005.
+Sources and equations: docs/optimizers.md.
 """
 
 from __future__ import annotations
@@ -56,6 +48,9 @@ _DAMPING = (1e-4, 1.0, 100.0)  # smallest, first, largest after a rejection
 _ABORT = 1.05
 _MEMORY = 40
 _NONE = -1
+# Attributes that a checkpoint holds besides the policies and the records.
+_STAMPS = ("fields", "incumbents", "trials", "others")
+_NUMBERS = ("fall", "damping", "accepted", "proposed", "iteration")
 
 
 class GaussNewton:
@@ -72,8 +67,8 @@ class GaussNewton:
     context : Context
         Basis, target, weights, horizon and the exploratory trajectory.
     fields : int
-        M, initial fields that judge a policy. More fit the distribution better and cost M rollouts
-        a step.
+        M, initial fields that judge a policy: more fit the distribution better, at M rollouts a
+        step.
     modes : int
         Coordinates of the fitted model, at least n_s.
     learning_rate, smoothing_radius : float, optional
@@ -101,11 +96,9 @@ class GaussNewton:
         self._seed = seed
         self._budget = 2 * iterations
         self._fields = np.arange(fields, dtype=np.int64)
-        # Stamps of the records of the incumbent, of the candidate, and of what the incumbent is
-        # compared with.
-        self._incumbents = np.full(fields, _NONE, dtype=np.int64)
-        self._trials = np.full(fields, _NONE, dtype=np.int64)
-        self._others = np.full(fields, _NONE, dtype=np.int64)
+        # Stamps of the records of the incumbent, the candidate, and what the incumbent is compared
+        # to.
+        self._incumbents, self._trials, self._others = np.full((3, fields), _NONE, dtype=np.int64)
         self._records = Records(_MEMORY, 3.0 * float(np.abs(context.exploration.states).max()))
         self._candidate = self._policy.copy()
         self._fall = 0.0
@@ -119,10 +112,7 @@ class GaussNewton:
         """The incumbent: the best policy so far."""
         return self._policy.copy()
 
-    @property
-    def best_policy(self) -> Array:
-        """The incumbent."""
-        return self.policy
+    best_policy = policy
 
     @property
     def iteration(self) -> int:
@@ -139,24 +129,19 @@ class GaussNewton:
         left = self._budget - self._records.count
         missing = np.flatnonzero(self._incumbents == _NONE)
         if missing.size:
-            return (
-                [self._rollout(self._policy, int(i)) for i in missing]
-                if left >= missing.size
-                else []
-            )
+            new = [self._rollout(self._policy, int(i)) for i in missing]
+            return new if left >= missing.size else []
         if not self._proposed or left <= 0:
             return []
         return [self._rollout(self._candidate, int(np.argmax(self._trials == _NONE)))]
 
     def tell(self, results: Sequence[RolloutResult]) -> Row:
         """Take the rollouts in, and when they decide about a candidate, propose the next."""
-        asked = self.ask()
-        require_results(results, len(asked))
+        require_results(results, len(self.ask()))
+        for result in results:
+            self._records.sound(result)
         self._iteration += 1
-        row: Row = {
-            "iteration": self._iteration,
-            "diverged": sum(not result.usable for result in results),
-        }
+        row: Row = {"iteration": self._iteration, "diverged": sum(not r.usable for r in results)}
         missing = np.flatnonzero(self._incumbents == _NONE)
         if missing.size:
             first = self._records.count == 0
@@ -187,38 +172,21 @@ class GaussNewton:
         return {
             "policy": self._policy.copy(),
             "candidate": self._candidate.copy(),
-            "fields": self._fields.copy(),
-            "incumbents": self._incumbents.copy(),
-            "trials": self._trials.copy(),
-            "others": self._others.copy(),
-            "fall": np.array(self._fall),
-            "damping": np.array(self._damping),
-            "accepted": np.array(self._accepted),
-            "proposed": np.array(self._proposed),
-            "iteration": np.array(self._iteration),
+            **{name: getattr(self, f"_{name}").copy() for name in _STAMPS},
+            **{name: np.array(getattr(self, f"_{name}")) for name in _NUMBERS},
             "seed": np.array(self._seed),
+            "field_count": np.array(self._fields.size),
             **self._records.state(self._proposer.n_z, n_a, gains),
         }
 
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
         """Continue from a checkpoint with the same seed and number of fields."""
-        require_state(state, self.state(), ("seed",))
-        policies = checked_policy(state["policy"]), checked_policy(state["candidate"])
-        if state["fields"].shape != self._fields.shape:
-            raise ValueError(
-                f"the checkpoint was written with {state['fields'].size} fields, but this training "
-                f"has {self._fields.size}; continue with the same parameters or start anew."
-            )
-        self._policy, self._candidate = policies
-        self._fields = state["fields"].astype(np.int64)
-        self._incumbents = state["incumbents"].astype(np.int64)
-        self._trials = state["trials"].astype(np.int64)
-        self._others = state["others"].astype(np.int64)
-        self._fall = float(state["fall"].item())
-        self._damping = float(state["damping"].item())
-        self._accepted = bool(state["accepted"].item())
-        self._proposed = bool(state["proposed"].item())
-        self._iteration = int(state["iteration"].item())
+        require_state(state, self.state(), ("seed", "field_count"))
+        self._policy, self._candidate = map(checked_policy, (state["policy"], state["candidate"]))
+        for name in _STAMPS:
+            setattr(self, f"_{name}", state[name].astype(np.int64))
+        for name in _NUMBERS:
+            setattr(self, f"_{name}", state[name].item())
         self._records.restore(state)
 
     def _rollout(self, policy: Array, slot: int) -> Rollout:
@@ -234,10 +202,8 @@ class GaussNewton:
     def _judge(self, row: Row) -> bool:
         """Accept or reject the candidate, or let it run on; whether the decision has fallen."""
         ran = self._trials != _NONE
-        trial, incumbent = (
-            self._mean_cost(self._trials[ran]),
-            self._mean_cost(self._incumbents[ran]),
-        )
+        trial = self._mean_cost(self._trials[ran])
+        incumbent = self._mean_cost(self._incumbents[ran])
         if trial >= _ABORT * incumbent or (ran.all() and trial >= incumbent):
             self._damping = min(4.0 * self._damping, _DAMPING[2])
             self._others = self._trials.copy()
@@ -265,6 +231,11 @@ class GaussNewton:
     def _propose(self, row: Row) -> None:
         if self._budget - self._records.count < len(self._fields):
             return
+        if not np.isfinite(self._mean_cost(self._incumbents)):
+            # Nothing to improve on: halve the gains until the rollouts come to their end.
+            start = self._policy if self._accepted else self._candidate
+            self._candidate, self._fall, self._proposed = 0.5 * start, 0.0, True
+            return
         # One thread: a threaded LAPACK rounds differently for another number of threads.
         with threadpool_limits(limits=1):
             proposal = self._proposer.propose(
@@ -274,10 +245,6 @@ class GaussNewton:
                 damping=self._damping,
                 accepted=self._accepted,
             )
-        if proposal is None:
-            return
-        self._candidate, self._fall, self._proposed = proposal.policy, proposal.fall, True
-        row["predicted_fall"] = proposal.fall
-        row["mismatch"] = proposal.mismatch
-        row["kappa"] = proposal.kappa
-        row["models"] = proposal.models
+        if proposal is not None:
+            self._candidate, self._fall, self._proposed = proposal.policy, proposal.fall, True
+            row.update(proposal.row())

@@ -11,36 +11,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
 
-from tuner_node.optimizers.base import Array, Context
+from tuner_node.optimizers.base import Array, Context, Row
 from tuner_node.optimizers.fit import LocalModel, extended_basis, fit
-from tuner_node.optimizers.sensitivity import Path, expand, predict_difference
+from tuner_node.optimizers.selection import KAPPAS, LOCAL, RIDGES, Pair, choices, mismatches
+from tuner_node.optimizers.sensitivity import Path, damped_step
 from tuner_node.optimizers.trajectories import Record
 
 __all__ = ["Proposal", "Proposer"]
 
-# Candidates of the model: ridges of the quadratic part, and forgetting over an episode,
-# exp(-kappa).
-_RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
-_KAPPAS = (0.0, 5.0, 15.0)
-# After an accepted step a simpler choice is good enough within this factor and margin of the best
-# prediction.
-_ENOUGH = (1.5, 0.03)
-# Models are averaged whose error is within this factor and margin of the best, and within this of
-# it.
-_ALIKE = (3.0, 0.03, 0.15)
 # A step that predicts less than this share of the cost is not worth its rollouts: the next choice.
 _LEAST_FALL = 1e-3
-# A prediction error counts at most this much, relative to the difference it predicts.
-_WORST = 2.0
 # Weight of a rollout in the fit: falls with its age, down to a floor, and with its cost.
 _AGEING = 0.9
 _AGEING_FLOOR = 0.3
-# Share of the trust region that bounds all gains alike, relative to the one in input energy.
-_ISOTROPY = 0.3
-# A comparison with a rollout that costs more than this many times the incumbent is not local.
-_LOCAL = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +49,15 @@ class Proposal:
     models: int
     kappa: float
     mismatch: float
+
+    def row(self) -> Row:
+        """What a history row says about it."""
+        return {
+            "predicted_fall": self.fall,
+            "models": self.models,
+            "kappa": self.kappa,
+            "mismatch": self.mismatch,
+        }
 
 
 class Proposer:
@@ -153,18 +146,28 @@ class Proposer:
         models = self._fit(data, V, incumbents)
         policy = incumbents[0].policy
         K = np.ascontiguousarray(policy[:, : self.n_s])
-        errors = self._mismatches(models, V, K, incumbents, others)
+        pairs = self._pairs(V, incumbents, others)
+        errors = mismatches(models, K, pairs, self._horizon)
         paths = [self._path(record, V) for record in incumbents if len(record.actions)]
         least = _LEAST_FALL * self._level(incumbents)
         proposal = None
-        for kappa, chosen in self._choices(errors, accepted):
+        for kappa, chosen in choices(errors, accepted):
             ensemble = [models[i] for i in chosen]
-            step, fall = self._step(ensemble, paths, K, V.T @ self._target, kappa, damping)
+            step, fall = damped_step(
+                ensemble,
+                paths,
+                K,
+                target=V.T @ self._target,
+                state_weight=self._q,
+                action_weight=self._r,
+                gamma=float(np.exp(-kappa / self._horizon)),
+                damping=damping,
+            )
             candidate = self.moved(policy, step)
             if not (np.isfinite(candidate).all() and np.isfinite(fall)):
                 continue
             if proposal is None or fall > proposal.fall:
-                mismatch = float(errors[chosen, _KAPPAS.index(kappa)].min())
+                mismatch = float(errors[chosen, KAPPAS.index(kappa)].min())
                 proposal = Proposal(candidate, fall, len(ensemble), kappa, mismatch)
             if fall >= least:
                 break
@@ -191,7 +194,7 @@ class Proposer:
             np.concatenate(a),
             np.concatenate(change),
             np.concatenate(weights),
-            _RIDGES,
+            RIDGES,
         )
 
     def _level(self, incumbents: Sequence[Record]) -> float:
@@ -210,99 +213,22 @@ class Proposer:
             x, record.actions, np.column_stack([x[:, : self.n_s], np.full(length, self._one)])
         )
 
-    def _choices(self, errors: Array, accepted: bool) -> list[tuple[float, list[int]]]:
-        """Forgetting and the models to average over, the choice to use first."""
-        best = errors.min(axis=0)
-        order = [int(j) for j in np.argsort(best, kind="stable")]
-        if accepted:
-            first = int(np.argmax(best <= _ENOUGH[0] * best.min() + _ENOUGH[1]))
-            order = [first, *order]
-        alike = np.minimum(_ALIKE[0] * best + _ALIKE[1], best + _ALIKE[2])
-        return [
-            (_KAPPAS[j], [int(i) for i in np.flatnonzero(errors[:, j] <= alike[j])]) for j in order
-        ]
-
-    def _mismatches(
-        self,
-        models: Sequence[LocalModel],
-        V: Array,
-        K: Array,
-        incumbents: Sequence[Record],
-        others: Sequence[Record | None],
-    ) -> Array:
-        pairs = []
+    def _pairs(
+        self, V: Array, incumbents: Sequence[Record], others: Sequence[Record | None]
+    ) -> list[Pair]:
+        """Pairs of whole rollouts: two fields, and two policies on one field."""
+        chosen = []
         for i, record in enumerate(incumbents):
             neighbour, other = incumbents[(i + 1) % len(incumbents)], others[i]
             if neighbour is not record and neighbour.usable and record.usable:
-                pairs.append((record, neighbour))
-            if other is not None and other.cost < _LOCAL * record.cost and record.usable:
-                pairs.append((record, other))
-        errors = np.zeros((len(models), len(_KAPPAS)))
-        if not pairs:
-            return errors
-        first = [self._path(record, V) for record, _ in pairs]
-        second = [self._path(record, V) for _, record in pairs]
-        forcing = np.stack(
-            [
-                path.features @ (self.theta(b.policy) - self.theta(a.policy)).T
-                for path, (a, b) in zip(second, pairs, strict=True)
-            ]
-        )
-        x = np.stack([path.x for path in first])
-        measured = np.stack([path.x for path in second]) - x
-        size = np.maximum(np.sum(measured**2, axis=(1, 2)), 1e-300)
-        gammas = np.exp(-np.array(_KAPPAS) / self._horizon)
-        for i, model in enumerate(models):
-            with np.errstate(over="ignore", invalid="ignore"):
-                predicted = predict_difference(
-                    model.jacobians(x),
-                    model.B,
-                    K,
-                    initial=measured[:, 0],
-                    forcing=forcing,
-                    gammas=gammas,
-                )
-                error = np.sum((predicted - measured) ** 2, axis=(2, 3)) / size
-            error = np.where(np.isfinite(error), np.minimum(error, _WORST), _WORST)
-            errors[i] = error.mean(axis=1)
-        return errors
-
-    def _step(
-        self,
-        models: Sequence[LocalModel],
-        paths: Sequence[Path],
-        K: Array,
-        target: Array,
-        kappa: float,
-        damping: float,
-    ) -> tuple[Array, float]:
-        n_f = self.n_s + 1
-        p = self.n_a * n_f
-        g, H, features = np.zeros(p), np.zeros((p, p)), np.zeros((n_f, n_f))
-        with np.errstate(over="ignore", invalid="ignore"):
-            for path in paths:
-                share = 1.0 / (len(paths) * len(models))
-                for model in models:
-                    expansion = expand(
-                        path,
-                        model.jacobians(path.x),
-                        model.B,
-                        K,
-                        target=target,
-                        state_weight=self._q,
-                        action_weight=self._r,
-                        gamma=float(np.exp(-kappa / self._horizon)),
-                    )
-                    g += share * expansion.gradient
-                    H += share * expansion.curvature
-                features += path.features.T @ path.features / (len(path.features) * len(paths))
-        if not (np.isfinite(g).all() and np.isfinite(H).all()):
-            return np.full((self.n_a, n_f), np.nan), np.nan
-        # Directions that the rollouts hardly excite would otherwise take gains of any size, and the
-        # closed loop leaves the range of the linearisation through them.
-        features[np.diag_indices(n_f)] += _ISOTROPY * np.trace(features) / n_f
-        region = 2.0 * self._r * np.kron(np.eye(self.n_a), features)
-        matrix = H + damping * region
-        matrix[np.diag_indices(p)] += 1e-9 * np.trace(H) / p
-        d = -linalg.solve(matrix, g, assume_a="pos")
-        return d.reshape(self.n_a, n_f), float(-(g @ d + 0.5 * d @ H @ d))
+                chosen.append((record, neighbour))
+            if other is not None and record.usable and other.cost < LOCAL * record.cost:
+                chosen.append((record, other))
+        return [
+            Pair(
+                self._path(first, V),
+                self._path(second, V),
+                self.theta(second.policy) - self.theta(first.policy),
+            )
+            for first, second in chosen
+        ]

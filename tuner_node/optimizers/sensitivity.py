@@ -22,14 +22,21 @@ control) and Abbeel, Quigley, Ng, "Using inaccurate models in reinforcement lear
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
-__all__ = ["Expansion", "Path", "expand", "predict_difference"]
+from tuner_node.optimizers.fit import LocalModel
+
+__all__ = ["Expansion", "Path", "damped_step", "expand", "predict_difference"]
 
 Array = NDArray[np.float64]
+
+# Share of the trust region that bounds all gains alike, relative to the one in input energy.
+_ISOTROPY = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,3 +156,63 @@ def predict_difference(
         moved = np.einsum("pij,cpj->cpi", closed[:, k], delta) + drive[:, k]
         delta = gammas[:, None, None] * moved
     return difference
+
+
+def damped_step(
+    models: Sequence[LocalModel],
+    paths: Sequence[Path],
+    K: Array,
+    *,
+    target: Array,
+    state_weight: float,
+    action_weight: float,
+    gamma: float,
+    damping: float,
+) -> tuple[Array, float]:
+    """The damped Gauss-Newton step of theta, and the fall of the cost that it predicts.
+
+        (H + lambda D) d = -g,        D = 2 r I (x) (F + 0.3 tr(F) / (n_s + 1) I),        F = mean
+        [s; 1][s; 1]^T
+
+    g and H are averaged over paths and models. An average over models that disagree has a large H
+    where they do, and so a small step. F alone measures a step by the input energy that it adds;
+    its second term bounds the gains in directions of s that the rollouts hardly excite, through
+    which the closed loop would otherwise leave the range of the linearisation.
+
+    Returns
+    -------
+    (n_a, n_s + 1) array and float
+        NaN if g and H are not finite.
+    """
+    n_a, n_f = models[0].B.shape[1], K.shape[1] + 1
+    p = n_a * n_f
+    g, H, energy = np.zeros(p), np.zeros((p, p)), np.zeros((n_f, n_f))
+    # A model that is unstable along a path overflows.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for path in paths:
+            share = 1.0 / (len(paths) * len(models))
+            for model in models:
+                expansion = expand(
+                    path,
+                    model.jacobians(path.x),
+                    model.B,
+                    K,
+                    target=target,
+                    state_weight=state_weight,
+                    action_weight=action_weight,
+                    gamma=gamma,
+                )
+                g += share * expansion.gradient
+                H += share * expansion.curvature
+            energy += path.features.T @ path.features / (len(path.features) * len(paths))
+        energy[np.diag_indices(n_f)] += _ISOTROPY * np.trace(energy) / n_f
+        matrix = H + damping * 2.0 * action_weight * np.kron(np.eye(n_a), energy)
+        matrix[np.diag_indices(p)] += 1e-9 * np.trace(H) / p
+        nothing = np.full((n_a, n_f), np.nan), np.nan
+        if not (np.isfinite(g).all() and np.isfinite(matrix).all()):
+            return nothing
+        try:
+            d = -linalg.cho_solve(linalg.cho_factor(matrix), g)
+        except linalg.LinAlgError:
+            return nothing
+        return d.reshape(n_a, n_f), float(-(g @ d + 0.5 * d @ H @ d))

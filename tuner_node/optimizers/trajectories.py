@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner_node.optimizers.base import Array, RolloutResult, State, Trajectory
+from tuner_node.optimizers.base import Array, RolloutResult, State
 
 __all__ = ["Record", "Records"]
 
@@ -70,13 +70,7 @@ class Records:
 
     def add(self, policy: Array, result: RolloutResult, keep: set[int]) -> Record:
         """Remember a rollout; `keep` are the stamps that must not be forgotten."""
-        trajectory = result.trajectory
-        if trajectory is None:
-            raise ValueError(
-                "this optimiser learns from trajectories, but a result has none; record the states "
-                "and actions of the rollouts, or choose an optimiser that needs costs only."
-            )
-        states, actions = self._sound(trajectory, result.usable)
+        states, actions = self.sound(result)
         cost = float(result.cost) if result.usable else float("inf")
         record = Record(self.count, np.array(policy), cost, states, actions)
         self._records[record.stamp] = record
@@ -120,7 +114,14 @@ class Records:
         self._limit = float(state["record_limit"].item())
         self.count = int(state["record_count"].item())
 
-    def _sound(self, trajectory: Trajectory, usable: bool) -> tuple[Array, Array]:
+    def sound(self, result: RolloutResult) -> tuple[Array, Array]:
+        """The states and actions that can be learned from, or a ValueError."""
+        trajectory, usable = result.trajectory, result.usable
+        if trajectory is None:
+            raise ValueError(
+                "this optimiser learns from trajectories, but a result has none; record the states "
+                "and actions of the rollouts, or choose an optimiser that needs costs only."
+            )
         states = np.array(trajectory.states, dtype=np.float64)
         actions = np.array(trajectory.actions, dtype=np.float64)
         if states.ndim != 2 or actions.ndim != 2 or len(states) - len(actions) not in (0, 1):

@@ -1,0 +1,306 @@
+"""Compare optimisers in one process: DMDc and LQT warm start, one optimiser, held-out fields.
+
+    python -m bringup.study_optimizers --optimizer gauss_newton --problem kdv --seeds 6
+
+For every seed: an exploratory episode, the reduced model and its tracking gains, 2 * iterations
+rollouts of the optimiser, and then the cost of its policy on held-out initial fields that no
+optimiser has seen. Prints a table and writes all numbers as JSON. No topics, no nodes: what is
+measured is the optimiser.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controller_node.dmdc import identify
+from controller_node.lqt import track
+from controller_node.policy import ProjectedLaw, excitation
+from loop_interfaces.problem import load_parameters, shipped_problems
+from pde_sim_node.build import build_plant
+from pde_sim_node.plant import Plant
+from tuner_node.optimizers import OPTIMIZERS, Context, Rollout, RolloutResult, Trajectory
+from tuner_node.seeds import Purpose, derive
+from tuner_node.training import CHECK_FIELDS
+
+Array = NDArray[np.float64]
+# At most so many environments at once: more only cost memory.
+_BATCH = 20
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training, and what to measure about it."""
+
+    problem: str
+    optimizer: str
+    seed: int
+    iterations: int
+    evaluation_seed: int
+    evaluation_fields: int
+    fresh_fields: int
+    attempts: int | None
+    options: dict[str, Any]
+
+
+def run_episode(
+    plant: Plant, seeds: Sequence[int], act: Callable[[int, Array], Array]
+) -> list[RolloutResult]:
+    """One episode from the fields of `seeds`; act(k, states) gives the actions."""
+    states = np.empty((plant.horizon + 1, len(seeds), plant.n_z))
+    actions = np.empty((plant.horizon, len(seeds), plant.n_a))
+    states[0] = plant.reset(np.array(seeds, dtype=np.int64))
+    for k in range(plant.horizon):
+        actions[k] = act(k, states[k])
+        states[k + 1] = plant.step(actions[k])
+    costs = plant.episode_costs()
+    results = []
+    for m, diverged_step in enumerate(costs.diverged_step):
+        diverged = bool(diverged_step >= 0)
+        length = int(diverged_step) if diverged else plant.horizon
+        trajectory = Trajectory(states[: length + 1, m].copy(), actions[:length, m].copy())
+        results.append(RolloutResult(float(costs.mean[m]), diverged, trajectory))
+    return results
+
+
+def answer(law: ProjectedLaw, step: int, states: Array) -> Array:
+    """The actions of a law, whatever the step."""
+    return law.actions(states)
+
+
+def run_rollouts(plant: Plant, U: Array, rollouts: Sequence[Rollout]) -> list[RolloutResult]:
+    """Measure rollouts of the projected law."""
+    results: list[RolloutResult] = []
+    for first in range(0, len(rollouts), _BATCH):
+        part = rollouts[first : first + _BATCH]
+        law = ProjectedLaw([U], plant.target)
+        law.set(np.stack([rollout.policy for rollout in part]))
+        seeds = [rollout.field_seed for rollout in part]
+        results += run_episode(plant, seeds, partial(answer, law))
+    return results
+
+
+def warm_start(plant: Plant, parameters: dict[str, Any], seed: int) -> tuple[Array, Context]:
+    """The tracking gains of the model that one exploratory episode gives.
+
+    As in a training, an episode whose gains do no better than no control is explored again.
+    """
+    attempts = int(parameters["identification_attempts"])
+    check = [derive(seed, Purpose.CHECK_FIELD, i) for i in range(CHECK_FIELDS)]
+    for attempt in range(attempts):
+        policy, context = design(plant, parameters, seed, attempt)
+        rollouts = [Rollout(p, f) for p in (np.zeros_like(policy), policy) for f in check]
+        results = run_rollouts(plant, context.U, rollouts)
+        none, lqt = results[: len(check)], results[len(check) :]
+        if not any(result.diverged for result in lqt) and np.mean(
+            [result.cost for result in lqt]
+        ) < np.mean([result.cost for result in none]):
+            break
+    return policy, context
+
+
+def design(
+    plant: Plant, parameters: dict[str, Any], seed: int, attempt: int
+) -> tuple[Array, Context]:
+    """Exploratory episode, reduced model and tracking gains of one attempt."""
+    noise = derive(seed, Purpose.EXCITATION, attempt)
+    variance = parameters["exploration_variance"]
+    result = run_episode(
+        plant,
+        [derive(seed, Purpose.EXPLORATORY_FIELD, attempt)],
+        lambda k, _: excitation(noise, k, plant.n_a, variance)[None],
+    )[0]
+    if result.diverged or result.trajectory is None:
+        raise RuntimeError(
+            f"the exploratory episode of seed {seed} diverged: explore with less variance"
+        )
+    exploration = result.trajectory
+    model = identify(
+        exploration.states,
+        exploration.actions,
+        p=parameters["dmdc_rank"],
+        n_s=parameters["reduced_order"],
+    )
+    weights = {key: parameters[key] for key in ("state_weight", "action_weight")}
+    context = Context(
+        U=model.U,
+        target=plant.target,
+        horizon=plant.horizon,
+        exploration=exploration,
+        **weights,
+    )
+    return track(model, **weights).policy, context
+
+
+def run(job: Job) -> dict[str, Any]:
+    """One training with its evaluations, as JSON-able numbers."""
+    options = {} if job.attempts is None else {"identification_attempts": job.attempts}
+    parameters = load_parameters(job.problem, options)
+    plant = build_plant(parameters)
+    policy, context = warm_start(plant, parameters, job.seed)
+    optimizer = OPTIMIZERS[job.optimizer](
+        policy,
+        seed=job.seed,
+        iterations=job.iterations,
+        learning_rate=parameters["learning_rate"],
+        smoothing_radius=parameters["smoothing_radius"],
+        context=context,
+        **job.options,
+    )
+    held_out = [
+        derive(job.evaluation_seed, Purpose.EVALUATION_FIELD, i)
+        for i in range(job.evaluation_fields)
+    ]
+
+    def evaluate(candidate: Array) -> list[float]:
+        rollouts = [Rollout(candidate, seed) for seed in held_out]
+        return [result.cost for result in run_rollouts(plant, context.U, rollouts)]
+
+    budget = 2 * job.iterations
+    costs = {"0": evaluate(policy)}
+    marks = [mark for mark in (budget // 4, budget // 2) if mark > 0]
+    used = diverged = 0
+    history = []
+    seconds = 0.0
+    while not optimizer.done:
+        rollouts = optimizer.ask()
+        while marks and used + len(rollouts) > marks[0]:
+            costs[str(marks.pop(0))] = evaluate(optimizer.best_policy)
+        results = run_rollouts(plant, context.U, rollouts)
+        used += len(results)
+        diverged += sum(result.diverged for result in results)
+        begin = time.perf_counter()
+        history.append(optimizer.tell(results))
+        seconds += time.perf_counter() - begin
+    costs[str(budget)] = evaluate(optimizer.best_policy)
+    fresh = [
+        derive(job.evaluation_seed + 1 + job.seed, Purpose.EVALUATION_FIELD, i)
+        for i in range(job.fresh_fields)
+    ]
+    last = run_rollouts(plant, context.U, [Rollout(optimizer.best_policy, seed) for seed in fresh])
+    return {
+        "problem": job.problem,
+        "seed": job.seed,
+        "rollouts": used,
+        "diverged_rollouts": diverged,
+        "costs": costs,
+        "fresh_costs": [result.cost for result in last],
+        "fresh_diverged": sum(result.diverged for result in last),
+        "optimizer_seconds": seconds,
+        "history": history,
+    }
+
+
+def table(results: Sequence[dict[str, Any]]) -> str:
+    """Mean over the seeds (worst seed) of the mean stage cost, after the rollouts of a column."""
+    lines: list[str] = []
+    for problem in dict.fromkeys(result["problem"] for result in results):
+        chosen = [result for result in results if result["problem"] == problem]
+        marks = sorted(chosen[0]["costs"], key=int)
+        costs = np.array([[np.mean(result["costs"][mark]) for mark in marks] for result in chosen])
+        if not lines:
+            lines.append(
+                f"{'problem':<12}"
+                + "".join(f"{mark + ' rollouts':>20}" for mark in marks)
+                + f"{'mean of ratios':>16}{'diverged':>10}{'fresh':>12}"
+            )
+        ratio = float(np.mean(costs[:, -1] / costs[:, 0]) - 1.0)
+        diverged = sum(result["diverged_rollouts"] for result in chosen)
+        fresh = sum(result["fresh_diverged"] for result in chosen)
+        count = sum(len(result["fresh_costs"]) for result in chosen)
+        cells = [
+            f"{mean:.4g} ({worst:.4g})"
+            for mean, worst in zip(costs.mean(axis=0), costs.max(axis=0), strict=True)
+        ]
+        lines.append(
+            f"{problem:<12}"
+            + "".join(f"{cell:>20}" for cell in cells)
+            + f"{100 * ratio:>15.1f}%{diverged:>10}{f'{fresh}/{count}':>12}"
+        )
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--optimizer", choices=sorted(OPTIMIZERS), default="gauss_newton")
+    parser.add_argument(
+        "--problem",
+        action="append",
+        help="a shipped problem or a YAML file; all shipped ones if absent",
+    )
+    parser.add_argument("--seeds", type=int, default=6, help="number of seeds (default 6)")
+    parser.add_argument("--first-seed", type=int, default=0, help="the first seed (default 0)")
+    parser.add_argument("--iterations", type=int, default=40, help="half the rollouts (default 40)")
+    parser.add_argument(
+        "--evaluation-seed", type=int, default=2024, help="draws the held-out fields"
+    )
+    parser.add_argument("--evaluation-fields", type=int, default=10, help="held-out fields")
+    parser.add_argument(
+        "--fresh-fields",
+        type=int,
+        default=0,
+        help="further fields on which the final policy must not diverge",
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="a parameter of the optimiser, as JSON",
+    )
+    parser.add_argument(
+        "--attempts", type=int, help="identifications until one beats no control (as in a training)"
+    )
+    parser.add_argument("--jobs", type=int, default=1, help="processes (default 1)")
+    parser.add_argument("--output", type=Path, help="write all numbers to this JSON file")
+    options = parser.parse_args(arguments)
+    settings = {}
+    for item in options.set:
+        name, _, value = item.partition("=")
+        settings[name] = json.loads(value)
+    jobs = [
+        Job(
+            problem,
+            options.optimizer,
+            seed,
+            options.iterations,
+            options.evaluation_seed,
+            options.evaluation_fields,
+            options.fresh_fields,
+            options.attempts,
+            settings,
+        )
+        for problem in options.problem or list(shipped_problems())
+        for seed in range(options.first_seed, options.first_seed + options.seeds)
+    ]
+    results = []
+    with ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool:
+        for result in pool.map(run, jobs):
+            costs = {mark: round(float(np.mean(c)), 4) for mark, c in result["costs"].items()}
+            print(
+                f"{result['problem']} seed {result['seed']}: {costs}", file=sys.stderr, flush=True
+            )
+            results.append(result)
+    print(table(results))
+    if options.output:
+        options.output.write_text(
+            json.dumps({"settings": vars(options), "results": results}, default=str)
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

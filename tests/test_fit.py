@@ -1,0 +1,242 @@
+"""The fitted local models and the sensitivities along trajectories."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tuner_node.optimizers.fit import LocalModel, extended_basis, fit
+from tuner_node.optimizers.selection import KAPPAS, Pair, choices, mismatches
+from tuner_node.optimizers.sensitivity import Path, damped_step, expand, predict_difference
+
+R, N_A, N_S, STEPS = 4, 2, 3, 12
+
+
+def planted(seed: int = 0, bend: float = 0.1) -> LocalModel:
+    rng = np.random.default_rng(seed)
+    H = bend * rng.standard_normal((R, R, R))
+    return LocalModel(
+        centre=0.1 * rng.standard_normal(R),
+        constant=0.05 * rng.standard_normal(R),
+        linear=0.3 * rng.standard_normal((R, R)) - 0.3 * np.eye(R),
+        B=rng.standard_normal((R, N_A)),
+        quadratic=0.5 * (H + H.transpose(0, 2, 1)),
+    )
+
+
+def roll(model: LocalModel, theta: np.ndarray, x: np.ndarray) -> Path:
+    """Closed loop a = K s + b of the model, with theta = [K b]."""
+    states, actions = [], []
+    for _ in range(STEPS):
+        a = theta @ np.append(x[:N_S], 1.0)
+        states.append(x)
+        actions.append(a)
+        x = model.step(x, a)
+    s = np.array(states)
+    return Path(s, np.array(actions), np.column_stack([s[:, :N_S], np.ones(STEPS)]))
+
+
+THETA = 0.1 * np.random.default_rng(9).standard_normal((N_A, N_S + 1))
+START = np.array([0.5, -0.3, 0.2, 0.4])
+TARGET = np.array([0.1, 0.2, -0.1, 0.0])
+
+
+def test_fit_recovers_a_planted_quadratic_system() -> None:
+    model = planted()
+    rng = np.random.default_rng(1)
+    x, a = rng.standard_normal((3000, R)), rng.standard_normal((3000, N_A))
+    # So many samples of unit spread that a ridge of 1e-8 and of 1e-5 biases by about as much.
+    fitted = fit(x, a, model.step(x, a) - x, np.ones(3000), [1e-8])[0]
+    np.testing.assert_allclose(fitted.step(x, a), model.step(x, a), atol=2e-4)
+    np.testing.assert_allclose(fitted.jacobians(x), model.jacobians(x), atol=2e-4)
+    np.testing.assert_allclose(fitted.B, model.B, atol=2e-4)
+    np.testing.assert_allclose(fitted.quadratic, model.quadratic, atol=2e-4)
+
+
+def test_an_infinite_ridge_fits_an_affine_system() -> None:
+    model = planted(bend=0.0)
+    rng = np.random.default_rng(2)
+    x, a = rng.standard_normal((500, R)), rng.standard_normal((500, N_A))
+    affine, stiff = fit(x, a, model.step(x, a) - x, np.ones(500), [np.inf, 1e9])
+    assert not affine.quadratic.any()
+    np.testing.assert_allclose(affine.step(x, a), model.step(x, a), atol=1e-4)
+    # A very large ridge tends to the same model.
+    np.testing.assert_allclose(stiff.linear, affine.linear, atol=1e-6)
+
+
+def test_weights_choose_between_two_systems() -> None:
+    first, second = planted(0), planted(5)
+    rng = np.random.default_rng(3)
+    x, a = rng.standard_normal((2000, R)), rng.standard_normal((2000, N_A))
+    change = np.concatenate([first.step(x, a)[:1000], second.step(x, a)[1000:]]) - x
+    weights = np.r_[np.ones(1000), np.zeros(1000)]
+    fitted = fit(x, a, change, weights, [1e-8])[0]
+    np.testing.assert_allclose(fitted.B, first.B, atol=1e-3)
+
+
+def test_jacobians_are_the_derivative_of_the_step() -> None:
+    model, a = planted(), np.zeros(N_A)
+    jacobian = model.jacobians(START)
+    h = 1e-6
+    for j in range(R):
+        e = h * np.eye(R)[j]
+        difference = (model.step(START + e, a) - model.step(START - e, a)) / (2 * h)
+        np.testing.assert_allclose(jacobian[:, j], difference, atol=1e-9)
+
+
+def test_basis_is_orthonormal_begins_with_the_given_modes_and_spans_the_data() -> None:
+    rng = np.random.default_rng(4)
+    U = np.linalg.qr(rng.standard_normal((30, 3)))[0]
+    states = rng.standard_normal((50, 5)) @ rng.standard_normal((5, 30))
+    V = extended_basis(U, [states[:20], states[20:]], 12)
+    # The data has rank 5: no more modes than that are added, however many are asked for.
+    assert V.shape == (30, 8)
+    assert np.array_equal(V[:, :3], U)
+    np.testing.assert_allclose(V.T @ V, np.eye(8), atol=1e-12)
+    np.testing.assert_allclose(states @ V @ V.T, states, atol=1e-10)
+    assert np.array_equal(extended_basis(U, [states], 3), U)
+    assert np.array_equal(extended_basis(U, [states @ U @ U.T], 9)[:, :3], U)
+
+
+def mean_cost(model: LocalModel, theta: np.ndarray, q: float, r: float) -> float:
+    path = roll(model, theta, START)
+    return float(q * np.sum((path.x - TARGET) ** 2) + r * np.sum(path.a**2)) / STEPS
+
+
+def test_gradient_is_that_of_the_closed_loop() -> None:
+    model, q, r, h = planted(), 1.5, 0.3, 1e-6
+    path = roll(model, THETA, START)
+    expansion = expand(
+        path,
+        model.jacobians(path.x),
+        model.B,
+        THETA[:, :N_S],
+        target=TARGET,
+        state_weight=q,
+        action_weight=r,
+        gamma=1.0,
+    )
+    for i in range(THETA.size):
+        e = h * np.eye(THETA.size)[i].reshape(THETA.shape)
+        up, down = mean_cost(model, THETA + e, q, r), mean_cost(model, THETA - e, q, r)
+        assert expansion.gradient[i] == pytest.approx((up - down) / (2 * h), rel=1e-6, abs=1e-8)
+    assert np.linalg.eigvalsh(expansion.curvature).min() > -1e-12
+
+
+def test_curvature_is_exact_where_the_trajectory_is_linear_in_theta() -> None:
+    # Without feedback of the state into the actions, only b moves, and x is affine in b.
+    model = planted(bend=0.0)
+    theta = np.zeros_like(THETA)
+    path = roll(model, theta, START)
+    expansion = expand(
+        path,
+        model.jacobians(path.x),
+        model.B,
+        theta[:, :N_S],
+        target=TARGET,
+        state_weight=1.0,
+        action_weight=0.5,
+        gamma=1.0,
+    )
+    step = np.zeros_like(THETA)
+    step[:, N_S] = [0.7, -0.4]
+    d = step.ravel()
+    predicted = expansion.gradient @ d + 0.5 * d @ expansion.curvature @ d
+    actual = mean_cost(model, theta + step, 1.0, 0.5) - mean_cost(model, theta, 1.0, 0.5)
+    assert predicted == pytest.approx(actual, rel=1e-10)
+
+
+def test_forgetting_shortens_the_memory_of_the_sensitivities() -> None:
+    model = planted()
+    path = roll(model, THETA, START)
+    settings = {"target": TARGET, "state_weight": 1.0, "action_weight": 0.1}
+    arguments = (path, model.jacobians(path.x), model.B, THETA[:, :N_S])
+    none = expand(*arguments, **settings, gamma=1e-12)
+    # With no memory only the direct effect on the actions is left.
+    direct = 2 * 0.1 / STEPS * (path.a.T @ path.features).ravel()
+    np.testing.assert_allclose(none.gradient, direct, atol=1e-9)
+
+
+def test_differences_are_predicted_to_first_order() -> None:
+    model = planted()
+    first = roll(model, THETA, START)
+    errors = []
+    for scale in (1e-3, 5e-4):
+        change = scale * np.random.default_rng(5).standard_normal(THETA.shape)
+        offset = scale * np.ones(R)
+        second = roll(model, THETA + change, START + offset)
+        predicted = predict_difference(
+            model.jacobians(first.x)[None],
+            model.B,
+            THETA[:, :N_S],
+            initial=offset[None],
+            forcing=(second.features @ change.T)[None],
+            gammas=np.array([1.0]),
+        )[0, 0]
+        errors.append(np.abs(predicted - (second.x - first.x)).max())
+    # Second order in the size of the change.
+    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.2)
+
+
+def test_the_true_model_has_the_smallest_mismatch() -> None:
+    true, wrong = planted(), planted(7)
+    change = 1e-5 * np.ones_like(THETA)
+    pair = Pair(roll(true, THETA, START), roll(true, THETA + change, START), change)
+    errors = mismatches([wrong, true], THETA[:, :N_S], [pair], STEPS)
+    assert errors.shape == (2, len(KAPPAS))
+    assert errors[1, 0] < 1e-4 < errors[0, 0]
+    assert errors.max() <= 2.0
+    assert not mismatches([wrong, true], THETA[:, :N_S], [], STEPS).any()
+
+
+def test_an_exploding_model_is_the_worst_not_an_error() -> None:
+    true = planted()
+    exploding = LocalModel(true.centre, true.constant, 1e200 * np.eye(R), true.B, true.quadratic)
+    change = 1e-3 * np.ones_like(THETA)
+    pair = Pair(roll(true, THETA, START), roll(true, THETA + change, START), change)
+    assert mismatches([exploding], THETA[:, :N_S], [pair], STEPS)[0, 0] == 2.0
+    step, fall = damped_step(
+        [exploding],
+        [pair.first],
+        THETA[:, :N_S],
+        target=TARGET,
+        state_weight=1.0,
+        action_weight=1.0,
+        gamma=1.0,
+        damping=1.0,
+    )
+    assert np.isnan(step).all()
+    assert np.isnan(fall)
+
+
+def test_choices_prefer_little_forgetting_after_a_success_only() -> None:
+    errors = np.full((3, len(KAPPAS)), 0.5)
+    errors[1, 0], errors[0, 0], errors[1, 1] = 0.12, 0.2, 0.1
+    kappa, models = choices(errors, True)[0]
+    assert kappa == 0.0
+    assert models == [0, 1]
+    assert choices(errors, False)[0] == (KAPPAS[1], [1])
+    assert sorted(k for k, _ in choices(errors, True)) == sorted(KAPPAS)
+
+
+def test_the_step_shrinks_with_the_damping_and_predicts_its_fall() -> None:
+    model = planted()
+    path = roll(model, THETA, START)
+    sizes, falls = [], []
+    for damping in (0.1, 100.0, 1e6):
+        step, fall = damped_step(
+            [model],
+            [path],
+            THETA[:, :N_S],
+            target=TARGET,
+            state_weight=1.0,
+            action_weight=0.1,
+            gamma=1.0,
+            damping=damping,
+        )
+        sizes.append(float(np.linalg.norm(step)))
+        falls.append(fall)
+    assert sizes[0] > sizes[1] > sizes[2] > 0
+    assert falls[0] > falls[1] > falls[2] > 0
+    actual = mean_cost(model, THETA, 1.0, 0.1) - mean_cost(model, THETA + step, 1.0, 0.1)
+    assert actual == pytest.approx(falls[2], rel=0.05)

@@ -1,0 +1,293 @@
+"""Gauss-Newton on measured trajectories: a known optimum, its safeguards, its checkpoints."""
+
+from __future__ import annotations
+
+import io
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+from controller_node.dmdc import ReducedModel
+from controller_node.lqt import track
+from tuner_node.optimizers import Context, GaussNewton, Rollout, RolloutResult, Trajectory
+
+N_Z, N_S, N_A, T = 7, 4, 2, 80
+Q, R = 1.0, 0.2
+
+
+class Plant:
+    """s' = A s + B a, lifted to N_Z dimensions; `bend` adds a quadratic term."""
+
+    def __init__(self, bend: float = 0.0) -> None:
+        rng = np.random.default_rng(0)
+        A = rng.standard_normal((N_S, N_S))
+        self.A = 1.02 * A / np.abs(np.linalg.eigvals(A)).max()
+        self.B = rng.standard_normal((N_S, N_A))
+        self.U = np.linalg.qr(rng.standard_normal((N_Z, N_S)))[0]
+        self.target = self.U @ np.array([0.5, -0.2, 0.3, 0.1])
+        self.bend = bend
+        self.model = ReducedModel(A=self.A, B=self.B, U=self.U)
+        self.best = track(self.model, state_weight=Q, action_weight=R).policy
+
+    def run(self, policy: np.ndarray, seed: int, noise: np.ndarray | None = None) -> RolloutResult:
+        s = np.random.default_rng(seed).standard_normal(N_S)
+        b = policy[:, N_S:] @ self.U.T @ self.target
+        states, actions, cost = [self.U @ s], [], 0.0
+        for k in range(T):
+            a = policy[:, :N_S] @ s + b if noise is None else noise[k]
+            cost += Q * float(np.sum((states[-1] - self.target) ** 2)) + R * float(a @ a)
+            s = self.A @ s + self.B @ a + self.bend * np.tanh(s) * s[::-1]
+            actions.append(a)
+            if np.abs(s).max() > 1e3:
+                done = Trajectory(np.array(states), np.array(actions)[:-1])
+                return RolloutResult(1e9, True, done)
+            states.append(self.U @ s)
+        return RolloutResult(cost / T, False, Trajectory(np.array(states), np.array(actions)))
+
+    def context(self) -> Context:
+        noise = 0.3 * np.random.default_rng(1).standard_normal((T, N_A))
+        exploration = self.run(np.zeros((N_A, 2 * N_S)), 77, noise).trajectory
+        assert exploration is not None
+        return Context(self.U, self.target, Q, R, T, exploration)
+
+
+def make(plant: Plant, policy: np.ndarray | None = None, **changes: Any) -> GaussNewton:
+    settings: dict[str, Any] = {"seed": 5, "iterations": 16, "context": plant.context()}
+    return GaussNewton(0.6 * plant.best if policy is None else policy, **(settings | changes))
+
+
+def measure(plant: Plant, asked: list[Rollout]) -> list[RolloutResult]:
+    return [plant.run(rollout.policy, rollout.field_seed) for rollout in asked]
+
+
+def mean_cost(plant: Plant, policy: np.ndarray) -> float:
+    return float(np.mean([plant.run(policy, 10**6 + i).cost for i in range(40)]))
+
+
+def test_converges_to_the_known_optimum_of_a_linear_quadratic_plant() -> None:
+    plant = Plant()
+    optimizer = make(plant, iterations=30)
+    start, best = mean_cost(plant, optimizer.policy), mean_cost(plant, plant.best)
+    used = 0
+    while not optimizer.done:
+        asked = optimizer.ask()
+        used += len(asked)
+        optimizer.tell(measure(plant, asked))
+    final = mean_cost(plant, optimizer.best_policy)
+    assert start > 1.05 * best
+    # The infinite-horizon law is optimal up to the end of the episode.
+    assert final == pytest.approx(best, rel=0.01)
+    assert used <= 60
+
+
+def test_improves_a_plant_that_is_not_linear() -> None:
+    plant = Plant(bend=0.1)
+    optimizer = make(plant)
+    start = mean_cost(plant, optimizer.policy)
+    while not optimizer.done:
+        optimizer.tell(measure(plant, optimizer.ask()))
+    assert mean_cost(plant, optimizer.best_policy) < 0.95 * start
+
+
+def test_asks_are_pure_rows_are_json_and_the_budget_is_kept() -> None:
+    plant = Plant()
+    optimizer = make(plant, iterations=12)
+    total, costs = 0, []
+    while not optimizer.done:
+        first, second = optimizer.ask(), optimizer.ask()
+        for a, b in zip(first, second, strict=True):
+            assert np.array_equal(a.policy, b.policy)
+            assert a.field_seed == b.field_seed
+            a.policy[:] = np.nan
+        assert np.isfinite(optimizer.ask()[0].policy).all()
+        total += len(second)
+        row = optimizer.tell(measure(plant, second))
+        assert json.loads(json.dumps(row, allow_nan=False)) == row
+        assert row["rollouts"] == total
+        assert row["iteration"] == optimizer.iteration
+        costs.append(row["cost"])
+    assert 24 - 3 < total <= 24
+    assert optimizer.ask() == []
+    with pytest.raises(ValueError, match="done"):
+        optimizer.tell([])
+
+
+def test_candidates_are_judged_on_the_fields_of_the_incumbent() -> None:
+    plant = Plant()
+    optimizer = make(plant)
+    fields = [rollout.field_seed for rollout in optimizer.ask()]
+    assert len(set(fields)) == 3
+    optimizer.tell(measure(plant, optimizer.ask()))
+    seen = []
+    for _ in range(3):
+        asked = optimizer.ask()
+        assert len(asked) == 1
+        seen.append(asked[0].field_seed)
+        row = optimizer.tell(measure(plant, asked))
+    assert seen == fields
+    assert row["accepted"] is True
+    # After an acceptance the oldest field is replaced by a fresh one.
+    fresh = optimizer.ask()
+    assert [rollout.field_seed for rollout in fresh] != fields[:1]
+    assert fresh[0].field_seed not in fields
+    assert np.array_equal(fresh[0].policy, optimizer.policy)
+
+
+def test_a_clearly_worse_candidate_is_given_up_after_one_rollout() -> None:
+    plant = Plant()
+    optimizer = make(plant)
+    optimizer.tell(measure(plant, optimizer.ask()))
+    before = optimizer.policy
+    damping = float(optimizer.state()["damping"].item())
+    worse = plant.run(np.zeros_like(before), optimizer.ask()[0].field_seed)
+    row = optimizer.tell([RolloutResult(1e4, False, worse.trajectory)])
+    assert row["accepted"] is False
+    assert row["damping"] == 4 * damping
+    assert np.array_equal(optimizer.policy, before)
+
+
+def diverged(plant: Plant, rollout: Rollout, tail: str) -> RolloutResult:
+    result = plant.run(rollout.policy, rollout.field_seed)
+    assert result.trajectory is not None
+    states, actions = result.trajectory.states.copy(), result.trajectory.actions.copy()
+    if tail == "nan":
+        states[9:], actions[9:] = np.nan, np.nan
+    elif tail == "frozen":
+        states[9:] = states[9]
+    elif tail == "huge":
+        states[9:] *= 1e30
+    elif tail == "empty":
+        states, actions = states[:1], actions[:0]
+    return RolloutResult(1e9 if tail != "nan" else np.nan, True, Trajectory(states, actions))
+
+
+@pytest.mark.parametrize("tail", ["nan", "frozen", "huge", "empty"])
+def test_a_diverged_candidate_stays_out_of_the_policy_and_of_the_model(tail: str) -> None:
+    plant = Plant()
+    optimizer = make(plant)
+    optimizer.tell(measure(plant, optimizer.ask()))
+    before = optimizer.policy
+    for _ in range(3):
+        row = optimizer.tell([diverged(plant, optimizer.ask()[0], tail)])
+        assert row["diverged"] == 1
+        assert row["accepted"] is False
+        assert json.dumps(row, allow_nan=False)
+    assert np.array_equal(optimizer.policy, before)
+    assert max(len(states) for states in [optimizer.state()["record_states"]]) < 4 * (T + 1)
+    start = mean_cost(plant, before)
+    while not optimizer.done:
+        optimizer.tell(measure(plant, optimizer.ask()))
+    assert mean_cost(plant, optimizer.policy) < start
+
+
+def test_a_warm_start_that_diverges_is_halved_until_it_does_not() -> None:
+    plant = Plant()
+    wild = 8.0 * plant.best
+    optimizer = make(plant, wild)
+    results = measure(plant, optimizer.ask())
+    assert all(result.diverged for result in results)
+    row = optimizer.tell(results)
+    assert "cost" not in row
+    assert np.array_equal(optimizer.ask()[0].policy, 0.5 * wild)
+    while not optimizer.done:
+        row = optimizer.tell(measure(plant, optimizer.ask()))
+        assert json.dumps(row, allow_nan=False)
+    assert mean_cost(plant, optimizer.best_policy) < 1.1 * mean_cost(plant, plant.best)
+
+
+def test_only_divergence_never_moves_the_policy() -> None:
+    plant = Plant()
+    optimizer = make(plant)
+    before = optimizer.policy
+    while not optimizer.done:
+        optimizer.tell([diverged(plant, rollout, "nan") for rollout in optimizer.ask()])
+    assert np.array_equal(optimizer.policy, before)
+
+
+@pytest.mark.parametrize("stop", [0, 1, 2, 4, 9, 17])
+def test_a_restored_training_ends_with_the_same_bits(stop: int) -> None:
+    plant = Plant(bend=0.1)
+
+    def step(optimizer: GaussNewton) -> dict[str, Any]:
+        asked = optimizer.ask()
+        results = measure(plant, asked)
+        if optimizer.iteration == 4:
+            results[0] = diverged(plant, asked[0], "nan")
+        return optimizer.tell(results)
+
+    whole, rows = make(plant), []
+    while not whole.done:
+        rows.append(step(whole))
+    first = make(plant)
+    for _ in range(stop):
+        step(first)
+    buffer = io.BytesIO()
+    np.savez(buffer, **first.state())
+    buffer.seek(0)
+    second = make(plant)
+    with np.load(buffer, allow_pickle=False) as stored:
+        second.restore(dict(stored))
+    assert [step(second) for _ in range(len(rows) - stop)] == rows[stop:]
+    assert second.done
+    assert np.array_equal(second.policy, whole.policy)
+
+
+def test_refuses_foreign_checkpoints() -> None:
+    plant = Plant()
+    optimizer = make(plant)
+    with pytest.raises(ValueError, match="seed = 6"):
+        optimizer.restore(make(plant, seed=6).state())
+    with pytest.raises(ValueError, match="field_count = 2"):
+        optimizer.restore(make(plant, fields=2).state())
+    with pytest.raises(ValueError, match="holds"):
+        optimizer.restore({"policy": optimizer.policy})
+
+
+def test_needs_sound_trajectories_and_stays_as_it_was_without() -> None:
+    plant = Plant()
+    optimizer = make(plant)
+    good = measure(plant, optimizer.ask())
+    trajectory = good[0].trajectory
+    assert trajectory is not None
+    broken = Trajectory(trajectory.states * np.nan, trajectory.actions)
+    short = Trajectory(trajectory.states[:-4], trajectory.actions)
+    for bad, message in (
+        (RolloutResult(1.0), "learns from trajectories"),
+        (RolloutResult(1.0, False, broken), "finite trajectory"),
+        (RolloutResult(1.0, False, short), "T or T"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            optimizer.tell([*good[:2], bad])
+    assert optimizer.iteration == 0
+    assert len(optimizer.ask()) == 3
+    optimizer.tell(good)
+    with pytest.raises(ValueError, match="one result per rollout, 1, but got 3"):
+        optimizer.tell(good)
+
+
+def test_a_target_outside_of_the_basis_leaves_the_constant_part_alone() -> None:
+    plant = Plant()
+    outside = np.linalg.qr(np.column_stack([plant.U, np.ones(N_Z)]))[0][:, N_S]
+    plant.target = outside
+    policy = 0.6 * plant.best
+    optimizer = make(plant, policy)
+    while not optimizer.done:
+        optimizer.tell(measure(plant, optimizer.ask()))
+    assert np.array_equal(optimizer.policy[:, N_S:], policy[:, N_S:])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"fields": 0}, "fields must be positive"),
+        ({"iterations": 0}, "iterations must be positive"),
+        ({"modes": 3}, "at least n_s = 4"),
+        ({"policy": np.zeros((2, 6))}, "basis U with 3 columns"),
+        ({"policy": np.zeros((3, 8))}, "exploratory trajectory must have"),
+    ],
+)
+def test_refuses_bad_parameters(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make(Plant(), **changes)
