@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 SHELL := /bin/bash
 
-.PHONY: setup run test lint types check clean
+.PHONY: setup run test chromium lint types check clean
 
 setup: .venv/ready
 
@@ -19,8 +19,14 @@ run: setup
 	$(BIN)/pdeloop train burgers
 
 # Two workers; each test over topics has a ROS domain of its own.
-test: setup
+test: setup chromium
 	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+# The report's page is tested in a real browser. Where it cannot be had, that test says so.
+chromium:
+	@command -v chromium >/dev/null || { test "$$(id -u)" = 0 && command -v apt-get >/dev/null \
+		&& { apt-get update -qq; apt-get install -y -qq --no-install-recommends chromium >/dev/null; }; } \
+		|| echo "chromium is not installed (Debian's package chromium): a test will fail without it" >&2
 
 lint: setup
 	$(BIN)/ruff check .

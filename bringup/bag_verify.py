@@ -29,6 +29,7 @@ from tuner_node.build import build_training
 from tuner_node.training import Batch, BatchResult
 
 Array = NDArray[np.float64]
+_TUNERS = ("seed", "seeds", "iterations", "start", "optimizer")
 SHOWN = 5
 """Differences that are described; the others are only counted."""
 
@@ -86,23 +87,24 @@ class Report:
         return "\n".join(lines)
 
 
-def verify(path: Path, parameters: Path | None) -> Report:
-    """Recompute what is in the bag at `path`.
+def verify(*paths: Path, parameters: Path | None = None) -> Report:
+    """Recompute what is in the bags at `paths`; several bags of one run are one.
 
-    parameters: a parameter file to use instead of what the bag says.
+    parameters: a parameter file to use instead of what the bags say.
     """
-    bag = Bag(path)
-    report = Report(str(bag.path))
-    known = bag.parameters()
+    bags = [Bag(path) for path in paths]
+    report = Report(", ".join(str(bag.path) for bag in bags))
     given = None if parameters is None else read_yaml(parameters)
     runs: dict[int, _Run] = {}
-    for episode in bag.episodes():
-        report.episodes += 1
-        number = episode.key[1]
-        if number not in runs:
-            values = given if given is not None else known.get(number)
-            runs[number] = _Run(number, values, report)
-        runs[number].episode(episode)
+    for bag in bags:
+        known = bag.parameters()
+        for episode in bag.episodes():
+            report.episodes += 1
+            number = episode.key[1]
+            if number not in runs:
+                values = given if given is not None else known.get(number)
+                runs[number] = _Run(number, values, report)
+            runs[number].episode(episode)
     for run in runs.values():
         run.finish()
     if not report.episodes:
@@ -114,7 +116,7 @@ class _Run:
     """The episodes of one run, and what they must be."""
 
     def __init__(self, number: int, values: Mapping[str, Any] | None, report: Report) -> None:
-        self._report = report
+        self._number, self._report = number, report
         self._results: dict[bytes, tuple[Array, Array | None, int]] = {}
         self._rows: list[tuple[bytes, RecordedEpisode, int]] = []
         self._values: dict[str, Any] | None = None
@@ -124,6 +126,7 @@ class _Run:
                 "(give them with --parameters FILE)"
             )
             return
+        self._given = set(values)
         self._values = {**check(table(), {}), **values}
         self._plant = build_plant(self._values)
         self._fingerprint = fingerprint(self._values)
@@ -156,6 +159,18 @@ class _Run:
     def finish(self) -> None:
         """Replay the training on the recorded costs."""
         if self._values is None or not self._rows:
+            return
+        if unknown := [name for name in _TUNERS if name not in self._given]:
+            self._report.notes.append(
+                f"run {self._number}: the tuner's {', '.join(unknown)} not known, so its policies "
+                "cannot be followed"
+            )
+            return
+        if not any(episode.exploratory for _, episode, _ in self._rows):
+            self._report.notes.append(
+                f"run {self._number}: its exploratory episode is not here, so its policies cannot be "
+                "followed (give all bags of the run)"
+            )
             return
         training = build_training(self._values)
         used: set[bytes] = set()

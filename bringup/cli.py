@@ -8,9 +8,12 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from bringup.bench_cli import add_bench
 from loop_interfaces.parameters import TUNER, ParameterError, read_yaml
 from loop_interfaces.problem import shipped_problems
 
+_EXTRAS = {"rosbags": "record", "mcap": "record", "matplotlib": "report"}
+"""Modules that only some commands need, and the extra that installs them."""
 _DEFAULTS = {spec.name: spec for spec in TUNER}
 
 
@@ -25,6 +28,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # RunFolderError, CheckpointError, ParameterError, DomainError, NodeError and the plant's
         # and controller's refusals; anything else is a bug and shows its traceback.
         print(f"pdeloop: {error}", file=sys.stderr)
+        return 1
+    except ModuleNotFoundError as error:
+        extra = _EXTRAS.get((error.name or "").split(".")[0])
+        if extra is None:
+            raise
+        print(f"pdeloop: needs {error.name}: pip install 'pdeloop[{extra}]'", file=sys.stderr)
         return 1
     except BrokenPipeError:
         sys.stderr.close()
@@ -43,6 +52,8 @@ def _parser() -> argparse.ArgumentParser:
     _add_identify(commands)
     _add_reproduce(commands)
     _add_report(commands)
+    add_bench(commands)
+    _add_secure(commands)
     problems = commands.add_parser(
         "problems",
         help="list the shipped problems",
@@ -89,6 +100,17 @@ def _add_train(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help="run the same code without ROS; the policy is the same to the bit",
     )
     train.add_argument(
+        "--network",
+        action="store_true",
+        help="let messages leave this machine (default: loopback interface only)",
+    )
+    train.add_argument(
+        "--faulty-line",
+        metavar="LOSS,DUPLICATION,DELAY",
+        help="for tests: a relay between plant and controller that loses and repeats messages with "
+        "these probabilities and delays them by up to so many seconds",
+    )
+    train.add_argument(
         "--resume", type=Path, metavar="DIR", help="continue the interrupted run in DIR"
     )
     train.add_argument(
@@ -105,7 +127,36 @@ def _add_train(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         action="store_true",
         help="as --record, and stop the training if the recording fails",
     )
+    train.add_argument(
+        "--directions",
+        type=int,
+        metavar="D",
+        help="several directions an iteration, 2 D environments a seed (--optimizer directions)",
+    )
+    train.add_argument(
+        "--pairs", type=int, default=1, metavar="K", help="plants with a controller each [1]"
+    )
+    train.add_argument(
+        "--pin",
+        action="store_true",
+        help="a core for each plant and controller, and polling: less time per step, more power",
+    )
     train.set_defaults(command=_train)
+
+
+def _add_secure(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    secure = commands.add_parser(
+        "secure",
+        help="print an access policy for SROS2",
+        description="Print a policy for `ros2 security generate_artifacts -p` in which each node "
+        "has its own topics and nothing else (docs/security.md).",
+        epilog="example: pdeloop secure --namespace /lab > policy.xml",
+    )
+    secure.add_argument("--namespace", default="/", metavar="NS", help="namespace of the loop [/]")
+    secure.add_argument(
+        "--pairs", nargs="+", default=[""], metavar="NS", help="namespaces of its pairs below it"
+    )
+    secure.set_defaults(command=_secure)
 
 
 def _add_evaluate(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -142,7 +193,13 @@ def _add_bag(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         ("recover", _bag_recover, "make an ordinary bag of an unfinished one"),
     ):
         action = actions.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
-        action.add_argument("bag", type=Path, metavar="BAG", help="folder of a bag or of a run")
+        action.add_argument(
+            "bag",
+            type=Path,
+            metavar="BAG",
+            nargs="+" if name == "verify" else None,
+            help="folder of a bag or of a run" + "; all bags of a run" * (name == "verify"),
+        )
         action.set_defaults(command=command)
         if name == "info":
             action.add_argument("--json", action="store_true", help="print JSON")
@@ -218,29 +275,44 @@ _BAG = "Look into a bag that --record or recorder_node wrote, verify it, or reco
 
 
 def _train(options: argparse.Namespace) -> int:
-    from bringup.training_run import Recording, run_again, run_new
+    from bringup.training_run import Recording, Transport, run_again, run_new
 
     recording = None
     if options.record or options.record_or_stop:
+        import recorder_node.bag  # noqa: F401  # the recorder would only say so in its log
+
         storage = options.bag_storage or "mcap"
         recording = Recording(storage, options.bag_per_episode, options.record_or_stop)
     elif options.bag_storage or options.bag_per_episode:
         raise ParameterError("--bag-storage and --bag-per-episode go with --record")
-    names = ("iterations", "seed", "seeds", "start", "optimizer")
+    transport = Transport(
+        options.in_process,
+        recording,
+        options.network,
+        options.faulty_line,
+        options.pairs,
+        options.pin,
+    )
+    names = ("iterations", "seed", "seeds", "start", "optimizer", "directions")
     given = {n: getattr(options, n) for n in names if getattr(options, n) is not None}
+    if (
+        options.directions is not None
+        and given.setdefault("optimizer", "directions") != "directions"
+    ):
+        raise ParameterError("--directions goes with --optimizer directions")
     if options.resume is not None:
         if options.problem or given or options.out:
             raise ParameterError(
                 "--resume continues a run with its own parameters; "
                 "give it alone (or with --in-process)"
             )
-        return run_again(options.resume, options.in_process, recording)
+        return run_again(options.resume, transport)
     if options.problem is None:
         raise ParameterError(
             f"no problem given; expected one of {', '.join(shipped_problems())}, a YAML file, "
             "or --resume DIR"
         )
-    return run_new(options.problem, given, options.out, options.in_process, recording)
+    return run_new(options.problem, given, options.out, transport)
 
 
 def _evaluate(options: argparse.Namespace) -> int:
@@ -267,7 +339,7 @@ def _bag_info(options: argparse.Namespace) -> int:
 def _bag_verify(options: argparse.Namespace) -> int:
     from bringup.bag_verify import verify
 
-    report = verify(options.bag, options.parameters)
+    report = verify(*options.bag, parameters=options.parameters)
     print(report.text())
     return 1 if report.count else 0
 
@@ -313,6 +385,13 @@ def _report(options: argparse.Namespace) -> int:
 
     page = report(options.folder, options.out)
     print(f"report in {page}")
+    return 0
+
+
+def _secure(options: argparse.Namespace) -> int:
+    from bringup.secure import policy
+
+    print(policy(options.namespace, tuple(options.pairs)), end="")
     return 0
 
 

@@ -20,6 +20,7 @@ class Display:
         self._total = iterations * seeds
         self._every = max(1, self._total // 8)
         self._told = 0
+        self._rollouts: dict[int, int] = {}
         self._progress: Progress | None = None
         self._task: Any = None
 
@@ -82,11 +83,13 @@ class Display:
             self.line(phase)
 
     def _iteration(self, row: Mapping[str, Any]) -> None:
-        self._told += 1
+        # Optimisers differ in what an iteration is; two rollouts are one of the paper's.
+        self._rollouts[row["seed"]] = row["rollouts"]
+        before, self._told = self._told, sum(self._rollouts.values()) // 2
         cost = f"cost {row['cost']:.4g}" if "cost" in row else "diverged"
         if self._progress is not None:
             self._progress.update(self._task, completed=self._told, cost=cost)
-        elif self._told % self._every == 0 or not row.get("updated", True):
+        elif self._told // self._every > before // self._every or row["diverged"]:
             self.line(f"  seed {row['seed']}, iteration {row['iteration']}: {cost}")
 
 

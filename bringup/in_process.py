@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from controller_node.identification import DesignSettings, design
 from controller_node.policy import ProjectedLaw, excitation
 from loop_interfaces import model_rows
-from loop_interfaces.topics import COMPLETED, StartColumn
+from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn
 from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.plant import Plant
+from tuner_node.observer import cut
 from tuner_node.training import Batch, BatchResult, Training
 
 Array = NDArray[np.float64]
@@ -51,6 +52,7 @@ class LocalPair:
                 Batch(
                     batch.rows[i : i + max_batch],
                     None if batch.policies is None else batch.policies[i : i + max_batch],
+                    batch.trajectories,
                 )
             )
             for i in range(0, len(batch.rows), max_batch)
@@ -60,6 +62,8 @@ class LocalPair:
             np.concatenate([part.costs for part in parts]),
             np.concatenate(models) if models else None,
             self._fingerprint,
+            [t for part in parts for t in part.trajectories or ()] if batch.trajectories else None,
+            self.plant.target,
         )
 
     def _episode(self, batch: Batch) -> BatchResult:
@@ -67,6 +71,7 @@ class LocalPair:
         states = plant.reset(batch.rows[:, StartColumn.SEED].astype(np.int64))
         columns = batch.rows[:, [StartColumn.EXCITATION, StartColumn.VARIANCE]]
         excitations = [(int(seed), float(variance)) for seed, variance in columns]
+        watched = batch.exploratory or batch.trajectories
         history, actions_taken = [states.copy()], []
         if not batch.exploratory:
             assert self._law is not None and batch.policies is not None
@@ -74,18 +79,21 @@ class LocalPair:
         for k in range(plant.horizon):
             if batch.exploratory:
                 actions = np.stack([excitation(s, k, settings.n_a, v) for s, v in excitations])
-                actions_taken.append(actions)
             else:
                 assert self._law is not None
                 actions = self._law.actions(states)
             states = plant.step(actions)
-            if batch.exploratory:
+            if watched:
+                actions_taken.append(actions.copy())
                 history.append(states.copy())
         costs = plant.episode_costs()
         ended = np.where(costs.diverged_step >= 0, costs.diverged_step, COMPLETED)
         table = np.column_stack([costs.mean, costs.total, ended.astype(np.float64)])
+        seen = None
+        if batch.trajectories:
+            seen = cut(np.stack(history), np.stack(actions_taken), table[:, CostColumn.ENDED])
         if not batch.exploratory:
-            return BatchResult(table)
+            return BatchResult(table, trajectories=seen)
         if (ended != COMPLETED).any():
             raise ValueError(
                 f"no reduced model: the plant diverged under exploration at step "
@@ -96,7 +104,7 @@ class LocalPair:
             model_rows.pack(design(trajectory[:, m], applied[:, m], plant.target, settings))
             for m in range(len(excitations))
         ]
-        return BatchResult(table, np.stack(models))
+        return BatchResult(table, np.stack(models), trajectories=seen)
 
 
 def train(training: Training, pair: LocalPair, report: Report, *, max_batch: int = 1024) -> None:

@@ -8,14 +8,14 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from loop_interfaces.isolation import loopback_environment
-
 STOP_GRACE = 1.5
 """Seconds between SIGINT and SIGKILL when the run ends."""
+RECORDER_GRACE = 10.0
+"""The same for a recorder, which has a bag to finish."""
 BACK_OFF = (0.0, 0.5, 1.0, 2.0, 4.0)
 """Seconds before the first, second, ... restart of a node."""
 STEADY = 30.0
@@ -67,12 +67,14 @@ class Supervisor:
     domain: int
     log_folder: Path
     tell: Callable[[str], None]
+    isolation: Mapping[str, str]
+    """Environment variables that say where messages may go (loop_interfaces.isolation)."""
     _environment: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._environment = {
             **os.environ,
-            **loopback_environment(),
+            **self.isolation,
             "ROS_DOMAIN_ID": str(self.domain),
             "ROS_LOG_DIR": str(self.log_folder),
             "PYTHONUNBUFFERED": "1",
@@ -98,19 +100,28 @@ class Supervisor:
         return False
 
     def stop(self) -> None:
-        """End every node: SIGINT to all, SIGKILL to who is left after STOP_GRACE."""
-        alive = [child.process for child in self.children if child.process is not None]
-        for process in alive:
-            _signal(process, signal.SIGINT)
-        deadline = time.monotonic() + STOP_GRACE
-        for process in alive:
-            try:
-                process.wait(max(0.0, deadline - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                _signal(process, signal.SIGKILL)
-                process.wait()
-        for child in self.children:
-            child.process, child.due = None, None
+        """End every node: SIGINT to all, SIGKILL to who is left after STOP_GRACE.
+
+        The main node ends first, then what is optional, a recorder: it must see all that the main
+        node did, but a reader drops what it has not taken yet when the writer leaves.
+        """
+        for group, grace in (
+            ([child for child in self.children if child.name == self.main], STOP_GRACE),
+            ([child for child in self.children if child.optional], RECORDER_GRACE),
+            (self.children, STOP_GRACE),
+        ):
+            alive = [child.process for child in group if child.process is not None]
+            for process in alive:
+                _signal(process, signal.SIGINT)
+            deadline = time.monotonic() + grace
+            for process in alive:
+                try:
+                    process.wait(max(0.0, deadline - time.monotonic()))
+                except subprocess.TimeoutExpired:
+                    _signal(process, signal.SIGKILL)
+                    process.wait()
+            for child in group:
+                child.process, child.due = None, None
 
     def _start(self, child: Child, now: float) -> None:
         with child.log.open("ab") as log:
@@ -121,7 +132,7 @@ class Supervisor:
                 stderr=subprocess.STDOUT,
                 env=self._environment,
                 start_new_session=True,  # Ctrl-C in the terminal reaches the supervisor only
-                preexec_fn=_die_with_parent,
+                preexec_fn=die_with_parent,
             )
         child.started, child.due = now, None
 
@@ -167,5 +178,6 @@ _LIBC = ctypes.CDLL(None, use_errno=True)
 _PR_SET_PDEATHSIG = 1
 
 
-def _die_with_parent() -> None:
+def die_with_parent() -> None:
+    """For `preexec_fn`: the child is killed when the process that started it ends."""
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import itertools
 import json
 import signal
+import sys
+import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -16,7 +18,9 @@ from typing import Any
 from bringup.display import Display, ProgressFile, summary_text
 from bringup.domain import own_domain
 from bringup.in_process import LocalPair, train
+from bringup.pairs import PairNode, pair_nodes, tuner_parameter
 from bringup.supervisor import Child, NodeError, Supervisor, node_command
+from loop_interfaces.isolation import NETWORK, loopback_environment
 from loop_interfaces.parameters import ParameterError, check, table
 from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_equation, build_plant
@@ -35,7 +39,16 @@ class Interruption(BaseException):
 def resolve(problem: str, options: Mapping[str, Any]) -> dict[str, Any]:
     """The parameters of a new run; ValueError if the problem's plant cannot be built from them."""
     values = load_parameters(problem, options)
-    build_plant(values)
+    # Compiled code is kept on disk, so that this is slow once only, and not for the nodes.
+    notice = threading.Timer(
+        1.0, print, ["compiling the plant's kernel, once ..."], {"file": sys.stderr}
+    )
+    notice.daemon = True
+    notice.start()
+    try:
+        build_plant(values)
+    finally:
+        notice.cancel()
     physical = asdict(build_equation(values))
     del physical["length"]
     return {**values, **{f"physical.{name}": value for name, value in physical.items()}}
@@ -50,51 +63,83 @@ class Recording:
     required: bool = False
 
 
+@dataclass(frozen=True)
+class Transport:
+    """How a training is carried out; nothing of this changes its results.
+
+    in_process: without ROS; network: let the messages leave this machine; faulty_line: 'LOSS,
+    DUPLICATION,DELAY' of a relay between plant and controller; pairs: of plant and controller; pin:
+    give each of their nodes a core.
+    """
+
+    in_process: bool = False
+    recording: Recording | None = None
+    network: bool = False
+    faulty_line: str | None = None
+    pairs: int = 1
+    pin: bool = False
+
+    def __post_init__(self) -> None:
+        if self.in_process and (self.recording or self.network or self.faulty_line):
+            raise ParameterError(
+                "--record, --network and --faulty-line are about topics; leave out --in-process"
+            )
+        if self.in_process and (self.pairs > 1 or self.pin):
+            raise ParameterError("--pairs and --pin are about nodes; leave out --in-process")
+        if self.pairs > 1 and self.faulty_line:
+            raise ParameterError("--faulty-line is the line of one pair; leave out --pairs")
+        pair_nodes(self.pairs, self.pin)
+        if self.faulty_line is not None:
+            self.line_arguments()
+
+    def line_arguments(self) -> list[str]:
+        """The relay's ROS parameters."""
+        words = (self.faulty_line or "").split(",")
+        try:
+            numbers = [float(word) for word in words]
+        except ValueError:
+            numbers = []
+        if len(numbers) != 3:
+            raise ParameterError(
+                f"--faulty-line is {self.faulty_line!r}; expected LOSS,DUPLICATION,DELAY "
+                "like 0.01,0.02,0.005 (two probabilities and seconds)"
+            )
+        names = ("loss", "duplicate", "delay")
+        return [f"{name}:={number}" for name, number in zip(names, numbers, strict=True)]
+
+
 def run_new(
-    problem: str,
-    options: Mapping[str, Any],
-    out: Path | None,
-    in_process: bool,
-    recording: Recording | None = None,
+    problem: str, options: Mapping[str, Any], out: Path | None, transport: Transport
 ) -> int:
     """Train from the start in a new folder; returns the exit code."""
-    _check_recording(in_process, recording)
     values = resolve(problem, options)
     folder = out or Path("runs") / f"{values['problem']}-{timestamp()}"
     RunFolder(folder).create(values)
-    return _run(folder, values, in_process, recording)
+    return _run(folder, values, transport)
 
 
-def run_again(folder: Path, in_process: bool, recording: Recording | None = None) -> int:
+def run_again(folder: Path, transport: Transport) -> int:
     """Continue the training in `folder`; returns the exit code."""
-    _check_recording(in_process, recording)
     values = {**check(table(), {}), **RunFolder(folder).parameters()}
     if (folder / "result.json").exists():
         raise RunFolderError(f"the run in {folder} is complete; there is nothing to continue")
-    return _run(folder, values, in_process, recording)
+    return _run(folder, values, transport)
 
 
-def _check_recording(in_process: bool, recording: Recording | None) -> None:
-    if in_process and recording is not None:
-        raise ParameterError("--record records topics; leave out --in-process")
-
-
-def _run(
-    folder: Path, values: dict[str, Any], in_process: bool, recording: Recording | None
-) -> int:
+def _run(folder: Path, values: dict[str, Any], transport: Transport) -> int:
     display = Display(values["iterations"], values["seeds"])
     started = time.monotonic()
     try:
         with interruptible():
-            if in_process:
+            if transport.in_process:
                 _train_here(folder, values, display)
             else:
-                _train_over_topics(folder, display, recording)
+                _train_over_topics(folder, display, transport)
     except Interruption as signal_name:
         display.close()
         display.line(
             f"stopped by {signal_name}; continue with: pdeloop train --resume {folder}"
-            + (" --in-process" if in_process else "")
+            + (" --in-process" if transport.in_process else "")
         )
         return 130
     finally:
@@ -127,35 +172,58 @@ def _train_here(folder: Path, values: dict[str, Any], display: Display) -> None:
         ) from error
 
 
-def _train_over_topics(folder: Path, display: Display, recording: Recording | None) -> None:
+def _train_over_topics(folder: Path, display: Display, transport: Transport) -> None:
+    recording = transport.recording
     logs = folder / "logs"
     logs.mkdir(exist_ok=True)
     parameters = ["--params-file", str(folder / "parameters.yaml")]
     own = {"tuner_node": [f"out:={folder}", "resume:=true"], "recorder_node": []}
-    names = ["pde_sim_node", "controller_node", "tuner_node"]
+    remaps: dict[str, list[str]] = {}
+    names = [*pair_nodes(transport.pairs, transport.pin), PairNode("tuner_node", "tuner_node")]
+    for name in own:
+        own[name] += tuner_parameter(transport.pairs)
     if recording is not None:
         bag = _unused(folder / "bag")
-        names.insert(0, "recorder_node")
-        own["recorder_node"] = [
+        names.insert(0, PairNode("recorder_node", "recorder_node"))
+        own["recorder_node"] += [
             f"bag:={bag}",
             f"bag_storage:={recording.storage}",
             f"bag_per_episode:={str(recording.bag_per_episode).lower()}",
         ]
         own["tuner_node"].append(f"recorder:={'required' if recording.required else 'start'}")
+    if transport.faulty_line is not None:
+        remaps = {"pde_sim_node": ["state:=state_sent"], "controller_node": ["action:=action_sent"]}
     children = {
-        name: Child(
-            name,
-            node_command(name, *parameters, *(w for v in own.get(name, []) for w in ("-p", v))),
-            logs / f"{name}.log",
-            optional=name == "recorder_node",
+        node.name: Child(
+            node.name,
+            node_command(
+                node.package,
+                *parameters,
+                *(w for v in (*node.parameters, *own.get(node.package, [])) for w in ("-p", v)),
+                *(w for r in (*node.remaps, *remaps.get(node.package, [])) for w in ("-r", r)),
+            ),
+            logs / f"{node.name}.log",
+            optional=node.package == "recorder_node",
         )
-        for name in names
+        for node in names
     }
+    if transport.faulty_line is not None:
+        arguments = [word for value in transport.line_arguments() for word in ("-p", value)]
+        command = node_command("bringup.relay", *arguments)
+        children["relay"] = Child("relay", command, logs / "relay.log")
     recorder = children.get("recorder_node")
     progress = ProgressFile(folder / "progress.jsonl")
     begun = False
     with own_domain() as domain:
-        supervisor = Supervisor(list(children.values()), "tuner_node", domain, logs, display.line)
+        display.line(f"start (ROS_DOMAIN_ID={domain}{', on the network' * transport.network})")
+        supervisor = Supervisor(
+            list(children.values()),
+            "tuner_node",
+            domain,
+            logs,
+            display.line,
+            {NETWORK: "1"} if transport.network else loopback_environment(),
+        )
         try:
             done = False
             while not done:
@@ -208,6 +276,7 @@ __all__ = [
     "Interruption",
     "NodeError",
     "Recording",
+    "Transport",
     "interruptible",
     "resolve",
     "run_again",

@@ -18,7 +18,7 @@ from controller_node.responder import Responder
 from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.node_loop import NodeLoop, node_main, qos
-from loop_interfaces.parameters import PROBLEM
+from loop_interfaces.parameters import EXECUTION, PROBLEM
 from loop_interfaces.protocol import ModelFailure, Send
 from loop_interfaces.ros_parameters import declare, given_parameters
 from loop_interfaces.topics import (
@@ -34,20 +34,23 @@ from loop_interfaces.topics import (
     WRITER_DEPTH,
 )
 
-CONTROLLER_PARAMETERS = tuple(
-    spec
-    for spec in PROBLEM
-    if spec.name
-    in (
-        "problem",
-        "n_a",
-        "dmdc_rank",
-        "reduced_order",
-        "state_weight",
-        "action_weight",
-    )
+CONTROLLER_PARAMETERS = (
+    *(
+        spec
+        for spec in PROBLEM
+        if spec.name
+        in (
+            "problem",
+            "n_a",
+            "dmdc_rank",
+            "reduced_order",
+            "state_weight",
+            "action_weight",
+        )
+    ),
+    *EXECUTION,
 )
-"""The problem parameters that concern the controller."""
+"""The parameters that concern the controller."""
 
 
 class ControllerNode:
@@ -55,7 +58,8 @@ class ControllerNode:
 
     def __init__(self, node: Node, loop: NodeLoop) -> None:
         values = declare(node, CONTROLLER_PARAMETERS, given_parameters(node))
-        settings = {k: v for k, v in values.items() if k != "problem"}
+        settings = {k: v for k, v in values.items() if k not in ("problem", "pin")}
+        loop.pin(values["pin"])
         responder = Responder(DesignSettings(**settings))
         self._responder = responder
         self._wire(node, loop)

@@ -133,7 +133,8 @@ class Responder:
         self._served = (frame.run, frame.plant)
         self.answered += 1
         self.episode = frame.episode
-        return [Send(ACTION, replace(frame, values=actions))]
+        answer = Frame(frame.run, frame.episode, frame.step, frame.time, actions, frame.plant)
+        return [Send(ACTION, answer)]
 
     def cost(self, frame: Frame) -> list[Send | ModelFailure]:
         """At the end of an exploratory episode: reduce and design."""

@@ -31,12 +31,18 @@ from rclpy.subscription import Subscription
 from rclpy.utilities import remove_ros_args, try_shutdown
 from std_msgs.msg import Float64MultiArray
 
+from loop_interfaces.affinity import pin_process
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.isolation import PROFILE, is_confined, outside_sockets
 from loop_interfaces.topics import READER_DEPTH, WRITER_DEPTH, Topic
 
 HOUSEKEEPING = 0.05
 """Seconds between two rounds of the executor and of the node's slow duties."""
+POLL = 200e-6
+"""Seconds that a node with a core of its own polls for the next message before it waits: longer
+than a round of a fast plant, shorter than what anyone would notice."""
+OBSERVER_DEPTH = 2000
+"""Samples that may wait for an observer that was not scheduled for a while."""
 SUSPENDED = 2.0
 """Seconds without being scheduled after which a process takes its peers to have dropped it.
 
@@ -70,6 +76,15 @@ def qos(topic: Topic, depth: int) -> QoSProfile:
     )
 
 
+def observer_qos(topic: Topic) -> QoSProfile:
+    """For who watches states and actions: their writers keep one sample, so a lost one could not be
+    sent again, and acknowledgements would slow the loop.
+    """
+    profile = qos(topic, OBSERVER_DEPTH)
+    profile.reliability = ReliabilityPolicy.BEST_EFFORT
+    return profile
+
+
 def scoped(namespace: str, name: str) -> str:
     """`name` below the relative `namespace` (empty: the node's own)."""
     return f"{namespace.strip('/')}/{name}" if namespace.strip("/") else name
@@ -84,26 +99,38 @@ class Sender:
             Float64MultiArray, scoped(namespace, topic.name), qos(topic, WRITER_DEPTH)
         )
 
+        # Past rclpy's wrapper, which locks the handle and looks at the type of every message.
+        self._publish = self.publisher.handle.publish_raw
+
     def send(self, frame: Frame) -> None:
-        self.publisher.publish(self._codec.encode(frame))
+        self._publish(self._codec.encode_into_own(frame))
 
 
 class _Receiver:
     """Takes frames from one topic and hands them to a callback."""
 
     def __init__(
-        self, node: Node, topic: Topic, callback: Callable[[Frame], None], namespace: str
+        self,
+        node: Node,
+        topic: Topic,
+        callback: Callable[[Frame], None],
+        namespace: str,
+        *,
+        observer: bool = False,
     ) -> None:
         self.callback = callback
-        self.codec = ArrayCodec(topic.labels)
+        self.observer = observer
+        self.decode = ArrayCodec(topic.labels).decode
         self.subscription: Subscription = node.create_subscription(
             Float64MultiArray,
             scoped(namespace, topic.name),
             lambda _: None,  # never called: see OutsideExecutor
-            qos(topic, READER_DEPTH),
+            observer_qos(topic) if observer else qos(topic, READER_DEPTH),
             callback_group=OutsideExecutor(),
             raw=True,
         )
+        self.handle = self.subscription.handle
+        self.take = self.handle.take_message
 
 
 class NodeLoop:
@@ -118,6 +145,7 @@ class NodeLoop:
         self.refused: Counter[str] = Counter()
         self._receivers: list[_Receiver] = []
         self._stop_reason: str | None = None
+        self._poll = 0.0
         self.suspended = False
         """Whether `run` ended because the process had been suspended (SIGSTOP, a frozen machine)."""
         self._executor = SingleThreadedExecutor(context=node.context)
@@ -138,6 +166,17 @@ class NodeLoop:
         self._receivers.append(receiver)
         return receiver.subscription
 
+    def observe(
+        self, topic: Topic, callback: Callable[[Frame], None], namespace: str = ""
+    ) -> Subscription:
+        """Like `receive`, for somebody who watches a loop without taking part in it.
+
+        Best effort with a deep history: the loop neither waits for an observer nor repeats for it.
+        """
+        receiver = _Receiver(self.node, topic, callback, namespace, observer=True)
+        self._receivers.append(receiver)
+        return receiver.subscription
+
     @staticmethod
     def now() -> float:
         """Monotonic time in s, as handed to `tick` and `housekeeping`."""
@@ -146,6 +185,16 @@ class NodeLoop:
     def stop(self, reason: str) -> None:
         """Leave `run` after the present event."""
         self._stop_reason = reason
+
+    def pin(self, core: int) -> None:
+        """Stay on one core and poll before waiting; -1: neither. ValueError for a core not allowed."""
+        if core >= 0:
+            pin_process(core)
+            self._poll = POLL
+
+    def resume(self) -> None:
+        """Make `run` possible again after `stop`."""
+        self._stop_reason = None
 
     @property
     def stopped(self) -> bool:
@@ -165,15 +214,20 @@ class NodeLoop:
         every HOUSEKEEPING seconds.
         """
         context = self.node.context
-        count = len(self._receivers)
-        wait_set = _rclpy.WaitSet(count, 0, 0, 0, 0, 0, context.handle)
-        handles = [receiver.subscription.handle for receiver in self._receivers]
-        by_pointer = {r.subscription.handle.pointer: r for r in self._receivers}
-        next_round = time.monotonic()
+        receivers, clock = self._receivers, time.monotonic
+        wait_set = _rclpy.WaitSet(len(receivers), 0, 0, 0, 0, 0, context.handle)
+        handles = [receiver.handle for receiver in receivers]
+        by_pointer = {receiver.handle.pointer: receiver for receiver in receivers}
+        clear, add = wait_set.clear_entities, wait_set.add_subscription
+        wait, ready = wait_set.wait, wait_set.get_ready_entities
+        next_round = clock()
         last_round, cpu = next_round, time.process_time()
-        while not self.stopped:
-            now = time.monotonic()
+        poll_until = 0.0
+        while self._stop_reason is None:
+            now = clock()
             if now >= next_round:
+                if not context.ok():
+                    break
                 gap, worked = now - last_round, time.process_time() - cpu
                 if gap > SUSPENDED and worked < gap / 2:
                     self.suspended = True
@@ -183,30 +237,42 @@ class NodeLoop:
                 housekeeping(now)
                 self._report(now)
                 next_round = now + HOUSEKEEPING
+                continue
             due = deadline()
             if due is not None and now >= due:
                 tick(now)
                 continue
+            if now < poll_until:
+                for receiver in receivers:
+                    if self._take(receiver):
+                        poll_until = clock() + self._poll
+                continue
             wake = next_round if due is None else min(due, next_round)
-            wait_set.clear_entities()
+            clear()
             for handle in handles:
-                wait_set.add_subscription(handle)
-            wait_set.wait(max(0, int((wake - now) * 1e9)))
-            for pointer in wait_set.get_ready_entities("subscription"):
-                self._take(by_pointer[pointer])
+                add(handle)
+            wait(int((wake - now) * 1e9))
+            for pointer in ready("subscription"):
+                receiver = by_pointer[pointer]
+                while self._take(receiver) and receiver.observer:
+                    pass
+                if self._poll:
+                    poll_until = clock() + self._poll
         return self._stop_reason or "shutdown"
 
-    def _take(self, receiver: _Receiver) -> None:
-        taken = receiver.subscription.handle.take_message(Float64MultiArray, True)
+    def _take(self, receiver: _Receiver) -> bool:
+        """Handle the next message of `receiver`; False if there is none."""
+        taken = receiver.take(Float64MultiArray, True)
         if taken is None:
-            return
+            return False
         try:
-            receiver.callback(receiver.codec.decode(taken[0]))
+            receiver.callback(receiver.decode(taken[0]))
         except ValueError as error:
             self._last_reason = f"{receiver.subscription.topic_name}: {error}"[:300]
             self.refused[self._last_reason] += 1
             if len(self.refused) > 1000:  # a flood with ever new reasons must not grow memory
                 self.refused = Counter({"others": sum(self.refused.values())})
+        return True
 
     def _report(self, now: float) -> None:
         total = sum(self.refused.values())

@@ -173,7 +173,26 @@ PLANT = (
         unit="s",
     ),
     Spec("publish_clock", True, "publish simulated time on /clock while somebody listens"),
+    Spec(
+        "real_time_factor",
+        0.0,
+        "simulated seconds per second of the wall clock; 0: as fast as possible",
+        0.0,
+        1e6,
+    ),
 )
+
+EXECUTION = (
+    Spec(
+        "pin",
+        -1,
+        "core on which every thread of the node stays, polling for 200 microseconds before it "
+        "waits; -1: all cores, no polling",
+        -1,
+        4095,
+    ),
+)
+"""How plant and controller use the machine."""
 
 TUNER = (
     Spec("seed", 0, "seed of everything random in the training", 0, MAX_SEED),
@@ -225,7 +244,15 @@ TUNER = (
         "optimizer",
         "two_point",
         "method of the adapt phase",
-        choices=("two_point", "directions"),
+        choices=("two_point", "directions", "gauss_newton"),
+    ),
+    Spec(
+        "directions",
+        4,
+        "directions D of an iteration of the optimizer 'directions': 2 D environments a seed; the "
+        "budget of 'iterations' is shared out, so that there are iterations / D of them",
+        1,
+        1_000_000,
     ),
     Spec(
         "recorder",
@@ -251,7 +278,7 @@ RECORDER = (
 
 def table() -> tuple[Spec, ...]:
     """Every parameter of the nodes."""
-    return (*PROBLEM, *PLANT, *TUNER, *RECORDER)
+    return (*PROBLEM, *PLANT, *EXECUTION, *TUNER, *RECORDER)
 
 
 def check_names(names: Iterable[str], known: Iterable[str]) -> None:

@@ -14,9 +14,9 @@ from loop_interfaces.frames import Frame
 from loop_interfaces.topics import Topic
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Send:
-    """Publish `frame` on `topic`."""
+    """Publish `frame` on `topic`. Never changed once it is made (see `Frame`)."""
 
     topic: Topic
     frame: Frame

@@ -14,6 +14,7 @@ import numpy as np
 from loop_interfaces.frames import MAX_VALUES, Frame, FrameError
 from loop_interfaces.protocol import Send, Tally
 from loop_interfaces.topics import COMPLETED, COST, STATE, TARGET, VOID, StartColumn, Topic
+from pde_sim_node.pace import Pace
 from pde_sim_node.plant import Plant
 
 
@@ -21,7 +22,8 @@ class Lockstep:
     """One plant serving the episodes of one run at a time.
 
     plant: what is stepped; fingerprint: of its parameters (see build.fingerprint); sample_time (s):
-    simulated time per step; action_timeout (s), max_repeats, run_hold (s): see
+    simulated time per step; real_time_factor: simulated seconds per second, 0 as fast as
+    possible; action_timeout (s), max_repeats, run_hold (s): see
     loop_interfaces.parameters. `now` is any monotonic time in s.
     """
 
@@ -34,6 +36,7 @@ class Lockstep:
         action_timeout: float,
         max_repeats: int,
         run_hold: float,
+        real_time_factor: float = 0.0,
     ) -> None:
         self._plant = plant
         self._fingerprint = fingerprint
@@ -53,6 +56,9 @@ class Lockstep:
         self._repeats = 0
         self._tuner_heard = -np.inf
         self._deadline: float | None = None
+        self._held = False
+        """Whether the next state is ready and waits for its instant."""
+        self.pace = Pace(sample_time / real_time_factor) if real_time_factor else None
 
     @property
     def deadline(self) -> float | None:
@@ -89,10 +95,11 @@ class Lockstep:
                     f"(until it ends, or is silent for {self._run_hold:g} s)"
                 )
             self.run, self.episode, self._active, self._reply = frame.run, -1, False, None
-            self._deadline = None
+            self._deadline, self._held = None, False
         self._tuner_heard = now
         if not len(rows):
             self.run, self.episode, self._active, self._deadline = 0, -1, False, None
+            self._held = False
             return []
         if frame.episode < self.episode:
             self.tally["starts of an earlier episode"] += 1
@@ -104,10 +111,13 @@ class Lockstep:
                     "a new episode needs a new number"
                 )
             self.tally["starts repeated"] += 1
-            return [self._reply] if self._reply else []
+            return [self._reply] if self._reply and not self._held else []
         states = self._plant.reset(rows[:, StartColumn.SEED].astype(np.int64))
         self.episode, self._rows, self._active = frame.episode, rows.copy(), True
         self.time = max(self.time, frame.time) + self._sample_time
+        self._held = False
+        if self.pace:
+            self.pace.begin(now)
         return self._publish_state(states, now)
 
     def action(self, frame: Frame, now: float) -> list[Send]:
@@ -130,16 +140,31 @@ class Lockstep:
             raise FrameError(
                 f"expected an action of shape {expected} (env, actuator), got {frame.values.shape}"
             )
+        if self._held:
+            self.tally["actions before their state"] += 1
+            return []
         self._tuner_heard = now
         if plant.step_index == plant.horizon:
             return [self._finish(void=False)]
         states = plant.step(frame.values)
         self.steps_total += plant.batch
         self.time += self._sample_time
+        if self.pace:
+            self._reply, self._held = self._stamped(STATE, states), True
+            self._deadline = self.pace.next(now)
+            return []
         return self._publish_state(states, now)
 
     def tick(self, now: float) -> list[Send]:
-        """Send the state again when its answer is overdue; give the episode up after max_repeats."""
+        """Send the state again when its answer is overdue; give the episode up after max_repeats.
+
+        With a pace also: send the next state at its instant. Call it once right after `action`,
+        too, so that a state which is ready too late is told from one that is sent too late.
+        """
+        if self._held and self.pace and self._reply and self.pace.ready(now):
+            self._held, self._repeats = False, 0
+            self._deadline = now + self._action_timeout
+            return [self._reply]
         if self._deadline is None or now < self._deadline or self._reply is None:
             return []
         if self._repeats >= self._max_repeats:

@@ -17,7 +17,7 @@ from rosgraph_msgs.msg import Clock
 from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.node_loop import NodeLoop, node_main
-from loop_interfaces.parameters import PLANT, PROBLEM, Spec
+from loop_interfaces.parameters import EXECUTION, PLANT, PROBLEM, Spec
 from loop_interfaces.protocol import Send
 from loop_interfaces.ros_parameters import declare, given_parameters
 from loop_interfaces.topics import ACTION, COST, START, STATE, TARGET
@@ -31,7 +31,7 @@ def declare_parameters(node: Node) -> dict[str, Any]:
     given = given_parameters(node)
     names = {spec.name for spec in PLANT_PARAMETERS}
     physical = {name: value for name, value in given.items() if name.startswith("physical.")}
-    values = declare(node, [s for s in PROBLEM if s.name in names] + list(PLANT), given)
+    values = declare(node, [s for s in PROBLEM if s.name in names] + [*PLANT, *EXECUTION], given)
     specs = [
         Spec(
             f"physical.{item.name}",
@@ -63,6 +63,7 @@ class PlantNode:
 
     def __init__(self, node: Node, loop: NodeLoop) -> None:
         values = declare_parameters(node)
+        loop.pin(values["pin"])  # before the plant counts the cores it has
         plant = build_plant(values)
         if plant.compiled_in_seconds > 0.0:
             node.get_logger().info(f"compiled the kernel in {plant.compiled_in_seconds:.1f} s")
@@ -73,7 +74,9 @@ class PlantNode:
             action_timeout=values["action_timeout"],
             max_repeats=values["max_repeats"],
             run_hold=values["run_hold"],
+            real_time_factor=values["real_time_factor"],
         )
+        self._paced = self._lockstep.pace is not None
         self._wire(node, loop, publish_clock=values["publish_clock"])
         node.get_logger().info(
             f"{values['problem']}: {plant.n_z} points, {plant.n_a} actuators, "
@@ -99,13 +102,26 @@ class PlantNode:
             deadline=lambda: lockstep.deadline,
             housekeeping=self._housekeeping,
         )
+        if not self._loop.suspended:
+            self._report_pace()
         return 0
 
     def _on_start(self, frame: Frame) -> None:
         self._send(self._lockstep.start(frame, self._loop.now()))
+        if not self._lockstep.run:
+            self._report_pace()
 
     def _on_action(self, frame: Frame) -> None:
         self._send(self._lockstep.action(frame, self._loop.now()))
+        if self._paced:
+            self._send(self._lockstep.tick(self._loop.now()))
+
+    def _report_pace(self) -> None:
+        """How well the wall clock was kept, at the end of a run or of this node."""
+        pace = self._lockstep.pace
+        if pace and pace.count:
+            self._node.get_logger().info(f"real time: {pace.summary()}")
+            pace.clear()
 
     def _send(self, sends: list[Send]) -> None:
         for send in sends:

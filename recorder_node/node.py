@@ -7,7 +7,9 @@ It takes serialised bytes in batches, off the loop's path. What is written: reco
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import sys
 import time
 from dataclasses import dataclass
@@ -200,7 +202,7 @@ class RecorderNode:
         self._peers = Peers(
             node,
             required=[f"{n}{topic.name}" for n in self._namespaces for topic in (STATE, ACTION)],
-            others=[node.resolve_topic_name(START.name)],
+            others=[f"{n}{START.name}" for n in self._namespaces],
         )
         self._status: Publisher | None = None
 
@@ -291,8 +293,15 @@ def _make(node: Node, loop: NodeLoop) -> RecorderNode:
         raise ConfigurationError(str(error)) from error
 
 
+def _stand_back() -> None:
+    """Let the loop's processes go first: a message that arrives here must not preempt its sender."""
+    with contextlib.suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+
+
 def main(args: list[str] | None = None) -> int:
     """Console script."""
+    _stand_back()
     keep_on_this_machine()
     return node_main("recorder_node", args, _make)
 

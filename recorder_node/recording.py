@@ -54,6 +54,7 @@ class Source:
 def sources(namespace: str) -> list[Source]:
     """The topics of a pair in the absolute `namespace` ('/' or '/left')."""
     base = namespace.rstrip("/")
+    namespace = base or "/"
     found = [
         Source(Channel(f"{base}/{topic.name}", ARRAY_TYPE, topic.latched), topic, namespace)
         for topic in ARRAYS

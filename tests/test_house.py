@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-NODES = ("pde_sim_node", "controller_node", "tuner_node")
+NODES = ("pde_sim_node", "controller_node", "tuner_node", "recorder_node")
 WITH_ROS = {"node.py", "node_loop.py", "ros_parameters.py"}
 """Files that may import rclpy or messages."""
 ROS = ("rclpy", "std_msgs", "std_srvs", "rosgraph_msgs", "rcl_interfaces", "diagnostic_msgs")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner_node.optimizers import OPTIMIZERS, Optimizer
+from tuner_node.optimizers import NEED_TRAJECTORIES, OPTIMIZERS, Context, Optimizer
 from tuner_node.training import Training, TrainingSettings
 
 
@@ -17,13 +17,27 @@ def build_training(values: Mapping[str, Any]) -> Training:
     from_zero = values["start"] == "zero"
     rate = values["learning_rate_from_zero" if from_zero else "learning_rate"]
 
-    def make_optimizer(policy: NDArray[np.float64], seed: int) -> Optimizer:
+    options: dict[str, Any] = {}
+    if values["optimizer"] == "directions":
+        most = min(values["iterations"], 2 * values["n_a"] * values["reduced_order"])
+        if values["directions"] > most:
+            raise ValueError(
+                f"parameter 'directions' is {values['directions']}; expected at most {most}, as "
+                "many as there are iterations and entries of the policy"
+            )
+        options["directions"] = values["directions"]
+
+    def make_optimizer(
+        policy: NDArray[np.float64], seed: int, context: Context | None
+    ) -> Optimizer:
         return OPTIMIZERS[values["optimizer"]](
             policy,
             seed=seed,
             iterations=values["iterations"],
             learning_rate=rate,
             smoothing_radius=values["smoothing_radius"],
+            context=context,
+            **options,
         )
 
     settings = TrainingSettings(
@@ -35,5 +49,8 @@ def build_training(values: Mapping[str, Any]) -> Training:
         start=values["start"],
         exploration_variance=values["exploration_variance"],
         identification_attempts=values["identification_attempts"],
+        state_weight=values["state_weight"],
+        action_weight=values["action_weight"],
+        trajectories=values["optimizer"] in NEED_TRAJECTORIES,
     )
     return Training(settings, make_optimizer)

@@ -19,12 +19,18 @@ from numpy.typing import NDArray
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import ModelFailure, Send, Tally
 from loop_interfaces.topics import MODEL, POLICY, START, VOID, CostColumn, StartColumn
+from tuner_node.observer import Observer
+from tuner_node.optimizers import Trajectory
 from tuner_node.training import UNKNOWN_PLANT, Batch, BatchResult
 
 Array = NDArray[np.float64]
 Order = tuple[int, Send]
 """(pair, message): publish the message in that pair's namespace."""
 EPISODES_PER_INCARNATION = 2**32
+LATE = 0.5
+"""Seconds after its cost within which the last samples of an episode must have come in."""
+MAX_TARGETS = 64
+"""Plants whose target is remembered."""
 ASK_AGAIN = 2.0
 """Seconds without an answer after which an episode's policy and start are sent once more."""
 
@@ -41,9 +47,17 @@ class _Chunk:
     attempts: int = 0
     costs: Array | None = None
     models: Array | None = None
+    trajectories: list[Trajectory] | None = None
 
-    def done(self, exploratory: bool) -> bool:
-        return self.costs is not None and (not exploratory or self.models is not None)
+    def done(self, batch: Batch) -> bool:
+        return (
+            self.costs is not None
+            and (self.models is not None or not batch.exploratory)
+            and (self.trajectories is not None or not batch.trajectories)
+        )
+
+    def forget(self) -> None:
+        self.costs = self.models = self.trajectories = None
 
 
 @dataclass
@@ -55,6 +69,10 @@ class _Pair:
     episode: int = -1
     heard: float = 0.0
     sent: float = 0.0
+    observer: Observer = field(default_factory=Observer)
+    held: Frame | None = None
+    """A cost that waits for the last samples of its trajectories, and since when."""
+    held_since: float = 0.0
 
 
 @dataclass
@@ -77,6 +95,7 @@ class Dispatcher:
     plant: int = UNKNOWN_PLANT
     _batch: Batch | None = None
     _models: Frame | None = None
+    _targets: dict[int, Array] = field(default_factory=dict)
     _chunks: list[_Chunk] = field(default_factory=list)
     _waiting: list[_Chunk] = field(default_factory=list)
     _issued: int = 0
@@ -155,8 +174,27 @@ class Dispatcher:
             )
         else:
             known.chunk.costs = frame.values.copy()
+            if self._batch.trajectories:
+                known.held, known.held_since = frame, now
+                self._collect(known)
             self._release_if_done(known)
         return self._hand_out(now)
+
+    def target(self, pair: int, frame: Frame, now: float) -> list[Order]:
+        """Learn the target z_r of a plant."""
+        if len(self._targets) < MAX_TARGETS or frame.plant in self._targets:
+            self._targets[frame.plant] = frame.values.copy()
+        return []
+
+    def state(self, pair: int, frame: Frame, now: float) -> list[Order]:
+        """Take a sample z_k of a pair's episode."""
+        self.pairs[pair].observer.state(frame)
+        return []
+
+    def action(self, pair: int, frame: Frame, now: float) -> list[Order]:
+        """Take a sample a_k of a pair's episode."""
+        self.pairs[pair].observer.action(frame)
+        return []
 
     def model(self, pair: int, frame: Frame, now: float) -> list[Order]:
         """Take the reduced models of an exploratory episode."""
@@ -192,7 +230,14 @@ class Dispatcher:
         for number, pair in enumerate(self.pairs):
             if pair.chunk is None:
                 continue
-            if pair.missing:
+            if pair.held is not None:
+                self._collect(pair)
+                if pair.held is not None and now - pair.held_since > LATE:
+                    lost = pair.observer.lost(pair.held.plant, pair.held.step)
+                    self._retry(pair, f"the tuner missed {lost} samples of episode {pair.episode}")
+                else:
+                    self._release_if_done(pair)
+            elif pair.missing:
                 pair.heard = now  # absent, not silent: the latched topics serve it when it is back
             elif now - pair.heard > self.episode_timeout:
                 self._retry(
@@ -212,12 +257,19 @@ class Dispatcher:
     def result(self) -> BatchResult | None:
         """The batch's result once every row has one, in the batch's order."""
         batch = self._batch
-        if batch is None or not all(chunk.done(batch.exploratory) for chunk in self._chunks):
+        if batch is None or not all(chunk.done(batch) for chunk in self._chunks):
             return None
         self._batch = None
         costs = np.concatenate([chunk.costs for chunk in self._chunks if chunk.costs is not None])
         models = [chunk.models for chunk in self._chunks if chunk.models is not None]
-        return BatchResult(costs, np.concatenate(models) if models else None, self.plant)
+        seen = [t for chunk in self._chunks for t in chunk.trajectories or ()]
+        return BatchResult(
+            costs,
+            np.concatenate(models) if models else None,
+            self.plant,
+            seen if batch.trajectories else None,
+            self._targets.get(self.plant),
+        )
 
     def missing(self) -> list[str]:
         """Who is not on the network, in words, of pairs that have work."""
@@ -242,8 +294,17 @@ class Dispatcher:
 
     def _release_if_done(self, pair: _Pair) -> None:
         assert pair.chunk is not None and self._batch is not None
-        if pair.chunk.done(self._batch.exploratory):
+        if pair.chunk.done(self._batch):
             pair.chunk = None
+
+    def _collect(self, pair: _Pair) -> None:
+        """Take the held episode's trajectories, if all samples and the target are there."""
+        held, chunk = pair.held, pair.chunk
+        assert held is not None and chunk is not None
+        if held.plant in self._targets and not pair.observer.lost(held.plant, held.step):
+            ended = held.values[:, CostColumn.ENDED]
+            chunk.trajectories = pair.observer.trajectories(held.plant, held.step, ended)
+            pair.held = None
 
     def _retry(self, pair: _Pair, reason: str) -> None:
         chunk = pair.chunk
@@ -253,8 +314,8 @@ class Dispatcher:
         chunk.attempts += 1
         if chunk.attempts >= self.max_attempts:
             raise DispatchError(f"gave up after {chunk.attempts} attempts: {reason}")
-        chunk.costs = chunk.models = None
-        pair.chunk = None
+        chunk.forget()
+        pair.chunk = pair.held = None
         self._waiting.append(chunk)
 
     def _hand_out(self, now: float) -> list[Order]:
@@ -277,15 +338,16 @@ class Dispatcher:
                     f"{pair.episode}; another pair starts it again with the same seeds"
                 )
                 self.tally["episodes taken over"] += 1
-                pair.chunk.costs = pair.chunk.models = None
+                pair.chunk.forget()
                 self._waiting.append(pair.chunk)
-                pair.chunk = None
+                pair.chunk = pair.held = None
                 return
 
     def _begin(self, number: int, pair: _Pair, chunk: _Chunk, now: float) -> list[Order]:
         self._issued += 1
         pair.chunk, pair.heard = chunk, now
         pair.episode = self.incarnation * EPISODES_PER_INCARNATION + self._issued
+        pair.observer.begin(self.run, pair.episode)
         return self._ask(number, pair, now, again=False)
 
     def _ask(self, number: int, pair: _Pair, now: float, *, again: bool = True) -> list[Order]:

@@ -24,6 +24,7 @@ from loop_interfaces.parameters import PROBLEM, TUNER
 from loop_interfaces.protocol import ModelFailure
 from loop_interfaces.ros_parameters import declare, given_parameters
 from loop_interfaces.topics import (
+    ACTION,
     COST,
     MODEL,
     MODEL_FAILED,
@@ -32,6 +33,8 @@ from loop_interfaces.topics import (
     READER_DEPTH,
     RECORDER_STATUS,
     START,
+    STATE,
+    TARGET,
 )
 from tuner_node.build import build_training
 from tuner_node.dispatch import Dispatcher, DispatchError, Order
@@ -125,6 +128,11 @@ class TunerNode:
             self._senders.append(
                 {t.name: loop.sender(t, namespace) for t in (POLICY, START, MODEL)}
             )
+            if session.training.settings.trajectories:
+                # Before the costs: what has come in with one is then taken before it.
+                loop.receive(TARGET, self._handler(session.target, number), namespace)
+                loop.observe(STATE, partial(self._observe, session.state, number), namespace)
+                loop.observe(ACTION, partial(self._observe, session.action, number), namespace)
             cost = loop.receive(COST, self._handler(session.cost, number), namespace)
             model = loop.receive(MODEL_IDENTIFIED, self._handler(session.model, number), namespace)
             self._cost_topics.append(cost.topic_name)
@@ -135,6 +143,11 @@ class TunerNode:
                 partial(self._on_failure, number),
                 qos(MODEL, READER_DEPTH),
             )
+
+    def _observe(
+        self, take: Callable[[int, Frame, float], list[Order]], pair: int, frame: Frame
+    ) -> None:
+        take(pair, frame, self._loop.now())
 
     def _handler(
         self, handle: Callable[[int, Frame, float], list[Order]], pair: int

@@ -27,14 +27,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.frames import MAX_ID
-from loop_interfaces.parameters import PLANT, RECORDER, ParameterError, read_yaml, write_yaml
+from loop_interfaces.parameters import (
+    EXECUTION,
+    PLANT,
+    RECORDER,
+    ParameterError,
+    read_yaml,
+    write_yaml,
+)
 from loop_interfaces.topics import COMPLETED
 from tuner_node import checkpoint
 from tuner_node.training import CONTROLLERS, Training
 
 TRANSIENT = (
     *("out", "resume", "pairs", "max_batch", "episode_timeout", "max_attempts", "recorder"),
-    *(spec.name for spec in (*PLANT, *RECORDER)),
+    *(spec.name for spec in (*PLANT, *EXECUTION, *RECORDER)),
 )
 """Parameters that change how a training is carried out, not what comes out of it."""
 

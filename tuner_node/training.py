@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from loop_interfaces import model_rows
 from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn
-from tuner_node.optimizers import Optimizer, Rollout, RolloutResult
+from tuner_node.optimizers import Context, Optimizer, Rollout, RolloutResult, Trajectory
 from tuner_node.seeds import Purpose, derive
 
 Array = NDArray[np.float64]
@@ -43,6 +43,8 @@ class Batch:
 
     rows: Array
     policies: Array | None
+    trajectories: bool = False
+    """Whether the result must carry the trajectories."""
 
     @property
     def exploratory(self) -> bool:
@@ -54,12 +56,14 @@ class BatchResult:
     """Results of a batch.
 
     costs (R, 3): mean, total, ended of each row; models (R, rows, n_s) after exploration;
-    plant: fingerprint of the plant.
+    plant: fingerprint of the plant; where the batch asked for trajectories: these, and the target.
     """
 
     costs: Array
     models: Array | None = None
     plant: int = UNKNOWN_PLANT
+    trajectories: list[Trajectory] | None = None
+    target: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -74,10 +78,13 @@ class TrainingSettings:
     start: str
     exploration_variance: float
     identification_attempts: int
+    state_weight: float
+    action_weight: float
+    trajectories: bool
 
 
-OptimizerFactory = Callable[[Array, int], Optimizer]
-"""(warm-start policy, seed) -> optimiser."""
+OptimizerFactory = Callable[[Array, int, Context | None], Optimizer]
+"""(warm-start policy, seed, context where trajectories are asked for) -> optimiser."""
 
 
 @dataclass
@@ -101,10 +108,14 @@ class Training:
     ended: Array | None = None
     """How those rollouts ended (see CostColumn.ENDED), of the same shape."""
     plant: int = UNKNOWN_PLANT
+    explorations: list[Trajectory | None] = field(default_factory=list)
+    """The exploratory trajectory of every seed, where the optimiser wants trajectories."""
+    target: Array | None = None
 
     def __post_init__(self) -> None:
         self.pending = list(range(self.settings.seeds))
         self.attempts = [0] * self.settings.seeds
+        self.explorations = [None] * self.settings.seeds
 
     def next_batch(self) -> Batch | None:
         """The rollouts wanted now; the same at every call until `finish`. None: all is done."""
@@ -119,12 +130,12 @@ class Training:
                 ]
                 for m in self.pending
             ]
-            return Batch(np.array(rows, dtype=np.float64), None)
+            return Batch(np.array(rows, dtype=np.float64), None, self.settings.trajectories)
         if self.phase == "check":
             return _batch(self._check_rollouts())
         if self.phase == "adapt":
             wanted = [(m, rollout) for m, asked in enumerate(self._asked()) for rollout in asked]
-            return _batch(wanted)
+            return _batch(wanted, self.settings.trajectories)
         if self.phase == "evaluate":
             return _batch(self._evaluation_rollouts())
         return None
@@ -134,6 +145,10 @@ class Training:
         self.plant = result.plant
         if self.phase == "identify":
             assert result.models is not None
+            if result.trajectories is not None:
+                for m, trajectory in zip(self.pending, result.trajectories, strict=True):
+                    self.explorations[m] = trajectory
+                self.target = result.target
             return self._identified(result.models)
         if self.phase == "check":
             return self._checked(result)
@@ -166,6 +181,12 @@ class Training:
         }
         if self.models is not None:
             arrays["models"] = self.models
+        for m, exploration in enumerate(self.explorations):
+            if exploration is not None:
+                arrays[f"exploration{m}.states"] = exploration.states
+                arrays[f"exploration{m}.actions"] = exploration.actions
+        if self.target is not None:
+            arrays["target"] = self.target
         if self.evaluation is not None and self.ended is not None:
             arrays |= {"evaluation": self.evaluation, "ended": self.ended}
         for m, optimizer in enumerate(self.optimizers):
@@ -179,6 +200,12 @@ class Training:
         self.attempts = arrays["attempts"].tolist()
         self.pending = arrays["pending"].tolist()
         self.models = arrays.get("models")
+        self.target = arrays.get("target")
+        for m in range(self.settings.seeds):
+            if f"exploration{m}.states" in arrays:
+                self.explorations[m] = Trajectory(
+                    arrays[f"exploration{m}.states"], arrays[f"exploration{m}.actions"]
+                )
         if self.phase in ("adapt", "evaluate", "done"):
             self._start_optimizers()
         for m, optimizer in enumerate(self.optimizers):
@@ -266,9 +293,22 @@ class Training:
     def _start_optimizers(self) -> None:
         zero = self.settings.start == "zero"
         self.optimizers = [
-            self.make_optimizer(np.zeros_like(policy) if zero else policy, seed)
-            for policy, seed in zip(self.warm_starts(), self._seeds(), strict=True)
+            self.make_optimizer(np.zeros_like(policy) if zero else policy, seed, self._context(m))
+            for m, (policy, seed) in enumerate(zip(self.warm_starts(), self._seeds(), strict=True))
         ]
+
+    def _context(self, m: int) -> Context | None:
+        exploration = self.explorations[m]
+        if exploration is None or self.target is None or self.models is None:
+            return None
+        return Context(
+            U=model_rows.unpack(self.models[m], self.settings.n_a).U,
+            target=self.target,
+            state_weight=self.settings.state_weight,
+            action_weight=self.settings.action_weight,
+            horizon=len(exploration.actions),
+            exploration=exploration,
+        )
 
     def _asked(self) -> list[list[Rollout]]:
         return [[] if optimizer.done else optimizer.ask() for optimizer in self.optimizers]
@@ -281,15 +321,18 @@ class Training:
             if not asked:
                 continue
             own = result.costs[first : first + len(asked)]
+            seen: Sequence[Trajectory | None] = [None] * len(asked)
+            if result.trajectories is not None:
+                seen = result.trajectories[first : first + len(asked)]
             first += len(asked)
             told = optimizer.tell(
                 [
                     RolloutResult(
                         cost=float(cost[CostColumn.MEAN]),
                         diverged=bool(cost[CostColumn.ENDED] != COMPLETED),
-                        trajectory=None,
+                        trajectory=trajectory,
                     )
-                    for cost in own
+                    for cost, trajectory in zip(own, seen, strict=True)
                 ]
             )
             rows.append({"event": "iteration", "seed": seed, **told})
@@ -330,8 +373,8 @@ class Training:
         ]
 
 
-def _batch(wanted: Sequence[tuple[int, Rollout]]) -> Batch:
+def _batch(wanted: Sequence[tuple[int, Rollout]], trajectories: bool = False) -> Batch:
     rows = np.empty((len(wanted), len(StartColumn)))
     for row, (model, rollout) in zip(rows, wanted, strict=True):
         row[:] = (rollout.field_seed, -1, 0.0, model)
-    return Batch(rows, np.stack([rollout.policy for _, rollout in wanted]))
+    return Batch(rows, np.stack([rollout.policy for _, rollout in wanted]), trajectories)

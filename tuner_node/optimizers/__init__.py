@@ -16,6 +16,7 @@ from tuner_node.optimizers.gauss_newton import GaussNewton
 from tuner_node.optimizers.two_point import TwoPoint
 
 __all__ = [
+    "NEED_TRAJECTORIES",
     "OPTIMIZERS",
     "Context",
     "Directions",
@@ -33,3 +34,7 @@ __all__ = [
 OPTIMIZERS: dict[str, Callable[..., Optimizer]] = {
     cls.name: cls for cls in (TwoPoint, Directions, GaussNewton)
 }
+NEED_TRAJECTORIES = tuple(
+    cls.name for cls in (TwoPoint, Directions, GaussNewton) if cls.needs_trajectories
+)
+"""The optimisers whose results must carry their trajectories."""

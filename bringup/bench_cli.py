@@ -1,0 +1,96 @@
+"""`pdeloop bench`: the measuring programs. Each imports what it needs when it is called."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+from pathlib import Path
+from typing import Any
+
+
+def add_bench(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """The command group `bench`."""
+    bench = commands.add_parser(
+        "bench",
+        help="measure this machine: kernel, round trip, batch, training, pairs, real time",
+        description="Measure. What is compared runs in turns in one run; figures are medians.",
+    )
+    programs = bench.add_subparsers(required=True, metavar="PROGRAM")
+    rtt = _add(programs, "rtt", "rounds a second of the loop beside a bare ping-pong")
+    rtt.add_argument("--turns", type=int, default=9, metavar="N", help="turns of each [9]")
+    rtt.add_argument("--seconds", type=float, default=0.4, metavar="S", help="of a turn [0.4]")
+    rtt.add_argument("--only", choices=("pinned", "unpinned"), help="one of the two")
+    batch = _add(programs, "batch", "environment-steps a second against the batch")
+    batch.add_argument("--problem", default="allen-cahn", metavar="PROBLEM", help="[allen-cahn]")
+    batch.add_argument("--turns", type=int, default=3, metavar="N", help="turns of each [3]")
+    train = _add(programs, "train", "a whole training: topics against in-process")
+    train.add_argument("--problem", default="burgers", metavar="PROBLEM", help="[burgers]")
+    train.add_argument("--turns", type=int, default=3, metavar="N", help="trainings of each [3]")
+    train.add_argument("--iterations", type=int, default=40, metavar="N", help="[40]")
+    train.add_argument("--pin", action="store_true", help="with --pin as well")
+    real = _add(programs, "realtime", "jitter and missed deadlines at P1's 20 Hz and at 1 kHz")
+    real.add_argument("--seconds", type=float, default=10.0, metavar="S", help="of each rate [10]")
+    real.add_argument("--pin", action="store_true", help="with cores of their own")
+    pairs = _add(
+        programs, "pairs", "1, 2, 4 pairs on hosts made of network namespaces (needs root)"
+    )
+    pairs.add_argument("--pairs", type=int, nargs="+", default=[1, 2, 4], metavar="K")
+    pairs.add_argument("--iterations", type=int, default=20, metavar="N", help="[20]")
+    pairs.add_argument("--loss", type=float, default=0.01, help="share of lost messages [0.01]")
+    pairs.add_argument("--delay", type=float, default=0.002, help="largest delay in s [0.002]")
+    pairs.add_argument("--problem", default="burgers", metavar="PROBLEM", help="[burgers]")
+    soak = _add(programs, "soak", "trainings under random faults, compared bit for bit")
+    soak.add_argument("--minutes", type=float, default=20.0, metavar="N", help="[20]")
+    soak.add_argument("--problem", default="allen-cahn", metavar="PROBLEM", help="[allen-cahn]")
+    soak.add_argument("--iterations", type=int, default=100, metavar="N", help="of each [100]")
+    soak.add_argument(
+        "--seed", type=int, default=0, metavar="S", help="of faults and trainings [0]"
+    )
+    kernel = _add(programs, "kernel", "time of a step beside other implementations")
+    kernel.add_argument(
+        "--batches", type=int, nargs="+", default=[1, 2, 12, 64], metavar="M", help="[1 2 12 64]"
+    )
+    kernel.add_argument("--jax", metavar="PYTHON", help="interpreter that can import JAX")
+    kernel.add_argument("--controlgym", metavar="PYTHON", help="interpreter with controlgym 1.0.0")
+
+
+def _add(
+    programs: argparse._SubParsersAction[argparse.ArgumentParser], name: str, text: str
+) -> argparse.ArgumentParser:
+    program = programs.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
+    program.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    program.add_argument("--out", type=Path, metavar="FILE", help="write the JSON there, too")
+    program.set_defaults(command=_bench, program=name)
+    return program
+
+
+def _bench(options: argparse.Namespace) -> int:
+    given = {
+        name: value
+        for name, value in vars(options).items()
+        if name not in ("command", "program", "json", "out") and value is not None
+    }
+    result, text = _measure(options.program, given)
+    if options.out is not None:
+        options.out.write_text(json.dumps(result, indent=1) + "\n")
+    print(json.dumps(result) if options.json else text)
+    return 0
+
+
+def _measure(program: str, given: dict[str, Any]) -> tuple[Any, str]:
+    module = importlib.import_module(f"bringup.bench_{program}")
+    if program == "kernel":
+        from dataclasses import asdict
+
+        for name in ("jax", "controlgym"):
+            given[f"{name}_python"] = given.pop(name, None)
+        rows = module.run(**given)
+        return [asdict(row) for row in rows], module.table(rows)
+    if program == "rtt":
+        only = given.pop("only", None)
+        given["modes"] = tuple(
+            p for p in (False, True) if only in (None, "pinned" if p else "unpinned")
+        )
+    result = module.run(**given)
+    return result, module.text(result)

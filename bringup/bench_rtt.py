@@ -1,0 +1,122 @@
+"""`pdeloop bench rtt`: the loop's rounds a second beside a bare ping-pong, in one run.
+
+Both run all the time, in processes of their own, and take turns of a fraction of a second, so that
+what else the machine does weighs on both alike; the figures are medians over the turns. A round of
+the loop is: state, action, one step of the plant. Its overhead is the round without the solver,
+which is measured in turns as well.
+"""
+
+from __future__ import annotations
+
+from statistics import median
+from typing import Any
+
+from bringup.bench_processes import Bench, bench, machine, markdown
+from loop_interfaces.affinity import free_cores
+from loop_interfaces.problem import load_parameters
+
+PROBLEM = "allen-cahn"
+"""P2: of the paper's problems the one whose step is shortest."""
+BATCHES = (2, 64)
+PAYLOAD = 256
+"""Numbers in a request of the bare ping-pong."""
+
+
+def measure(
+    batches: tuple[int, ...], turns: int, seconds: float, pinned: bool
+) -> list[dict[str, Any]]:
+    """One row for each batch."""
+    with bench() as running:
+        return _measure(running, batches, turns, seconds, pinned)
+
+
+def _measure(
+    running: Bench, batches: tuple[int, ...], turns: int, seconds: float, pinned: bool
+) -> list[dict[str, Any]]:
+    one, two = free_cores(2) if pinned else (-1, -1)
+    ping = running.start("bringup.ping", f"pin:={one}")
+    running.start("bringup.ping", "end:=pong", f"pin:={two}")
+    horizon = "horizon:=1000"
+    running.start("pde_sim_node", horizon, f"pin:={one}", problem=PROBLEM)
+    running.start("controller_node", f"pin:={two}", problem=PROBLEM)
+    driver = running.start("bringup.driver", horizon, f"solver_pin:={one}", problem=PROBLEM)
+    n_z = load_parameters(PROBLEM, {})["n_z"]
+    for batch in batches:  # compile, find each other, warm up
+        driver.ask(do="episodes", batch=batch, seconds=0.1)
+        driver.ask(do="solver", batch=batch, seconds=0.1)
+    ping.ask(seconds=0.1, numbers=PAYLOAD)
+    samples: dict[tuple[str, int], list[float]] = {}
+
+    def note(what: str, batch: int, value: float) -> None:
+        samples.setdefault((what, batch), []).append(value)
+
+    for _ in range(turns):
+        for batch in batches:
+            for what, numbers in (("ping", PAYLOAD), ("ping_same", batch * n_z)):
+                got = ping.ask(seconds=seconds, numbers=numbers)
+                note(what, batch, got["seconds"] / got["rounds"])
+            got = driver.ask(do="episodes", batch=batch, seconds=seconds)
+            note("round", batch, got["seconds"] / got["rounds"])
+            note(
+                "solver", batch, driver.ask(do="solver", batch=batch, seconds=seconds / 4)["median"]
+            )
+    rows = []
+    for batch in batches:
+        us = {w: 1e6 * median(samples[w, batch]) for w in ("ping", "ping_same", "round", "solver")}
+        overheads = [
+            1e6 * (r - s)
+            for r, s in zip(samples["round", batch], samples["solver", batch], strict=True)
+        ]
+        ratios = {
+            name: median(
+                o / (1e6 * p) for o, p in zip(overheads, samples[name, batch], strict=True)
+            )
+            for name in ("ping", "ping_same")
+        }
+        rows.append(
+            {
+                "pinned": pinned,
+                "batch": batch,
+                "ping_us": us["ping"],
+                "ping_same_payload_us": us["ping_same"],
+                "rounds_per_second": 1e6 / us["round"],
+                "round_us": us["round"],
+                "solver_us": us["solver"],
+                "overhead_us": median(overheads),
+                "ratio": ratios["ping"],
+                "ratio_same_payload": ratios["ping_same"],
+            }
+        )
+    return rows
+
+
+def run(
+    turns: int = 7, seconds: float = 0.4, modes: tuple[bool, ...] = (False, True)
+) -> dict[str, Any]:
+    """Everything, as JSON-able data."""
+    rows = [row for pinned in modes for row in measure(BATCHES, turns, seconds, pinned)]
+    return {"problem": PROBLEM, "machine": machine(), "rows": rows}
+
+
+def text(result: dict[str, Any]) -> str:
+    """A table of `result`."""
+    head = (
+        "pinned", "batch", "rounds/s", "round µs", "solver µs", "overhead µs",
+        "ping-pong µs", "ratio", "same payload µs", "ratio",
+    )  # fmt: skip
+    rows = [
+        (
+            "yes" if row["pinned"] else "no",
+            row["batch"],
+            f"{row['rounds_per_second']:.0f}",
+            f"{row['round_us']:.0f}",
+            f"{row['solver_us']:.0f}",
+            f"{row['overhead_us']:.0f}",
+            f"{row['ping_us']:.0f}",
+            f"{row['ratio']:.2f}",
+            f"{row['ping_same_payload_us']:.0f}",
+            f"{row['ratio_same_payload']:.2f}",
+        )
+        for row in result["rows"]
+    ]
+    return markdown(head, rows)

@@ -1,0 +1,1 @@
+"""Stands in for the tuner in measurements: episodes on demand, timed."""

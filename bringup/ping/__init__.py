@@ -1,0 +1,1 @@
+"""A bare ping-pong between two processes: what the middleware alone costs."""

@@ -1,0 +1,109 @@
+"""`pdeloop secure`: a policy for SROS2 in which each node has its own topics and nothing else.
+
+The form is the policy schema 0.2.0 of SROS2 (`ros2 security generate_artifacts -p FILE`). It needs a
+ROS 2 whose middleware is built with DDS security; the PyPI wheels' is not (docs/security.md).
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass
+
+from loop_interfaces import topics
+
+
+@dataclass(frozen=True)
+class Role:
+    """The topics of one node, by relative name (absolute ones begin with /)."""
+
+    node: str
+    publishes: tuple[str, ...]
+    subscribes: tuple[str, ...]
+
+
+_ARRAYS = tuple(topic.name for topic in topics.ARRAYS)
+ROLES = (
+    Role(
+        "pde_sim_node",
+        (topics.STATE.name, topics.COST.name, topics.TARGET.name, "/clock"),
+        (topics.START.name, topics.ACTION.name),
+    ),
+    Role(
+        "controller_node",
+        (topics.ACTION.name, topics.MODEL_IDENTIFIED.name, topics.MODEL_FAILED),
+        tuple(
+            topic.name
+            for topic in (
+                *(topics.STATE, topics.TARGET, topics.START),
+                *(topics.POLICY, topics.MODEL, topics.COST),
+            )
+        ),
+    ),
+    Role(
+        "tuner_node",
+        (topics.POLICY.name, topics.START.name, topics.MODEL.name),
+        (topics.COST.name, topics.MODEL_IDENTIFIED.name, topics.MODEL_FAILED),
+    ),
+    Role(
+        "recorder_node",
+        (topics.RECORDER_STATUS,),
+        (*_ARRAYS, topics.MODEL_FAILED, "/clock"),
+    ),
+)
+"""Who may publish and subscribe what; the tests hold it against the running nodes."""
+
+EVERY_NODE_PUBLISHES = ("/rosout", "/parameter_events")
+EVERY_NODE_ANSWERS = (
+    "describe_parameters",
+    "get_parameter_types",
+    "get_parameters",
+    "get_type_description",
+    "list_parameters",
+    "set_parameters",
+    "set_parameters_atomically",
+)
+
+
+def policy(namespace: str = "/", pairs: tuple[str, ...] = ("",)) -> str:
+    """The SROS2 policy of one loop in `namespace`, as XML.
+
+    pairs: namespaces of the plant and controller pairs relative to `namespace`, as the tuner's
+    parameter. The enclave of a node is /pdeloop, its pair, its name.
+    """
+    root = ET.Element("policy", version="0.2.0")
+    enclaves = ET.SubElement(root, "enclaves")
+    for role in ROLES:
+        serves_all = role.node in ("tuner_node", "recorder_node")
+        for own in ("",) if serves_all else pairs:
+            reached = pairs if serves_all else ("",)
+            _enclave(enclaves, role, _join(namespace, own), own, reached)
+    ET.indent(root)
+    head = '<?xml version="1.0" encoding="UTF-8"?>\n'
+    return head + ET.tostring(root, encoding="unicode") + "\n"
+
+
+def _enclave(
+    parent: ET.Element, role: Role, namespace: str, pair: str, reached: tuple[str, ...]
+) -> None:
+    path = "/".join(part for part in ("/pdeloop", pair.strip("/"), role.node) if part)
+    enclave = ET.SubElement(parent, "enclave", path=path)
+    profile = ET.SubElement(
+        ET.SubElement(enclave, "profiles"), "profile", ns=namespace, node=role.node
+    )
+    services = ET.SubElement(profile, "services", reply="ALLOW")
+    for service in EVERY_NODE_ANSWERS:
+        ET.SubElement(services, "service").text = f"~/{service}"
+    for attribute, names in (
+        ("publish", (*EVERY_NODE_PUBLISHES, *role.publishes)),
+        ("subscribe", role.subscribes),
+    ):
+        rules = ET.SubElement(profile, "topics", {attribute: "ALLOW"})
+        for name in names:
+            absolute = name.startswith("/") or name == topics.RECORDER_STATUS
+            for place in ("",) if absolute else reached:
+                ET.SubElement(rules, "topic").text = "/".join(filter(None, (place, name)))
+
+
+def _join(namespace: str, pair: str) -> str:
+    parts = [part for part in (namespace.strip("/"), pair.strip("/")) if part]
+    return "/" + "/".join(parts)

@@ -1,0 +1,36 @@
+"""Disks that refuse: a real one that is full after a megabyte, and a folder nobody can write to."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+
+@contextlib.contextmanager
+def small_disk(folder: Path, megabytes: int, *options: str) -> Iterator[Path]:
+    """A tmpfs of this size mounted at `folder`; only root can mount."""
+    if os.getuid() != 0:
+        pytest.skip("mounting a small disk needs root")
+    folder.mkdir()
+    how = ",".join((f"size={megabytes}m", *options))
+    subprocess.run(["mount", "-t", "tmpfs", "-o", how, "tmpfs", str(folder)], check=True)
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+@contextlib.contextmanager
+def read_only_folder(folder: Path) -> Iterator[Path]:
+    """A folder that cannot be written to: for root one on a read-only disk."""
+    if os.getuid() == 0:
+        with small_disk(folder, 1, "ro") as mounted:
+            yield mounted
+        return
+    folder.mkdir(mode=0o500)
+    yield folder

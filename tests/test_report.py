@@ -1,0 +1,120 @@
+"""The report of a small run: every figure, and a page that a real browser shows without complaint."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from tests.loop_harness import processes
+from tests.small import SMALL
+
+LIMIT = 120.0
+COMMON = ("training-curves", "costs", "small-behaviour", "small-gains", "small-spectrum")
+BROWSER = [
+    "chromium",
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--enable-logging=stderr",
+    "--log-level=0",
+]
+
+
+@pytest.fixture(scope="module", params=["run", "reproduction"])
+def folder(request, tmp_path_factory) -> Path:
+    """A small finished run, or a small reproduction."""
+    base = tmp_path_factory.mktemp(request.param)
+    options = ("--seeds", "2", "--iterations", "4", "--out", str(base / "out"))
+    command = ("train", str(SMALL), "--in-process")
+    if request.param == "reproduction":
+        command = ("reproduce", str(SMALL))
+    with processes(base) as running:
+        running.wait(running.pdeloop(*command, *options), LIMIT)
+        running.wait(running.pdeloop("report", str(base / "out")), LIMIT)
+    return base / "out"
+
+
+def console(page: Path, profile: Path) -> tuple[list[str], str]:
+    """The browser's console messages while it shows `page`, and the page's final DOM."""
+    assert shutil.which("chromium"), (
+        "this test shows the report in a real browser and needs the command `chromium`; "
+        "install Debian's package chromium (make chromium, as root)"
+    )
+    done = subprocess.run(
+        [*BROWSER, f"--user-data-dir={profile}", "--dump-dom", page.as_uri()],
+        capture_output=True,
+        text=True,
+        timeout=LIMIT,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    return [line for line in done.stderr.splitlines() if "CONSOLE" in line], done.stdout
+
+
+def test_every_figure_is_there_as_png_and_svg(folder):
+    for name in COMMON:
+        picture = imread(folder / "report" / f"{name}.png")
+        assert picture.shape[1] > 600
+        assert np.unique(picture[..., :3].reshape(-1, 3), axis=0).shape[0] > 20
+        root = ElementTree.parse(folder / "report" / f"{name}.svg").getroot()
+        assert root.tag.endswith("svg") and len(list(root.iter())) > 50
+    assert len(list((folder / "report").glob("*.png"))) == len(COMMON)
+
+
+def test_axes_are_labelled_with_units_and_controllers_named(folder):
+    names = ["no control", "LQT", "LQT-PO"]
+    names += ["pure PO"] if (folder / "reproduction.json").exists() else []
+    svg = (folder / "report" / "small-behaviour.svg").read_text()
+    for words in ("x (m)", "t (s)", "u(x, t)", "actions", "target", *names):
+        assert words in svg, words
+    assert "iteration" in (folder / "report" / "training-curves.svg").read_text()
+    assert "mean stage cost" in (folder / "report" / "costs.svg").read_text()
+
+
+def test_a_controller_has_the_same_colour_in_every_figure(folder):
+    from bringup.figures import COLOURS
+
+    for name in ("costs", "small-behaviour", "small-spectrum"):
+        svg = (folder / "report" / f"{name}.svg").read_text().lower()
+        for controller in ("none", "lqt", "lqt_po"):
+            assert COLOURS[controller].lower() in svg, (name, controller)
+
+
+def test_the_page_needs_no_network_and_holds_everything(folder):
+    page = (folder / "report" / "index.html").read_text()
+    assert not re.search(r'(src|href)="(?!data:|#)', page)
+    assert "http" not in page
+    for name in COMMON:
+        assert f'id="{name}"' in page
+    for words in ("reduced_order", "learning_rate", "numpy", "no control", "LQT-PO"):
+        assert words in page
+
+
+def test_a_real_browser_shows_the_page_without_a_console_message(folder, tmp_path):
+    page = folder / "report" / "index.html"
+    messages, dom = console(page, tmp_path / "profile")
+    assert messages == []
+    assert dom.count("<img") == len(COMMON)
+    # The same page with a script that says what the browser made of it: the console is heard, and
+    # every picture was decoded.
+    script = (
+        "<script>addEventListener('load', () => { for (const i of document.images)"
+        " console.log('picture ' + i.naturalWidth); console.error('heard'); });</script></body>"
+    )
+    probe = tmp_path / "probe.html"
+    probe.write_text(page.read_text().replace("</body>", script))
+    messages, _ = console(probe, tmp_path / "profile2")
+    widths = [int(m) for line in messages for m in re.findall(r"picture (\d+)", line)]
+    assert len(widths) == len(COMMON) and min(widths) > 600
+    assert any("heard" in line for line in messages)

@@ -1,0 +1,299 @@
+"""Recording real loops: nothing is missed, everything can be recomputed, and failures do no harm."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import struct
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+
+from bringup.bag_reader import Bag
+from bringup.bag_tools import describe, recover
+from bringup.bag_verify import verify
+from bringup.offline_identification import identify
+from loop_interfaces.model_rows import pack
+from tests.loop_harness import Processes, until
+from tests.small import SMALL, same_bits
+from tests.small_disk import read_only_folder, small_disk
+from tests.topics.test_loop import (
+    LIMIT,
+    assert_same_training,
+    in_process,
+    iterations_done,
+    tuner_arguments,
+)
+
+pytestmark = pytest.mark.topics
+STEPS, ITERATIONS = 30, 6
+EPISODES = ITERATIONS + 3  # exploration, check, the iterations, evaluation
+
+
+def trained(loop: Processes, folder: Path, *options: str, iterations: int = ITERATIONS) -> str:
+    run = loop.pdeloop(
+        "train", str(SMALL), "--iterations", str(iterations), "--out", str(folder), *options
+    )
+    return loop.wait(run, LIMIT)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory, request) -> Path:
+    """A small run recorded by the command line, as one MCAP bag."""
+    from tests.loop_harness import processes
+
+    folder = tmp_path_factory.mktemp("recorded")
+    with processes(folder) as loop:
+        trained(loop, folder / "run", "--record", "--seeds", "2")
+    return folder / "run"
+
+
+@pytest.mark.parametrize(
+    "how",
+    [["--record"], ["--record", "--bag-storage", "sqlite3"], ["--record", "--bag-per-episode"]],
+    ids=["mcap", "sqlite3", "one bag an episode"],
+)
+def test_a_recorded_run_is_complete_and_everything_in_it_is_recomputed(loop, tmp_path, how):
+    text = trained(loop, tmp_path / "run", *how)
+    assert f"recorded in {tmp_path / 'run' / 'bag'}" in text
+    assert_same_training(tmp_path / "run", in_process(iterations=ITERATIONS))
+    report = verify(tmp_path / "run" / "bag")
+    assert (report.count, report.incomplete, report.notes) == (0, [], [])
+    assert report.episodes == EPISODES
+    rollouts = report.compared["costs"] - 1
+    assert report.compared["policies"] == rollouts
+    assert report.compared["steps"] == report.compared["costs"] * STEPS
+    index = Bag(tmp_path / "run" / "bag").index()
+    assert [row["complete"] for row in index] == [True] * EPISODES
+    with AnyReader(Bag(tmp_path / "run" / "bag").parts) as reader:
+        states = [c for c in reader.connections if c.topic == "/state"]
+        assert sum(1 for _ in reader.messages(states)) == EPISODES * (STEPS + 1)
+        clocks = [c for c in reader.connections if c.topic == "/clock"]
+        assert sum(1 for _ in reader.messages(clocks)) == EPISODES * (STEPS + 1)
+
+
+def test_two_libraries_read_the_same_numbers(recorded):
+    mine = {e.number: e for e in Bag(recorded).episodes()}
+    with (recorded / "bag" / "bag.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        count = 0
+        for _, _, _, message in reader.iter_decoded_messages(topics="/state"):
+            _, episode, step = (int(number) for number in message.data[:3])
+            expected = mine[episode].states[step].values
+            assert np.array(message.data[5:]).tobytes() == expected.tobytes()
+            count += 1
+    assert count == sum(len(e.states) for e in mine.values()) == EPISODES * (STEPS + 1)
+    with AnyReader([recorded / "bag"]) as bag:
+        for connection, _, raw in bag.messages(
+            [c for c in bag.connections if c.topic == "/action"]
+        ):
+            message = bag.deserialize(raw, connection.msgtype)
+            _, episode, step = (int(number) for number in message.data[:3])
+            assert message.data[5:].tobytes() == mine[episode].actions[step].values.tobytes()
+
+
+@pytest.mark.parametrize("topic", ["state", "action", "policy", "cost", "model", "start"])
+def test_verify_finds_a_single_bit_that_was_changed(recorded, tmp_path, topic):
+    copy = tmp_path / "bag"
+    shutil.copytree(recorded / "bag", copy)
+    episodes = list(Bag(copy).episodes())
+    exploratory, adapting = episodes[0], episodes[4]
+    frame, words = {
+        "state": (adapting.states[17], f"z_17 of episode {adapting.number}"),
+        "action": (adapting.actions[12], f"a_12 of episode {adapting.number}"),
+        "policy": (adapting.policy, f"policy of episode {adapting.number}"),
+        "cost": (adapting.cost, f"cost of episode {adapting.number}"),
+        "model": (exploratory.model, f"model of episode {exploratory.number}"),
+        "start": (adapting.start, f"of episode {adapting.number}"),
+    }[topic]
+    ids = struct.pack("<3d", frame.run, frame.episode, frame.step)
+    needle = frame.values.tobytes()
+    file = copy / "bag.mcap"
+    content = bytearray(file.read_bytes())
+    place = content.find(needle)
+    while content[place - 40 : place - 16] != ids:
+        place = content.find(needle, place + 1)
+        assert place > 0
+    content[place] ^= 1  # the last bit of the first number
+    file.write_bytes(content)
+    report = verify(copy)
+    assert report.count > 0
+    assert any(words in text for text in report.differences), report.text()
+    assert verify(recorded).count == 0
+
+
+def test_the_command_line_informs_verifies_and_identifies(loop, recorded, tmp_path):
+    text = loop.wait(loop.pdeloop("bag", "info", str(recorded)), LIMIT)
+    assert f"{EPISODES} episodes, 1 of them exploratory, 0 incomplete" in text
+    assert "/state" in text
+    text = loop.wait(loop.pdeloop("bag", "verify", str(recorded)), LIMIT)
+    assert "no difference, to the bit" in text
+    out = tmp_path / "model.npz"
+    text = loop.wait(
+        loop.pdeloop(
+            *("identify", "--bag", str(recorded), "--environment", "1", "--rank", "8"),
+            *("--order", "4", "--out", str(out)),
+        ),
+        LIMIT,
+    )
+    assert "the same, to the bit, as the model that the controller published" in text
+    with np.load(out) as saved, np.load(recorded / "policy.npz") as live:
+        assert same_bits(saved["model"][0], live["model"][1])
+
+
+def test_identify_from_a_bag_equals_the_live_model(recorded):
+    with np.load(recorded / "policy.npz") as live:
+        for seed in (0, 1):
+            found = identify(recorded / "bag", rank=None, order=None, environment=seed)
+            assert same_bits(pack(found.model), live["model"][seed])
+            assert found.live
+    both = identify(recorded / "bag", rank=8, order=4)
+    assert both.steps == 2 * STEPS and both.live is None
+
+
+def test_identify_needs_nothing_but_the_topics_of_a_foreign_plant(recorded, tmp_path):
+    copy = tmp_path / "bag"
+    shutil.copytree(recorded / "bag", copy)
+    (copy / "parameters.json").unlink()
+    (copy / "episodes.jsonl").unlink()
+    found = identify(copy, rank=8, order=4, environment=0, weights=(1.0, 1.0))
+    with np.load(recorded / "policy.npz") as live:
+        assert same_bits(pack(found.model), live["model"][0])
+    with pytest.raises(RuntimeError, match="does not say which rank to use; give it with --rank"):
+        identify(copy, rank=None, order=4)
+    report = verify(copy)
+    assert "its parameters are not in the bag" in report.notes[0]
+    assert verify(copy, parameters=recorded / "parameters.yaml").count == 0
+
+
+class Hand:
+    """Nodes started by hand, with a recorder beside them."""
+
+    def __init__(
+        self, loop: Processes, bag: Path, out: Path, recorder: str, **more: object
+    ) -> None:
+        self.bag, self.out = bag, out
+        self.recorder = loop.node(
+            "recorder_node",
+            *(word for n, v in {"bag": bag, **more}.items() for word in ("-p", f"{n}:={v}")),
+        )
+        for name in ("pde_sim_node", "controller_node"):
+            loop.node(name, "--params-file", str(SMALL))
+        self.tuner = loop.node(
+            "tuner_node",
+            *("--params-file", str(SMALL), "-p", f"recorder:={recorder}"),
+            *tuner_arguments(out, iterations=300),
+        )
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_killed_recorder_loses_a_second_at_most_and_the_training_goes_on(loop, tmp_path, storage):
+    hand = Hand(loop, tmp_path / "bag", tmp_path / "run", "start", bag_storage=storage)
+    until(lambda: iterations_done(hand.out) >= 150, LIMIT, "iteration 150")
+    hand.recorder.send_signal(signal.SIGKILL)
+    killed = time.time()
+    loop.wait(hand.tuner, LIMIT)
+    assert_same_training(hand.out, in_process(iterations=300))
+    content = describe(hand.bag)
+    assert not content["finished"]
+    assert content["last"] / 1e9 > killed - 1.0
+    whole = [e for e in content["episodes"] if not e["missing"]]
+    assert len(whole) >= len(content["episodes"]) - 1
+    report = verify(hand.bag)
+    assert report.count == 0 and report.compared["policies"] > 20
+    target, messages = recover(hand.bag, tmp_path / "recovered")
+    assert messages == content["messages"]
+    with AnyReader([target]) as reader:
+        assert reader.message_count == messages
+    assert verify(target).count == 0
+
+
+def test_a_training_that_must_be_recorded_stops_when_the_recorder_does(loop, tmp_path):
+    hand = Hand(loop, tmp_path / "bag", tmp_path / "run", "required")
+    until(lambda: iterations_done(hand.out) >= 20, LIMIT, "iteration 20")
+    hand.recorder.send_signal(signal.SIGTERM)
+    loop.wait(hand.recorder, 5.0)
+    text = loop.wait(hand.tuner, 10.0, code=1)
+    assert "tuner_node: the recorder is gone, and this training is required" in text
+    assert verify(hand.bag).count == 0
+
+
+@pytest.mark.parametrize("recorder", ["start", "required"])
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_full_disk_ends_the_recording_and_the_training_as_the_user_chose(
+    loop, tmp_path, storage, recorder
+):
+    with small_disk(tmp_path / "disk", megabytes=3) as disk:
+        hand = Hand(loop, disk / "bag", tmp_path / "run", recorder, bag_storage=storage)
+        text = loop.wait(hand.recorder, LIMIT, code=3)
+        last = text.strip().splitlines()[-1]
+        assert last.startswith(f"recorder_node: cannot write to {disk / 'bag'}: ")
+        assert "No space left on device" in last or "disk is full" in last
+        assert "recording stopped" in last
+        loop.wait(hand.tuner, LIMIT, code=0 if recorder == "start" else 1)
+        if recorder == "start":
+            assert_same_training(hand.out, in_process(iterations=300))
+        report = verify(hand.bag)
+        assert report.count == 0 and report.compared["policies"] > 20
+
+
+def test_a_bag_that_cannot_be_begun_is_refused_in_one_line(loop, tmp_path):
+    (tmp_path / "there").mkdir()
+    text = loop.wait(loop.node("recorder_node", "-p", f"bag:={tmp_path / 'there'}"), 20.0, code=1)
+    assert text.strip().splitlines() == [
+        f"recorder_node: {tmp_path / 'there'} already exists; choose another folder for the bag"
+    ]
+    with read_only_folder(tmp_path / "locked") as folder:
+        text = loop.wait(loop.node("recorder_node", "-p", f"bag:={folder / 'b'}"), 20.0, code=1)
+    (line,) = text.strip().splitlines()
+    assert line.startswith(f"recorder_node: cannot write a bag to {folder / 'b'}: ")
+
+
+def test_a_second_recording_of_a_run_gets_a_bag_of_its_own(loop, tmp_path):
+    out = tmp_path / "run"
+    run = loop.pdeloop("train", str(SMALL), "--iterations", "400", "--out", str(out), "--record")
+    until(lambda: iterations_done(out) >= 30, LIMIT, "iteration 30")
+    run.send_signal(signal.SIGINT)
+    loop.wait(run, 10.0, code=130)
+    loop.wait(loop.pdeloop("train", "--resume", str(out), "--record"), LIMIT)
+    assert_same_training(out, in_process(iterations=400))
+    for name in ("bag", "bag-2"):
+        report = verify(out / name)
+        assert report.count == 0, report.text()
+    assert "exploratory episode is not here" in verify(out / "bag-2").notes[0]
+    both = verify(out / "bag", out / "bag-2")
+    assert (both.count, both.notes) == (0, [])
+    assert len(both.incomplete) <= 1  # the one that Ctrl-C cut short
+    assert both.compared["policies"] == 8 + 2 * 400 + 30
+
+
+def test_one_recorder_records_several_pairs(loop, tmp_path):
+    for pair in ("a", "b"):
+        where = ("-r", f"__ns:=/{pair}", "--params-file", str(SMALL))
+        loop.node("pde_sim_node", *where, "-p", "publish_clock:=false")
+        loop.node("controller_node", *where)
+    pairs = ("-p", "pairs:=['a','b']")
+    recorder = loop.node("recorder_node", "-p", f"bag:={tmp_path / 'bag'}", *pairs)
+    tuner = loop.node(
+        "tuner_node",
+        *("--params-file", str(SMALL), "-p", "recorder:=start", *pairs),
+        *tuner_arguments(tmp_path / "run", seeds=2, max_batch=3),
+    )
+    loop.wait(tuner, LIMIT)
+    recorder.send_signal(signal.SIGINT)
+    loop.wait(recorder, 10.0)
+    assert_same_training(tmp_path / "run", in_process(seeds=2))
+    report = verify(tmp_path / "bag")
+    assert (report.count, report.incomplete, report.notes) == (0, [], []), report.text()
+    namespaces = {json.loads(line)["namespace"] for line in _index(tmp_path / "bag")}
+    assert namespaces == {"/a", "/b"}
+
+
+def _index(bag: Path) -> list[str]:
+    return (bag / "episodes.jsonl").read_text().splitlines()

@@ -1,0 +1,73 @@
+"""Collects the trajectories of an episode from the ordinary `state` and `action` topics. Pure.
+
+A sample that was lost is never interpolated: the episode has no trajectories then, and is run again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loop_interfaces.frames import Frame
+from loop_interfaces.topics import COMPLETED
+from tuner_node.optimizers import Trajectory
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class Observer:
+    """The samples of one episode of one pair, by (plant, step)."""
+
+    run: int = -1
+    episode: int = -1
+    _states: dict[tuple[int, int], Array] = field(default_factory=dict)
+    _actions: dict[tuple[int, int], Array] = field(default_factory=dict)
+
+    def begin(self, run: int, episode: int) -> None:
+        """Forget the last episode and listen to this one."""
+        self.run, self.episode = run, episode
+        self._states, self._actions = {}, {}
+
+    def state(self, frame: Frame) -> None:
+        """Take z_k; repeated ones are equal."""
+        if (frame.run, frame.episode) == (self.run, self.episode):
+            self._states[frame.plant, frame.step] = frame.values.copy()
+
+    def action(self, frame: Frame) -> None:
+        """Take a_k."""
+        if (frame.run, frame.episode) == (self.run, self.episode):
+            self._actions[frame.plant, frame.step] = frame.values.copy()
+
+    def lost(self, plant: int, steps: int) -> int:
+        """How many of the samples z_0..z_T and a_0..a_{T-1} are missing."""
+        states = sum((plant, k) in self._states for k in range(steps + 1))
+        actions = sum((plant, k) in self._actions for k in range(steps))
+        return 2 * steps + 1 - states - actions
+
+    def trajectories(self, plant: int, steps: int, ended: Array) -> list[Trajectory]:
+        """The trajectory of every environment; one that diverged at step k ends with z_k.
+
+        ended (M,): as in CostColumn.ENDED. Only when `lost` says that nothing is missing.
+        """
+        states = np.stack([self._states[plant, k] for k in range(steps + 1)])
+        actions = np.stack([self._actions[plant, k] for k in range(steps)])
+        return cut(states, actions, ended)
+
+
+def cut(states: Array, actions: Array, ended: Array) -> list[Trajectory]:
+    """The trajectories of the M environments of an episode, each up to where it ended.
+
+    states (T+1, M, n_z), actions (T, M, n_a), ended (M,).
+    """
+    steps = len(actions)
+    last = [steps if end == COMPLETED else int(end) for end in ended]
+    return [
+        Trajectory(
+            np.ascontiguousarray(states[: k + 1, m]),
+            np.ascontiguousarray(actions[:k, m]),
+        )
+        for m, k in enumerate(last)
+    ]
