@@ -41,7 +41,7 @@ def resolve(problem: str, options: Mapping[str, Any]) -> dict[str, Any]:
     values = load_parameters(problem, options)
     # Compiled code is kept on disk, so that this is slow once only, and not for the nodes.
     notice = threading.Timer(
-        1.0, print, ["compiling the plant's kernel, once ..."], {"file": sys.stderr}
+        4.0, print, ["compiling the plant's kernel, once ..."], {"file": sys.stderr}
     )
     notice.daemon = True
     notice.start()
