@@ -26,6 +26,8 @@ from loop_interfaces.topics import COMPLETED, VOID, CostColumn, StartColumn
 from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.plant import DIVERGED_COST
 from tuner_node.build import build_training
+from tuner_node.observer import cut
+from tuner_node.optimizers import NEED_TRAJECTORIES, Trajectory
 from tuner_node.training import Batch, BatchResult
 
 Array = NDArray[np.float64]
@@ -119,6 +121,7 @@ class _Run:
         self._number, self._report = number, report
         self._results: dict[bytes, tuple[Array, Array | None, int]] = {}
         self._rows: list[tuple[bytes, RecordedEpisode, int]] = []
+        self._trajectories: dict[bytes, Trajectory] = {}
         self._values: dict[str, Any] | None = None
         if values is None:
             report.notes.append(
@@ -188,9 +191,19 @@ class _Run:
                 return
             if batch.policies is not None:
                 report.compared["policies"] += len(keys)
+            seen = None
+            if batch.trajectories:
+                if any(key not in self._trajectories for key in keys):
+                    report.notes.append(
+                        f"samples of an episode after iteration {training.iteration} are missing, "
+                        "and the optimiser used them, so the training is not followed further"
+                    )
+                    return
+                seen = [self._trajectories[key] for key in keys]
             costs = np.stack([cost for cost, _, _ in results])
+            stacked = np.stack(models) if models else None
             training.finish(
-                BatchResult(costs, np.stack(models) if models else None, self._fingerprint)
+                BatchResult(costs, stacked, self._fingerprint, seen, self._plant.target)
             )
         unused = [episode for key, episode, _ in self._rows if key not in used]
         if unused:
@@ -207,10 +220,16 @@ class _Run:
         if episode.exploratory and episode.model is None:
             return
         policies = None if episode.policy is None else episode.policy.values
+        assert self._values is not None
+        seen: list[Trajectory] = []
+        if self._values["optimizer"] in NEED_TRAJECTORIES and not episode.missing:
+            seen = cut(*episode.trajectory(), episode.cost.values[:, CostColumn.ENDED])
         for i, key in enumerate(_keys(episode.start.values, policies)):
             model = episode.model.values[i] if episode.model is not None else None
             cost = episode.cost.values[i]
             self._rows.append((key, episode, i))
+            if seen:
+                self._trajectories[key] = seen[i]
             if key not in self._results:
                 self._results[key] = (cost, model, episode.number)
                 continue

@@ -78,6 +78,16 @@ def test_a_recorded_run_is_complete_and_everything_in_it_is_recomputed(loop, tmp
         assert sum(1 for _ in reader.messages(clocks)) == EPISODES * (STEPS + 1)
 
 
+def test_the_policies_of_an_optimiser_that_uses_trajectories_are_recomputed_from_them(
+    loop, tmp_path
+):
+    trained(loop, tmp_path / "run", "--record", "--optimizer", "gauss_newton")
+    report = verify(tmp_path / "run")
+    assert report.count == 0, report.differences
+    assert report.notes == []
+    assert report.compared["policies"] > 2 * ITERATIONS
+
+
 def test_two_libraries_read_the_same_numbers(recorded):
     mine = {e.number: e for e in Bag(recorded).episodes()}
     with (recorded / "bag" / "bag.mcap").open("rb") as file:
