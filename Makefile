@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 SHELL := /bin/bash
 
-.PHONY: setup run test chromium lint types check clean
+.PHONY: setup run test packages lint types check clean
 
 setup: .venv/ready
 
@@ -19,14 +19,22 @@ run: setup
 	$(BIN)/pdeloop train burgers
 
 # Two workers; each test over topics has a ROS domain of its own.
-test: setup chromium
+test: setup packages
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
-# The report's page is tested in a real browser. Where it cannot be had, that test says so.
-chromium:
-	@command -v chromium >/dev/null || { test "$$(id -u)" = 0 && command -v apt-get >/dev/null \
-		&& { apt-get update -qq; apt-get install -y -qq --no-install-recommends chromium >/dev/null; }; } \
-		|| echo "chromium is not installed (Debian's package chromium): a test will fail without it" >&2
+# Debian's packages that tests need: a real browser for the report's page, faketime to make a clock
+# jump, iproute2 for hosts made of network namespaces. Where they cannot be had, those tests fail and say so.
+packages:
+	@missing=(); \
+	command -v chromium >/dev/null || missing+=(chromium); \
+	command -v ip >/dev/null || missing+=(iproute2); \
+	ls /usr/lib/*/faketime/libfaketime.so.1 >/dev/null 2>&1 || missing+=(faketime); \
+	if [ $${#missing[@]} = 0 ]; then exit 0; fi; \
+	if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+		apt-get update -qq && apt-get install -y -qq --no-install-recommends "$${missing[@]}" >/dev/null; \
+	else \
+		echo "not installed: $${missing[*]} (Debian's names): some tests will fail without" >&2; \
+	fi
 
 lint: setup
 	$(BIN)/ruff check .

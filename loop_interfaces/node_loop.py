@@ -41,6 +41,8 @@ HOUSEKEEPING = 0.05
 POLL = 200e-6
 """Seconds that a node with a core of its own polls for the next message before it waits: longer
 than a round of a fast plant, shorter than what anyone would notice."""
+LOOK = 1.0
+"""Seconds between two looks at who publishes on the node's topics."""
 OBSERVER_DEPTH = 2000
 """Samples that may wait for an observer that was not scheduled for a while."""
 SUSPENDED = 2.0
@@ -153,6 +155,7 @@ class NodeLoop:
         self._last_reason = ""
         self._reported = 0
         self._report_at = 0.0
+        self._look_at = 0.0
 
     def sender(self, topic: Topic, namespace: str = "") -> Sender:
         """A publisher of frames on `topic`."""
@@ -236,6 +239,7 @@ class NodeLoop:
                 self._executor.spin_once(timeout_sec=0)
                 housekeeping(now)
                 self._report(now)
+                self._look_for_strangers(now)
                 next_round = now + HOUSEKEEPING
                 continue
             due = deadline()
@@ -273,6 +277,26 @@ class NodeLoop:
             if len(self.refused) > 1000:  # a flood with ever new reasons must not grow memory
                 self.refused = Counter({"others": sum(self.refused.values())})
         return True
+
+    def _look_for_strangers(self, now: float) -> None:
+        """Say who else publishes what one node of the loop should publish."""
+        if now < self._look_at:
+            return
+        self._look_at = now + LOOK
+        for receiver in self._receivers:
+            topic = receiver.subscription.topic_name
+            if self.node.count_publishers(topic) < 2:
+                continue
+            found = {
+                f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
+                for endpoint in self.node.get_publishers_info_by_topic(topic)
+            }
+            if len(found) > 1:
+                self.node.get_logger().warning(
+                    f"{len(found)} nodes publish {topic}: {', '.join(sorted(found))}; "
+                    "only messages of this run, episode, step and plant count",
+                    throttle_duration_sec=10.0,
+                )
 
     def _report(self, now: float) -> None:
         total = sum(self.refused.values())

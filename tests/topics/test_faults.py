@@ -275,6 +275,37 @@ print(sent, flush=True)
 """
 
 
+def test_a_strange_publisher_is_reported_by_name_and_changes_nothing(loop, tmp_path):
+    running = start_pair(loop)
+    out = tmp_path / "run"
+    tuner = start_tuner(loop, out, iterations=600)
+    until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
+    stranger = loop.start("-c", STRANGER, name="stranger")
+    loop.wait(tuner, LIMIT)
+    assert_same_training(out, in_process(iterations=600))
+    assert "2 nodes publish /action: /controller_node, /stranger" in loop.output(running["plant"])
+    stranger.kill()
+
+
+STRANGER = """
+import time
+import numpy as np, rclpy
+from std_msgs.msg import Float64MultiArray
+from loop_interfaces.frames import ArrayCodec, Frame
+from loop_interfaces.node_loop import qos
+from loop_interfaces.topics import ACTION
+rclpy.init()
+node = rclpy.create_node("stranger")
+publisher = node.create_publisher(Float64MultiArray, "action", qos(ACTION, 1))
+codec = ArrayCodec(ACTION.labels)
+k = 0
+while True:
+    k += 1
+    publisher.publish(codec.encode(Frame(1, 2 + k % 50, k % 31, 0.5, np.full((2, 4), 1e3))))
+    time.sleep(0.001)
+"""
+
+
 def resident(process: subprocess.Popen[bytes]) -> int:
     """Resident memory in kB."""
     for line in Path(f"/proc/{process.pid}/status").read_text().splitlines():
