@@ -155,6 +155,16 @@ def test_a_second_plant_with_other_parameters_never_mixes_in(loop, tmp_path):
     assert "plant with other parameters" in text
 
 
+def test_a_second_plant_with_the_same_parameters_is_harmless(loop, tmp_path):
+    start_pair(loop)
+    out = tmp_path / "run"
+    tuner = start_tuner(loop, out, iterations=500)
+    until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
+    loop.node("pde_sim_node", *PARAMETERS)
+    loop.wait(tuner, LIMIT)
+    assert_same_training(out, in_process(iterations=500))
+
+
 def test_a_new_run_is_not_disturbed_by_what_an_earlier_one_left_latched(loop, tmp_path):
     start_pair(loop)
     first = start_tuner(loop, tmp_path / "first", iterations=400)
