@@ -23,7 +23,7 @@ from bringup.hosts import environment, hosts, on
 from bringup.in_process import LocalPair, train
 from bringup.pairs import namespaces
 from bringup.training_run import resolve
-from loop_interfaces.parameters import write_yaml
+from loop_interfaces.parameters import yaml_text
 from tuner_node.build import build_training
 
 SEEDS = 4
@@ -78,7 +78,7 @@ def serve(
     with hosts(count + 1) as names, bench() as running:
         problem = running.folder / "problem.yaml"
         kept = {k: v for k, v in values.items() if k not in ("out", "resume", "pairs")}
-        write_yaml(problem, kept)
+        problem.write_text(yaml_text(kept))
         names_of_pairs = namespaces(count) if count > 1 else ["pair0"]
         nodes = [
             _pair(running, problem, name, namespace, faults, seed)

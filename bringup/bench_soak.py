@@ -103,7 +103,8 @@ class _Training:
         options = [
             word for name, value in self._options.items() for word in (f"--{name}", f"{value}")
         ]
-        process = self._start(self._problem, *options, "--out", str(self._out))
+        fresh = (self._problem, *options, "--out", str(self._out))
+        process = self._start(*fresh)
         limit = time.monotonic() + LIMIT
         while not (self._out / "result.json").exists():
             if time.monotonic() > limit:
@@ -113,7 +114,8 @@ class _Training:
             if process.poll() is not None:
                 self._end_of(process)
                 report.resumes += 1
-                process = self._start("--resume", str(self._out))
+                begun = (self._out / "parameters.yaml").exists()
+                process = self._start(*(("--resume", str(self._out)) if begun else fresh))
             deadline = time.monotonic() + float(rng.uniform(*PAUSE))
             while time.monotonic() < deadline and process.poll() is None:
                 self._watch_memory()

@@ -2,8 +2,8 @@
 
 The hot path takes serialised bytes from the middleware, decodes them with one `frombuffer`, and
 publishes bytes; it is driven by a WaitSet of the node's array subscriptions alone. Parameter
-services, timers and whatever else the node has are served by an ordinary executor every
-`HOUSEKEEPING` seconds, off the critical path. Array subscriptions sit in a callback group that the
+services, timers and whatever else the node has are served by an ordinary executor now and then
+(`HOUSEKEEPING`), off the critical path. Array subscriptions sit in a callback group that the
 executor never runs, so both can share one node and ROS tools see one node.
 """
 
@@ -38,6 +38,10 @@ from loop_interfaces.topics import READER_DEPTH, WRITER_DEPTH, Topic
 
 HOUSEKEEPING = 0.05
 """Seconds between two rounds of the executor and of the node's slow duties."""
+BUSY_HOUSEKEEPING = 0.2
+"""The same while messages stream through: a round of the executor costs as much as ten of them."""
+BUSY = 20
+"""Messages since the last round that make a stream."""
 POLL = 200e-6
 """Seconds that a node with a core of its own polls for the next message before it waits: longer
 than a round of a fast plant, shorter than what anyone would notice."""
@@ -214,7 +218,7 @@ class NodeLoop:
         """Handle events until `stop` or a signal; returns the reason.
 
         tick(now) is called when `deadline()` (monotonic s, or None) has passed; housekeeping(now)
-        every HOUSEKEEPING seconds.
+        every HOUSEKEEPING seconds, or BUSY_HOUSEKEEPING.
         """
         context = self.node.context
         receivers, clock = self._receivers, time.monotonic
@@ -225,7 +229,7 @@ class NodeLoop:
         wait, ready = wait_set.wait, wait_set.get_ready_entities
         next_round = clock()
         last_round, cpu = next_round, time.process_time()
-        poll_until = 0.0
+        poll_until, handled = 0.0, 0
         while self._stop_reason is None:
             now = clock()
             if now >= next_round:
@@ -240,7 +244,8 @@ class NodeLoop:
                 housekeeping(now)
                 self._report(now)
                 self._look_for_strangers(now)
-                next_round = now + HOUSEKEEPING
+                next_round = now + (BUSY_HOUSEKEEPING if handled > BUSY else HOUSEKEEPING)
+                handled = 0
                 continue
             due = deadline()
             if due is not None and now >= due:
@@ -249,6 +254,7 @@ class NodeLoop:
             if now < poll_until:
                 for receiver in receivers:
                     if self._take(receiver):
+                        handled += 1
                         poll_until = clock() + self._poll
                 continue
             wake = next_round if due is None else min(due, next_round)
@@ -259,7 +265,8 @@ class NodeLoop:
             for pointer in ready("subscription"):
                 receiver = by_pointer[pointer]
                 while self._take(receiver) and receiver.observer:
-                    pass
+                    handled += 1
+                handled += 1
                 if self._poll:
                     poll_until = clock() + self._poll
         return self._stop_reason or "shutdown"

@@ -335,8 +335,8 @@ def _flatten(body: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def write_yaml(path: Path, values: Mapping[str, Any], comment: str = "") -> None:
-    """Writes `values` as a ROS parameter file; dotted names become nested maps."""
+def yaml_text(values: Mapping[str, Any], comment: str = "") -> str:
+    """`values` as a ROS parameter file; dotted names become nested maps."""
     nested: dict[str, Any] = {}
     for name, value in values.items():
         *groups, last = name.split(".")
@@ -345,4 +345,4 @@ def write_yaml(path: Path, values: Mapping[str, Any], comment: str = "") -> None
             place = place.setdefault(group, {})
         place[last] = value
     text = yaml.safe_dump({"/**": {"ros__parameters": nested}}, sort_keys=False)
-    path.write_text("".join(f"# {line}\n" for line in comment.splitlines()) + text)
+    return "".join(f"# {line}\n" for line in comment.splitlines()) + text

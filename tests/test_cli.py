@@ -75,6 +75,18 @@ def test_a_folder_that_holds_a_run_is_left_as_it_was(tmp_path, capsys):
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
 
 
+def test_a_run_that_was_killed_while_its_folder_was_made_can_be_begun_again(tmp_path, capsys):
+    out = tmp_path / "run"
+    assert train(out) == 0
+    expected = (out / "policy.npz").read_bytes()
+    for left in ([], ["run.json"]):
+        for path in out.iterdir():
+            if path.is_file() and path.name not in left:
+                path.unlink()
+        assert train(out) == 0
+        assert (out / "policy.npz").read_bytes() == expected
+
+
 def test_an_unwritable_folder_is_refused(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     line = error_of(capsys, "train", str(SMALL), "--out", str(tmp_path / "file" / "run"))

@@ -11,7 +11,7 @@ from loop_interfaces.parameters import (
     check_names,
     read_yaml,
     table,
-    write_yaml,
+    yaml_text,
 )
 from loop_interfaces.parameters import ParameterError as Refused
 from loop_interfaces.problem import load_parameters, shipped_problems
@@ -70,7 +70,7 @@ def test_shipped_problems_load_and_build(name):
 
 def test_written_parameters_read_back(tmp_path):
     values = check(PROBLEM, {}) | {"physical.viscosity": 1e-4}
-    write_yaml(tmp_path / "p.yaml", values)
+    (tmp_path / "p.yaml").write_text(yaml_text(values))
     assert read_yaml(tmp_path / "p.yaml") == values
 
 

@@ -33,7 +33,7 @@ from loop_interfaces.parameters import (
     RECORDER,
     ParameterError,
     read_yaml,
-    write_yaml,
+    yaml_text,
 )
 from loop_interfaces.topics import COMPLETED
 from tuner_node import checkpoint
@@ -75,8 +75,12 @@ class RunFolder:
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             kept = {k: v for k, v in parameters.items() if k not in ("out", "resume")}
-            write_yaml(self.path / "parameters.yaml", kept, "resolved parameters of this run")
-            return self._identify(RunIdentity(1 + secrets.randbelow(MAX_ID - 1), 0), parameters)
+            # parameters.yaml comes last and whole: where it is, there is a run.
+            identity = RunIdentity(1 + secrets.randbelow(MAX_ID - 1), 0)
+            self._identify(identity, parameters)
+            text = yaml_text(kept, "resolved parameters of this run")
+            checkpoint.write_atomically(self.path / "parameters.yaml", text.encode())
+            return identity
         except OSError as error:
             raise RunFolderError(f"cannot write to {self.path}: {error.strerror}") from error
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loop_interfaces.parameters import write_yaml
+from loop_interfaces.parameters import yaml_text
 from tests.loop_harness import Processes, until
 from tests.small import SMALL, parameters, same_bits, train_here
 from tuner_node.training import Training
@@ -154,7 +154,7 @@ def test_a_rollout_that_diverges_is_marked_and_the_training_goes_on(loop: Proces
     values = {k: v for k, v in parameters().items() if k not in ("seed", "seeds", "iterations")}
     problem = {k: v for k, v in values.items() if k in DIVERGING or k.startswith("physical.")}
     path = tmp_path / "tight.yaml"
-    write_yaml(path, {**problem, "divergence_bound": 1.1, "smoothing_radius": 5.0})
+    path.write_text(yaml_text({**problem, "divergence_bound": 1.1, "smoothing_radius": 5.0}))
     out = tmp_path / "run"
     run = loop.pdeloop("train", str(path), "--iterations", "12", "--out", str(out))
     loop.wait(run, LIMIT)
