@@ -35,8 +35,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         print(f"pdeloop: needs {error.name}: pip install 'pdeloop[{extra}]'", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        print("pdeloop: interrupted", file=sys.stderr)
+        return 130
     except BrokenPipeError:
         sys.stderr.close()
+        return 1
+    except OSError as error:
+        where = f" ({error.filename})" if error.filename else ""
+        print(f"pdeloop: {error.strerror or error}{where}", file=sys.stderr)
         return 1
 
 

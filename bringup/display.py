@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sys
 from collections.abc import Mapping
@@ -111,7 +112,12 @@ class ProgressFile:
             return []
         self._position += len(new)
         *lines, self._rest = (self._rest + new).split(b"\n")
-        return [json.loads(line) for line in lines if line]
+        found = []
+        for line in lines:
+            with contextlib.suppress(ValueError):  # torn by a disk that was full
+                row = json.loads(line)
+                found += [row] if isinstance(row, dict) else []
+        return found
 
 
 def summary_text(problem: str, summary: Mapping[str, Any], folder: Path) -> str:

@@ -23,7 +23,8 @@ def evaluate(folder: Path, *, fields: int, seed: int, mean_field: bool) -> dict[
     fields, seed: how many initial fields are drawn, from which seed; mean_field: use the mean of the
     initial distribution instead. Returns {controller: (training seeds, fields) nested lists}.
     """
-    values = {**check(table(), {}), **RunFolder(folder).parameters()}
+    given = RunFolder(folder).parameters()
+    values = {**given, **check(table(), given)}
     path = folder / "policy.npz"
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:

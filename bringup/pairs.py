@@ -53,4 +53,9 @@ def pair_nodes(pairs: int, pin: bool) -> list[PairNode]:
 
 def tuner_parameter(pairs: int) -> list[str]:
     """What the tuner and the recorder have to know of the pairs."""
-    return [f"pairs:=[{', '.join(namespaces(pairs))}]"] if pairs > 1 else []
+    return [f"pairs:=[{', '.join(namespaces(pairs) if pairs > 1 else [quoted('')])}]"]
+
+
+def quoted(text: object) -> str:
+    """A text as a ROS argument: without quotes `5`, `no` or `a: b` would be something else."""
+    return "'" + str(text).replace("'", "''") + "'"

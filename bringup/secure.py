@@ -42,7 +42,10 @@ ROLES = (
     Role(
         "tuner_node",
         (topics.POLICY.name, topics.START.name, topics.MODEL.name),
-        (topics.COST.name, topics.MODEL_IDENTIFIED.name, topics.MODEL_FAILED),
+        (
+            *(topics.COST.name, topics.MODEL_IDENTIFIED.name, topics.MODEL_FAILED),
+            *(topics.STATE.name, topics.ACTION.name, topics.TARGET.name),  # for Gauss-Newton
+        ),
     ),
     Role(
         "recorder_node",

@@ -102,14 +102,15 @@ class Supervisor:
     def stop(self) -> None:
         """End every node: SIGINT to all, SIGKILL to who is left after STOP_GRACE.
 
-        The main node ends first, then what is optional, a recorder: it must see all that the main
-        node did, but a reader drops what it has not taken yet when the writer leaves.
+        With a recorder (an optional child) the main node ends first, then the recorder: it must see
+        all that the main node did, but a reader drops what it has not taken when the writer leaves.
         """
-        for group, grace in (
-            ([child for child in self.children if child.name == self.main], STOP_GRACE),
-            ([child for child in self.children if child.optional], RECORDER_GRACE),
-            (self.children, STOP_GRACE),
-        ):
+        recorders = [child for child in self.children if child.optional and child.process]
+        groups = [(self.children, STOP_GRACE)]
+        if recorders:
+            main = [child for child in self.children if child.name == self.main]
+            groups = [(main, STOP_GRACE), (recorders, RECORDER_GRACE), *groups]
+        for group, grace in groups:
             alive = [child.process for child in group if child.process is not None]
             for process in alive:
                 _signal(process, signal.SIGINT)

@@ -18,7 +18,7 @@ from typing import Any
 from bringup.display import Display, ProgressFile, summary_text
 from bringup.domain import own_domain
 from bringup.in_process import LocalPair, train
-from bringup.pairs import PairNode, pair_nodes, tuner_parameter
+from bringup.pairs import PairNode, pair_nodes, quoted, tuner_parameter
 from bringup.supervisor import Child, NodeError, Supervisor, node_command
 from loop_interfaces.isolation import NETWORK, loopback_environment
 from loop_interfaces.parameters import ParameterError, check, table
@@ -120,7 +120,8 @@ def run_new(
 
 def run_again(folder: Path, transport: Transport) -> int:
     """Continue the training in `folder`; returns the exit code."""
-    values = {**check(table(), {}), **RunFolder(folder).parameters()}
+    given = RunFolder(folder).parameters()
+    values = {**given, **check(table(), given)}
     if (folder / "result.json").exists():
         raise RunFolderError(f"the run in {folder} is complete; there is nothing to continue")
     return _run(folder, values, transport)
@@ -151,6 +152,11 @@ def _run(folder: Path, values: dict[str, Any], transport: Transport) -> int:
 
 
 def _train_here(folder: Path, values: dict[str, Any], display: Display) -> None:
+    with RunFolder(folder).held():
+        _train_holding(folder, values, display)
+
+
+def _train_holding(folder: Path, values: dict[str, Any], display: Display) -> None:
     training = build_training(values)
     recorder = Recorder(folder, values, training, resume=True, warn=display.line)
 
@@ -159,10 +165,8 @@ def _train_here(folder: Path, values: dict[str, Any], display: Display) -> None:
         recorder.keep(now=time.monotonic())
         display.row(row)
 
-    try:
-        train(training, LocalPair(values), report, max_batch=values["max_batch"])
-    finally:
-        recorder.keep(now=time.monotonic(), force=True)
+    # Nothing is saved on the way out of an interruption: it may come in the middle of an update.
+    train(training, LocalPair(values), report, max_batch=values["max_batch"])
     try:
         recorder.finish({"transport": "in-process"})
     except OSError as error:
@@ -177,7 +181,10 @@ def _train_over_topics(folder: Path, display: Display, transport: Transport) -> 
     logs = folder / "logs"
     logs.mkdir(exist_ok=True)
     parameters = ["--params-file", str(folder / "parameters.yaml")]
-    own = {"tuner_node": [f"out:={folder}", "resume:=true"], "recorder_node": []}
+    own = {
+        "tuner_node": [f"out:={quoted(folder.resolve())}", "resume:=true", "recorder:=none"],
+        "recorder_node": [],
+    }
     remaps: dict[str, list[str]] = {}
     names = [*pair_nodes(transport.pairs, transport.pin), PairNode("tuner_node", "tuner_node")]
     for name in own:
@@ -186,7 +193,7 @@ def _train_over_topics(folder: Path, display: Display, transport: Transport) -> 
         bag = _unused(folder / "bag")
         names.insert(0, PairNode("recorder_node", "recorder_node"))
         own["recorder_node"] += [
-            f"bag:={bag}",
+            f"bag:={quoted(bag.resolve())}",
             f"bag_storage:={recording.storage}",
             f"bag_per_episode:={str(recording.bag_per_episode).lower()}",
         ]

@@ -45,11 +45,14 @@ class _Run:
     start: Frame | None = None
     policy: Frame | None = None
     models: list[model_rows.ModelRows] = field(default_factory=list)
+    generation: int = -1
+    """Number of these models; an episode names the one that its policies belong to."""
     laws: dict[int, tuple[ProjectedLaw, int]] = field(default_factory=dict)
     """The law for each plant, and the episode it is set for."""
     samples: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)
     """States of an exploratory episode, by (plant, step)."""
-    identified: Send | ModelFailure | None = None
+    identified: dict[int, Send | ModelFailure] = field(default_factory=dict)
+    """What came out of an exploratory episode, by plant."""
 
     def episode_start(self, frame: Frame) -> Frame | None:
         """The start of the frame's episode, if it is the one this run is in."""
@@ -98,9 +101,11 @@ class Responder:
         run = self._run(frame.run)
         if run.episode_start(frame) is None:
             run.start = replace(frame, values=rows.copy())
-            run.samples, run.identified = {}, None
-        elif run.identified is not None:
-            return [run.identified]  # asked again: what was answered may have been lost
+            run.samples, run.identified = {}, {}
+        elif run.identified:
+            return list(
+                run.identified.values()
+            )  # asked again: what was answered may have been lost
         return self._answer_pending()
 
     def policy(self, frame: Frame) -> list[Send]:
@@ -119,7 +124,7 @@ class Responder:
         """Take a run's reduced models."""
         run = self._run(frame.run)
         run.models = [model_rows.unpack(rows.copy(), self._settings.n_a) for rows in frame.values]
-        run.laws = {}
+        run.generation, run.laws = frame.step, {}
         return self._answer_pending()
 
     def state(self, frame: Frame) -> list[Send]:
@@ -142,10 +147,14 @@ class Responder:
         start = run.episode_start(frame) if run else None
         if run is None or start is None or start.values[0, StartColumn.EXCITATION] < 0:
             return []
-        if run.identified is None:
-            run.identified = self._identify(run, start, frame)
-            run.samples = {}
-        return [run.identified]
+        if frame.values.shape != (len(start.values), len(CostColumn)):
+            raise FrameError(
+                f"expected costs of shape {(len(start.values), len(CostColumn))}, "
+                f"got {frame.values.shape}"
+            )
+        if frame.plant not in run.identified and len(run.identified) < MAX_KEPT:
+            run.identified[frame.plant] = self._identify(run, start, frame)
+        return [run.identified[frame.plant]] if frame.plant in run.identified else []
 
     def waits_for(self) -> list[str]:
         """Topics that the state waiting for its answer still lacks; empty when none waits."""
@@ -157,7 +166,7 @@ class Responder:
         lacking = [] if start else ["episode/start"]
         lacking += [] if pending.plant in self._targets else ["target"]
         if start and start.values[0, StartColumn.EXCITATION] < 0:
-            lacking += [] if run.models else ["model"]
+            lacking += [] if run.models and run.generation == start.step else ["model"]
             if run.policy is None or run.policy.episode != pending.episode:
                 lacking.append("policy")
         return lacking
@@ -196,7 +205,9 @@ class Responder:
     ) -> ProjectedLaw | None:
         """The law set for the run's episode; None while something has not arrived yet."""
         policy = run.policy
-        if policy is None or policy.episode != start.episode or not run.models:
+        if policy is None or policy.episode != start.episode:
+            return None
+        if not run.models or run.generation != start.step:
             return None
         if law is None:
             law = ProjectedLaw([model.U for model in run.models], target)
@@ -224,14 +235,14 @@ class Responder:
                 f"the plant diverged under exploration at step {int(ended.max())}; "
                 "lower exploration_variance",
             )
-        steps = range(cost.step + 1)
         held = {step: z for (plant, step), z in run.samples.items() if plant == cost.plant}
-        if sorted(held) != list(steps):
+        if len(held) != cost.step + 1 or max(held) != cost.step:
             return failure(
                 True,
-                f"the controller holds {len(held)} of the {len(steps)} states "
+                f"the controller holds {len(held)} of the {cost.step + 1} states "
                 "of the exploratory episode",
             )
+        steps = range(cost.step + 1)
         target = self._targets.get(cost.plant)
         if target is None:  # as none of its states was answered, somebody else did
             return failure(True, "the plant's target has not arrived")

@@ -14,6 +14,7 @@ import os
 import signal
 import sys
 import time
+import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator
 from types import FrameType
@@ -45,6 +46,8 @@ BUSY = 20
 POLL = 200e-6
 """Seconds that a node with a core of its own polls for the next message before it waits: longer
 than a round of a fast plant, shorter than what anyone would notice."""
+CRASHED = 70
+"""Exit code after a bug; 1 means that the node was asked for something it cannot do."""
 LOOK = 1.0
 """Seconds between two looks at who publishes on the node's topics."""
 OBSERVER_DEPTH = 2000
@@ -257,7 +260,10 @@ class NodeLoop:
                         handled += 1
                         poll_until = clock() + self._poll
                 continue
-            wake = next_round if due is None else min(due, next_round)
+            # Never longer than HOUSEKEEPING: a wait does not end by a signal.
+            wake = min(next_round, now + HOUSEKEEPING)
+            if due is not None:
+                wake = min(wake, due)
             clear()
             for handle in handles:
                 add(handle)
@@ -388,6 +394,9 @@ def node_main(name: str, args: list[str] | None, make: Callable[[Node, NodeLoop]
     except ConfigurationError as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 1
+    except Exception:  # a bug: say where, and let a supervisor start the node again
+        traceback.print_exc()
+        return CRASHED
 
 
 def _refuse_other_words(name: str, args: list[str] | None) -> None:

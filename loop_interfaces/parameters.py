@@ -18,6 +18,7 @@ import yaml
 
 Value = bool | int | float | str | list[str]
 MAX_YAML_BYTES = 1_000_000
+MAX_PARAMETERS = 10_000
 
 
 class ParameterError(ValueError):
@@ -76,7 +77,7 @@ class Spec:
 
     def _coerce(self, value: Any) -> Any:
         if self.type is float and isinstance(value, int) and not isinstance(value, bool):
-            value = float(value)
+            value = float(value) if abs(value) < 2**1000 else math.inf
         if not isinstance(value, self.type) or (self.type is int and isinstance(value, bool)):
             return None
         if isinstance(value, list):
@@ -144,7 +145,9 @@ PROBLEM = (
         "learning_rate", 1e-4, "eta of the policy gradient from the LQT warm start", positive=True
     ),
     Spec("learning_rate_from_zero", 1e-5, "eta of the policy gradient from zero", positive=True),
-    Spec("smoothing_radius", 0.1, "r, size of the two-point perturbation", positive=True),
+    Spec(
+        "smoothing_radius", 0.1, "r, size of the two-point perturbation", positive=True, maximum=1e6
+    ),
 )
 """What a problem's YAML file may set, besides `physical.*` (the equation's own parameters)."""
 
@@ -332,6 +335,8 @@ def _flatten(body: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
             flat.update(_flatten(value, f"{prefix}{key}."))
         else:
             flat[f"{prefix}{key}"] = value
+        if len(flat) > MAX_PARAMETERS:
+            raise ParameterError(f"more than {MAX_PARAMETERS} parameters in one file")
     return flat
 
 

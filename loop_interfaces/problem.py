@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sysconfig
 from collections.abc import Mapping
 from pathlib import Path
@@ -58,7 +59,7 @@ def _physical(given: Mapping[str, Any]) -> dict[str, float]:
         if name.startswith("physical."):
             if isinstance(value, bool) or not isinstance(value, (int, float)):
                 raise ParameterError(f"parameter '{name}' is {value!r}; expected a number")
-            physical[name] = float(value)
+            physical[name] = float(value) if abs(value) < 2**1000 else math.inf
     return physical
 
 

@@ -51,7 +51,7 @@ class ModelFailure:
                 retry=bool(fields["retry"]),
                 reason=str(fields["reason"]),
             )
-        except (KeyError, TypeError, ValueError, RecursionError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
             raise ValueError(f"expected the JSON of a model failure, got {text[:80]!r}") from error
 
 

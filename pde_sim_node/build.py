@@ -38,7 +38,8 @@ def fingerprint(values: Mapping[str, Any]) -> int:
     """
     equation = build_equation(values)
     content = {spec: values[spec] for spec in _PLANT_VALUES} | asdict(equation)
-    source = inspect.getsource(type(equation))
+    # The whole module: constants and functions beside the class are part of the equation.
+    source = inspect.getsource(inspect.getmodule(type(equation)) or type(equation))
     digest = hashlib.sha256(json.dumps([content, source], sort_keys=True).encode()).digest()
     return 1 + int.from_bytes(digest[:8], "big") % (MAX_ID - 1)
 

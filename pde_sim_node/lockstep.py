@@ -17,6 +17,9 @@ from loop_interfaces.topics import COMPLETED, COST, STATE, TARGET, VOID, StartCo
 from pde_sim_node.pace import Pace
 from pde_sim_node.plant import Plant
 
+MAX_TIME = 2.0**31
+"""Simulated time (s) that /clock can tell, and a start can set."""
+
 
 class Lockstep:
     """One plant serving the episodes of one run at a time.
@@ -88,6 +91,8 @@ class Lockstep:
         Raises FrameError for a malformed seed list or another run's episode while one is under way.
         """
         rows = self._check_rows(frame)
+        if not 0.0 <= frame.time < MAX_TIME:
+            raise FrameError(f"expected a time from 0 to {MAX_TIME:g} s, got {frame.time:g}")
         if frame.run != self.run:
             if self.run and now - self._tuner_heard < self._run_hold:
                 raise FrameError(

@@ -23,7 +23,7 @@ from loop_interfaces.ros_parameters import declare, given_parameters
 from loop_interfaces.topics import ACTION, COST, START, STATE, TARGET
 from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.equations import load_equation
-from pde_sim_node.lockstep import Lockstep
+from pde_sim_node.lockstep import MAX_TIME, Lockstep
 
 
 def declare_parameters(node: Node) -> dict[str, Any]:
@@ -126,7 +126,8 @@ class PlantNode:
     def _send(self, sends: list[Send]) -> None:
         for send in sends:
             self._senders[send.topic].send(send.frame)
-            if self._clock_wanted and self._clock is not None and send.topic is STATE:
+            wanted = self._clock_wanted and send.topic is STATE
+            if wanted and self._clock is not None and send.frame.time < MAX_TIME:
                 nanoseconds = round(send.frame.time * 1e9)
                 self._clock.publish(_CLOCK.pack(0, 1, 0, *divmod(nanoseconds, 10**9)))
 

@@ -11,6 +11,7 @@ import pytest
 from bringup.cli import main
 from tests.small import SMALL, parameters, same_bits, train_here
 from tuner_node import checkpoint
+from tuner_node.results import RunFolder
 
 
 def error_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -135,6 +136,37 @@ def test_damaged_run_files_are_one_clear_line(tmp_path, capsys):
     assert "no usable checkpoint" in error_of(capsys, "train", "--resume", str(out), "--in-process")
     (out / "policy.npz").write_bytes(b"PK\3\4nonsense")
     assert "policy.npz cannot be read" in error_of(capsys, "evaluate", str(out))
+
+
+def test_a_checkpoint_of_another_run_is_not_taken(tmp_path, capsys):
+    for name in ("a", "b"):
+        assert train(tmp_path / name) == 0
+        (tmp_path / name / "result.json").unlink()
+    for file in ("checkpoint", "checkpoint.previous"):
+        source = tmp_path / "a" / file
+        if source.exists():
+            (tmp_path / "b" / file).write_bytes(source.read_bytes())
+    capsys.readouterr()
+    line = error_of(capsys, "train", "--resume", str(tmp_path / "b"), "--in-process")
+    assert "belongs to another run" in line
+
+
+def test_a_folder_that_another_process_works_on_is_left_alone(tmp_path, capsys):
+    out = tmp_path / "run"
+    assert train(out) == 0
+    (out / "result.json").unlink()
+    with RunFolder(out).held():
+        line = error_of(capsys, "train", "--resume", str(out), "--in-process")
+    assert "another process works on the run" in line
+
+
+def test_a_file_that_expands_without_end_is_refused(tmp_path, capsys):
+    levels = ["a0: &a0 {x: 1}"] + [
+        f"a{i}: &a{i} {{{', '.join(f'k{j}: *a{i - 1}' for j in range(10))}}}" for i in range(1, 12)
+    ]
+    text = "/**:\n  ros__parameters:\n" + "".join(f"    {line}\n" for line in levels)
+    (tmp_path / "bomb.yaml").write_text(text)
+    assert "more than 10000 parameters" in error_of(capsys, "train", str(tmp_path / "bomb.yaml"))
 
 
 def test_problems_lists_the_shipped_ones(capsys):

@@ -17,7 +17,7 @@ def test_one_pair_has_no_namespace_and_several_share_one_clock() -> None:
     plant, controller = pairs.pair_nodes(1, pin=False)
     assert (plant.name, controller.name) == ("pde_sim_node", "controller_node")
     assert plant.remaps == controller.remaps == plant.parameters == []
-    assert pairs.tuner_parameter(1) == []
+    assert pairs.tuner_parameter(1) == ["pairs:=['']"]
     nodes = pairs.pair_nodes(3, pin=False)
     assert len({node.name for node in nodes}) == 6
     with_clock = [

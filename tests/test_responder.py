@@ -150,6 +150,23 @@ def test_a_state_of_another_episode_or_run_is_not_answered():
     assert len(responder.state(Frame(RUN, 1, 0, 0.0, state))) == 1
 
 
+def test_a_policy_waits_for_the_models_it_belongs_to():
+    rows = models()
+    policy = model_rows.unpack(rows[0], 4).policy
+    state = Frame(RUN, 3, 0, 0.0, PLANT.reset(np.array([1])).copy())
+    responder = Responder(SETTINGS)
+    responder.target(TARGET)
+    responder.model(Frame(RUN, 0, 1, 0.0, 2.0 * rows))  # of the identification that was thrown away
+    responder.start(Frame(RUN, 3, 2, 0.0, np.array([[1.0, -1.0, 0.0, 0.0]])))
+    assert responder.policy(Frame(RUN, 3, 2, 0.0, policy[np.newaxis])) == []
+    assert responder.state(state) == []
+    assert responder.waits_for() == ["model"]
+    (send,) = responder.model(Frame(RUN, 0, 2, 0.0, rows))
+    s = model_rows.unpack(rows[0], 4)
+    expected = s.K_a @ (s.U.T @ state.values[0]) + s.K_b @ (s.U.T @ PLANT.target)
+    assert np.allclose(send.frame.values[0], expected, rtol=1e-12, atol=1e-13)
+
+
 def test_two_runs_are_answered_side_by_side_and_forgotten_when_released():
     responder = Responder(SETTINGS)
     responder.target(TARGET)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -97,7 +99,9 @@ def test_a_diverged_rollout_never_reaches_the_policy():
         if result.models is not None:
             pair.use_models(training.models)
     before = training.policies()
-    diverged = BatchResult(np.array([[1e9, 3e10, 7.0], [2.0, 60.0, COMPLETED]]))
+    diverged = BatchResult(
+        np.array([[1e9, 3e10, 7.0], [2.0, 60.0, COMPLETED]]), plant=training.plant
+    )
     (row,) = training.finish(diverged)
     assert row["diverged"] == 1
     assert not row["updated"]
@@ -105,6 +109,16 @@ def test_a_diverged_rollout_never_reaches_the_policy():
     while (batch := training.next_batch()) is not None:
         training.finish(pair.run(batch))
     assert np.isfinite(training.policies()).all()
+
+
+def test_a_plant_with_other_parameters_does_not_continue_a_training():
+    values = parameters(iterations=2)
+    training, pair = build_training(values), LocalPair(values)
+    training.finish(pair.run(training.next_batch()))
+    pair.use_models(training.models)
+    other = replace(pair.run(training.next_batch()), plant=5)
+    with pytest.raises(ValueError, match="the plant has other parameters"):
+        training.finish(other)
 
 
 def test_damaged_checkpoints_are_passed_over_or_refused(tmp_path):

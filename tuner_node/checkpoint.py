@@ -68,18 +68,22 @@ def save(path: Path, arrays: Arrays) -> None:
     part.replace(path)
 
 
-def load(path: Path) -> tuple[dict[str, NDArray[Any]], list[str]]:
+def load(path: Path, run: int | None = None) -> tuple[dict[str, NDArray[Any]], list[str]]:
     """The newest good checkpoint at `path` and warnings about what was passed over.
 
-    What is damaged is set aside as `checkpoint*.damaged`, so that the next `save` cannot take it for
-    the checkpoint to keep. Raises CheckpointError when neither the file nor its predecessor is whole.
+    run: the run it must belong to, if given. What is damaged or foreign is set aside as
+    `checkpoint*.damaged`, so that the next `save` cannot take it for the checkpoint to keep.
+    Raises CheckpointError when neither the file nor its predecessor is whole.
     """
     warnings: list[str] = []
     for candidate in (path.with_name(path.name + ".new"), path, previous(path)):
         if not candidate.exists():
             continue
         try:
-            return _read(candidate), warnings
+            arrays = _read(candidate)
+            if run is not None and int(arrays.get("run", np.array(-1))) != run:
+                raise CheckpointError(f"{candidate} belongs to another run")
+            return arrays, warnings
         except CheckpointError as error:
             warnings.append(str(error))
             with contextlib.suppress(OSError):

@@ -10,6 +10,7 @@ so neither does the batch's result. Episode numbers only grow, also across resta
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -27,6 +28,8 @@ Array = NDArray[np.float64]
 Order = tuple[int, Send]
 """(pair, message): publish the message in that pair's namespace."""
 EPISODES_PER_INCARNATION = 2**32
+STRANGE = 20.0
+"""Seconds with costs of another plant only after which the run stops."""
 LATE = 0.5
 """Seconds after its cost within which the last samples of an episode must have come in."""
 MAX_TARGETS = 64
@@ -73,6 +76,8 @@ class _Pair:
     held: Frame | None = None
     """A cost that waits for the last samples of its trajectories, and since when."""
     held_since: float = 0.0
+    strange_since: float = math.inf
+    """Since when only another plant's costs come."""
 
 
 @dataclass
@@ -133,9 +138,13 @@ class Dispatcher:
         self._waiting = list(self._chunks)
         return self._hand_out(now)
 
-    def models(self, models: Array) -> list[Order]:
-        """Give every pair the run's reduced models."""
-        frame = self._models = Frame(self.run, 0, 0, self.sim_time, models)
+    def models(self, models: Array, generation: int) -> list[Order]:
+        """Give every pair the run's reduced models.
+
+        generation: their number; episodes name the one that they are about, so that a policy never
+        meets the models before it.
+        """
+        frame = self._models = Frame(self.run, 0, generation, self.sim_time, models)
         return [(pair, Send(MODEL, frame)) for pair in range(len(self.pairs))]
 
     def release(self) -> list[Order]:
@@ -162,12 +171,18 @@ class Dispatcher:
         if self.plant == UNKNOWN_PLANT:
             self.plant = frame.plant
         if frame.plant != self.plant:
+            known.strange_since = min(known.strange_since, now)
+            if now - known.strange_since > STRANGE:
+                raise DispatchError(
+                    f"the plant has other parameters (fingerprint {frame.plant}) than the one this "
+                    f"run began with ({self.plant}); continue it with that one, or start a new run"
+                )
             raise FrameError(
                 f"the cost of episode {frame.episode} comes from a plant with other parameters "
                 f"(fingerprint {frame.plant}) than this run's ({self.plant}); stop that plant"
             )
         self.sim_time = max(self.sim_time, frame.time)
-        known.heard = now
+        known.heard, known.strange_since = now, math.inf
         if (frame.values[:, CostColumn.ENDED] == VOID).any():
             self._retry(
                 known, f"episode {known.episode} is void: no action came from the controller"
@@ -355,8 +370,10 @@ class Dispatcher:
         assert self._batch is not None and chunk is not None
         pair.sent = now
 
+        generation = self._models.step if self._models is not None else 0
+
         def frame(values: Array) -> Frame:
-            return Frame(self.run, pair.episode, 0, self.sim_time, values)
+            return Frame(self.run, pair.episode, generation, self.sim_time, values)
 
         # The policy first: it is then mostly there when the first state arrives.
         sends = [Send(MODEL, self._models)] if again and self._models is not None else []

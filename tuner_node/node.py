@@ -7,6 +7,7 @@ Messages, order and parameters: docs/interfaces.md. What it does is in tuner_nod
 
 from __future__ import annotations
 
+import contextlib
 import secrets
 import sys
 from collections.abc import Callable, Mapping
@@ -39,7 +40,7 @@ from loop_interfaces.topics import (
 from tuner_node.build import build_training
 from tuner_node.dispatch import Dispatcher, DispatchError, Order
 from tuner_node.record import Recorder
-from tuner_node.results import RunIdentity, summarise
+from tuner_node.results import RunFolder, RunIdentity, summarise
 from tuner_node.session import Session
 
 RIVAL_GRACE = 6.0
@@ -59,21 +60,28 @@ def declare_parameters(node: Node) -> dict[str, Any]:
 class TunerNode:
     """Moves messages between the topics and the session, and keeps the run folder."""
 
-    def __init__(self, node: Node, loop: NodeLoop) -> None:
+    def __init__(self, node: Node, loop: NodeLoop, held: contextlib.ExitStack) -> None:
+        """`held` keeps the run folder from other processes, as long as this one lives."""
         values = declare_parameters(node)
         self._log = node.get_logger()
         training = build_training(values)
         self._recorder: Recorder | None = None
         identity = RunIdentity(1 + secrets.randbelow(MAX_ID - 1), 0)
         if values["out"]:
+            folder = RunFolder(Path(str(values["out"])))
+            if values["resume"]:
+                folder.parameters()
+                held.enter_context(folder.held())
             self._recorder = Recorder(
-                Path(str(values["out"])),
+                folder.path,
                 values,
                 training,
                 resume=bool(values["resume"]),
                 warn=self._log.warning,
             )
             identity = self._recorder.identity
+            if not values["resume"]:
+                held.enter_context(folder.held())
         pairs: list[str] = values["pairs"]
         dispatcher = Dispatcher.create(
             run=identity.run,
@@ -270,7 +278,12 @@ class TunerNode:
 def main(args: list[str] | None = None) -> int:
     """Console script."""
     keep_on_this_machine()
-    return node_main("tuner_node", args, TunerNode)
+    with contextlib.ExitStack() as held:
+
+        def make(node: Node, loop: NodeLoop) -> TunerNode:
+            return TunerNode(node, loop, held)
+
+        return node_main("tuner_node", args, make)
 
 
 if __name__ == "__main__":

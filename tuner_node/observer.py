@@ -43,8 +43,8 @@ class Observer:
 
     def lost(self, plant: int, steps: int) -> int:
         """How many of the samples z_0..z_T and a_0..a_{T-1} are missing."""
-        states = sum((plant, k) in self._states for k in range(steps + 1))
-        actions = sum((plant, k) in self._actions for k in range(steps))
+        states = sum(p == plant and k <= steps for p, k in self._states)
+        actions = sum(p == plant and k < steps for p, k in self._actions)
         return 2 * steps + 1 - states - actions
 
     def trajectories(self, plant: int, steps: int, ended: Array) -> list[Trajectory]:

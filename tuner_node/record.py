@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from tuner_node import checkpoint
 from tuner_node.results import RunFolder, RunIdentity
 from tuner_node.training import Training
@@ -58,7 +60,8 @@ class Recorder:
             return
         self._saved_at = now
         try:
-            checkpoint.save(self._folder.checkpoint, self._training.state())
+            arrays = self._training.state() | {"run": np.array(self.identity.run)}
+            checkpoint.save(self._folder.checkpoint, arrays)
             self._changed = False
         except OSError as error:
             self._warn(
@@ -75,7 +78,7 @@ class Recorder:
     def _restore(self) -> None:
         if not self._folder.checkpoint.exists() and not any(self._folder.path.glob("checkpoint*")):
             return  # stopped before its first checkpoint: it begins again, identically
-        arrays, warnings = checkpoint.load(self._folder.checkpoint)
+        arrays, warnings = checkpoint.load(self._folder.checkpoint, run=self.identity.run)
         for warning in warnings:
             self._warn(f"{warning}; using an older checkpoint")
         self._training.restore(arrays)

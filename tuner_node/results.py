@@ -11,12 +11,14 @@ logs/              one file a node, when the command line started them
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import json
 import os
 import platform
 import secrets
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from io import BytesIO
@@ -122,10 +124,29 @@ class RunFolder:
                 "continue it with its own, or start a new run in another folder"
             )
 
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep other processes from working on the run. RunFolderError if one does."""
+        try:
+            file = (self.path / "lock").open("wb")
+        except OSError as error:
+            raise RunFolderError(f"cannot write to {self.path}: {error.strerror}") from error
+        with file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise RunFolderError(
+                    f"another process works on the run in {self.path}; let it end, or stop it"
+                ) from error
+            yield
+
     def note(self, row: Mapping[str, Any]) -> None:
         """Append one line to progress.jsonl."""
-        with (self.path / "progress.jsonl").open("a") as file:
-            file.write(json.dumps(row) + "\n")
+        with (self.path / "progress.jsonl").open("ab+") as file:
+            end = file.seek(0, os.SEEK_END)
+            file.seek(max(0, end - 1))
+            torn = end > 0 and file.read(1) != b"\n"  # by a disk that was full
+            file.write(b"\n" * torn + json.dumps(row).encode() + b"\n")
 
     def finish(self, training: Training, extra: Mapping[str, Any]) -> dict[str, Any]:
         """Write policy.npz and result.json; returns the latter's content."""

@@ -11,7 +11,7 @@ from typing import Any
 
 from loop_interfaces.frames import Frame
 from loop_interfaces.protocol import ModelFailure
-from tuner_node.dispatch import Dispatcher, Order
+from tuner_node.dispatch import Dispatcher, DispatchError, Order
 from tuner_node.training import Training
 
 Report = Callable[[Mapping[str, Any]], None]
@@ -37,8 +37,9 @@ class Session:
         if self._phase:
             return self.dispatcher.ask_again(now)
         orders: list[Order] = []
-        if self.training.models is not None:
-            orders += self.dispatcher.models(self.training.models)
+        training = self.training
+        if training.models is not None and training.phase != "identify":
+            orders += self.dispatcher.models(training.models, training.generation)
         return orders + self._next(now)
 
     def presence(self, pair: int, missing: Sequence[str], now: float) -> list[Order]:
@@ -73,10 +74,15 @@ class Session:
         if result is None:
             return orders
         self.established = True
-        for row in self.training.finish(result):
+        training = self.training
+        try:
+            rows = training.finish(result)
+        except ValueError as error:  # a result that the training cannot use: no use in waiting
+            raise DispatchError(str(error)) from error
+        for row in rows:
             self._report(row)
-        if result.models is not None and self.training.models is not None:
-            orders = orders + self.dispatcher.models(self.training.models)
+        if result.models is not None and training.models is not None:
+            orders = orders + self.dispatcher.models(training.models, training.generation)
         return orders + self._next(now)
 
     def _next(self, now: float) -> list[Order]:

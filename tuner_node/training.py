@@ -142,6 +142,11 @@ class Training:
 
     def finish(self, result: BatchResult) -> list[dict[str, Any]]:
         """Take the results of the batch that `next_batch` gave, in its order."""
+        if self.plant not in (UNKNOWN_PLANT, result.plant):
+            raise ValueError(
+                f"the plant has other parameters (fingerprint {result.plant}) than the one this run "
+                f"began with ({self.plant}); continue it with that one, or start a new run"
+            )
         self.plant = result.plant
         if self.phase == "identify":
             assert result.models is not None
@@ -164,6 +169,11 @@ class Training:
         """The LQT policies of the models, (S, n_a, 2 n_s)."""
         assert self.models is not None
         return np.stack([model_rows.unpack(rows, self.settings.n_a).policy for rows in self.models])
+
+    @property
+    def generation(self) -> int:
+        """Number of the present models: grows whenever one of them is identified again."""
+        return 1 + sum(self.attempts)
 
     @property
     def iteration(self) -> int:

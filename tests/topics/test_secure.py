@@ -45,7 +45,10 @@ def test_the_policy_allows_each_running_node_what_it_does_and_no_more(loop: Proc
     import json
 
     for role in ROLES:
-        own = ["-p", "bag:=recorded"] if role.node == "recorder_node" else []
+        own = {
+            "recorder_node": ["-p", "bag:=recorded"],
+            "tuner_node": ["-p", "optimizer:=gauss_newton"],
+        }.get(role.node, [])
         loop.node(role.node, *own)
     names = [role.node for role in ROLES]
     text = loop.wait(loop.start("-c", GRAPH, json.dumps(names), name="graph"), 40.0)
