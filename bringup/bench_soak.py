@@ -18,7 +18,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,7 @@ PAUSE = (0.1, 2.5)
 """Seconds between two faults: now within a start-up, now after some checkpoints."""
 LIMIT = 600.0
 """Seconds that one training may take under faults."""
-SETTLE = 6.0
+SETTLE = 10.0
 """Seconds of life before a process's memory counts as its memory at the start."""
 
 
@@ -244,11 +244,16 @@ def run(minutes: float, problem: str, iterations: int, seed: int) -> dict[str, A
         print(text, file=sys.stderr, flush=True)
 
     report = soak(minutes, problem=problem, iterations=iterations, seed=seed, tell=tell)
-    result = asdict(report)
+    result = as_dict(report)
     if report.mismatches:
         tell(text(result))
         raise RuntimeError(f"{report.mismatches} of {report.trainings} trainings differ")
     return result
+
+
+def as_dict(report: SoakReport) -> dict[str, Any]:
+    """The report as JSON knows it."""
+    return asdict(replace(report, faults=Counter())) | {"faults": dict(report.faults)}
 
 
 def text(result: dict[str, Any]) -> str:

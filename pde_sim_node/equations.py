@@ -14,6 +14,7 @@ class ``path/to/file.py:ClassName`` where the name of an equation is expected (s
 
 import hashlib
 import importlib
+import importlib.machinery
 import importlib.util
 import math
 import sys
@@ -21,7 +22,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from types import MappingProxyType, ModuleType
+from types import CodeType, MappingProxyType, ModuleType
 from typing import Any, ClassVar
 
 import numpy as np
@@ -330,6 +331,15 @@ def load_module(dotted: str) -> ModuleType:
         raise ValueError(f"the equation module {dotted!r} cannot be imported: {error}") from error
 
 
+class _FreshSource(importlib.machinery.SourceFileLoader):
+    """Compiles the source each time: compiled code kept beside it is told apart by time and size
+    only, and an edit within the same second can leave both.
+    """
+
+    def get_code(self, fullname: str) -> CodeType | None:
+        return self.source_to_code(self.get_data(self.path), self.path)
+
+
 def load_file(path: Path) -> ModuleType:
     """Execute a file as a module, once for each content: an edited file is a new module."""
     if not path.is_file():
@@ -341,7 +351,8 @@ def load_file(path: Path) -> ModuleType:
     module_name = f"equation_{path.stem}_{digest}"
     if module_name in sys.modules:
         return sys.modules[module_name]
-    spec = importlib.util.spec_from_file_location(module_name, path)
+    loader = _FreshSource(module_name, str(path))
+    spec = importlib.util.spec_from_file_location(module_name, path, loader=loader)
     if spec is None or spec.loader is None:
         raise ValueError(f"the equation file {str(path)!r} cannot be read as Python")
     module = importlib.util.module_from_spec(spec)

@@ -17,7 +17,7 @@ import rclpy
 rclpy.init()
 node = rclpy.create_node("observer")
 names = json.loads(sys.argv[1])
-seen, before, end = {}, None, time.monotonic() + 20.0
+seen, before, same, end = {}, None, 0, time.monotonic() + 30.0
 while time.monotonic() < end:
     time.sleep(0.5)
     found = {name for name, _ in node.get_node_names_and_namespaces()}
@@ -34,7 +34,8 @@ while time.monotonic() < end:
         ]
         for name in names
     }
-    if seen == before:
+    same = same + 1 if seen == before else 0
+    if same == 6:  # nothing new for three seconds
         break
     before = seen
 print(json.dumps(seen))

@@ -6,15 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from bringup.bench_soak import soak, text
+from bringup.bench_soak import as_dict, soak, text
 from tests.small import SMALL
 
 pytestmark = pytest.mark.topics
 
 
 def test_a_minute_of_random_faults_changes_no_bit(tmp_path: Path):
-    from dataclasses import asdict
-
     lines: list[str] = []
     report = soak(
         0.8,
@@ -24,9 +22,9 @@ def test_a_minute_of_random_faults_changes_no_bit(tmp_path: Path):
         tell=lines.append,
         folder=tmp_path / "soak",
     )
-    told = "\n".join([*lines, text(asdict(report))])
+    told = "\n".join([*lines, text(as_dict(report))])
     assert report.mismatches == 0, told
     assert report.trainings >= 1, told
     assert sum(report.faults.values()) >= 10, told
     assert report.environment_steps >= 60 * 2 * 30, told
-    assert all(last < first + 30 for first, last in report.memory_mb.values()), told
+    assert all(last < 300 for _, last in report.memory_mb.values()), told
