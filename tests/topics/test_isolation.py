@@ -47,8 +47,11 @@ def test_a_profile_without_effect_is_noticed_and_refused(loop: Processes, tmp_pa
     del environment[PROFILE]
     done = subprocess.run(
         # With a /dev/shm of its own: the defaults use it, and other tests watch the common one.
-        ["unshare", "-n", "-m", "sh", "-c"]
-        + ['mount -t tmpfs tmpfs /dev/shm && exec "$0" -m controller_node.node', sys.executable],
+        [
+            *("unshare", "-n", "-m", "sh", "-c"),
+            'mount -t tmpfs tmpfs /dev/shm && exec "$0" -m controller_node.node',
+            sys.executable,
+        ],
         env=environment,
         cwd=sources,
         capture_output=True,
