@@ -27,4 +27,4 @@ def test_a_minute_of_random_faults_changes_no_bit(tmp_path: Path):
     assert report.trainings >= 1, told
     assert sum(report.faults.values()) >= 10, told
     assert report.environment_steps >= 60 * 2 * 30, told
-    assert all(last < 300 for _, last in report.memory_mb.values()), told
+    assert all(last < first + 30 for first, last in report.memory_mb.values()), told
