@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from bringup.bench_cli import add_bench
+from bringup.bench.cli import add_bench
 from loop_interfaces.parameters import TUNER, ParameterError, read_yaml
 from loop_interfaces.problem import shipped_problems
 
@@ -336,7 +336,7 @@ def _evaluate(options: argparse.Namespace) -> int:
 
 
 def _bag_info(options: argparse.Namespace) -> int:
-    from bringup.bag_tools import describe, info_text
+    from bringup.bags.tools import describe, info_text
 
     content = describe(options.bag)
     print(json.dumps(content) if options.json else info_text(content))
@@ -344,7 +344,7 @@ def _bag_info(options: argparse.Namespace) -> int:
 
 
 def _bag_verify(options: argparse.Namespace) -> int:
-    from bringup.bag_verify import verify
+    from bringup.bags.verify import verify
 
     report = verify(*options.bag, parameters=options.parameters)
     print(report.text())
@@ -352,7 +352,7 @@ def _bag_verify(options: argparse.Namespace) -> int:
 
 
 def _bag_recover(options: argparse.Namespace) -> int:
-    from bringup.bag_tools import recover
+    from bringup.bags.tools import recover
 
     path, messages = recover(options.bag, options.out)
     print(f"{messages} messages in {path}")
@@ -360,7 +360,7 @@ def _bag_recover(options: argparse.Namespace) -> int:
 
 
 def _identify(options: argparse.Namespace) -> int:
-    from bringup.offline_identification import identify, save
+    from bringup.bags.identification import identify, save
 
     found = identify(
         options.bag,
@@ -378,7 +378,7 @@ def _identify(options: argparse.Namespace) -> int:
 
 
 def _reproduce(options: argparse.Namespace) -> int:
-    from bringup.reproduce import reproduce
+    from bringup.reproduce.experiment import reproduce
 
     names = ("seeds", "iterations", "seed", "identification_attempts")
     given = {n: getattr(options, n) for n in names if getattr(options, n) is not None}
@@ -388,7 +388,7 @@ def _reproduce(options: argparse.Namespace) -> int:
 
 
 def _report(options: argparse.Namespace) -> int:
-    from bringup.report import report
+    from bringup.report.page import report
 
     page = report(options.folder, options.out)
     print(f"report in {page}")

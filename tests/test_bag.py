@@ -14,8 +14,8 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from bringup.bag_reader import Bag
-from bringup.bag_tools import recover
+from bringup.bags.reader import Bag
+from bringup.bags.tools import recover
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.topics import ACTION, COST, START, STATE
 from recorder_node.bag import STORAGES, BagError

@@ -7,7 +7,9 @@ import os
 import numpy as np
 import pytest
 
-from bringup import bench_batch, bench_train, pairs
+from bringup import pairs
+from bringup.bench import batch as bench_batch
+from bringup.bench import train as bench_train
 from bringup.cli import main
 from loop_interfaces import affinity
 from loop_interfaces.parameters import ParameterError

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bringup.bench_kernel import Grid, NumpyPlant
+from bringup.bench.kernel import Grid, NumpyPlant
 from pde_sim_node import integrator
 from pde_sim_node.equations import AllenCahn, Burgers, Equation, KortewegDeVries, load_equation
 from pde_sim_node.integrator import fine_length

@@ -9,8 +9,8 @@ import time
 import numpy as np
 import pytest
 
-from bringup import reproduce
 from bringup.in_process import LocalPair
+from bringup.reproduce import experiment as reproduce
 from loop_interfaces.topics import CostColumn
 from tests.loop_harness import Processes, until
 from tests.small import SMALL, parameters, same_bits, train_here

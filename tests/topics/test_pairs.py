@@ -8,9 +8,10 @@ import os
 import numpy as np
 import pytest
 
-from bringup import bench_pairs, bench_realtime
-from bringup.bench_processes import bench
-from bringup.hosts import can_make_hosts, hosts
+from bringup.bench import pairs as bench_pairs
+from bringup.bench import realtime as bench_realtime
+from bringup.bench.hosts import can_make_hosts, hosts
+from bringup.bench.processes import bench
 from bringup.in_process import LocalPair, train
 from bringup.training_run import resolve
 from tests.loop_harness import Processes
@@ -78,5 +79,5 @@ def test_a_paced_plant_takes_as_long_as_the_wall_clock_says() -> None:
 
 def test_the_processes_of_a_measurement_end_with_it() -> None:
     with bench() as running:
-        node = running.start("bringup.ping", "end:=pong")
+        node = running.start("bringup.bench.ping", "end:=pong")
     assert node.process.poll() is not None

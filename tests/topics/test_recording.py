@@ -15,10 +15,10 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from bringup.bag_reader import Bag
-from bringup.bag_tools import describe, recover
-from bringup.bag_verify import verify
-from bringup.offline_identification import identify
+from bringup.bags.identification import identify
+from bringup.bags.reader import Bag
+from bringup.bags.tools import describe, recover
+from bringup.bags.verify import verify
 from loop_interfaces.model_rows import pack
 from tests.loop_harness import Processes, until
 from tests.small import SMALL, same_bits

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from bringup.bench_soak import as_dict, soak, text
+from bringup.bench.soak import as_dict, soak, text
 from tests.small import SMALL
 
 pytestmark = pytest.mark.topics

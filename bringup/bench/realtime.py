@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from bringup.bench_processes import BenchError, bench, machine, markdown
+from bringup.bench.processes import BenchError, bench, machine, markdown
 from loop_interfaces.affinity import free_cores
 from loop_interfaces.problem import load_parameters
 
@@ -40,7 +40,7 @@ def run(seconds: float = 10.0, pin: bool = False, rates: tuple[float, ...] = RAT
             )
             running.start("controller_node", f"pin:={cores[1]}", problem=PROBLEM)
             limit = f"give_up:={seconds + 60}"
-            driver = running.start("bringup.driver", horizon, limit, problem=PROBLEM)
+            driver = running.start("bringup.bench.driver", horizon, limit, problem=PROBLEM)
             driver.ask(do="begin", batch=1, seconds=3.0)  # until all have found each other
             driver.ask(do="episodes", batch=1, seconds=0.0)
             plant.end()

@@ -1,6 +1,6 @@
 """How much a recorder slows the loop: one training, a recorder beside it now and then.
 
-    python -m bringup.bench_recording burgers --windows 8
+    python -m bringup.bench.recording burgers --windows 8
 
 The same three nodes run all the time and only the recorder comes and goes, so that what else the
 machine does weighs on both sides alike. Prints the medians of the time of an iteration with and

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bringup.bag_reader import Bag, RecordedEpisode
+from bringup.bags.reader import Bag, RecordedEpisode
 from controller_node import dmdc, lqt
 from controller_node.policy import ProjectedLaw
 from loop_interfaces.model_rows import ModelRows, pack

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bringup import reproduce
+from bringup.reproduce import experiment as reproduce
 from controller_node.policy import ProjectedLaw
 from loop_interfaces import model_rows
 from loop_interfaces.model_rows import ModelRows

@@ -1,6 +1,6 @@
 """Compare optimisers in one process: DMDc and LQT warm start, one optimiser, held-out fields.
 
-    python -m bringup.study_optimizers --optimizer gauss_newton --problem kdv --seeds 6
+    python -m bringup.bench.optimizers --optimizer gauss_newton --problem kdv --seeds 6
 
 For every seed: an exploratory episode, the reduced model and its tracking gains, 2 * iterations
 rollouts of the optimiser, and then the cost of its policy on held-out initial fields that no

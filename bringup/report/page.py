@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from bringup.report_data import ProblemData, ReportData, gather
+from bringup.report.data import ProblemData, ReportData, gather
 from tuner_node.results import RunFolderError
 
 PAGE = "index.html"
@@ -24,7 +24,7 @@ def report(folder: Path, out: Path | None) -> Path:
     """Write the report of the run or reproduction in `folder`; returns the page's path."""
     import matplotlib
 
-    from bringup.figures import STYLE
+    from bringup.report.figures import STYLE
 
     data = gather(folder)
     target = out or folder / "report"
@@ -47,7 +47,7 @@ def report(folder: Path, out: Path | None) -> Path:
 
 def _figures(data: ReportData) -> Iterator[tuple[str, str, Any]]:
     """Name, caption and figure, one after the other."""
-    from bringup import figures
+    from bringup.report import figures
 
     learning = [problem for problem in data.problems if problem.curves]
     if learning:
@@ -117,7 +117,7 @@ def _page(data: ReportData, pictures: list[tuple[str, str, bytes]]) -> str:
 
 
 def _results(data: ReportData) -> str:
-    from bringup.figures import PROBLEMS, TITLES
+    from bringup.report.figures import PROBLEMS, TITLES
 
     if data.rows:
         names: tuple[str, ...] = ("none", "lqt", "lqt_po", "pure_po")

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bringup.bag_reader import Bag, RecordedEpisode
+from bringup.bags.reader import Bag, RecordedEpisode
 from controller_node.identification import DesignSettings, design
 from controller_node.policy import ProjectedLaw, excitation
 from loop_interfaces import model_rows

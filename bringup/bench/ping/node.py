@@ -121,7 +121,7 @@ def _message(numbers: int) -> bytes:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run by `python -m bringup.ping.node`."""
+    """Run by `python -m bringup.bench.ping.node`."""
     keep_on_this_machine()
     return node_main("ping_node", args, PingNode)
 

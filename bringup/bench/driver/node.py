@@ -163,7 +163,7 @@ class DriverNode:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run by `python -m bringup.driver.node`."""
+    """Run by `python -m bringup.bench.driver.node`."""
     keep_on_this_machine()
     return node_main("driver_node", args, DriverNode)
 

@@ -18,7 +18,7 @@ from matplotlib.image import AxesImage
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
-from bringup.report_data import Behaviour, ProblemData
+from bringup.report.data import Behaviour, ProblemData
 from pde_sim_node.plant import DIVERGED_COST
 
 Array = NDArray[np.float64]

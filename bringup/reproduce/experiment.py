@@ -1,7 +1,7 @@
 """`pdeloop reproduce`: the paper's whole experiment, a process a core, and its table.
 
 DIR/reproduction.json            what was asked for
-DIR/PROBLEM/lqt, DIR/PROBLEM/zero  a run folder each: LQT-PO and pure PO (bringup.reproduction)
+DIR/PROBLEM/lqt, DIR/PROBLEM/zero  a run folder each: LQT-PO and pure PO (bringup.reproduce.folder)
 DIR/table.json                   the figures of the table
 """
 
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-from bringup.reproduction import STARTS, Job, run, work
+from bringup.reproduce.folder import STARTS, Job, run, work
 from bringup.training_run import Interruption, interruptible
 from pde_sim_node.plant import DIVERGED_COST
 from tuner_node.results import RunFolderError, timestamp, versions

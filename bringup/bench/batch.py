@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from bringup.bench_processes import bench, machine, markdown
+from bringup.bench.processes import bench, machine, markdown
 
 BATCHES = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
 LONG, SHORT = 1000, 100
@@ -30,7 +30,7 @@ def run(problem: str = "allen-cahn", turns: int = 3, batches: tuple[int, ...] = 
             length = f"horizon:={horizon}"
             running.start("pde_sim_node", length, problem=problem)
             running.start("controller_node", problem=problem)
-            driver = running.start("bringup.driver", length, problem=problem)
+            driver = running.start("bringup.bench.driver", length, problem=problem)
             for turn in range(-1, turns):  # the first one is to warm up
                 for batch in own:
                     got = driver.ask(do="episodes", batch=batch, seconds=0.3 if turn >= 0 else 0.0)

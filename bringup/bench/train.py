@@ -18,7 +18,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from bringup.bench_processes import BenchError, machine, markdown
+from bringup.bench.processes import BenchError, machine, markdown
 from loop_interfaces.affinity import free_cores
 
 LIMIT = 600.0

@@ -79,7 +79,7 @@ def _bench(options: argparse.Namespace) -> int:
 
 
 def _measure(program: str, given: dict[str, Any]) -> tuple[Any, str]:
-    module = importlib.import_module(f"bringup.bench_{program}")
+    module = importlib.import_module(f"bringup.bench.{program}")
     if program == "kernel":
         from dataclasses import asdict
 

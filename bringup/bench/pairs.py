@@ -1,7 +1,7 @@
 """`pdeloop bench pairs`: one training served by pairs on several hosts, some of which fail.
 
-The hosts are network namespaces joined by veth (bringup.hosts). The tuner is on one, every pair of
-plant and controller on another. With faults a relay sits between plant and controller, and in the
+The hosts are network namespaces joined by veth (bringup.bench.hosts). The tuner is on one, every pair
+of plant and controller on another. With faults a relay sits between plant and controller, and in the
 last run one pair is killed in the middle for good. Each result is compared, bit for bit, with that
 of the training in one process.
 """
@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bringup.bench_processes import Bench, BenchError, BenchProcess, bench, machine, markdown
-from bringup.hosts import environment, hosts, on
+from bringup.bench.hosts import environment, hosts, on
+from bringup.bench.processes import Bench, BenchError, BenchProcess, bench, machine, markdown
 from bringup.in_process import LocalPair, train
 from bringup.pairs import namespaces
 from bringup.training_run import resolve

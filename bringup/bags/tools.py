@@ -7,7 +7,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from bringup.bag_reader import Bag, Message
+from bringup.bags.reader import Bag, Message
 from loop_interfaces.topics import ARRAYS
 from recorder_node.bag import BagError, BagWriter, Channel
 from recorder_node.recording import INDEX, PARAMETERS

@@ -11,7 +11,7 @@ from __future__ import annotations
 from statistics import median
 from typing import Any
 
-from bringup.bench_processes import Bench, bench, machine, markdown
+from bringup.bench.processes import Bench, bench, machine, markdown
 from loop_interfaces.affinity import free_cores
 from loop_interfaces.problem import load_parameters
 
@@ -34,12 +34,12 @@ def _measure(
     running: Bench, batches: tuple[int, ...], turns: int, seconds: float, pinned: bool
 ) -> list[dict[str, Any]]:
     one, two = free_cores(2) if pinned else (-1, -1)
-    ping = running.start("bringup.ping", f"pin:={one}")
-    running.start("bringup.ping", "end:=pong", f"pin:={two}")
+    ping = running.start("bringup.bench.ping", f"pin:={one}")
+    running.start("bringup.bench.ping", "end:=pong", f"pin:={two}")
     horizon = "horizon:=1000"
     running.start("pde_sim_node", horizon, f"pin:={one}", problem=PROBLEM)
     running.start("controller_node", f"pin:={two}", problem=PROBLEM)
-    driver = running.start("bringup.driver", horizon, f"solver_pin:={one}", problem=PROBLEM)
+    driver = running.start("bringup.bench.driver", horizon, f"solver_pin:={one}", problem=PROBLEM)
     n_z = load_parameters(PROBLEM, {})["n_z"]
     for batch in batches:  # compile, find each other, warm up
         driver.ask(do="episodes", batch=batch, seconds=0.1)

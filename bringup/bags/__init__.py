@@ -1,0 +1,1 @@
+"""Recorded bags: reading, verifying, recovering, identifying from them."""
