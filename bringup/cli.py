@@ -95,6 +95,7 @@ def _add_train(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         spec = _DEFAULTS[name]
         train.add_argument(
             f"--{name}",
+            type=lambda text: text.replace("-", "_"),  # gauss-newton as well as gauss_newton
             choices=spec.choices,
             help=f"{spec.description} [{spec.default}]",
         )

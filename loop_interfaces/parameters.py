@@ -245,7 +245,7 @@ TUNER = (
     ),
     Spec(
         "optimizer",
-        "two_point",
+        "gauss_newton",
         "method of the adapt phase",
         choices=("two_point", "directions", "gauss_newton"),
     ),

@@ -72,6 +72,7 @@ def run(
 
 def _train(problem: str, iterations: int, out: Path, words: list[str]) -> dict[str, Any]:
     command = [sys.executable, "-m", "bringup.cli", "train", problem, "--out", str(out)]
+    command += ["--optimizer", "two_point"]  # always the same number of rollouts
     began = time.time()
     process = subprocess.Popen(
         [*command, "--iterations", str(iterations), *words],

@@ -167,7 +167,7 @@ def test_a_rollout_that_diverges_is_marked_and_the_training_goes_on(loop: Proces
 DIVERGING = {
     "problem", "equation", "length", "n_z", "n_a", "actuator_width", "sample_time",
     "integration_time", "horizon", "dmdc_rank", "reduced_order", "exploration_variance",
-    "learning_rate",
+    "optimizer", "learning_rate",
 }  # fmt: skip
 
 
