@@ -15,9 +15,11 @@ from std_msgs.msg import String
 
 from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
+from loop_interfaces.endpoints import qos
 from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.node_loop import NodeLoop, node_main, qos
+from loop_interfaces.node_loop import NodeLoop
+from loop_interfaces.node_main import node_main
 from loop_interfaces.parameters import EXECUTION, PROBLEM
 from loop_interfaces.protocol import ModelFailure, Send
 from loop_interfaces.ros_parameters import declare, given_parameters

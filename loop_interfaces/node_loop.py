@@ -9,33 +9,20 @@ executor never runs, so both can share one node and ROS tools see one node.
 
 from __future__ import annotations
 
-import contextlib
-import os
-import signal
-import sys
 import time
-import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator
-from types import FrameType
-from typing import Any, Protocol
+from collections.abc import Callable
 
-import rclpy
-from rclpy.callback_groups import CallbackGroup
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
-from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
-from rclpy.utilities import remove_ros_args, try_shutdown
 from std_msgs.msg import Float64MultiArray
 
 from loop_interfaces.affinity import pin_process
-from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.isolation import PROFILE, is_confined, outside_sockets
-from loop_interfaces.topics import READER_DEPTH, WRITER_DEPTH, Topic
+from loop_interfaces.endpoints import Receiver, Sender
+from loop_interfaces.frames import Frame
+from loop_interfaces.topics import Topic
 
 HOUSEKEEPING = 0.05
 """Seconds between two rounds of the executor and of the node's slow duties."""
@@ -46,100 +33,13 @@ BUSY = 20
 POLL = 200e-6
 """Seconds that a node with a core of its own polls for the next message before it waits: longer
 than a round of a fast plant, shorter than what anyone would notice."""
-CRASHED = 70
-"""Exit code after a bug; 1 means that the node was asked for something it cannot do."""
 LOOK = 1.0
 """Seconds between two looks at who publishes on the node's topics."""
-OBSERVER_DEPTH = 2000
-"""Samples that may wait for an observer that was not scheduled for a while."""
 SUSPENDED = 2.0
 """Seconds without being scheduled after which a process takes its peers to have dropped it.
 
 The DDS lease is 3 s: peers that stop hearing a participant forget it, while it does not know and
 does not introduce itself again. Joining as a new participant is the way back."""
-
-
-class OutsideExecutor(CallbackGroup):
-    """Entities of this group are never taken by an executor."""
-
-    def can_execute(self, entity: Any) -> bool:
-        return False
-
-    def beginning_execution(self, entity: Any) -> bool:
-        return False
-
-    def ending_execution(self, entity: Any) -> None:
-        return None
-
-
-def qos(topic: Topic, depth: int) -> QoSProfile:
-    """The quality of service of a topic; always reliable, so that only a dying peer loses data.
-
-    depth: WRITER_DEPTH or READER_DEPTH, or more for a recorder.
-    """
-    return QoSProfile(
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if topic.latched else DurabilityPolicy.VOLATILE,
-        history=HistoryPolicy.KEEP_LAST,
-        depth=depth,
-    )
-
-
-def observer_qos(topic: Topic) -> QoSProfile:
-    """For who watches states and actions: their writers keep one sample, so a lost one could not be
-    sent again, and acknowledgements would slow the loop.
-    """
-    profile = qos(topic, OBSERVER_DEPTH)
-    profile.reliability = ReliabilityPolicy.BEST_EFFORT
-    return profile
-
-
-def scoped(namespace: str, name: str) -> str:
-    """`name` below the relative `namespace` (empty: the node's own)."""
-    return f"{namespace.strip('/')}/{name}" if namespace.strip("/") else name
-
-
-class Sender:
-    """Publishes frames on one topic."""
-
-    def __init__(self, node: Node, topic: Topic, namespace: str = "") -> None:
-        self._codec = ArrayCodec(topic.labels)
-        self.publisher: Publisher = node.create_publisher(
-            Float64MultiArray, scoped(namespace, topic.name), qos(topic, WRITER_DEPTH)
-        )
-
-        # Past rclpy's wrapper, which locks the handle and looks at the type of every message.
-        self._publish = self.publisher.handle.publish_raw
-
-    def send(self, frame: Frame) -> None:
-        self._publish(self._codec.encode_into_own(frame))
-
-
-class _Receiver:
-    """Takes frames from one topic and hands them to a callback."""
-
-    def __init__(
-        self,
-        node: Node,
-        topic: Topic,
-        callback: Callable[[Frame], None],
-        namespace: str,
-        *,
-        observer: bool = False,
-    ) -> None:
-        self.callback = callback
-        self.observer = observer
-        self.decode = ArrayCodec(topic.labels).decode
-        self.subscription: Subscription = node.create_subscription(
-            Float64MultiArray,
-            scoped(namespace, topic.name),
-            lambda _: None,  # never called: see OutsideExecutor
-            observer_qos(topic) if observer else qos(topic, READER_DEPTH),
-            callback_group=OutsideExecutor(),
-            raw=True,
-        )
-        self.handle = self.subscription.handle
-        self.take = self.handle.take_message
 
 
 class NodeLoop:
@@ -152,7 +52,7 @@ class NodeLoop:
     def __init__(self, node: Node) -> None:
         self.node = node
         self.refused: Counter[str] = Counter()
-        self._receivers: list[_Receiver] = []
+        self._receivers: list[Receiver] = []
         self._stop_reason: str | None = None
         self._poll = 0.0
         self.suspended = False
@@ -172,7 +72,7 @@ class NodeLoop:
         self, topic: Topic, callback: Callable[[Frame], None], namespace: str = ""
     ) -> Subscription:
         """Call `callback` with every frame of `topic`; a ValueError it raises refuses the message."""
-        receiver = _Receiver(self.node, topic, callback, namespace)
+        receiver = Receiver(self.node, topic, callback, namespace)
         self._receivers.append(receiver)
         return receiver.subscription
 
@@ -183,7 +83,7 @@ class NodeLoop:
 
         Best effort with a deep history: the loop neither waits for an observer nor repeats for it.
         """
-        receiver = _Receiver(self.node, topic, callback, namespace, observer=True)
+        receiver = Receiver(self.node, topic, callback, namespace, observer=True)
         self._receivers.append(receiver)
         return receiver.subscription
 
@@ -277,7 +177,7 @@ class NodeLoop:
                     poll_until = clock() + self._poll
         return self._stop_reason or "shutdown"
 
-    def _take(self, receiver: _Receiver) -> bool:
+    def _take(self, receiver: Receiver) -> bool:
         """Handle the next message of `receiver`; False if there is none."""
         taken = receiver.take(Float64MultiArray, True)
         if taken is None:
@@ -320,100 +220,3 @@ class NodeLoop:
             )
             self._reported = total
             self._report_at = now + 1.0
-
-
-class ConfigurationError(Exception):
-    """A node cannot start as it was asked to; the text is one sentence for the user."""
-
-
-@contextlib.contextmanager
-def ros_node(name: str, args: list[str] | None) -> Iterator[tuple[Node, NodeLoop]]:
-    """A node with its loop: initialises ROS, handles SIGINT and SIGTERM, and leaves nothing behind."""
-    try:
-        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    except Exception as error:  # rcl raises bare RuntimeErrors and its own types
-        raise ConfigurationError(_first_line(error)) from error
-    node = None
-    try:
-        try:
-            node = Node(name, start_parameter_services=True)
-        except Exception as error:
-            raise ConfigurationError(_first_line(error)) from error
-        if is_confined() and (outside := outside_sockets()):
-            raise ConfigurationError(
-                f"the Fast DDS profile {os.environ[PROFILE]} did not take effect (UDP sockets at "
-                f"{', '.join(outside)}); expected the loopback interface only, or PDELOOP_NETWORK=1"
-            )
-        loop = NodeLoop(node)
-
-        def stop(number: int, frame: FrameType | None) -> None:
-            loop.stop(signal.Signals(number).name)
-
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, stop)
-        yield node, loop
-    finally:
-        if node is not None:
-            node.destroy_node()
-        try_shutdown()
-
-
-class NodeBody(Protocol):
-    """What a node does: made with its parameters and topics, then run."""
-
-    def join(self, node: Node, loop: NodeLoop) -> None:
-        """Declare the parameters and wire the topics on a new `node`; what was learnt stays."""
-
-    def run(self) -> int:
-        """Work until the loop stops; returns the exit code, of no meaning if it was suspended."""
-
-
-def node_main(name: str, args: list[str] | None, make: Callable[[Node, NodeLoop], NodeBody]) -> int:
-    """The `main` of a node: makes its body, runs it and returns the exit code.
-
-    A process that was suspended for long joins again, as a new participant. 1 with one line on
-    stderr when the node cannot start as it was asked to: a ConfigurationError,
-    or a ValueError while it is made (a parameter out of range, a plant that cannot be built).
-    """
-    try:
-        _refuse_other_words(name, args)
-        body: NodeBody | None = None
-        while True:
-            with ros_node(name, args) as (node, loop):
-                try:
-                    if body is None:
-                        body = make(node, loop)
-                    else:
-                        body.join(node, loop)
-                        node.get_logger().warning("was suspended; joined the network again")
-                except ValueError as error:
-                    raise ConfigurationError(str(error)) from error
-                code = body.run()
-                if not loop.suspended:
-                    return code
-    except ConfigurationError as error:
-        print(f"{name}: {error}", file=sys.stderr)
-        return 1
-    except Exception:  # a bug: say where, and let a supervisor start the node again
-        traceback.print_exc()
-        return CRASHED
-
-
-def _refuse_other_words(name: str, args: list[str] | None) -> None:
-    """Words that are not ROS arguments would be ignored in silence; `--help` among them."""
-    words = remove_ros_args(args)[1:] if args is None else remove_ros_args(args)
-    if any(word in ("-h", "--help") for word in words):
-        print(
-            f"usage: {name} [--ros-args -p PARAMETER:=VALUE ... --params-file FILE -r __ns:=/NAME]"
-            "\n\nParameters, topics and what the node does: docs/interfaces.md;"
-            " with ROS tools: ros2 param describe."
-        )
-        raise SystemExit(0)
-    if words:
-        raise ConfigurationError(
-            f"unexpected argument '{words[0]}'; parameters are given as --ros-args -p NAME:=VALUE"
-        )
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

@@ -16,7 +16,8 @@ from rosgraph_msgs.msg import Clock
 
 from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.node_loop import NodeLoop, node_main
+from loop_interfaces.node_loop import NodeLoop
+from loop_interfaces.node_main import node_main
 from loop_interfaces.parameters import EXECUTION, PLANT, PROBLEM, Spec
 from loop_interfaces.protocol import Send
 from loop_interfaces.ros_parameters import declare, given_parameters

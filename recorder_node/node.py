@@ -23,14 +23,10 @@ from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray, String
 
+from loop_interfaces.endpoints import OutsideExecutor, scoped
 from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.node_loop import (
-    ConfigurationError,
-    NodeLoop,
-    OutsideExecutor,
-    node_main,
-    scoped,
-)
+from loop_interfaces.node_loop import NodeLoop
+from loop_interfaces.node_main import ConfigurationError, node_main
 from loop_interfaces.parameters import RECORDER, TUNER, table
 from loop_interfaces.ros_parameters import RemoteParameters, declare, given_parameters
 from loop_interfaces.topics import ACTION, RECORDER_STATUS, START, STATE

@@ -18,9 +18,11 @@ from typing import Any
 from rclpy.node import Node
 from std_msgs.msg import String
 
+from loop_interfaces.endpoints import Sender, qos, scoped
 from loop_interfaces.frames import MAX_ID, Frame
 from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.node_loop import ConfigurationError, NodeLoop, Sender, node_main, qos, scoped
+from loop_interfaces.node_loop import NodeLoop
+from loop_interfaces.node_main import ConfigurationError, node_main
 from loop_interfaces.parameters import PROBLEM, TUNER
 from loop_interfaces.protocol import ModelFailure
 from loop_interfaces.ros_parameters import declare, given_parameters

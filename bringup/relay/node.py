@@ -15,8 +15,10 @@ from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 
 from bringup.relay.faults import Faults, FaultyLine
+from loop_interfaces.endpoints import qos
 from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.node_loop import NodeLoop, node_main, qos
+from loop_interfaces.node_loop import NodeLoop
+from loop_interfaces.node_main import node_main
 from loop_interfaces.parameters import Spec
 from loop_interfaces.ros_parameters import declare
 from loop_interfaces.topics import ACTION, STATE

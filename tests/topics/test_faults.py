@@ -264,7 +264,7 @@ import sys, time
 import numpy as np, rclpy
 from std_msgs.msg import Float64MultiArray
 from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.node_loop import qos
+from loop_interfaces.endpoints import qos
 from loop_interfaces.topics import ARRAYS
 from tests.topics.test_faults import garbage
 rclpy.init()
@@ -302,7 +302,7 @@ import time
 import numpy as np, rclpy
 from std_msgs.msg import Float64MultiArray
 from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.node_loop import qos
+from loop_interfaces.endpoints import qos
 from loop_interfaces.topics import ACTION
 rclpy.init()
 node = rclpy.create_node("stranger")

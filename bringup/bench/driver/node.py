@@ -23,7 +23,8 @@ from loop_interfaces import model_rows
 from loop_interfaces.affinity import pin_process
 from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.node_loop import ConfigurationError, NodeLoop, node_main
+from loop_interfaces.node_loop import NodeLoop
+from loop_interfaces.node_main import ConfigurationError, node_main
 from loop_interfaces.parameters import PROBLEM, Spec
 from loop_interfaces.ros_parameters import declare
 from loop_interfaces.topics import COST, MODEL, POLICY, START, CostColumn
