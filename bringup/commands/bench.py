@@ -8,8 +8,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+from bringup.commands.common import Commands
 
-def add_bench(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+
+def add(commands: Commands) -> None:
     """The command group `bench`."""
     bench = commands.add_parser(
         "bench",
@@ -55,9 +57,7 @@ def add_bench(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     kernel.add_argument("--controlgym", metavar="PYTHON", help="interpreter with controlgym 1.0.0")
 
 
-def _add(
-    programs: argparse._SubParsersAction[argparse.ArgumentParser], name: str, text: str
-) -> argparse.ArgumentParser:
+def _add(programs: Commands, name: str, text: str) -> argparse.ArgumentParser:
     program = programs.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
     program.add_argument("--json", action="store_true", help="print JSON instead of a table")
     program.add_argument("--out", type=Path, metavar="FILE", help="write the JSON there, too")

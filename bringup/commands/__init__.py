@@ -1,0 +1,1 @@
+"""The commands of `pdeloop`, one module each: `add` declares the arguments, a handler does it."""

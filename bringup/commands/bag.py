@@ -1,0 +1,108 @@
+"""`pdeloop bag` and `pdeloop identify`: what is done with recordings."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from bringup.commands.common import Commands
+
+_BAG = "Look into a bag that --record or recorder_node wrote, verify it, or recover it."
+
+
+def add(commands: Commands) -> None:
+    """The commands `bag` and `identify`."""
+    _add_bag(commands)
+    _add_identify(commands)
+
+
+def _add_bag(commands: Commands) -> None:
+    bag = commands.add_parser(
+        "bag", help="look into a recorded bag, verify it, recover it", description=_BAG
+    )
+    actions = bag.add_subparsers(required=True, metavar="ACTION")
+    for name, command, text in (
+        ("info", _bag_info, "topics and episodes of a bag"),
+        ("verify", _bag_verify, "recompute states, actions, costs, models and policies"),
+        ("recover", _bag_recover, "make an ordinary bag of an unfinished one"),
+    ):
+        action = actions.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
+        action.add_argument(
+            "bag",
+            type=Path,
+            metavar="BAG",
+            nargs="+" if name == "verify" else None,
+            help="folder of a bag or of a run" + "; all bags of a run" * (name == "verify"),
+        )
+        action.set_defaults(command=command)
+        if name == "info":
+            action.add_argument("--json", action="store_true", help="print JSON")
+        if name == "verify":
+            action.add_argument(
+                "--parameters", type=Path, metavar="FILE", help="instead of those in the bag"
+            )
+        if name == "recover":
+            action.add_argument("--out", type=Path, metavar="DIR", help="[BAG-recovered]")
+
+
+def _add_identify(commands: Commands) -> None:
+    identify = commands.add_parser(
+        "identify",
+        help="reduced model from recorded episodes",
+        description="Identify a reduced model by DMDc from the exploratory episodes of a bag (all "
+        "episodes if none is), of this plant or a foreign one, and design LQ-tracking gains.",
+        epilog="example: pdeloop identify --bag runs/lab/bag --rank 8 --order 4 --out model.npz",
+    )
+    add = identify.add_argument
+    add("--bag", type=Path, metavar="BAG", required=True, help="folder of a bag or of a run")
+    add("--rank", type=int, metavar="P", help="p of the DMDc regression [that of the run]")
+    add("--order", type=int, metavar="NS", help="order n_s of the model [that of the run]")
+    add("--episode", type=int, metavar="N", help="only this episode")
+    add("--environment", type=int, metavar="M", help="only this environment of each episode")
+    add("--state-weight", type=float, metavar="Q", help="q of Q = q I [that of the run, or 1]")
+    add("--action-weight", type=float, metavar="R", help="r of R = r I [that of the run, or 1]")
+    add("--out", type=Path, metavar="FILE", help="write A, B, U, K_a, K_b, s_r to this .npz")
+    identify.set_defaults(command=_identify)
+
+
+def _bag_info(options: argparse.Namespace) -> int:
+    from bringup.bags.tools import describe, info_text
+
+    content = describe(options.bag)
+    print(json.dumps(content) if options.json else info_text(content))
+    return 0
+
+
+def _bag_verify(options: argparse.Namespace) -> int:
+    from bringup.bags.verify import verify
+
+    report = verify(*options.bag, parameters=options.parameters)
+    print(report.text())
+    return 1 if report.count else 0
+
+
+def _bag_recover(options: argparse.Namespace) -> int:
+    from bringup.bags.tools import recover
+
+    path, messages = recover(options.bag, options.out)
+    print(f"{messages} messages in {path}")
+    return 0
+
+
+def _identify(options: argparse.Namespace) -> int:
+    from bringup.bags.identification import identify, save
+
+    found = identify(
+        options.bag,
+        rank=options.rank,
+        order=options.order,
+        episode=options.episode,
+        environment=options.environment,
+        weights=(options.state_weight, options.action_weight),
+    )
+    print(found.text())
+    if options.out is not None:
+        save(found, options.out)
+        print(f"  written to {options.out}")
+    return 0
