@@ -15,7 +15,7 @@ from std_msgs.msg import String
 
 from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
-from loop_interfaces.endpoints import qos
+from loop_interfaces.endpoints import writer_qos
 from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.node_loop import NodeLoop
@@ -33,7 +33,6 @@ from loop_interfaces.topics import (
     START,
     STATE,
     TARGET,
-    WRITER_DEPTH,
 )
 
 CONTROLLER_PARAMETERS = (
@@ -76,7 +75,7 @@ class ControllerNode:
         self._node, self._loop = node, loop
         self._waiting_since = loop.now()
         self._senders = {topic: loop.sender(topic) for topic in (ACTION, MODEL_IDENTIFIED)}
-        self._failed = node.create_publisher(String, MODEL_FAILED, qos(MODEL, WRITER_DEPTH))
+        self._failed = node.create_publisher(String, MODEL_FAILED, writer_qos(MODEL))
         handlers: dict[object, Callable[[Frame], Sequence[Send | ModelFailure]]] = {
             STATE: responder.state,
             TARGET: responder.target,

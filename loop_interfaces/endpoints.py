@@ -6,6 +6,7 @@ on the hot path. The receivers are driven by loop_interfaces.node_loop.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -14,13 +15,14 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
-from std_msgs.msg import Float64MultiArray
+from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
 from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.topics import READER_DEPTH, WRITER_DEPTH, Topic
+from loop_interfaces.samples import AGE, STATE_KIND, Bundle
+from loop_interfaces.topics import READER_DEPTH, SAMPLES, WRITER_DEPTH, Topic
 
-OBSERVER_DEPTH = 2000
-"""Samples that may wait for an observer that was not scheduled for a while."""
+KEPT = 16
+"""Bundles of samples that their writer keeps for a reader which lost one."""
 
 
 class OutsideExecutor(CallbackGroup):
@@ -36,69 +38,121 @@ class OutsideExecutor(CallbackGroup):
         return None
 
 
-def qos(topic: Topic, depth: int) -> QoSProfile:
-    """The quality of service of a topic; always reliable, so that only a dying peer loses data.
-
-    depth: WRITER_DEPTH or READER_DEPTH, or more for a recorder.
-    """
+def writer_qos(topic: Topic) -> QoSProfile:
+    """What a publisher offers: reliable, so that it serves every kind of reader."""
     return QoSProfile(
         reliability=ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if topic.latched else DurabilityPolicy.VOLATILE,
         history=HistoryPolicy.KEEP_LAST,
-        depth=depth,
+        depth=WRITER_DEPTH,
     )
 
 
-def observer_qos(topic: Topic) -> QoSProfile:
-    """For who watches states and actions: their writers keep one sample, so a lost one could not be
-    sent again, and acknowledgements would slow the loop.
+def reader_qos(topic: Topic, depth: int = READER_DEPTH) -> QoSProfile:
+    """What a subscriber asks for: reliable if the topic is latched, else best effort.
+
+    In lock-step nothing is gained by acknowledging states and actions: the plant repeats a state
+    whose answer is missing long before the middleware would, and the acknowledgements cost as much
+    processor time as the samples.
     """
-    profile = qos(topic, OBSERVER_DEPTH)
-    profile.reliability = ReliabilityPolicy.BEST_EFFORT
+    profile = writer_qos(topic)
+    profile.depth = depth
+    if not topic.latched:
+        profile.reliability = ReliabilityPolicy.BEST_EFFORT
     return profile
 
 
+def samples_qos(depth: int) -> QoSProfile:
+    """Of the topic `samples`: reliable, for it is not repeated by the protocol."""
+    return QoSProfile(
+        reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=depth
+    )
+
+
 def scoped(namespace: str, name: str) -> str:
-    """`name` below the relative `namespace` (empty: the node's own)."""
-    return f"{namespace.strip('/')}/{name}" if namespace.strip("/") else name
+    """`name` below `namespace`: absolute with a leading slash, else relative; empty: the node's own.
+
+    A name with a leading slash stays as it is.
+    """
+    if name.startswith("/"):
+        return name
+    inner = namespace.strip("/")
+    return ("/" if namespace.startswith("/") else "") + (f"{inner}/{name}" if inner else name)
+
+
+class Bundler:
+    """Publishes `samples` for those who record or watch; nothing is kept while there are none.
+
+    Make it before the publisher of the states: who knows of the states then knows of the samples.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._publisher = node.create_publisher(UInt8MultiArray, SAMPLES, samples_qos(KEPT))
+        self._publish = self._publisher.handle.publish_raw
+        self._bundle = Bundle()
+        self._began = 0.0
+        self.wanted = False
+
+    def add(self, kind: int, raw: bytes) -> None:
+        """Keep a message for the next bundle. Call it only while `wanted`."""
+        if self._bundle.add(kind, time.monotonic_ns(), raw):
+            self.flush()
+
+    def flush(self) -> None:
+        """Publish what has been kept."""
+        if self._bundle.size:
+            self._publish(self._bundle.take(time.monotonic_ns()))
+        self._began = time.monotonic()
+
+    def look(self, now: float) -> None:
+        """Now and then: whether somebody listens, and whether the bundle has waited for long."""
+        self.wanted = self._publisher.get_subscription_count() > 0
+        if now - self._began > AGE:
+            self.flush()
 
 
 class Sender:
-    """Publishes frames on one topic."""
+    """Publishes frames on one topic; what it sends goes to the bundler, too."""
 
-    def __init__(self, node: Node, topic: Topic, namespace: str = "") -> None:
+    def __init__(
+        self, node: Node, topic: Topic, namespace: str = "", bundler: Bundler | None = None
+    ) -> None:
+        self._bundler = bundler
         self._codec = ArrayCodec(topic.labels)
         self.publisher: Publisher = node.create_publisher(
-            Float64MultiArray, scoped(namespace, topic.name), qos(topic, WRITER_DEPTH)
+            Float64MultiArray, scoped(namespace, topic.name), writer_qos(topic)
         )
 
         # Past rclpy's wrapper, which locks the handle and looks at the type of every message.
         self._publish = self.publisher.handle.publish_raw
 
     def send(self, frame: Frame) -> None:
-        self._publish(self._codec.encode_into_own(frame))
+        raw = self._codec.encode_into_own(frame)
+        self._publish(raw)
+        bundler = self._bundler
+        if bundler is not None and bundler.wanted:
+            bundler.add(STATE_KIND, bytes(raw))
 
 
 class Receiver:
-    """Takes frames from one topic and hands them to a callback."""
+    """Takes frames from one topic and hands them to a callback, and their bytes to the bundler."""
 
     def __init__(
         self,
         node: Node,
         topic: Topic,
         callback: Callable[[Frame], None],
-        namespace: str,
-        *,
-        observer: bool = False,
+        namespace: str = "",
+        bundler: Bundler | None = None,
     ) -> None:
         self.callback = callback
-        self.observer = observer
+        self.bundler = bundler
         self.decode = ArrayCodec(topic.labels).decode
         self.subscription: Subscription = node.create_subscription(
             Float64MultiArray,
             scoped(namespace, topic.name),
             lambda _: None,  # never called: see OutsideExecutor
-            observer_qos(topic) if observer else qos(topic, READER_DEPTH),
+            reader_qos(topic),
             callback_group=OutsideExecutor(),
             raw=True,
         )

@@ -12,6 +12,9 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
 
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
@@ -20,9 +23,11 @@ from rclpy.subscription import Subscription
 from std_msgs.msg import Float64MultiArray
 
 from loop_interfaces.affinity import pin_process
-from loop_interfaces.endpoints import Receiver, Sender
-from loop_interfaces.frames import Frame
-from loop_interfaces.topics import Topic
+from loop_interfaces.endpoints import Bundler, Receiver, Sender
+from loop_interfaces.frames import ArrayCodec, Frame
+from loop_interfaces.samples import ACTION_KIND, STATE_KIND
+from loop_interfaces.topics import ACTION, SAMPLES, STATE, Topic
+from loop_interfaces.watching import Watcher
 
 HOUSEKEEPING = 0.05
 """Seconds between two rounds of the executor and of the node's slow duties."""
@@ -42,6 +47,16 @@ The DDS lease is 3 s: peers that stop hearing a participant forget it, while it 
 does not introduce itself again. Joining as a new participant is the way back."""
 
 
+@dataclass
+class _Watched:
+    """A pair that is watched: how its messages are decoded, and who is called with them."""
+
+    watcher: Watcher
+    callbacks: dict[int, tuple[Callable[[bytes], Frame], Callable[[Frame], None]]] = field(
+        default_factory=dict
+    )
+
+
 class NodeLoop:
     """Runs one node until it is told to stop.
 
@@ -53,6 +68,8 @@ class NodeLoop:
         self.node = node
         self.refused: Counter[str] = Counter()
         self._receivers: list[Receiver] = []
+        self._bundler: Bundler | None = None
+        self._watched: dict[str, _Watched] = {}
         self._stop_reason: str | None = None
         self._poll = 0.0
         self.suspended = False
@@ -64,28 +81,44 @@ class NodeLoop:
         self._report_at = 0.0
         self._look_at = 0.0
 
-    def sender(self, topic: Topic, namespace: str = "") -> Sender:
-        """A publisher of frames on `topic`."""
-        return Sender(self.node, topic, namespace)
+    def sender(self, topic: Topic, namespace: str = "", *, bundled: bool = False) -> Sender:
+        """A publisher of frames on `topic`; bundled: they go out on `samples`, too."""
+        return Sender(self.node, topic, namespace, self.bundler if bundled else None)
 
     def receive(
-        self, topic: Topic, callback: Callable[[Frame], None], namespace: str = ""
+        self,
+        topic: Topic,
+        callback: Callable[[Frame], None],
+        namespace: str = "",
+        *,
+        bundled: bool = False,
     ) -> Subscription:
-        """Call `callback` with every frame of `topic`; a ValueError it raises refuses the message."""
-        receiver = Receiver(self.node, topic, callback, namespace)
-        self._receivers.append(receiver)
-        return receiver.subscription
+        """Call `callback` with every frame of `topic`; a ValueError it raises refuses the message.
 
-    def observe(
-        self, topic: Topic, callback: Callable[[Frame], None], namespace: str = ""
-    ) -> Subscription:
-        """Like `receive`, for somebody who watches a loop without taking part in it.
-
-        Best effort with a deep history: the loop neither waits for an observer nor repeats for it.
+        bundled: what has come in goes out on `samples`, too.
         """
-        receiver = Receiver(self.node, topic, callback, namespace, observer=True)
+        bundler = self.bundler if bundled else None
+        receiver = Receiver(self.node, topic, callback, namespace, bundler)
         self._receivers.append(receiver)
         return receiver.subscription
+
+    def observe(self, topic: Topic, callback: Callable[[Frame], None], namespace: str = "") -> None:
+        """Call `callback` with every state or action, without taking part in the loop.
+
+        The loop neither waits for an observer nor repeats for it (loop_interfaces.watching).
+        """
+        watched = self._watched.get(namespace)
+        if watched is None:
+            watched = self._watched[namespace] = _Watched(Watcher(self.node, namespace))
+        kind = {STATE: STATE_KIND, ACTION: ACTION_KIND}[topic]
+        watched.callbacks[kind] = (ArrayCodec(topic.labels).decode, callback)
+
+    @property
+    def bundler(self) -> Bundler:
+        """Publishes `samples`; made when it is first asked for."""
+        if self._bundler is None:
+            self._bundler = Bundler(self.node)
+        return self._bundler
 
     @staticmethod
     def now() -> float:
@@ -125,9 +158,10 @@ class NodeLoop:
         """
         context = self.node.context
         receivers, clock = self._receivers, time.monotonic
-        wait_set = _rclpy.WaitSet(len(receivers), 0, 0, 0, 0, 0, context.handle)
-        handles = [receiver.handle for receiver in receivers]
-        by_pointer = {receiver.handle.pointer: receiver for receiver in receivers}
+        handles, take_from = self._sources()
+        wait_set = _rclpy.WaitSet(
+            len(handles) + 2 * len(self._watched), 0, 0, 0, 0, 0, context.handle
+        )
         clear, add = wait_set.clear_entities, wait_set.add_subscription
         wait, ready = wait_set.wait, wait_set.get_ready_entities
         next_round = clock()
@@ -144,6 +178,11 @@ class NodeLoop:
                     return "suspended"
                 last_round, cpu = now, cpu + worked
                 self._executor.spin_once(timeout_sec=0)
+                if self._bundler is not None:
+                    self._bundler.look(now)
+                changed = [watched.watcher.look() for watched in self._watched.values()]
+                if any(changed):
+                    handles, take_from = self._sources()
                 housekeeping(now)
                 self._report(now)
                 self._look_for_strangers(now)
@@ -169,27 +208,59 @@ class NodeLoop:
                 add(handle)
             wait(int((wake - now) * 1e9))
             for pointer in ready("subscription"):
-                receiver = by_pointer[pointer]
-                while self._take(receiver) and receiver.observer:
-                    handled += 1
-                handled += 1
+                handled += take_from[pointer]()
                 if self._poll:
                     poll_until = clock() + self._poll
         return self._stop_reason or "shutdown"
 
-    def _take(self, receiver: Receiver) -> bool:
-        """Handle the next message of `receiver`; False if there is none."""
+    def _sources(self) -> tuple[list[Any], dict[int, Callable[[], int]]]:
+        """What to wait for, and what takes from it; the watched ones first: a cost comes after
+        the samples of its episode, and is to be handled after them.
+        """
+        found: dict[int, tuple[Any, Callable[[], int]]] = {}
+        for watched in self._watched.values():
+            for handle in watched.watcher.handles:
+                found[handle.pointer] = (handle, partial(self._drain, watched))
+        for receiver in self._receivers:
+            found[receiver.handle.pointer] = (receiver.handle, partial(self._take, receiver))
+        handles = [handle for handle, _ in found.values()]
+        return handles, {pointer: take for pointer, (_, take) in found.items()}
+
+    def _take(self, receiver: Receiver) -> int:
+        """Handle the next message of `receiver`; how many there were."""
         taken = receiver.take(Float64MultiArray, True)
         if taken is None:
-            return False
+            return 0
+        bundler = receiver.bundler
+        if bundler is not None and bundler.wanted:
+            bundler.add(ACTION_KIND, taken[0])
         try:
             receiver.callback(receiver.decode(taken[0]))
         except ValueError as error:
-            self._last_reason = f"{receiver.subscription.topic_name}: {error}"[:300]
-            self.refused[self._last_reason] += 1
-            if len(self.refused) > 1000:  # a flood with ever new reasons must not grow memory
-                self.refused = Counter({"others": sum(self.refused.values())})
-        return True
+            self._refuse(receiver.subscription.topic_name, error)
+        return 1
+
+    def _drain(self, watched: _Watched) -> int:
+        """Handle all samples that have come in; how many."""
+        count = 0
+        try:
+            for kind, _, raw in watched.watcher.drain():
+                count += 1
+                if kind in watched.callbacks:
+                    decode, callback = watched.callbacks[kind]
+                    try:
+                        callback(decode(raw))
+                    except ValueError as error:
+                        self._refuse("state" if kind == STATE_KIND else "action", error)
+        except ValueError as error:
+            self._refuse(SAMPLES, error)
+        return count
+
+    def _refuse(self, topic: str, error: ValueError) -> None:
+        self._last_reason = f"{topic}: {error}"[:300]
+        self.refused[self._last_reason] += 1
+        if len(self.refused) > 1000:  # a flood with ever new reasons must not grow memory
+            self.refused = Counter({"others": sum(self.refused.values())})
 
     def _look_for_strangers(self, now: float) -> None:
         """Say who else publishes what one node of the loop should publish."""

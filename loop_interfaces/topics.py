@@ -70,6 +70,9 @@ ACTION = Topic("action", ("env", "actuator"), latched=False)
 MODEL_FAILED = "model/failed"
 """std_msgs/String, latched: why an identification gave no model (JSON, see docs/interfaces.md)."""
 
+SAMPLES = "samples"
+"""std_msgs/UInt8MultiArray: the plant's states and actions, many in one message (samples.py)."""
+
 RECORDER_STATUS = "recorder/status"
 """std_msgs/String, latched: a recorder that is matched with the whole loop says so here (JSON)."""
 

@@ -1,6 +1,6 @@
 """pde_sim_node: the plant as a ROS 2 node.
 
-Subscribes  episode/start, action            Publishes  state, episode/cost, target, /clock
+Subscribes  episode/start, action   Publishes  state, episode/cost, target, samples, /clock
 Messages, order and parameters: docs/interfaces.md. The protocol is pde_sim_node.lockstep.
 """
 
@@ -21,6 +21,7 @@ from loop_interfaces.node_main import node_main
 from loop_interfaces.parameters import EXECUTION, PLANT, PROBLEM, Spec
 from loop_interfaces.protocol import Send
 from loop_interfaces.ros_parameters import declare, given_parameters
+from loop_interfaces.samples import CLOCK_KIND
 from loop_interfaces.topics import ACTION, COST, START, STATE, TARGET
 from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.equations import load_equation
@@ -89,11 +90,16 @@ class PlantNode:
 
     def _wire(self, node: Node, loop: NodeLoop, *, publish_clock: bool) -> None:
         self._node, self._loop = node, loop
-        self._senders = {topic: loop.sender(topic) for topic in (STATE, COST, TARGET)}
+        self._bundler = loop.bundler
+        self._senders = {
+            STATE: loop.sender(STATE, bundled=True),
+            COST: loop.sender(COST),
+            TARGET: loop.sender(TARGET),
+        }
         self._clock = node.create_publisher(Clock, "/clock", 1) if publish_clock else None
         self._clock_wanted = False
         loop.receive(START, self._on_start)
-        loop.receive(ACTION, self._on_action)
+        loop.receive(ACTION, self._on_action, bundled=True)
         self._send([self._lockstep.announcement()])
 
     def run(self) -> int:
@@ -126,11 +132,20 @@ class PlantNode:
 
     def _send(self, sends: list[Send]) -> None:
         for send in sends:
+            if send.topic is COST:
+                self._bundler.flush()  # who waits for the cost has the episode by then
             self._senders[send.topic].send(send.frame)
-            wanted = self._clock_wanted and send.topic is STATE
-            if wanted and self._clock is not None and send.frame.time < MAX_TIME:
-                nanoseconds = round(send.frame.time * 1e9)
-                self._clock.publish(_CLOCK.pack(0, 1, 0, *divmod(nanoseconds, 10**9)))
+            if send.topic is STATE and self._clock is not None and send.frame.time < MAX_TIME:
+                self._tell_time(round(send.frame.time * 1e9))
+
+    def _tell_time(self, nanoseconds: int) -> None:
+        if not (self._clock_wanted or self._bundler.wanted):
+            return
+        raw = _CLOCK.pack(0, 1, 0, *divmod(nanoseconds, 10**9))
+        if self._bundler.wanted:
+            self._bundler.add(CLOCK_KIND, raw)
+        if self._clock_wanted and self._clock is not None:
+            self._clock.publish(raw)
 
     def _housekeeping(self, now: float) -> None:
         self._clock_wanted = self._clock is not None and self._clock.get_subscription_count() > 0

@@ -20,20 +20,21 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
-from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray, String
 
-from loop_interfaces.endpoints import OutsideExecutor, scoped
+from loop_interfaces.endpoints import OutsideExecutor, reader_qos, scoped
+from loop_interfaces.frames import FrameError
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.node_loop import NodeLoop
 from loop_interfaces.node_main import ConfigurationError, node_main
 from loop_interfaces.parameters import RECORDER, TUNER, table
 from loop_interfaces.ros_parameters import RemoteParameters, declare, given_parameters
+from loop_interfaces.samples import ACTION_KIND, CLOCK_KIND, STATE_KIND
 from loop_interfaces.topics import ACTION, RECORDER_STATUS, START, STATE
+from loop_interfaces.watching import Watcher
 from recorder_node.bag import BagError
 from recorder_node.recording import (
     ARRAY_TYPE,
-    CLOCK_TYPE,
     TEXT_TYPE,
     Recording,
     Source,
@@ -47,8 +48,8 @@ DRAIN = 0.02
 """Seconds between two batches: often enough for the depth below, seldom enough to cost little."""
 FLUSH = 0.5
 """Seconds of recording that a SIGKILL may lose at the most."""
-DEPTH = 4000
-"""Samples a reader keeps: most of a second of the fastest loop, should this process be held up."""
+DEPTH = 100
+"""Samples a reader of a latched topic keeps: a few an episode, should this process be held up."""
 NAMELESS = "_NODE_NAME_UNKNOWN_"
 """What the graph says of an endpoint whose node it has not heard of yet."""
 PATIENCE = 3.0
@@ -57,7 +58,8 @@ REPORT = 1.0
 """Seconds between two messages on recorder/status."""
 QUIET = 0.1
 """At the end: seconds without a message after which nothing more is on its way."""
-_TYPES = {ARRAY_TYPE: Float64MultiArray, TEXT_TYPE: String, CLOCK_TYPE: Clock}
+_TYPES = {ARRAY_TYPE: Float64MultiArray, TEXT_TYPE: String}
+_KINDS = {STATE: STATE_KIND, ACTION: ACTION_KIND}
 
 STATUS_QOS = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
@@ -66,19 +68,6 @@ STATUS_QOS = QoSProfile(
     depth=1,
 )
 """Latched: a tuner that starts later learns of the recorder, too."""
-
-
-def reader_qos(source: Source) -> QoSProfile:
-    """Reliable for what is latched. Best effort for states and actions: their writers keep one
-    sample, so a lost one could not be sent again, and acknowledgements would slow the loop.
-    """
-    latched = source.channel.latched
-    return QoSProfile(
-        reliability=ReliabilityPolicy.RELIABLE if latched else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-        history=HistoryPolicy.KEEP_LAST,
-        depth=DEPTH,
-    )
 
 
 @dataclass
@@ -194,7 +183,19 @@ class RecorderNode:
 
     def _wire(self, node: Node, loop: NodeLoop) -> None:
         self._node, self._loop, self._log = node, loop, node.get_logger()
-        self._subscriptions = [(source, self._subscribe(source)) for source in self._what]
+        # States, actions and /clock come from watchers, the rest from subscriptions of their own.
+        self._watchers: list[tuple[Watcher, dict[int, Source]]] = []
+        clocks = [source for source in self._what if source.channel.type == CLOCK_TYPE]
+        times = {CLOCK_KIND: clocks[0]} if clocks else {}
+        for absolute in self._namespaces:
+            namespace = absolute.rstrip("/") or "/"
+            mine = [s for s in self._what if s.namespace == namespace]
+            kinds = {_KINDS[s.array]: s for s in mine if s.array in _KINDS} | times
+            first = not self._watchers
+            self._watchers.append((Watcher(node, namespace, clock=first and bool(times)), kinds))
+        self._subscriptions = [
+            (source, self._subscribe(source)) for source in self._what if source.channel.latched
+        ]
         self._peers = Peers(
             node,
             required=[f"{n}{topic.name}" for n in self._namespaces for topic in (STATE, ACTION)],
@@ -230,7 +231,7 @@ class RecorderNode:
             _TYPES[source.channel.type],
             source.channel.topic,
             lambda _: None,  # never called: see OutsideExecutor
-            reader_qos(source),
+            reader_qos(START, DEPTH),
             callback_group=OutsideExecutor(),
             raw=True,
         )
@@ -245,6 +246,13 @@ class RecorderNode:
     def _drain(self) -> int:
         """Record what has come in, in the order of arrival."""
         taken: list[tuple[int, int, Source, bytes]] = []
+        for watcher, by_kind in self._watchers:
+            try:
+                for kind, when, raw in watcher.drain():
+                    if kind in by_kind:
+                        taken.append((when, len(taken), by_kind[kind], raw))
+            except FrameError as error:
+                self._log.warning(f"samples: {error}", throttle_duration_sec=1.0)
         for source, subscription in self._subscriptions:
             message_type, handle = _TYPES[source.channel.type], subscription.handle
             for _ in range(DEPTH):
@@ -259,6 +267,8 @@ class RecorderNode:
         return len(taken)
 
     def _housekeeping(self, now: float) -> None:
+        for watcher, _ in self._watchers:
+            watcher.look()
         self._peers.look(now)
         run = self._recording.run
         if run and self._peers.changed(run):

@@ -11,7 +11,14 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 NODES = ("pde_sim_node", "controller_node", "tuner_node", "recorder_node")
-WITH_ROS = {"node.py", "node_loop.py", "node_main.py", "endpoints.py", "ros_parameters.py"}
+WITH_ROS = {
+    "node.py",
+    "node_loop.py",
+    "watching.py",
+    "node_main.py",
+    "endpoints.py",
+    "ros_parameters.py",
+}
 """Files that may import rclpy or messages."""
 ROS = ("rclpy", "std_msgs", "std_srvs", "rosgraph_msgs", "rcl_interfaces", "diagnostic_msgs")
 

@@ -18,7 +18,7 @@ from typing import Any
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from loop_interfaces.endpoints import Sender, qos, scoped
+from loop_interfaces.endpoints import Sender, reader_qos, scoped
 from loop_interfaces.frames import MAX_ID, Frame
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.node_loop import NodeLoop
@@ -33,7 +33,6 @@ from loop_interfaces.topics import (
     MODEL_FAILED,
     MODEL_IDENTIFIED,
     POLICY,
-    READER_DEPTH,
     RECORDER_STATUS,
     START,
     STATE,
@@ -151,7 +150,7 @@ class TunerNode:
                 String,
                 scoped(namespace, MODEL_FAILED),
                 partial(self._on_failure, number),
-                qos(MODEL, READER_DEPTH),
+                reader_qos(MODEL),
             )
 
     def _observe(

@@ -15,7 +15,7 @@ from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 
 from bringup.relay.faults import Faults, FaultyLine
-from loop_interfaces.endpoints import qos
+from loop_interfaces.endpoints import reader_qos, writer_qos
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.node_loop import NodeLoop
 from loop_interfaces.node_main import node_main
@@ -49,9 +49,13 @@ class RelayNode:
         self._lines = []
         for number, topic in enumerate((STATE, ACTION)):
             subscription = node.create_subscription(
-                Float64MultiArray, f"{topic.name}_sent", lambda _: None, qos(topic, 100), raw=True
+                Float64MultiArray,
+                f"{topic.name}_sent",
+                lambda _: None,
+                reader_qos(topic, 100),
+                raw=True,
             )
-            publisher = node.create_publisher(Float64MultiArray, topic.name, qos(topic, 1))
+            publisher = node.create_publisher(Float64MultiArray, topic.name, writer_qos(topic))
             line = FaultyLine(self._faults, np.random.default_rng([self._seed, number]))
             self._lines.append((subscription, publisher, line))
 

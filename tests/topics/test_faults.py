@@ -264,7 +264,7 @@ import sys, time
 import numpy as np, rclpy
 from std_msgs.msg import Float64MultiArray
 from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.endpoints import qos
+from loop_interfaces.endpoints import writer_qos
 from loop_interfaces.topics import ARRAYS
 from tests.topics.test_faults import garbage
 rclpy.init()
@@ -274,7 +274,7 @@ lines = []
 for topic in ARRAYS:
     shape = (2, 4, 8)[: len(topic.labels)]
     good = ArrayCodec(topic.labels).encode(Frame(1, 2, 3, 0.5, np.ones(shape)))
-    lines.append((node.create_publisher(Float64MultiArray, topic.name, qos(topic, 1)), good))
+    lines.append((node.create_publisher(Float64MultiArray, topic.name, writer_qos(topic)), good))
 sent, end = 0, time.monotonic() + 6.0
 while time.monotonic() < end:
     for publisher, good in lines:
@@ -302,11 +302,11 @@ import time
 import numpy as np, rclpy
 from std_msgs.msg import Float64MultiArray
 from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.endpoints import qos
+from loop_interfaces.endpoints import writer_qos
 from loop_interfaces.topics import ACTION
 rclpy.init()
 node = rclpy.create_node("stranger")
-publisher = node.create_publisher(Float64MultiArray, "action", qos(ACTION, 1))
+publisher = node.create_publisher(Float64MultiArray, "action", writer_qos(ACTION))
 codec = ArrayCodec(ACTION.labels)
 k = 0
 while True:

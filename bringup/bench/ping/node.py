@@ -18,14 +18,14 @@ from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 
 from loop_interfaces.affinity import pin_process
-from loop_interfaces.endpoints import qos
+from loop_interfaces.endpoints import reader_qos, writer_qos
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.node_loop import NodeLoop
 from loop_interfaces.node_main import node_main
 from loop_interfaces.parameters import Spec
 from loop_interfaces.ros_parameters import declare
-from loop_interfaces.topics import ACTION, READER_DEPTH, STATE, WRITER_DEPTH, Topic
+from loop_interfaces.topics import ACTION, STATE, Topic
 
 PARAMETERS = (
     Spec("end", "ping", "which end this is", choices=("ping", "pong")),
@@ -53,9 +53,9 @@ class PingNode:
     def join(self, node: Node, loop: NodeLoop) -> None:
         self._node, self._loop = node, loop
         own, other = (OUT, BACK) if self._end == "ping" else (BACK, OUT)
-        self._publisher = node.create_publisher(Float64MultiArray, own.name, qos(own, WRITER_DEPTH))
+        self._publisher = node.create_publisher(Float64MultiArray, own.name, writer_qos(own))
         self._handle = node.create_subscription(
-            Float64MultiArray, other.name, lambda _: None, qos(other, READER_DEPTH), raw=True
+            Float64MultiArray, other.name, lambda _: None, reader_qos(other), raw=True
         ).handle
         self._wait_set = _rclpy.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
 

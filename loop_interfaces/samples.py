@@ -1,0 +1,111 @@
+"""Many serialised messages in one: what the plant hands to those who record or watch the loop.
+
+A reader of its own for every state and action would cost the loop a packet and a wake-up per sample
+and reader. Instead the plant keeps the bytes of the states it sends and of the actions it receives,
+and publishes them together, some hundred at a time, on the topic `samples`
+(std_msgs/UInt8MultiArray, data_offset 0, no dims). Its data are, little-endian,
+
+    sent                               uint64, ns on the plant's monotonic clock
+    kind, length, stamp, bytes, ...    uint32, uint32, uint64 (ns, the same clock), `length` bytes
+
+repeated; kind 0 is a state, 1 an action, 2 the simulated time that goes with a state, and bytes are
+the message as it was on its own topic (the time also if nobody else reads /clock).
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from loop_interfaces.frames import FrameError
+
+STATE_KIND, ACTION_KIND, CLOCK_KIND = 0, 1, 2
+LIMIT = 256 * 1024
+"""Bytes after which a bundle is sent: a few milliseconds of a fast loop."""
+AGE = 0.1
+"""Seconds after which a bundle is sent that has not reached LIMIT."""
+
+_MESSAGE = struct.Struct("<4sIIIQ")
+"""CDR of an UInt8MultiArray without dims up to its data, and the first eight bytes of those."""
+_ENCODING = b"\x00\x01\x00\x00"
+_SAMPLE = struct.Struct("<IIQ")
+_TYPICAL_OFFSET = 100_000_000
+"""Nanoseconds by which the delay of a bundle may vary before its clock is taken to be another one."""
+
+
+class Bundle:
+    """Collects samples. `add` is on the hot path: two appends and an addition."""
+
+    def __init__(self) -> None:
+        self._parts: list[bytes] = []
+        self.size = 0
+
+    def add(self, kind: int, stamp: int, raw: bytes) -> bool:
+        """Keep a serialised message; whether the bundle should be sent now."""
+        self._parts.append(_SAMPLE.pack(kind, len(raw), stamp))
+        self._parts.append(raw)
+        self.size += _SAMPLE.size + len(raw)
+        return self.size >= LIMIT
+
+    def take(self, sent: int) -> bytes:
+        """CDR bytes of the message that holds them all; the bundle is empty afterwards."""
+        head = _MESSAGE.pack(_ENCODING, 0, 0, 8 + self.size, sent)
+        message = b"".join((head, *self._parts))
+        self._parts.clear()
+        self.size = 0
+        return message
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """A message of the bundle: one of the three kinds, ns on the plant's clock, its CDR bytes."""
+
+    kind: int
+    stamp: int
+    raw: bytes
+
+
+def unpack(message: bytes) -> tuple[int, Iterator[Sample]]:
+    """When the bundle was sent (ns on the plant's clock) and what is in it.
+
+    Raises FrameError, also while the samples are read, for bytes that are no bundle.
+    """
+    if len(message) < _MESSAGE.size:
+        raise FrameError(f"expected a bundle of samples, got {len(message)} bytes")
+    encoding, dims, offset, count, sent = _MESSAGE.unpack_from(message)
+    end = _MESSAGE.size - 8 + count
+    # RTPS rounds a payload up to four bytes.
+    if encoding != _ENCODING or dims or offset or not 0 <= len(message) - end < 4 or count < 8:
+        raise FrameError("expected a bundle of samples, got another layout")
+    return sent, _samples(message, end)
+
+
+def _samples(message: bytes, end: int) -> Iterator[Sample]:
+    position = _MESSAGE.size
+    while position < end:
+        start = position + _SAMPLE.size
+        if start > end:
+            raise FrameError("a bundle of samples ends within a sample")
+        kind, length, stamp = _SAMPLE.unpack_from(message, position)
+        position = start + length
+        if kind > CLOCK_KIND or position > end:
+            raise FrameError("a bundle of samples holds something that is no state, action or time")
+        yield Sample(kind, stamp, message[start:position])
+
+
+class ClockOffset:
+    """Puts the plant's stamps on the reader's clock: the smallest delay seen counts as none.
+
+    So the times of samples do not depend on how many came together, nor on the clocks of hosts.
+    """
+
+    def __init__(self) -> None:
+        self._offset: int | None = None
+
+    def update(self, sent: int, received: int) -> int:
+        """The offset in ns to add to a stamp, after a bundle sent and received at these times."""
+        new = received - sent
+        if self._offset is None or not 0 <= new - self._offset <= _TYPICAL_OFFSET:
+            self._offset = new
+        return self._offset

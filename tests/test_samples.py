@@ -1,0 +1,90 @@
+"""Bundles of serialised messages, and the clock they are stamped with."""
+
+from __future__ import annotations
+
+import struct
+
+import pytest
+
+from loop_interfaces.frames import FrameError
+from loop_interfaces.samples import (
+    ACTION_KIND,
+    CLOCK_KIND,
+    LIMIT,
+    STATE_KIND,
+    Bundle,
+    ClockOffset,
+    Sample,
+    unpack,
+)
+
+
+def bundled(*samples: Sample, sent: int = 99) -> bytes:
+    bundle = Bundle()
+    for sample in samples:
+        bundle.add(sample.kind, sample.stamp, sample.raw)
+    return bundle.take(sent)
+
+
+def test_what_goes_in_comes_out_in_order():
+    samples = [
+        Sample(STATE_KIND, 7, b"state bytes"),
+        Sample(CLOCK_KIND, 2**63, b""),
+        Sample(ACTION_KIND, 9, bytes(range(256))),
+    ]
+    sent, found = unpack(bundled(*samples, sent=12))
+    assert sent == 12
+    assert list(found) == samples
+
+
+def test_a_bundle_is_an_ordinary_uint8_array():
+    from rclpy.serialization import deserialize_message
+    from std_msgs.msg import UInt8MultiArray
+
+    raw = bundled(Sample(STATE_KIND, 7, b"abc"))
+    message = deserialize_message(raw, UInt8MultiArray)
+    assert message.layout.data_offset == 0 and not message.layout.dim
+    assert bytes(message.data) == struct.pack("<QIIQ", 99, STATE_KIND, 3, 7) + b"abc"
+
+
+def test_it_asks_to_be_sent_when_it_is_large_and_is_empty_afterwards():
+    bundle, count = Bundle(), 1
+    while not bundle.add(STATE_KIND, 0, bytes(1000)):
+        count += 1
+    assert LIMIT // 1016 <= count <= LIMIT // 1016 + 1
+    bundle.take(0)
+    assert bundle.size == 0
+    assert list(unpack(bundle.take(0))[1]) == []
+
+
+def test_every_truncation_is_refused():
+    raw = bundled(Sample(STATE_KIND, 7, b"state"), Sample(ACTION_KIND, 8, b"action"))
+    for length in range(len(raw)):
+        with pytest.raises(FrameError):
+            list(unpack(raw[:length])[1])
+
+
+@pytest.mark.parametrize("position", [0, 1, 4, 8, 12])
+def test_another_layout_is_refused(position: int):
+    raw = bytearray(bundled(Sample(STATE_KIND, 7, b"state")))
+    raw[position] ^= 0x40
+    with pytest.raises(FrameError, match="layout"):
+        unpack(bytes(raw))
+
+
+def test_an_unknown_kind_and_a_length_beyond_the_end_are_refused():
+    raw = bytearray(bundled(Sample(STATE_KIND, 7, b"state")))
+    for offset, number in ((24, 3), (28, 2**32 - 1)):
+        broken = bytearray(raw)
+        struct.pack_into("<I", broken, offset, number)
+        with pytest.raises(FrameError, match="no state, action or time"):
+            list(unpack(bytes(broken))[1])
+
+
+def test_stamps_are_put_on_the_readers_clock():
+    clock = ClockOffset()
+    assert clock.update(sent=1_000, received=5_000) == 4_000
+    assert clock.update(sent=2_000, received=9_000) == 4_000  # a bundle that took longer
+    assert clock.update(sent=3_000, received=6_500) == 3_500  # one that was faster
+    another = 10**12
+    assert clock.update(sent=4_000, received=another) == another - 4_000  # another plant's clock
