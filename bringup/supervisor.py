@@ -20,8 +20,11 @@ BACK_OFF = (0.0, 0.5, 1.0, 2.0, 4.0)
 """Seconds before the first, second, ... restart of a node."""
 STEADY = 30.0
 """Seconds of life after which earlier deaths of a node no longer count."""
-REFUSED = 1
-"""Exit code of a node that was asked for something it cannot do: restarting would not help."""
+REFUSED, CRASHED = 1, 70
+"""Exit codes of a node that was asked for something it cannot do, so that restarting would not help,
+and of one with a bug (loop_interfaces.node_main)."""
+_KILLED = range(-64, 0)
+"""Exit codes by signals."""
 
 
 class NodeError(RuntimeError):
@@ -32,7 +35,8 @@ class NodeError(RuntimeError):
 class Child:
     """One node: how it is started and how its life went.
 
-    optional: when it ends for another reason than a refusal, the others go on without it.
+    optional: the others go on without it when it ends by itself, or dies too often. before_start:
+    called before each start, to change the arguments.
     """
 
     name: str
@@ -44,6 +48,7 @@ class Child:
     started: float = 0.0
     due: float | None = 0.0
     optional: bool = False
+    before_start: Callable[[], None] | None = None
     ended: bool = False
 
     def last_words(self) -> str:
@@ -125,6 +130,8 @@ class Supervisor:
                 child.process, child.due = None, None
 
     def _start(self, child: Child, now: float) -> None:
+        if child.before_start is not None:
+            child.before_start()
         with child.log.open("ab") as log:
             child.process = subprocess.Popen(
                 child.arguments,
@@ -144,12 +151,13 @@ class Supervisor:
         child.process = None
         if code == REFUSED:
             raise NodeError(child.last_words() or f"{child.name} {how}; see {child.log}")
-        if child.optional:
+        child.deaths = 1 if now - child.started > STEADY else child.deaths + 1
+        often = child.deaths > len(BACK_OFF)
+        if child.optional and (often or code not in (CRASHED, *_KILLED)):
             child.ended = True
             self.tell(f"{child.name} {how}; {child.last_words()}")
             return
-        child.deaths = 1 if now - child.started > STEADY else child.deaths + 1
-        if child.deaths > len(BACK_OFF):
+        if often:
             raise NodeError(
                 f"{child.name} {how} for the {child.deaths}th time; its last words: "
                 f"{child.last_words() or 'none'} (see {child.log})"

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -190,10 +191,8 @@ def _train_over_topics(folder: Path, display: Display, transport: Transport) -> 
     for name in own:
         own[name] += tuner_parameter(transport.pairs)
     if recording is not None:
-        bag = _unused(folder / "bag")
         names.insert(0, PairNode("recorder_node", "recorder_node"))
         own["recorder_node"] += [
-            f"bag:={quoted(bag.resolve())}",
             f"bag_storage:={recording.storage}",
             f"bag_per_episode:={str(recording.bag_per_episode).lower()}",
         ]
@@ -219,6 +218,9 @@ def _train_over_topics(folder: Path, display: Display, transport: Transport) -> 
         command = node_command("bringup.relay", *arguments)
         children["relay"] = Child("relay", command, logs / "relay.log")
     recorder = children.get("recorder_node")
+    bags: list[Path] = []
+    if recorder is not None:
+        recorder.before_start = partial(_into_new_bag, recorder, folder, bags)
     progress = ProgressFile(folder / "progress.jsonl")
     begun = False
     with own_domain() as domain:
@@ -246,7 +248,8 @@ def _train_over_topics(folder: Path, display: Display, transport: Transport) -> 
         finally:
             supervisor.stop()
     if recorder is not None:
-        display.line(f"  recorded in {bag}" + (", not to the end" if recorder.ended else ""))
+        names_of_bags = ", ".join(str(bag) for bag in bags)
+        display.line(f"  recorded in {names_of_bags}" + ", not to the end" * recorder.ended)
 
 
 def _go_on_unrecorded(tuner: Child) -> None:
@@ -254,6 +257,15 @@ def _go_on_unrecorded(tuner: Child) -> None:
     tuner.arguments = [
         word.replace("recorder:=start", "recorder:=none") for word in tuner.arguments
     ]
+
+
+def _into_new_bag(recorder: Child, folder: Path, bags: list[Path]) -> None:
+    """A recorder that is started again writes another bag, and leaves the unfinished one alone."""
+    bags.append(_unused(folder / "bag"))
+    kept = [word for word in recorder.arguments if not word.startswith("bag:=")]
+    if kept[-1] == "-p":
+        kept.pop()
+    recorder.arguments = [*kept, "-p", f"bag:={quoted(bags[-1].resolve())}"]
 
 
 def _unused(path: Path) -> Path:

@@ -35,6 +35,7 @@ from loop_interfaces.watching import Watcher
 from recorder_node.bag import BagError
 from recorder_node.recording import (
     ARRAY_TYPE,
+    CLOCK_TYPE,
     TEXT_TYPE,
     Recording,
     Source,

@@ -96,6 +96,16 @@ class Processes:
                     found.append(int(entry.name))
         return found
 
+    def pids(self, node: str) -> list[int]:
+        """Processes of this test that run the module `node`.node, whoever started them."""
+        found = []
+        for pid in self.left_behind():
+            with contextlib.suppress(OSError):
+                words = Path(f"/proc/{pid}/cmdline").read_bytes().decode().split("\0")
+                if f"{node}.node" in words:
+                    found.append(pid)
+        return found
+
     def stop(self) -> None:
         """SIGINT, then SIGKILL, to all and to whatever they started."""
         for number, patience in ((signal.SIGINT, 3.0), (signal.SIGKILL, 3.0)):

@@ -92,7 +92,9 @@ class _Training:
     def __init__(
         self, problem: str, iterations: int, seed: int, out: Path, report: SoakReport
     ) -> None:
-        self._options = {"iterations": iterations, "seed": seed}
+        # The optimiser that needs costs only and the one that needs trajectories take turns.
+        optimizer = ("two_point", "gauss_newton")[seed % 2]
+        self._options = {"iterations": iterations, "seed": seed, "optimizer": optimizer}
         self._problem, self._out, self._report = problem, out, report
         self._log = out.with_suffix(".log")
         self._seen: dict[int, tuple[str, float, float]] = {}
@@ -104,7 +106,7 @@ class _Training:
             word for name, value in self._options.items() for word in (f"--{name}", f"{value}")
         ]
         fresh = (self._problem, *options, "--out", str(self._out))
-        process = self._start(*fresh)
+        process = self._start(*fresh, "--record")
         limit = time.monotonic() + LIMIT
         while not (self._out / "result.json").exists():
             if time.monotonic() > limit:
@@ -115,7 +117,9 @@ class _Training:
                 self._end_of(process)
                 report.resumes += 1
                 begun = (self._out / "parameters.yaml").exists()
-                process = self._start(*(("--resume", str(self._out)) if begun else fresh))
+                process = self._start(
+                    *(("--resume", str(self._out)) if begun else fresh), "--record"
+                )
             deadline = time.monotonic() + float(rng.uniform(*PAUSE))
             while time.monotonic() < deadline and process.poll() is None:
                 self._watch_memory()

@@ -86,7 +86,7 @@ def test_the_supervisor_restarts_what_dies_and_says_so(loop, tmp_path):
     run = loop.pdeloop("train", str(SMALL), "--iterations", "150", "--out", str(out))
     for count, name in ((10, "pde_sim_node"), (40, "controller_node"), (70, "tuner_node")):
         until(lambda n=count: iterations_done(out) >= n, LIMIT, f"iteration {count}")
-        (pid,) = [pid for pid in loop.left_behind() if f"{name}.node" in command_of(pid)]
+        (pid,) = loop.pids(name)
         os.kill(pid, signal.SIGKILL)
     text = loop.wait(run, LIMIT)
     assert_same_training(out, in_process(iterations=150))
@@ -114,21 +114,13 @@ def test_a_node_that_keeps_dying_is_given_up_with_its_last_words(loop, tmp_path)
     deadline = time.monotonic() + LIMIT
     while run.poll() is None:
         assert time.monotonic() < deadline, "the supervisor goes on forever"
-        for pid in set(loop.left_behind()) - killed:
-            if "controller_node.node" in command_of(pid):
-                os.kill(pid, signal.SIGKILL)
-                killed.add(pid)
+        for pid in set(loop.pids("controller_node")) - killed:
+            os.kill(pid, signal.SIGKILL)
+            killed.add(pid)
         time.sleep(0.05)
     text = loop.wait(run, 5.0, code=1)
     assert "controller_node was killed by SIGKILL for the 6th time" in text
     assert len(killed) == 6
-
-
-def command_of(pid: int) -> str:
-    try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()
-    except OSError:
-        return ""
 
 
 def test_a_second_tuner_is_refused_and_the_first_one_unharmed(loop, tmp_path):

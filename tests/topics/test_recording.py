@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
 import struct
@@ -307,3 +308,20 @@ def test_one_recorder_records_several_pairs(loop, tmp_path):
 
 def _index(bag: Path) -> list[str]:
     return (bag / "episodes.jsonl").read_text().splitlines()
+
+
+def test_a_killed_recorder_is_started_again_and_goes_on_in_another_bag(loop, tmp_path):
+    out = tmp_path / "run"
+    run = loop.pdeloop("train", str(SMALL), "--iterations", "900", "--out", str(out), "--record")
+    for bag, after in (("bag", 30), ("bag-2", 330)):
+        until(lambda n=after: iterations_done(out) >= n, LIMIT, f"iteration {after}")
+        until(lambda b=bag: (out / b / "parameters.json").exists(), LIMIT, f"recording in {bag}")
+        (pid,) = loop.pids("recorder_node")
+        os.kill(pid, signal.SIGKILL)
+    text = loop.wait(run, LIMIT)
+    assert text.count("recorder_node was killed by SIGKILL; starting it again") == 2
+    assert f"recorded in {out / 'bag'}, {out / 'bag-2'}, {out / 'bag-3'}\n" in text
+    assert_same_training(out, in_process(iterations=900))
+    report = verify(out)
+    assert report.count == 0, report.text()
+    assert describe(out / "bag-3")["finished"]
