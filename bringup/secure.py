@@ -14,19 +14,21 @@ from loop_interfaces import topics
 
 @dataclass(frozen=True)
 class Role:
-    """The topics of one node, by relative name (absolute ones begin with /)."""
+    """The topics of one node, by relative name (absolute ones begin with /), and its own services."""
 
     node: str
     publishes: tuple[str, ...]
     subscribes: tuple[str, ...]
+    services: tuple[str, ...] = ()
 
 
 _ARRAYS = tuple(topic.name for topic in topics.ARRAYS)
 ROLES = (
     Role(
         "pde_sim_node",
-        (topics.STATE.name, topics.COST.name, topics.TARGET.name, "/clock"),
+        (topics.STATE.name, topics.COST.name, topics.TARGET.name, topics.PAUSED.name, "/clock"),
         (topics.START.name, topics.ACTION.name),
+        ("pause", "resume", "step"),
     ),
     Role(
         "controller_node",
@@ -35,7 +37,7 @@ ROLES = (
             topic.name
             for topic in (
                 *(topics.STATE, topics.TARGET, topics.START),
-                *(topics.POLICY, topics.MODEL, topics.COST),
+                *(topics.POLICY, topics.MODEL, topics.COST, topics.PAUSED),
             )
         ),
     ),
@@ -44,8 +46,10 @@ ROLES = (
         (topics.POLICY.name, topics.START.name, topics.MODEL.name),
         (
             *(topics.COST.name, topics.MODEL_IDENTIFIED.name, topics.MODEL_FAILED),
+            topics.PAUSED.name,
             *(topics.STATE.name, topics.ACTION.name, topics.TARGET.name),  # for Gauss-Newton
         ),
+        ("pause", "resume", "stop"),
     ),
     Role(
         "recorder_node",
@@ -55,7 +59,7 @@ ROLES = (
 )
 """Who may publish and subscribe what; the tests hold it against the running nodes."""
 
-EVERY_NODE_PUBLISHES = ("/rosout", "/parameter_events")
+EVERY_NODE_PUBLISHES = ("/rosout", "/parameter_events", "/diagnostics")
 EVERY_NODE_ANSWERS = (
     "describe_parameters",
     "get_parameter_types",
@@ -94,7 +98,7 @@ def _enclave(
         ET.SubElement(enclave, "profiles"), "profile", ns=namespace, node=role.node
     )
     services = ET.SubElement(profile, "services", reply="ALLOW")
-    for service in EVERY_NODE_ANSWERS:
+    for service in (*EVERY_NODE_ANSWERS, *role.services):
         ET.SubElement(services, "service").text = f"~/{service}"
     for attribute, names in (
         ("publish", (*EVERY_NODE_PUBLISHES, *role.publishes)),

@@ -12,6 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from loop_interfaces.protocol import STOPPED
+
 STOP_GRACE = 1.5
 """Seconds between SIGINT and SIGKILL when the run ends."""
 RECORDER_GRACE = 10.0
@@ -74,6 +76,8 @@ class Supervisor:
     tell: Callable[[str], None]
     isolation: Mapping[str, str]
     """Environment variables that say where messages may go (loop_interfaces.isolation)."""
+    stopped: bool = False
+    """Whether the main node ended because an operator asked it to, through its service."""
     _environment: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -99,7 +103,8 @@ class Supervisor:
             code = child.process.poll()
             if code is None:
                 continue
-            if child.name == self.main and code == 0:
+            if child.name == self.main and code in (0, STOPPED):
+                self.stopped = code == STOPPED
                 return True
             self._bury(child, code, now)
         return False

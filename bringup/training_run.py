@@ -247,6 +247,8 @@ def _train_over_topics(folder: Path, display: Display, transport: Transport) -> 
                 time.sleep(0 if done else POLL)
         finally:
             supervisor.stop()
+    if supervisor.stopped:
+        raise Interruption("request")
     if recorder is not None:
         names_of_bags = ", ".join(str(bag) for bag in bags)
         display.line(f"  recorded in {names_of_bags}" + ", not to the end" * recorder.ended)

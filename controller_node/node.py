@@ -1,6 +1,7 @@
 """controller_node: the projected LQ-tracking law as a ROS 2 node.
 
 Subscribes  state, target, episode/start, policy, model, episode/cost
+            episode/paused (for /diagnostics only)
 Publishes   action, model/identified, model/failed
 Messages, order and parameters: docs/interfaces.md. The protocol is controller_node.responder.
 """
@@ -13,6 +14,7 @@ from collections.abc import Callable, Sequence
 from rclpy.node import Node
 from std_msgs.msg import String
 
+from controller_node.health import ControllerHealth
 from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
 from loop_interfaces.endpoints import writer_qos
@@ -29,6 +31,7 @@ from loop_interfaces.topics import (
     MODEL,
     MODEL_FAILED,
     MODEL_IDENTIFIED,
+    PAUSED,
     POLICY,
     START,
     STATE,
@@ -63,6 +66,7 @@ class ControllerNode:
         loop.pin(values["pin"])
         responder = Responder(DesignSettings(**settings))
         self._responder = responder
+        self._health = ControllerHealth(responder)
         self._wire(node, loop)
         node.get_logger().info(f"{values['problem']}: order {values['reduced_order']} tracking law")
 
@@ -73,7 +77,6 @@ class ControllerNode:
     def _wire(self, node: Node, loop: NodeLoop) -> None:
         responder = self._responder
         self._node, self._loop = node, loop
-        self._waiting_since = loop.now()
         self._senders = {topic: loop.sender(topic) for topic in (ACTION, MODEL_IDENTIFIED)}
         self._failed = node.create_publisher(String, MODEL_FAILED, writer_qos(MODEL))
         handlers: dict[object, Callable[[Frame], Sequence[Send | ModelFailure]]] = {
@@ -87,6 +90,12 @@ class ControllerNode:
         for topic in (STATE, TARGET, START, POLICY, MODEL, COST):
             loop.receive(topic, self._performer(handlers[topic]))
 
+        loop.listen(PAUSED, self._on_paused)
+        loop.diagnose("responder", self._health.report)
+
+    def _on_paused(self, frame: Frame) -> None:
+        self._health.plant_paused = bool(frame.values.any())
+
     def run(self) -> int:
         self._loop.run(
             tick=lambda now: None, deadline=lambda: None, housekeeping=self._housekeeping
@@ -94,10 +103,7 @@ class ControllerNode:
         return 0
 
     def _housekeeping(self, now: float) -> None:
-        lacking = self._responder.waits_for()
-        if not lacking:
-            self._waiting_since = now
-        elif now - self._waiting_since > 2.0:
+        if lacking := self._health.waiting(now):
             self._node.get_logger().warning(
                 f"a state waits for its action until there is: {', '.join(lacking)}",
                 throttle_duration_sec=5.0,

@@ -72,7 +72,32 @@ class Responder:
         self._pending: Frame | None = None
         self.tally = Tally()
         self.answered = 0
-        self.episode = -1
+        self.episode = self.step = -1
+        """Of the last answer."""
+        self.last_cost: float | None = None
+        """Mean stage cost of the last episode's environments."""
+        self.failure = ""
+        """Why the last identification gave no model; empty if it did."""
+        self._ended = (-1, -1)
+        """Run and episode of the last cost."""
+
+    @property
+    def run(self) -> int | None:
+        """The run that was answered last."""
+        return self._served[0] if self._served[0] >= 0 else None
+
+    @property
+    def under_way(self) -> bool:
+        """Whether the episode that was answered last goes on."""
+        run = self._served[0]
+        return run in self._runs and (run, self.episode) != self._ended
+
+    @property
+    def exploring(self) -> bool:
+        """Whether the episode that was answered last explores."""
+        run = self._runs.get(self._served[0])
+        start = run.start if run else None
+        return start is not None and bool(start.values[0, StartColumn.EXCITATION] >= 0)
 
     def target(self, frame: Frame) -> list[Send]:
         """Take the target z_r of a plant."""
@@ -137,12 +162,16 @@ class Responder:
         self._pending = None
         self._served = (frame.run, frame.plant)
         self.answered += 1
-        self.episode = frame.episode
+        self.episode, self.step = frame.episode, frame.step
         answer = Frame(frame.run, frame.episode, frame.step, frame.time, actions, frame.plant)
         return [Send(ACTION, answer)]
 
     def cost(self, frame: Frame) -> list[Send | ModelFailure]:
         """At the end of an exploratory episode: reduce and design."""
+        self._ended = (frame.run, frame.episode)
+        if frame.values.shape[1] == len(CostColumn) and len(frame.values):
+            completed = frame.values[frame.values[:, CostColumn.ENDED] == COMPLETED]
+            self.last_cost = float(completed[:, CostColumn.MEAN].mean()) if len(completed) else None
         run = self._runs.get(frame.run)
         start = run.episode_start(frame) if run else None
         if run is None or start is None or start.values[0, StartColumn.EXCITATION] < 0:
@@ -153,7 +182,10 @@ class Responder:
                 f"got {frame.values.shape}"
             )
         if frame.plant not in run.identified and len(run.identified) < MAX_KEPT:
-            run.identified[frame.plant] = self._identify(run, start, frame)
+            found = run.identified[frame.plant] = self._identify(run, start, frame)
+            failed = isinstance(found, ModelFailure)
+            self.failure = found.reason if isinstance(found, ModelFailure) else ""
+            self.tally["identifications failed" if failed else "models identified"] += 1
         return [run.identified[frame.plant]] if frame.plant in run.identified else []
 
     def waits_for(self) -> list[str]:

@@ -23,8 +23,10 @@ from rclpy.subscription import Subscription
 from std_msgs.msg import Float64MultiArray
 
 from loop_interfaces.affinity import pin_process
-from loop_interfaces.endpoints import Bundler, Receiver, Sender
+from loop_interfaces.endpoints import Bundler, Receiver, Sender, reader_qos, scoped
 from loop_interfaces.frames import ArrayCodec, Frame
+from loop_interfaces.health import Health
+from loop_interfaces.introspection import Introspection
 from loop_interfaces.samples import ACTION_KIND, STATE_KIND
 from loop_interfaces.topics import ACTION, SAMPLES, STATE, Topic
 from loop_interfaces.watching import Watcher
@@ -38,8 +40,6 @@ BUSY = 20
 POLL = 200e-6
 """Seconds that a node with a core of its own polls for the next message before it waits: longer
 than a round of a fast plant, shorter than what anyone would notice."""
-LOOK = 1.0
-"""Seconds between two looks at who publishes on the node's topics."""
 SUSPENDED = 2.0
 """Seconds without being scheduled after which a process takes its peers to have dropped it.
 
@@ -79,7 +79,11 @@ class NodeLoop:
         self._last_reason = ""
         self._reported = 0
         self._report_at = 0.0
-        self._look_at = 0.0
+        self._introspection = Introspection(
+            node,
+            refused=lambda: (sum(self.refused.values()), self._last_reason),
+            topics=lambda: [receiver.subscription.topic_name for receiver in self._receivers],
+        )
 
     def sender(self, topic: Topic, namespace: str = "", *, bundled: bool = False) -> Sender:
         """A publisher of frames on `topic`; bundled: they go out on `samples`, too."""
@@ -119,6 +123,26 @@ class NodeLoop:
         if self._bundler is None:
             self._bundler = Bundler(self.node)
         return self._bundler
+
+    def listen(self, topic: Topic, callback: Callable[[Frame], None], namespace: str = "") -> None:
+        """Like `receive`, for what is rare and not urgent: served with the housekeeping.
+
+        It costs the hot path nothing, not even a place in its WaitSet.
+        """
+        decode = ArrayCodec(topic.labels).decode
+        name = scoped(namespace, topic.name)
+
+        def take(raw: bytes) -> None:
+            try:
+                callback(decode(raw))
+            except ValueError as error:
+                self._refuse(name, error)
+
+        self.node.create_subscription(Float64MultiArray, name, take, reader_qos(topic), raw=True)
+
+    def diagnose(self, task: str, health: Callable[[float], Health]) -> None:
+        """Publish what `health(now)` says on /diagnostics, once a second."""
+        self._introspection.report(task, health)
 
     @staticmethod
     def now() -> float:
@@ -185,7 +209,7 @@ class NodeLoop:
                     handles, take_from = self._sources()
                 housekeeping(now)
                 self._report(now)
-                self._look_for_strangers(now)
+                self._introspection.round(now)
                 next_round = now + (BUSY_HOUSEKEEPING if handled > BUSY else HOUSEKEEPING)
                 handled = 0
                 continue
@@ -261,26 +285,6 @@ class NodeLoop:
         self.refused[self._last_reason] += 1
         if len(self.refused) > 1000:  # a flood with ever new reasons must not grow memory
             self.refused = Counter({"others": sum(self.refused.values())})
-
-    def _look_for_strangers(self, now: float) -> None:
-        """Say who else publishes what one node of the loop should publish."""
-        if now < self._look_at:
-            return
-        self._look_at = now + LOOK
-        for receiver in self._receivers:
-            topic = receiver.subscription.topic_name
-            if self.node.count_publishers(topic) < 2:
-                continue
-            found = {
-                f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
-                for endpoint in self.node.get_publishers_info_by_topic(topic)
-            }
-            if len(found) > 1:
-                self.node.get_logger().warning(
-                    f"{len(found)} nodes publish {topic}: {', '.join(sorted(found))}; "
-                    "only messages of this run, episode, step and plant count",
-                    throttle_duration_sec=10.0,
-                )
 
     def _report(self, now: float) -> None:
         total = sum(self.refused.values())

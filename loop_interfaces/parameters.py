@@ -30,6 +30,7 @@ class Spec:
     """One parameter. The type is the default's; `required` ones have no usable default.
 
     minimum, maximum: inclusive, unless `positive` (then value > 0). choices: the allowed words.
+    live: it may be changed while the node runs, because no result depends on it.
     """
 
     name: str
@@ -41,6 +42,7 @@ class Spec:
     choices: tuple[str, ...] = ()
     positive: bool = False
     multiple_of: int = 1
+    live: bool = False
 
     @property
     def type(self) -> type:
@@ -159,6 +161,7 @@ PLANT = (
         0.001,
         60.0,
         unit="s",
+        live=True,
     ),
     Spec(
         "max_repeats",
@@ -166,6 +169,7 @@ PLANT = (
         "repeats of one state without an answer after which the episode is void",
         1,
         1_000_000,
+        live=True,
     ),
     Spec(
         "run_hold",
@@ -174,6 +178,7 @@ PLANT = (
         0.1,
         3600.0,
         unit="s",
+        live=True,
     ),
     Spec("publish_clock", True, "publish simulated time on /clock while somebody listens"),
     Spec(
@@ -182,6 +187,7 @@ PLANT = (
         "simulated seconds per second of the wall clock; 0: as fast as possible",
         0.0,
         1e6,
+        live=True,
     ),
 )
 
@@ -227,7 +233,7 @@ TUNER = (
     ),
     Spec("out", "", "folder of the results and the checkpoint; empty: keep nothing"),
     Spec("resume", False, "continue the run whose checkpoint is in 'out'"),
-    Spec("max_batch", 1024, "environments of one episode at the most", 1, 65536),
+    Spec("max_batch", 1024, "environments of one episode at the most", 1, 65536, live=True),
     Spec(
         "episode_timeout",
         600.0,
@@ -235,6 +241,7 @@ TUNER = (
         1.0,
         86400.0,
         unit="s",
+        live=True,
     ),
     Spec(
         "max_attempts",
@@ -242,6 +249,7 @@ TUNER = (
         "attempts at one episode after which the run stops with an error",
         1,
         1000,
+        live=True,
     ),
     Spec(
         "optimizer",

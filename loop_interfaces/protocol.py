@@ -13,6 +13,9 @@ from dataclasses import dataclass
 from loop_interfaces.frames import Frame
 from loop_interfaces.topics import Topic
 
+STOPPED = 75
+"""Exit code of a tuner that an operator stopped after an iteration (as sysexits' EX_TEMPFAIL)."""
+
 
 @dataclass(slots=True)
 class Send:

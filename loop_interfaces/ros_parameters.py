@@ -1,14 +1,22 @@
-"""Declares the parameters of loop_interfaces.parameters on a node, and reads another node's."""
+"""Declares the parameters of loop_interfaces.parameters on a node, and reads another node's.
+
+All are read-only but the live ones, which no result depends on.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.node import Node
-from rclpy.parameter import parameter_value_to_python
+from rclpy.parameter import Parameter, parameter_value_to_python
 
 from loop_interfaces.parameters import ParameterError, Spec, check_names, table
 
@@ -25,7 +33,7 @@ def given_parameters(node: Node) -> dict[str, Any]:
 
 
 def declare(node: Node, specs: Iterable[Spec], given: dict[str, Any]) -> dict[str, Any]:
-    """Declares `specs` read-only with description and range; returns the checked values.
+    """Declares `specs` with description and range, read-only unless live; returns the checked values.
 
     Raises ParameterError naming parameter, value and range. A whole number is accepted for a
     floating-point parameter, as YAML writers expect.
@@ -38,13 +46,40 @@ def declare(node: Node, specs: Iterable[Spec], given: dict[str, Any]) -> dict[st
     return values
 
 
+def on_change(node: Node, specs: Iterable[Spec], apply: Callable[[dict[str, Any]], None]) -> None:
+    """Let the live ones of `specs` be set, in their range; apply(values) gets all live values then.
+
+    To be called once, after every `declare` of the node.
+    """
+    live = {spec.name: spec for spec in specs if spec.live}
+
+    def check_change(parameters: list[Parameter]) -> SetParametersResult:
+        try:
+            for parameter in parameters:
+                if parameter.name in live:
+                    live[parameter.name].check(parameter.value)
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def after_change(parameters: list[Parameter]) -> None:
+        changed = [parameter for parameter in parameters if parameter.name in live]
+        if changed:
+            apply({name: node.get_parameter(name).value for name in live})
+        for parameter in changed:
+            node.get_logger().info(f"parameter '{parameter.name}' is now {parameter.value}")
+
+    node.add_on_set_parameters_callback(check_change)
+    node.add_post_set_parameters_callback(after_change)
+
+
 def descriptor(spec: Spec) -> ParameterDescriptor:
-    """The ROS descriptor of a parameter: description with unit, range, read-only."""
+    """The ROS descriptor of a parameter: description with unit, range, read-only unless live."""
     unit = f" ({spec.unit})" if spec.unit else ""
     result = ParameterDescriptor(
         description=f"{spec.description}{unit}",
         additional_constraints=f"expected {spec.range}",
-        read_only=True,
+        read_only=not spec.live,
     )
     low = spec.minimum if spec.minimum is not None else (0.0 if spec.positive else -_LARGEST)
     high = spec.maximum if spec.maximum is not None else _LARGEST
@@ -100,4 +135,11 @@ class RemoteParameters:
             self._node.destroy_client(self._clients.pop())
 
 
-__all__ = ["ParameterError", "RemoteParameters", "declare", "descriptor", "given_parameters"]
+__all__ = [
+    "ParameterError",
+    "RemoteParameters",
+    "declare",
+    "descriptor",
+    "given_parameters",
+    "on_change",
+]

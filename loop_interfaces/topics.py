@@ -62,6 +62,8 @@ COST = Topic("episode/cost", ("env", "mean_total_ended"), latched=True)
 MODEL = Topic("model", ("model", "row", "mode"), latched=True)
 MODEL_IDENTIFIED = Topic("model/identified", ("model", "row", "mode"), latched=True)
 TARGET = Topic("target", ("x",), latched=True)
+PAUSED = Topic("episode/paused", ("paused",), latched=True)
+"""One number: 1 while an operator holds the plant, 0 otherwise. Moves nothing: only for who waits."""
 
 # Volatile, depth 1: in lock-step only the newest sample has a meaning; the plant repeats what is lost.
 STATE = Topic("state", ("env", "x"), latched=False)
@@ -76,4 +78,5 @@ SAMPLES = "samples"
 RECORDER_STATUS = "recorder/status"
 """std_msgs/String, latched: a recorder that is matched with the whole loop says so here (JSON)."""
 
+# Not `episode/paused`, which says nothing about an episode's numbers.
 ARRAYS = (START, STATE, ACTION, POLICY, COST, MODEL_IDENTIFIED, MODEL, TARGET)

@@ -5,6 +5,9 @@
 The plant advances only on the action stamped with the run, episode and step it waits for. Without
 one for `action_timeout` it sends its state again; after `max_repeats` the episode is void, which
 is not a cost. The answer to state T moves nothing: it says that the last state has arrived.
+
+A paused plant takes the answer it waits for and holds the next state back. Nothing is sent again and
+nothing is given up meanwhile; `episode/paused` tells everybody who waits for the plant.
 """
 
 from __future__ import annotations
@@ -13,12 +16,22 @@ import numpy as np
 
 from loop_interfaces.frames import MAX_VALUES, Frame, FrameError
 from loop_interfaces.protocol import Send, Tally
-from loop_interfaces.topics import COMPLETED, COST, STATE, TARGET, VOID, StartColumn, Topic
+from loop_interfaces.topics import COMPLETED, COST, PAUSED, STATE, TARGET, VOID, StartColumn, Topic
 from pde_sim_node.pace import Pace
 from pde_sim_node.plant import Plant
 
 MAX_TIME = 2.0**31
 """Simulated time (s) that /clock can tell, and a start can set."""
+PAUSED_REPORT = 1.0
+"""Seconds between two messages on `episode/paused` while the plant is paused."""
+
+_STALE = (
+    "actions of another episode",
+    "actions for another plant",
+    "actions of another step",
+    "actions before their state",
+    "starts of an earlier episode",
+)
 
 
 class Lockstep:
@@ -52,7 +65,10 @@ class Lockstep:
         self.run = 0
         self.episode = -1
         self.steps_total = 0
+        self.rounds_total = 0
         self.episodes_total = 0
+        self.last_cost: np.ndarray | None = None
+        """The rows of the last `episode/cost`."""
         self._rows = np.empty((0, len(StartColumn)))
         self._active = False
         self._reply: Send | None = None
@@ -60,8 +76,11 @@ class Lockstep:
         self._tuner_heard = -np.inf
         self._deadline: float | None = None
         self._held = False
-        """Whether the next state is ready and waits for its instant."""
+        """Whether the next state is ready and waits for its instant, or for the end of a pause."""
         self.pace = Pace(sample_time / real_time_factor) if real_time_factor else None
+        self.paused = False
+        self._stepping = False
+        """Whether a paused plant waits for the one action that it may still take."""
 
     @property
     def deadline(self) -> float | None:
@@ -77,13 +96,91 @@ class Lockstep:
     def step(self) -> int:
         return self._plant.step_index
 
+    @property
+    def horizon(self) -> int:
+        return self._plant.horizon
+
+    @property
+    def batch(self) -> int:
+        """Environments of the present or last episode."""
+        return self._plant.batch
+
+    @property
+    def stale(self) -> int:
+        """Messages that came too late, too early or for somebody else."""
+        return sum(count for reason, count in self.tally.items() if reason in _STALE)
+
     def overdue(self) -> bool:
         """Whether the awaited action has been missing for many repeats."""
-        return self._deadline is not None and self._repeats * self._action_timeout > 2.0
+        awaited = self._active and not self._held and self._deadline is not None
+        return awaited and self._repeats * self._action_timeout > 2.0
 
     def announcement(self) -> Send:
         """The target z_r, sent once at the start and latched."""
         return Send(TARGET, Frame(0, 0, 0, 0.0, self._plant.target, self._fingerprint))
+
+    def paused_report(self) -> Send:
+        """Whether the plant is paused, latched."""
+        episode = max(self.episode, 0)  # -1 before the first
+        paused = np.array([float(self.paused)])
+        return Send(
+            PAUSED, Frame(self.run, episode, self.step, self.time, paused, self._fingerprint)
+        )
+
+    def pause(self, now: float) -> list[Send]:
+        """Hold every further state back."""
+        self.paused, self._stepping = True, False
+        self._deadline = now + PAUSED_REPORT
+        return [self.paused_report()]
+
+    def resume(self, now: float) -> list[Send]:
+        """Go on: send the state that was held back, or again the one that is not answered."""
+        if not self.paused:
+            return []
+        self.paused, self._stepping, self._deadline = False, False, None
+        report = [self.paused_report()]
+        if not self._active:
+            self._held = False
+            return report
+        if self.pace:
+            self.pace.begin(now)
+        return report + self._send_state(now)
+
+    def adjust(
+        self,
+        now: float,
+        *,
+        action_timeout: float,
+        max_repeats: int,
+        run_hold: float,
+        real_time_factor: float,
+    ) -> list[Send]:
+        """Take other times from now on. They decide when messages go out, never what is in them."""
+        self._action_timeout, self._max_repeats = action_timeout, max_repeats
+        self._run_hold = run_hold
+        period = self._sample_time / real_time_factor if real_time_factor else None
+        if period == (self.pace.period if self.pace else None):
+            return []
+        self.pace = Pace(period) if period else None
+        if self.pace:
+            self.pace.begin(now)
+        if self.paused or not self._held:
+            return []
+        return self._send_state(now)  # it waited for an instant of the former pace
+
+    def step_once(self, now: float) -> list[Send]:
+        """Send one state although the plant is paused, and take its action.
+
+        Raises ValueError, one sentence, when there is nothing to step.
+        """
+        if not self.paused:
+            raise ValueError("the plant is not paused; expected a pause before a step")
+        if not self._active:
+            raise ValueError("no episode is under way; expected one to step in")
+        if self._stepping:
+            raise ValueError(f"step {self.step} still waits for its action")
+        self._stepping = True
+        return self._send_state(now)
 
     def start(self, frame: Frame, now: float) -> list[Send]:
         """Begin an episode, or answer again for one that is known.
@@ -99,12 +196,12 @@ class Lockstep:
                     f"run {frame.run} asked for an episode, but run {self.run} has this plant "
                     f"(until it ends, or is silent for {self._run_hold:g} s)"
                 )
-            self.run, self.episode, self._active, self._reply = frame.run, -1, False, None
-            self._deadline, self._held = None, False
+            self.run, self.episode, self._reply = frame.run, -1, None
+            self._idle(now)
         self._tuner_heard = now
         if not len(rows):
-            self.run, self.episode, self._active, self._deadline = 0, -1, False, None
-            self._held = False
+            self.run, self.episode = 0, -1
+            self._idle(now)
             return []
         if frame.episode < self.episode:
             self.tally["starts of an earlier episode"] += 1
@@ -120,7 +217,7 @@ class Lockstep:
         states = self._plant.reset(rows[:, StartColumn.SEED].astype(np.int64))
         self.episode, self._rows, self._active = frame.episode, rows.copy(), True
         self.time = max(self.time, frame.time) + self._sample_time
-        self._held = False
+        self._stepping = False
         if self.pace:
             self.pace.begin(now)
         return self._publish_state(states, now)
@@ -150,11 +247,12 @@ class Lockstep:
             return []
         self._tuner_heard = now
         if plant.step_index == plant.horizon:
-            return [self._finish(void=False)]
+            return [self._finish(now, void=False)]
         states = plant.step(frame.values)
         self.steps_total += plant.batch
+        self.rounds_total += 1
         self.time += self._sample_time
-        if self.pace:
+        if self.pace and not self.paused:
             self._reply, self._held = self._stamped(STATE, states), True
             self._deadline = self.pace.next(now)
             return []
@@ -166,34 +264,54 @@ class Lockstep:
         With a pace also: send the next state at its instant. Call it once right after `action`,
         too, so that a state which is ready too late is told from one that is sent too late.
         """
+        if self.paused and not self._stepping:
+            return self._still_paused(now)
         if self._held and self.pace and self._reply and self.pace.ready(now):
-            self._held, self._repeats = False, 0
-            self._deadline = now + self._action_timeout
-            return [self._reply]
+            return self._send_state(now)
         if self._deadline is None or now < self._deadline or self._reply is None:
             return []
-        if self._repeats >= self._max_repeats:
-            return [self._finish(void=True)]
+        if self._repeats >= self._max_repeats and not self.paused:
+            return [self._finish(now, void=True)]
         self._repeats += 1
         self.tally["states repeated"] += 1
         self._deadline = now + self._action_timeout
-        return [self._reply]
+        return [self._reply, self.paused_report()] if self.paused else [self._reply]
 
     def _publish_state(self, states: np.ndarray, now: float) -> list[Send]:
         self._reply = self._stamped(STATE, states)
-        self._repeats = 0
+        if self.paused:
+            self._held, self._stepping = True, False
+            self._deadline = now + PAUSED_REPORT
+            return []
+        return self._send_state(now)
+
+    def _send_state(self, now: float) -> list[Send]:
+        assert self._reply is not None
+        self._held, self._repeats = False, 0
         self._deadline = now + self._action_timeout
         return [self._reply]
 
-    def _finish(self, *, void: bool) -> Send:
+    def _still_paused(self, now: float) -> list[Send]:
+        if self._deadline is not None and now < self._deadline:
+            return []
+        self._deadline = now + PAUSED_REPORT
+        return [self.paused_report()]
+
+    def _idle(self, now: float) -> None:
+        """No episode is under way; a pause outlasts it."""
+        self._active = self._held = self._stepping = False
+        self._deadline = now + PAUSED_REPORT if self.paused else None
+
+    def _finish(self, now: float, *, void: bool) -> Send:
         costs = self._plant.episode_costs()
         ended = np.where(costs.diverged_step >= 0, costs.diverged_step, COMPLETED)
         if void:
             ended = np.full(self._plant.batch, VOID)
             self.tally["episodes void"] += 1
         values = np.column_stack([costs.mean, costs.total, ended.astype(np.float64)])
+        self.last_cost = values
         self._reply = self._stamped(COST, values)
-        self._active, self._deadline = False, None
+        self._idle(now)
         self.episodes_total += not void
         return self._reply
 

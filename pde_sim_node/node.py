@@ -1,6 +1,8 @@
 """pde_sim_node: the plant as a ROS 2 node.
 
-Subscribes  episode/start, action   Publishes  state, episode/cost, target, samples, /clock
+Subscribes  episode/start, action
+Publishes   state, episode/cost, target, episode/paused, samples, /clock
+Serves      ~/pause, ~/resume, ~/step (std_srvs/Trigger)
 Messages, order and parameters: docs/interfaces.md. The protocol is pde_sim_node.lockstep.
 """
 
@@ -8,6 +10,7 @@ from __future__ import annotations
 
 import struct
 import sys
+from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
@@ -15,22 +18,27 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
 from loop_interfaces.frames import Frame
+from loop_interfaces.introspection import offer
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.node_loop import NodeLoop
 from loop_interfaces.node_main import node_main
 from loop_interfaces.parameters import EXECUTION, PLANT, PROBLEM, Spec
 from loop_interfaces.protocol import Send
-from loop_interfaces.ros_parameters import declare, given_parameters
+from loop_interfaces.ros_parameters import declare, given_parameters, on_change
 from loop_interfaces.samples import CLOCK_KIND
-from loop_interfaces.topics import ACTION, COST, START, STATE, TARGET
+from loop_interfaces.topics import ACTION, COST, PAUSED, START, STATE, TARGET
 from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.equations import load_equation
+from pde_sim_node.health import PlantHealth
 from pde_sim_node.lockstep import MAX_TIME, Lockstep
 
 
-def declare_parameters(node: Node) -> dict[str, Any]:
-    """The plant's parameters, with the chosen equation's own under `physical.`."""
-    given = given_parameters(node)
+def declare_parameters(node: Node, changed: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """The plant's parameters, with the chosen equation's own under `physical.`.
+
+    changed: live ones as they were set meanwhile, when the network is joined again.
+    """
+    given = {**given_parameters(node), **(changed or {})}
     names = {spec.name for spec in PLANT_PARAMETERS}
     physical = {name: value for name, value in given.items() if name.startswith("physical.")}
     values = declare(node, [s for s in PROBLEM if s.name in names] + [*PLANT, *EXECUTION], given)
@@ -78,7 +86,9 @@ class PlantNode:
             run_hold=values["run_hold"],
             real_time_factor=values["real_time_factor"],
         )
+        self._health = PlantHealth(self._lockstep)
         self._paced = self._lockstep.pace is not None
+        self._changed: dict[str, Any] = {}
         self._wire(node, loop, publish_clock=values["publish_clock"])
         node.get_logger().info(
             f"{values['problem']}: {plant.n_z} points, {plant.n_a} actuators, "
@@ -86,7 +96,8 @@ class PlantNode:
         )
 
     def join(self, node: Node, loop: NodeLoop) -> None:
-        self._wire(node, loop, publish_clock=declare_parameters(node)["publish_clock"])
+        values = declare_parameters(node, self._changed)
+        self._wire(node, loop, publish_clock=values["publish_clock"])
 
     def _wire(self, node: Node, loop: NodeLoop, *, publish_clock: bool) -> None:
         self._node, self._loop = node, loop
@@ -95,12 +106,18 @@ class PlantNode:
             STATE: loop.sender(STATE, bundled=True),
             COST: loop.sender(COST),
             TARGET: loop.sender(TARGET),
+            PAUSED: loop.sender(PAUSED),
         }
         self._clock = node.create_publisher(Clock, "/clock", 1) if publish_clock else None
         self._clock_wanted = False
         loop.receive(START, self._on_start)
         loop.receive(ACTION, self._on_action, bundled=True)
-        self._send([self._lockstep.announcement()])
+        loop.diagnose("lock-step", self._health.report)
+        offer(node, "~/pause", self._pause)
+        offer(node, "~/resume", self._resume)
+        offer(node, "~/step", self._step)
+        on_change(node, PLANT, self._adjust)
+        self._send([self._lockstep.announcement(), self._lockstep.paused_report()])
 
     def run(self) -> int:
         lockstep = self._lockstep
@@ -112,6 +129,25 @@ class PlantNode:
         if not self._loop.suspended:
             self._report_pace()
         return 0
+
+    def _pause(self) -> str:
+        self._send(self._lockstep.pause(self._loop.now()))
+        return f"paused at step {self._lockstep.step}; an answer on its way is still taken"
+
+    def _resume(self) -> str:
+        was = "resumed" if self._lockstep.paused else "was not paused"
+        self._send(self._lockstep.resume(self._loop.now()))
+        return was
+
+    def _step(self) -> str:
+        self._send(self._lockstep.step_once(self._loop.now()))
+        return f"sent state {self._lockstep.step}"
+
+    def _adjust(self, values: dict[str, Any]) -> None:
+        self._report_pace()
+        self._changed = values
+        self._send(self._lockstep.adjust(self._loop.now(), **values))
+        self._paced = self._lockstep.pace is not None
 
     def _on_start(self, frame: Frame) -> None:
         self._send(self._lockstep.start(frame, self._loop.now()))

@@ -33,6 +33,7 @@ from loop_interfaces.samples import ACTION_KIND, CLOCK_KIND, STATE_KIND
 from loop_interfaces.topics import ACTION, RECORDER_STATUS, START, STATE
 from loop_interfaces.watching import Watcher
 from recorder_node.bag import BagError
+from recorder_node.health import RecorderHealth
 from recorder_node.recording import (
     ARRAY_TYPE,
     CLOCK_TYPE,
@@ -173,6 +174,7 @@ class RecorderNode:
             bag_per_episode=values["bag_per_episode"],
         )
         self._what = what
+        self._health = RecorderHealth(self._recording)
         self._flush_at = self._report_at = 0.0
         self._wire(node, loop)
         self._log.info(f"recording to {self._recording.path} ({values['bag_storage']})")
@@ -203,6 +205,9 @@ class RecorderNode:
             others=[f"{n}{START.name}" for n in self._namespaces],
         )
         self._status: Publisher | None = None
+        loop.diagnose(
+            "recording", lambda now: self._health.report(now, matched=self._status is not None)
+        )
 
     def run(self) -> int:
         """Record until a signal comes; 0, or RECORDING_FAILED when the disk refuses."""

@@ -17,10 +17,20 @@ WITH_ROS = {
     "watching.py",
     "node_main.py",
     "endpoints.py",
+    "introspection.py",
     "ros_parameters.py",
 }
 """Files that may import rclpy or messages."""
-ROS = ("rclpy", "std_msgs", "std_srvs", "rosgraph_msgs", "rcl_interfaces", "diagnostic_msgs")
+ROS = (
+    "rclpy",
+    "std_msgs",
+    "std_srvs",
+    "rosgraph_msgs",
+    "rcl_interfaces",
+    "diagnostic_msgs",
+    "sensor_msgs",
+    "visualization_msgs",
+)
 
 
 def sources(*packages: str) -> list[Path]:

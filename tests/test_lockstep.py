@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from loop_interfaces.frames import Frame, FrameError
-from loop_interfaces.topics import COMPLETED, COST, STATE, VOID, CostColumn
+from loop_interfaces.topics import COMPLETED, COST, PAUSED, STATE, VOID, CostColumn
 from pde_sim_node.build import build_plant
 from pde_sim_node.lockstep import Lockstep
 from tests.small import parameters
@@ -168,3 +168,162 @@ def test_simulated_time_only_grows_also_across_episodes_and_runs():
     times.append(protocol.start(late, 0.0)[0].frame.time)
     assert (np.diff(times) > 0).all()
     assert times[-1] > 1000
+
+
+def outcome(frames: list[Frame]) -> bytes:
+    return b"".join(frame.values.tobytes() for frame in frames)
+
+
+def test_a_paused_plant_holds_the_next_state_back_and_times_nothing_out():
+    quiet = run_episode(plant_protocol(), 1)
+
+    def pause_for_long(protocol, state, now):
+        if state.step not in (0, 12, 30):
+            return
+        (report,) = protocol.pause(now)
+        assert report.topic is PAUSED
+        assert report.frame.values.tolist() == [1.0]
+        assert (report.frame.run, report.frame.episode) == (RUN, 1)
+        for later in np.arange(now + 0.1, now + 60.0, 0.5):  # far past the void limit of 0.4 s
+            for send in protocol.tick(later):
+                assert send.topic is PAUSED
+            assert not protocol.overdue()
+        report, again = protocol.resume(now + 60.0)
+        assert report.frame.values.tolist() == [0.0]
+        assert (again.topic, again.frame.step) == (STATE, state.step)
+
+    paused = run_episode(plant_protocol(), 1, disturb=pause_for_long)
+    assert outcome(paused) == outcome(quiet)
+
+
+def test_a_paused_plant_says_so_once_a_second():
+    protocol = plant_protocol()
+    protocol.pause(0.0)
+    said = [now for now in np.arange(0.0, 10.0, 0.1) if protocol.tick(now)]
+    assert 9 <= len(said) <= 10
+    protocol.resume(10.0)
+    assert protocol.tick(20.0) == []
+
+
+def test_the_answer_on_its_way_is_taken_in_a_pause_and_then_every_step_lets_one_through():
+    quiet = run_episode(plant_protocol(), 1)
+    protocol = plant_protocol()
+    (send,) = protocol.start(start(1), 0.0)
+    frames = [send.frame]
+    protocol.pause(0.0)
+    assert protocol.action(answer(send.frame), 0.0) == []  # state 1 is held back
+    now = 0.0
+    while True:
+        now += 0.5
+        assert protocol.start(start(1), now) == []  # the tuner asks again: nothing slips out
+        (send,) = protocol.step_once(now)
+        frames.append(send.frame)
+        with pytest.raises(ValueError, match="still waits for its action"):
+            protocol.step_once(now)
+        again, report = protocol.tick(now + 0.2)  # an answer that is lost is asked for again
+        assert (again, report.topic) == (send, PAUSED)
+        answered = protocol.action(answer(send.frame), now + 0.3)
+        if send.frame.step == 30:
+            (cost,) = answered
+            break
+        assert answered == []
+        assert protocol.step == len(frames)
+    assert outcome([*frames, cost.frame]) == outcome(quiet)
+    with pytest.raises(ValueError, match="no episode is under way"):
+        protocol.step_once(now)
+
+
+def test_an_episode_that_starts_in_a_pause_waits_and_a_run_may_end_in_it():
+    protocol = plant_protocol()
+    protocol.pause(0.0)
+    assert protocol.start(start(1), 1.0) == []
+    _, state = protocol.resume(2.0)
+    assert (state.topic, state.frame.step) == (STATE, 0)
+    protocol.pause(3.0)
+    assert protocol.start(start(2, seeds=()), 4.0) == []
+    (report,) = protocol.resume(5.0)
+    assert report.topic is PAUSED
+    assert protocol.resume(6.0) == []
+    with pytest.raises(ValueError, match="not paused"):
+        protocol.step_once(6.0)
+    assert len(run_episode(protocol, 3, now=7.0)) == 32
+
+
+def test_a_stepped_plant_whose_controller_is_gone_never_gives_up():
+    protocol = plant_protocol()
+    protocol.start(start(1), 0.0)
+    protocol.pause(0.0)
+    protocol.step_once(0.0)
+    for now in np.arange(0.2, 100.0, 0.2):
+        assert all(send.topic in (STATE, PAUSED) for send in protocol.tick(now))
+    assert protocol.overdue()
+    assert protocol.active
+
+
+def paced(protocol: Lockstep, episode: int, change=None) -> list[Frame]:
+    """An episode in small steps of time; `change(protocol, state, now)` may turn the knobs."""
+    now, frames, waiting = 0.0, [], None
+    sends = protocol.start(start(episode), now)
+    while True:
+        for send in sends:
+            if send.topic is COST:
+                return [*frames, send.frame]
+            if send.topic is STATE:
+                waiting = send.frame
+                frames.append(send.frame)
+        now += 0.004
+        if waiting is not None:
+            frame, waiting = waiting, None
+            sends = protocol.action(answer(frame), now)
+            sends = [*sends, *protocol.tick(now)]
+            if change:
+                sends += change(protocol, frame, now)
+        else:
+            sends = protocol.tick(now)
+        assert now < 10.0
+
+
+def test_pace_and_times_may_change_within_an_episode_and_change_no_number():
+    quiet = run_episode(plant_protocol(), 1)
+    times = {"action_timeout": 0.1, "max_repeats": 3, "run_hold": 10.0}
+    factors = {5: 2.0, 9: 0.0, 14: 4.0, 20: 1.0, 25: 0.0}
+
+    def change(protocol, state, now):
+        if state.step in factors:
+            return protocol.adjust(now, **times, real_time_factor=factors[state.step])
+        return []
+
+    protocol = plant_protocol()
+    assert outcome(paced(protocol, 1, change)) == outcome(quiet)
+    assert protocol.pace is None
+
+
+def test_a_pause_moves_the_instants_of_a_paced_plant():
+    quiet = run_episode(plant_protocol(), 1)
+    protocol = plant_protocol()
+    protocol.adjust(0.0, action_timeout=0.1, max_repeats=3, run_hold=10.0, real_time_factor=1.0)
+
+    def change(protocol, state, now):
+        if state.step == 10:
+            return protocol.pause(now)
+        return []
+
+    now, steps = 0.0, []
+    sends = protocol.start(start(1), now)
+    for _ in range(2000):
+        now += 0.004
+        nexts = protocol.tick(now)
+        for send in sends:
+            if send.topic is STATE:
+                steps.append((now, send.frame))
+                nexts += protocol.action(answer(send.frame), now)
+                nexts += change(protocol, send.frame, now)
+        if protocol.paused and now - steps[-1][0] > 1.0:
+            nexts += protocol.resume(now)
+        sends = nexts
+    assert outcome([frame for _, frame in steps]) == outcome(quiet[:-1])
+    gaps = np.diff([when for when, _ in steps])
+    assert gaps[10] > 1.0
+    assert np.delete(gaps, 10).max() < 0.06
+    assert np.delete(gaps, 10).min() > 0.04
+    assert protocol.pace.missed == 0

@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import ModelFailure, Send, Tally
 from loop_interfaces.topics import MODEL, POLICY, START, VOID, CostColumn, StartColumn
-from tuner_node.observer import Observer
-from tuner_node.optimizers import Trajectory
 from tuner_node.training import UNKNOWN_PLANT, Batch, BatchResult
+from tuner_node.work import Chunk, Pair
 
 Array = NDArray[np.float64]
 Order = tuple[int, Send]
@@ -36,48 +35,12 @@ MAX_TARGETS = 64
 """Plants whose target is remembered."""
 ASK_AGAIN = 2.0
 """Seconds without an answer after which an episode's policy and start are sent once more."""
+PAUSE_LEASE = 10.0
+"""Seconds that a plant's word that it is paused holds; it says so once a second."""
 
 
 class DispatchError(RuntimeError):
     """An episode that cannot be run: attempts used up, or a model that cannot be designed."""
-
-
-@dataclass
-class _Chunk:
-    """A part of the batch: rows first..last; `rows` is where its results go."""
-
-    rows: slice
-    attempts: int = 0
-    costs: Array | None = None
-    models: Array | None = None
-    trajectories: list[Trajectory] | None = None
-
-    def done(self, batch: Batch) -> bool:
-        return (
-            self.costs is not None
-            and (self.models is not None or not batch.exploratory)
-            and (self.trajectories is not None or not batch.trajectories)
-        )
-
-    def forget(self) -> None:
-        self.costs = self.models = self.trajectories = None
-
-
-@dataclass
-class _Pair:
-    """One plant and its controller: what it works on, and what the network says of it."""
-
-    missing: tuple[str, ...] = ("plant", "controller")
-    chunk: _Chunk | None = None
-    episode: int = -1
-    heard: float = 0.0
-    sent: float = 0.0
-    observer: Observer = field(default_factory=Observer)
-    held: Frame | None = None
-    """A cost that waits for the last samples of its trajectories, and since when."""
-    held_since: float = 0.0
-    strange_since: float = math.inf
-    """Since when only another plant's costs come."""
 
 
 @dataclass
@@ -93,16 +56,20 @@ class Dispatcher:
     max_batch: int
     episode_timeout: float
     max_attempts: int
-    pairs: list[_Pair]
+    pairs: list[Pair]
     tally: Tally = field(default_factory=Tally)
     notes: list[str] = field(default_factory=list)
     sim_time: float = 0.0
     plant: int = UNKNOWN_PLANT
+    held: bool = False
+    """Whether an operator lets no new episode begin."""
+    last_costs: Array | None = None
+    """Mean stage costs of the last episode that was answered."""
     _batch: Batch | None = None
     _models: Frame | None = None
     _targets: dict[int, Array] = field(default_factory=dict)
-    _chunks: list[_Chunk] = field(default_factory=list)
-    _waiting: list[_Chunk] = field(default_factory=list)
+    _chunks: list[Chunk] = field(default_factory=list)
+    _waiting: list[Chunk] = field(default_factory=list)
     _issued: int = 0
 
     @staticmethod
@@ -125,7 +92,7 @@ class Dispatcher:
             episode_timeout=episode_timeout,
             max_attempts=max_attempts,
             plant=plant,
-            pairs=[_Pair() for _ in range(pairs)],
+            pairs=[Pair() for _ in range(pairs)],
         )
 
     def assign(self, batch: Batch, now: float) -> list[Order]:
@@ -134,7 +101,7 @@ class Dispatcher:
         parts = max(-(-count // self.max_batch), min(len(self._present()), count), 1)
         edges = np.linspace(0, count, parts + 1).astype(int).tolist()
         self._batch = batch
-        self._chunks = [_Chunk(slice(a, b)) for a, b in itertools.pairwise(edges)]
+        self._chunks = [Chunk(slice(a, b)) for a, b in itertools.pairwise(edges)]
         self._waiting = list(self._chunks)
         return self._hand_out(now)
 
@@ -156,6 +123,8 @@ class Dispatcher:
         """Learn which nodes of a pair are on the network."""
         known = self.pairs[pair]
         known.missing = tuple(missing)
+        if "plant" in missing:
+            known.paused_until = -math.inf
         return self._hand_out(now)
 
     def cost(self, pair: int, frame: Frame, now: float) -> list[Order]:
@@ -189,11 +158,44 @@ class Dispatcher:
             )
         else:
             known.chunk.costs = frame.values.copy()
+            self.last_costs = known.chunk.costs[:, CostColumn.MEAN]
             if self._batch.trajectories:
                 known.held, known.held_since = frame, now
                 self._collect(known)
             self._release_if_done(known)
         return self._hand_out(now)
+
+    def hold(self) -> None:
+        """Hand out no new episode; those under way go on."""
+        self.held = True
+
+    def resume(self, now: float) -> list[Order]:
+        """Hand out episodes again."""
+        self.held = False
+        return self._hand_out(now)
+
+    def paused(self, pair: int, frame: Frame, now: float) -> list[Order]:
+        """Learn whether a pair's plant is paused: it is not silent then, and gets no new episode."""
+        if frame.values.shape != (1,) or frame.values[0] not in (0.0, 1.0):
+            raise FrameError(f"expected one number, 0 or 1, got {frame.values.tolist()}")
+        if self.plant in (UNKNOWN_PLANT, frame.plant):
+            paused = bool(frame.values[0])
+            self.pairs[pair].paused_until = now + PAUSE_LEASE if paused else -math.inf
+        return self._hand_out(now)
+
+    def paused_pairs(self, now: float) -> list[int]:
+        """The pairs whose plants are paused."""
+        return [number for number, pair in enumerate(self.pairs) if now < pair.paused_until]
+
+    def episodes(self) -> list[int]:
+        """Numbers of the episodes under way."""
+        return [pair.episode for pair in self.pairs if pair.chunk is not None]
+
+    @property
+    def newest_episode(self) -> int | None:
+        """Number of the episode that was handed out last."""
+        newest = max(pair.episode for pair in self.pairs)
+        return newest if newest >= 0 else None
 
     def target(self, pair: int, frame: Frame, now: float) -> list[Order]:
         """Learn the target z_r of a plant."""
@@ -244,6 +246,9 @@ class Dispatcher:
         orders: list[Order] = []
         for number, pair in enumerate(self.pairs):
             if pair.chunk is None:
+                if self.held and pair.last is not None and now - pair.sent > ASK_AGAIN:
+                    pair.sent = now
+                    orders.append((number, pair.last))
                 continue
             if pair.held is not None:
                 self._collect(pair)
@@ -254,6 +259,10 @@ class Dispatcher:
                     self._release_if_done(pair)
             elif pair.missing:
                 pair.heard = now  # absent, not silent: the latched topics serve it when it is back
+            elif now < pair.paused_until:
+                pair.heard = now  # neither is a paused one
+                if now - pair.sent > ASK_AGAIN:  # keeps the plant for this run
+                    orders += self._ask(number, pair, now)
             elif now - pair.heard > self.episode_timeout:
                 self._retry(
                     pair,
@@ -294,10 +303,10 @@ class Dispatcher:
             for node in pair.missing
         ]
 
-    def _present(self) -> list[_Pair]:
+    def _present(self) -> list[Pair]:
         return [pair for pair in self.pairs if not pair.missing]
 
-    def _answering(self, pair: int, frame: Frame) -> _Pair | None:
+    def _answering(self, pair: int, frame: Frame) -> Pair | None:
         known = self.pairs[pair]
         if frame.run != self.run:
             self.tally["answers of another run"] += 1
@@ -307,12 +316,12 @@ class Dispatcher:
             return None
         return known
 
-    def _release_if_done(self, pair: _Pair) -> None:
+    def _release_if_done(self, pair: Pair) -> None:
         assert pair.chunk is not None and self._batch is not None
         if pair.chunk.done(self._batch):
             pair.chunk = None
 
-    def _collect(self, pair: _Pair) -> None:
+    def _collect(self, pair: Pair) -> None:
         """Take the held episode's trajectories, if all samples and the target are there."""
         held, chunk = pair.held, pair.chunk
         assert held is not None and chunk is not None
@@ -321,7 +330,7 @@ class Dispatcher:
             chunk.trajectories = pair.observer.trajectories(held.plant, held.step, ended)
             pair.held = None
 
-    def _retry(self, pair: _Pair, reason: str) -> None:
+    def _retry(self, pair: Pair, reason: str) -> None:
         chunk = pair.chunk
         assert chunk is not None
         self.notes.append(f"{reason}; starting it again with the same seeds")
@@ -335,8 +344,10 @@ class Dispatcher:
 
     def _hand_out(self, now: float) -> list[Order]:
         orders: list[Order] = []
+        if self.held:
+            return orders
         for number, pair in enumerate(self.pairs):
-            if pair.chunk is not None or pair.missing:
+            if pair.chunk is not None or pair.missing or now < pair.paused_until:
                 continue
             if not self._waiting:
                 self._take_from_the_absent()
@@ -358,14 +369,14 @@ class Dispatcher:
                 pair.chunk = pair.held = None
                 return
 
-    def _begin(self, number: int, pair: _Pair, chunk: _Chunk, now: float) -> list[Order]:
+    def _begin(self, number: int, pair: Pair, chunk: Chunk, now: float) -> list[Order]:
         self._issued += 1
         pair.chunk, pair.heard = chunk, now
         pair.episode = self.incarnation * EPISODES_PER_INCARNATION + self._issued
         pair.observer.begin(self.run, pair.episode)
         return self._ask(number, pair, now, again=False)
 
-    def _ask(self, number: int, pair: _Pair, now: float, *, again: bool = True) -> list[Order]:
+    def _ask(self, number: int, pair: Pair, now: float, *, again: bool = True) -> list[Order]:
         chunk = pair.chunk
         assert self._batch is not None and chunk is not None
         pair.sent = now
@@ -379,5 +390,6 @@ class Dispatcher:
         sends = [Send(MODEL, self._models)] if again and self._models is not None else []
         if self._batch.policies is not None:
             sends.append(Send(POLICY, frame(self._batch.policies[chunk.rows])))
-        sends.append(Send(START, frame(self._batch.rows[chunk.rows])))
+        pair.last = Send(START, frame(self._batch.rows[chunk.rows]))
+        sends.append(pair.last)
         return [(number, send) for send in sends]

@@ -1,7 +1,9 @@
 """tuner_node: identifies, designs and adapts over topics, as a ROS 2 node.
 
 For each pair of plant and controller, in its namespace:
-Publishes   policy, episode/start, model     Subscribes  episode/cost, model/identified, model/failed
+Publishes   policy, episode/start, model
+Subscribes  episode/cost, episode/paused, model/identified, model/failed
+Serves      ~/pause, ~/resume, ~/stop (std_srvs/Trigger)
 Messages, order and parameters: docs/interfaces.md. What it does is in tuner_node.session.
 """
 
@@ -20,18 +22,20 @@ from std_msgs.msg import String
 
 from loop_interfaces.endpoints import Sender, reader_qos, scoped
 from loop_interfaces.frames import MAX_ID, Frame
+from loop_interfaces.introspection import offer
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.node_loop import NodeLoop
 from loop_interfaces.node_main import ConfigurationError, node_main
 from loop_interfaces.parameters import PROBLEM, TUNER
-from loop_interfaces.protocol import ModelFailure
-from loop_interfaces.ros_parameters import declare, given_parameters
+from loop_interfaces.protocol import STOPPED, ModelFailure
+from loop_interfaces.ros_parameters import declare, given_parameters, on_change
 from loop_interfaces.topics import (
     ACTION,
     COST,
     MODEL,
     MODEL_FAILED,
     MODEL_IDENTIFIED,
+    PAUSED,
     POLICY,
     RECORDER_STATUS,
     START,
@@ -40,6 +44,7 @@ from loop_interfaces.topics import (
 )
 from tuner_node.build import build_training
 from tuner_node.dispatch import Dispatcher, DispatchError, Order
+from tuner_node.health import TunerHealth
 from tuner_node.record import Recorder
 from tuner_node.results import RunFolder, RunIdentity, summarise
 from tuner_node.session import Session
@@ -50,9 +55,12 @@ ABSENCE_REPORT = 5.0
 """Seconds between two reports of a missing plant or controller."""
 
 
-def declare_parameters(node: Node) -> dict[str, Any]:
-    """The tuner's parameters, and the problem's, which together define the training."""
-    given = given_parameters(node)
+def declare_parameters(node: Node, changed: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """The tuner's parameters, and the problem's, which together define the training.
+
+    changed: live ones as they were set meanwhile, when the network is joined again.
+    """
+    given = {**given_parameters(node), **(changed or {})}
     values = declare(node, [*PROBLEM, *TUNER], given)
     # The equation's own parameters are the plant's to check; here they only identify the run.
     return values | {name: value for name, value in given.items() if name.startswith("physical.")}
@@ -95,18 +103,21 @@ class TunerNode:
             plant=training.plant,
         )
         self._session = Session(training, dispatcher, self._report)
+        self._health = TunerHealth(self._session, values["iterations"])
         self._pairs = pairs
+        self._changed: dict[str, Any] = {}
         self._wire(node, loop)
         self._recording = str(values["recorder"])
         self._recorder_seen = self._recording == "none"
         self._failure: str | None = None
         self._absent_since: float | None = None
         self._absence_reported = float("-inf")
+        self._plants_paused: list[int] = []
         self._rival_since: float | None = None
         self._log.info(f"run {identity.run} of {values['problem']}, seed {values['seed']}")
 
     def run(self) -> int:
-        """Train to the end; 0 when done, 1 after a failure, 130 when interrupted."""
+        """Train to the end; 0 when done, 130 when interrupted, STOPPED on request."""
         self._perform(self._session.begin(self._loop.now()))
         reason = self._loop.run(
             tick=lambda now: None, deadline=lambda: None, housekeeping=self._housekeeping
@@ -120,11 +131,14 @@ class TunerNode:
             self._recorder.keep(now=self._loop.now(), force=True)
         if self._failure:
             raise ConfigurationError(self._failure)
+        if self._session.stopped:
+            self._log.info("stopped on request after an iteration")
+            return STOPPED
         self._log.info(f"stopped by {reason} before the end")
         return 130
 
     def join(self, node: Node, loop: NodeLoop) -> None:
-        declare_parameters(node)
+        declare_parameters(node, self._changed)
         self._wire(node, loop)
 
     def _wire(self, node: Node, loop: NodeLoop) -> None:
@@ -152,6 +166,37 @@ class TunerNode:
                 partial(self._on_failure, number),
                 reader_qos(MODEL),
             )
+            loop.listen(PAUSED, self._handler(session.paused, number), namespace)
+        loop.diagnose("training", lambda now: self._health.report(now, self._absent(now)))
+        offer(node, "~/pause", self._pause)
+        offer(node, "~/resume", self._resume)
+        offer(node, "~/stop", self._stop)
+        on_change(node, TUNER, self._adjust)
+
+    def _pause(self) -> str:
+        self._session.pause()
+        under_way = len(self._session.dispatcher.episodes())
+        return "paused" + (f"; {under_way} episode(s) under way will end" if under_way else "")
+
+    def _resume(self) -> str:
+        was = "resumed" if self._session.dispatcher.held else "was not paused"
+        self._guarded(self._session.resume)
+        return was
+
+    def _stop(self) -> str:
+        self._guarded(lambda now: self._session.stop())
+        if self._session.stopped:
+            return "stopping now"
+        return "stopping after this iteration" + (
+            ", which waits for a paused plant"
+            if self._session.dispatcher.paused_pairs(self._loop.now())
+            else ""
+        )
+
+    def _adjust(self, values: dict[str, Any]) -> None:
+        self._changed = values
+        for name, value in values.items():
+            setattr(self._session.dispatcher, name, value)
 
     def _observe(
         self, take: Callable[[int, Frame, float], list[Order]], pair: int, frame: Frame
@@ -182,7 +227,7 @@ class TunerNode:
         self._send(orders)
         if self._recorder:
             self._recorder.keep(now=self._loop.now())
-        if self._session.done:
+        if self._session.done or self._session.stopped:
             self._loop.stop("done")
 
     def _send(self, orders: list[Order]) -> None:
@@ -190,6 +235,8 @@ class TunerNode:
             self._senders[pair][send.topic.name].send(send.frame)
 
     def _housekeeping(self, now: float) -> None:
+        if self._loop.stopped:  # by a service, in this round
+            return
         absent = self._absent_recorder()
         for pair in range(len(self._senders)):
             missing = [
@@ -203,6 +250,7 @@ class TunerNode:
             self._guarded(partial(self._session.presence, pair, missing))
         self._guarded(self._session.tick)
         self._report_absence(now)
+        self._report_pauses(now)
         self._refuse_rival(now)
 
     def _absent_recorder(self) -> list[str]:
@@ -227,9 +275,21 @@ class TunerNode:
         if self._absent_since is None:
             self._absent_since = now
         waited = now - self._absent_since
-        if waited > 1.0 and now - self._absence_reported > ABSENCE_REPORT:
+        if self._absent(now) and now - self._absence_reported > ABSENCE_REPORT:
             self._absence_reported = now
             self._log.warning(f"waiting for {' and '.join(missing)} for {waited:.0f} s")
+
+    def _absent(self, now: float) -> list[str]:
+        """Who has been waited for, for longer than it takes to be found."""
+        waited = self._absent_since is not None and now - self._absent_since > 1.0
+        return self._session.dispatcher.missing() if waited else []
+
+    def _report_pauses(self, now: float) -> None:
+        paused = self._session.dispatcher.paused_pairs(now)
+        if paused != self._plants_paused:
+            self._plants_paused = paused
+            which = f" of pair {', '.join(map(str, paused))}" if len(self._pairs) > 1 else ""
+            self._log.info(f"the plant{which} is paused" if paused else "no plant is paused")
 
     def _refuse_rival(self, now: float) -> None:
         topics = [senders[START.name].publisher.topic_name for senders in self._senders]

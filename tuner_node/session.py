@@ -28,6 +28,11 @@ class Session:
         self.done = False
         self.established = False
         """Whether a pair has served this session: then it is the newcomer who has to go."""
+        self.stopping = False
+        """Whether an operator asked for the end after this iteration."""
+        self.stopped = False
+        """Whether that end has come; the training's state is that of a checkpoint."""
+        self._checked: dict[int, Mapping[str, Any]] = {}
 
     def begin(self, now: float) -> list[Order]:
         """The first messages; after a resume with the models that are already there.
@@ -41,6 +46,30 @@ class Session:
         if training.models is not None and training.phase != "identify":
             orders += self.dispatcher.models(training.models, training.generation)
         return orders + self._next(now)
+
+    def baseline(self, name: str) -> float | None:
+        """Mean cost of the controller `none` or `lqt` when the warm starts were checked, if known."""
+        costs = [float(row[name]) for row in self._checked.values()]
+        return sum(costs) / len(costs) if costs else None
+
+    def pause(self) -> None:
+        """Begin no new episode; those under way go on. Nothing times out meanwhile."""
+        self.dispatcher.hold()
+
+    def resume(self, now: float) -> list[Order]:
+        """Go on after a pause."""
+        return self._advance(self.dispatcher.resume(now), now)
+
+    def stop(self) -> list[Order]:
+        """End when the iteration under way is complete; at once in a pause, where none goes on.
+
+        What an unfinished iteration has is dropped, and computed again by who continues, identically.
+        """
+        self.stopping = True
+        return self._end() if self.dispatcher.held else []
+
+    def paused(self, pair: int, frame: Frame, now: float) -> list[Order]:
+        return self._advance(self.dispatcher.paused(pair, frame, now), now)
 
     def presence(self, pair: int, missing: Sequence[str], now: float) -> list[Order]:
         return self._advance(self.dispatcher.presence(pair, missing, now), now)
@@ -80,10 +109,18 @@ class Session:
         except ValueError as error:  # a result that the training cannot use: no use in waiting
             raise DispatchError(str(error)) from error
         for row in rows:
+            if row["event"] == "checked":
+                self._checked[row["seed"]] = row
             self._report(row)
         if result.models is not None and training.models is not None:
             orders = orders + self.dispatcher.models(training.models, training.generation)
+        if self.stopping and training.phase != "done":
+            return orders + self._end()
         return orders + self._next(now)
+
+    def _end(self) -> list[Order]:
+        self.stopped = True
+        return self.dispatcher.release()
 
     def _next(self, now: float) -> list[Order]:
         batch = self.training.next_batch()

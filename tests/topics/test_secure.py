@@ -60,7 +60,8 @@ def test_the_policy_allows_each_running_node_what_it_does_and_no_more(loop: Proc
         assert set(published) == absolute | set(EVERY_NODE_PUBLISHES), role.node
         wanted = {name if name.startswith("/") else f"/{name}" for name in role.subscribes}
         assert set(subscribed) - {"/parameter_events"} == wanted, role.node
-        assert set(services) == {f"/{role.node}/{name}" for name in EVERY_NODE_ANSWERS}
+        answered = {*EVERY_NODE_ANSWERS, *role.services}
+        assert set(services) == {f"/{role.node}/{name}" for name in answered}
 
 
 def test_the_policy_has_the_form_of_sros2_and_an_enclave_for_every_node_of_every_pair():

@@ -1,0 +1,62 @@
+"""What a node tells of itself on /diagnostics: a level, a sentence, named values. No ROS import.
+
+Levels as in diagnostic_msgs/DiagnosticStatus: OK; WARN, somebody should look (a message was
+refused, an operator holds the node, a neighbour is missing); ERROR, the node cannot do its work; STALE,
+what it shows is old, because nothing comes any more though something should.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+
+class Level(IntEnum):
+    """Levels of diagnostic_msgs/DiagnosticStatus."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+    STALE = 3
+
+
+@dataclass
+class Health:
+    """One report. values: what an operator asks, by name, in the order of showing."""
+
+    level: Level
+    message: str
+    values: Mapping[str, object] = field(default_factory=dict)
+
+    def worsened(self, level: Level, message: str) -> Health:
+        """The same with one thing more to say."""
+        if self.level is Level.OK:
+            return Health(level, message, self.values)
+        return Health(max(self.level, level), f"{self.message}; {message}", self.values)
+
+    def texts(self) -> list[tuple[str, str]]:
+        """Names and values as text: numbers with six digits, yes and no, nothing for None."""
+        return [(name, _text(value)) for name, value in self.values.items()]
+
+
+class Rate:
+    """How fast a counter grows, from one look at it to the next."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._when: float | None = None
+
+    def per_second(self, count: int, now: float) -> float:
+        """Growth per s since the last call; 0 at the first."""
+        since, self._when = self._when, now
+        grown, self._count = count - self._count, count
+        return grown / (now - since) if since is not None and now > since else 0.0
+
+
+def _text(value: object) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,133 @@
+"""A training held, stopped and continued by an operator: the same policy, to the bit."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import pytest
+
+from bringup.in_process import LocalPair
+from loop_interfaces.frames import Frame
+from loop_interfaces.topics import MODEL, POLICY, START, StartColumn
+from tests.small import parameters, same_bits, train_here
+from tuner_node.build import build_training
+from tuner_node.dispatch import Dispatcher
+from tuner_node.session import Session
+from tuner_node.training import Batch, Training
+
+ITERATIONS = 5
+
+
+@cache
+def values():
+    return parameters(iterations=ITERATIONS, seeds=2)
+
+
+@cache
+def undisturbed() -> Training:
+    return train_here(values())
+
+
+class Loop:
+    """A session and a plant and controller that answer its orders, one episode a call."""
+
+    def __init__(self, training: Training, incarnation: int = 0) -> None:
+        dispatcher = Dispatcher.create(
+            run=7,
+            n_a=values()["n_a"],
+            pairs=1,
+            incarnation=incarnation,
+            max_batch=3,
+            episode_timeout=10.0,
+            max_attempts=3,
+        )
+        self.rows: list = []
+        self.now = 0.0
+        self.session = Session(training, dispatcher, self.rows.append)
+        self.pair = LocalPair(values())
+        self.plant = 1
+        self.policy = None
+        self.start: Frame | None = None
+        self.released = False
+        self.take(self.session.begin(self.now))
+        self.take(self.session.presence(0, (), self.now))
+
+    def take(self, orders) -> None:
+        for _, send in orders:
+            if send.topic is MODEL:
+                self.pair.use_models(send.frame.values)
+            elif send.topic is POLICY:
+                self.policy = send.frame.values
+            elif send.topic is START and not len(send.frame.values):
+                self.released = True
+            elif send.topic is START:
+                self.start = send.frame
+
+    def episode(self) -> None:
+        """Answer the last start."""
+        self.now += 1.0
+        frame, self.start = self.start, None
+        exploring = frame.values[0, StartColumn.EXCITATION] >= 0
+        result = self.pair.run(Batch(frame.values, None if exploring else self.policy))
+
+        def answer(array):
+            return Frame(frame.run, frame.episode, 30, self.now, array, self.plant)
+
+        self.take(self.session.cost(0, answer(result.costs), self.now))
+        if result.models is not None:
+            self.take(self.session.model(0, answer(result.models), self.now))
+
+    def iterations(self) -> int:
+        return sum(row["event"] == "iteration" for row in self.rows) // 2
+
+
+def same(a: Training, b: Training) -> bool:
+    return same_bits(a.policies(), b.policies()) and same_bits(a.evaluation, b.evaluation)
+
+
+def test_a_paused_session_begins_no_episode_and_goes_on_with_the_same_bits():
+    loop = Loop(build_training(values()))
+    while not loop.session.done:
+        loop.session.pause()
+        loop.episode()
+        if loop.session.done:
+            break
+        assert loop.start is None
+        loop.now += 1000.0
+        loop.take(loop.session.tick(loop.now))  # keeps the plant: the last start, once more
+        loop.start = None
+        loop.take(loop.session.resume(loop.now))
+        assert loop.start is not None
+    assert same(loop.session.training, undisturbed())
+    assert not [row for row in loop.rows if row["event"] == "repeated"]
+
+
+@pytest.mark.parametrize("after", range(1, 30, 4))
+def test_a_session_that_was_asked_to_stop_ends_with_its_iteration_and_can_be_continued(after):
+    loop = Loop(build_training(values()))
+    for _ in range(after):
+        loop.episode()
+        if loop.session.done:
+            break
+    done = loop.iterations()
+    loop.take(loop.session.stop())
+    while not (loop.session.stopped or loop.session.done):
+        loop.episode()
+    assert loop.iterations() <= done + 1
+    assert loop.released
+    continued = build_training(values())
+    continued.restore(loop.session.training.state())
+    again = Loop(continued, incarnation=1)
+    while not again.session.done:
+        again.episode()
+    assert same(again.session.training, undisturbed())
+
+
+def test_stopping_a_paused_session_ends_it_at_once():
+    loop = Loop(build_training(values()))
+    for _ in range(6):
+        loop.episode()
+    loop.session.pause()
+    loop.take(loop.session.stop())
+    assert loop.session.stopped
+    assert loop.released

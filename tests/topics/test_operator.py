@@ -1,0 +1,162 @@
+"""What an operator does with the services: pause, step, resume, stop; the policy stays the same."""
+
+from __future__ import annotations
+
+import signal
+
+import pytest
+
+from loop_interfaces.protocol import STOPPED
+from tests.loop_harness import Processes, until
+from tests.operator_harness import operator
+from tests.small import SMALL
+from tests.topics.test_faults import PARAMETERS, start_pair, start_tuner
+from tests.topics.test_loop import LIMIT, assert_same_training, in_process, iterations_done
+
+pytestmark = pytest.mark.topics
+ITERATIONS = 150
+
+
+def complaints(text: str) -> list[str]:
+    return [line for line in text.splitlines() if "[WARN]" in line or "[ERROR]" in line]
+
+
+def test_a_paused_and_stepped_plant_gives_the_same_policy_and_nobody_complains(
+    loop: Processes, tmp_path
+):
+    # The state would be void after 1 s without an answer, the episode silent after 2 s.
+    running = start_pair(loop, max_repeats=20)
+    out = tmp_path / "run"
+    with operator(loop) as desk:
+        running["tuner"] = start_tuner(loop, out, iterations=ITERATIONS, episode_timeout=2.0)
+        until(lambda: iterations_done(out) >= 20, LIMIT, "iteration 20")
+        desk.call("/pde_sim_node/pause")
+        until(lambda: desk.values("pde_sim_node").get("paused") == "yes", LIMIT, "paused plant")
+        done = iterations_done(out)
+        desk.wait_for_reports("pde_sim_node", 6)
+        assert iterations_done(out) == done
+        _, level, message, values = desk.status("pde_sim_node")
+        assert level == 1
+        assert message.startswith("paused at step ")
+        assert desk.status("controller_node")[1] == 0
+        assert desk.values("controller_node")["plant paused"] == "yes"
+        assert desk.values("tuner_node")["paused plants"] == "1"
+        step = int(values["step"])
+        for _ in range(3):
+            desk.call("/pde_sim_node/step")
+            step = step + 1 if step < 30 else 0
+            until(
+                lambda expected=str(step): desk.values("pde_sim_node")["step"] == expected,
+                LIMIT,
+                f"step {step}",
+            )
+            desk.wait_for_reports("pde_sim_node", 2)
+            assert desk.values("pde_sim_node")["step"] == str(step)
+        desk.call("/pde_sim_node/resume")
+        loop.wait(running["tuner"], LIMIT)
+        assert_same_training(out, in_process(iterations=ITERATIONS))
+        until(
+            lambda: desk.status("controller_node")[2] == "no episode under way",
+            LIMIT,
+            "end of the last episode",
+        )
+    for process in running.values():
+        assert complaints(loop.output(process)) == []
+    assert '"repeated"' not in (out / "progress.jsonl").read_text()
+
+
+def test_a_controller_that_restarts_while_the_plant_is_paused_changes_nothing(
+    loop: Processes, tmp_path
+):
+    running = start_pair(loop, max_repeats=20)
+    out = tmp_path / "run"
+    with operator(loop) as desk:
+        tuner = start_tuner(loop, out, iterations=ITERATIONS)
+        until(lambda: iterations_done(out) >= 20, LIMIT, "iteration 20")
+        desk.call("/pde_sim_node/pause")
+        running["controller"].send_signal(signal.SIGKILL)
+        running["controller"].wait()
+        desk.wait_for_reports("pde_sim_node", 5)
+        loop.node("controller_node", *PARAMETERS)
+        desk.call("/pde_sim_node/resume")
+        loop.wait(tuner, LIMIT)
+    assert_same_training(out, in_process(iterations=ITERATIONS))
+
+
+def test_a_paused_tuner_begins_no_episode_and_keeps_the_plant(loop: Processes, tmp_path):
+    start_pair(loop, run_hold=3.0)
+    out = tmp_path / "run"
+    with operator(loop) as desk:
+        tuner = start_tuner(loop, out, iterations=ITERATIONS)
+        until(lambda: iterations_done(out) >= 20, LIMIT, "iteration 20")
+        desk.call("/tuner_node/pause")
+        until(
+            lambda: desk.values("tuner_node").get("episodes under way") == "0", LIMIT, "quiet loop"
+        )
+        done = iterations_done(out)
+        episodes = desk.values("pde_sim_node")["episodes"]
+        desk.wait_for_reports("tuner_node", 5)  # longer than run_hold
+        second = start_tuner(loop, tmp_path / "second", seed=1)
+        text = loop.wait(second, 30.0, code=1)
+        assert "another tuner publishes /episode/start" in text
+        assert iterations_done(out) == done
+        assert iterations_done(tmp_path / "second") == 0
+        assert desk.values("pde_sim_node")["episodes"] == episodes
+        assert desk.status("tuner_node")[2].startswith("paused in iteration ")
+        assert desk.call("/tuner_node/resume") == "resumed"
+        loop.wait(tuner, LIMIT)
+    assert_same_training(out, in_process(iterations=ITERATIONS))
+    assert '"repeated"' not in (out / "progress.jsonl").read_text()
+
+
+@pytest.mark.parametrize("paused", [False, True], ids=["running", "paused"])
+def test_a_tuner_that_was_asked_to_stop_is_continued_to_the_same_policy(
+    loop: Processes, tmp_path, paused
+):
+    start_pair(loop)
+    out = tmp_path / "run"
+    with operator(loop) as desk:
+        tuner = start_tuner(loop, out, iterations=ITERATIONS)
+        until(lambda: iterations_done(out) >= 20, LIMIT, "iteration 20")
+        if paused:
+            desk.call("/tuner_node/pause")
+        desk.call("/tuner_node/stop")
+        text = loop.wait(tuner, 10.0, code=STOPPED)
+        assert "stopped on request" in text
+        assert 20 <= iterations_done(out) < ITERATIONS
+        until(
+            lambda: desk.status("pde_sim_node")[2] == "no run; ready for one", LIMIT, "free plant"
+        )
+    again = start_tuner(loop, out, iterations=ITERATIONS, resume="true")
+    loop.wait(again, LIMIT)
+    assert_same_training(out, in_process(iterations=ITERATIONS))
+
+
+def test_the_command_line_ends_with_a_stopped_tuner_and_continues(loop: Processes, tmp_path):
+    out = tmp_path / "run"
+    options = ("--iterations", str(ITERATIONS), "--optimizer", "two_point", "--out", str(out))
+    with operator(loop) as desk:
+        run = loop.pdeloop("train", str(SMALL), *options)
+        until(lambda: iterations_done(out) >= 20, LIMIT, "iteration 20")
+        desk.call("/tuner_node/stop")
+        text = loop.wait(run, 15.0, code=130)
+    assert f"stopped by request; continue with: pdeloop train --resume {out}" in text
+    assert iterations_done(out) < ITERATIONS
+    assert not (out / "result.json").exists()
+    loop.wait(loop.pdeloop("train", "--resume", str(out)), LIMIT)
+    assert_same_training(out, in_process(iterations=ITERATIONS))
+
+
+def test_services_that_do_not_fit_the_moment_say_why(loop: Processes):
+    start_pair(loop)
+    with operator(loop) as desk:
+        success, message = desk.ask(call="/pde_sim_node/step")
+        assert not success
+        assert message == "the plant is not paused; expected a pause before a step"
+        assert desk.call("/pde_sim_node/resume") == "was not paused"
+        desk.call("/pde_sim_node/pause")
+        desk.call("/pde_sim_node/pause")  # again: no harm
+        success, message = desk.ask(call="/pde_sim_node/step")
+        assert not success
+        assert message == "no episode is under way; expected one to step in"
+        assert desk.call("/pde_sim_node/resume") == "resumed"
