@@ -77,7 +77,7 @@ class Responder:
         self.last_cost: float | None = None
         """Mean stage cost of the last episode's environments."""
         self.failure = ""
-        """Why the last identification gave no model; empty if it did."""
+        """Why the last episode's identification gave no model; empty if it did."""
         self._ended = (-1, -1)
         """Run and episode of the last cost."""
 
@@ -127,6 +127,7 @@ class Responder:
         if run.episode_start(frame) is None:
             run.start = replace(frame, values=rows.copy())
             run.samples, run.identified = {}, {}
+            self.failure = ""
         elif run.identified:
             return list(
                 run.identified.values()
