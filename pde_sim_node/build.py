@@ -38,10 +38,17 @@ def fingerprint(values: Mapping[str, Any]) -> int:
     """
     equation = build_equation(values)
     content = {spec: values[spec] for spec in _PLANT_VALUES} | asdict(equation)
-    # The whole module: constants and functions beside the class are part of the equation.
-    source = inspect.getsource(inspect.getmodule(type(equation)) or type(equation))
-    digest = hashlib.sha256(json.dumps([content, source], sort_keys=True).encode()).digest()
-    return 1 + int.from_bytes(digest[:8], "big") % (MAX_ID - 1)
+    digest = hashlib.sha256(json.dumps([content, sources(equation)], sort_keys=True).encode())
+    return 1 + int.from_bytes(digest.digest()[:8], "big") % (MAX_ID - 1)
+
+
+def sources(equation: Equation) -> list[str]:
+    """The source of the equation's class and of the classes it is derived from.
+
+    Each with its whole module: constants and functions beside the class are part of the equation.
+    """
+    kinds = [kind for kind in type(equation).__mro__ if issubclass(kind, Equation)]
+    return [inspect.getsource(inspect.getmodule(kind) or kind) for kind in kinds]
 
 
 _PLANT_VALUES = (

@@ -38,7 +38,7 @@ from .spectra import (
     synthesise,
 )
 
-__all__ = ["PLAN", "all_finite", "step"]
+__all__ = ["PLAN", "accept", "all_finite", "stage_cost", "step"]
 
 PLAN = np.dtype(
     [
@@ -47,7 +47,8 @@ PLAN = np.dtype(
         ("scratch", np.int64),  # address of w
         ("scratch_apart", np.int64),  # distance d of its planes
         ("pointwise", np.int64),  # address of the compiled nonlinearity
-        ("n_z", np.int64),
+        ("n_x", np.int64),  # grid points
+        ("n_z", np.int64),  # size of the state, the same
         ("n_a", np.int64),
         ("steps", np.int64),  # internal steps of a sampling time
         ("modes", np.int64),  # n_z//2 + 1, up to whole lanes
@@ -161,6 +162,18 @@ def stage_cost(state: int, action: int, w: int, plan: Any, c: int) -> float:
     return cost
 
 
+@jit
+def accept(total: float, state: int, w: int, plan: Any) -> bool:
+    """Take over the new state, if it and the costs so far are within bounds."""
+    valid = math.isfinite(total)
+    for j in range(plan.n_z):
+        valid &= abs(read(w, plan.state + j)) <= plan.bound
+    if valid:
+        for j in range(plan.n_z):
+            write(state, j, read(w, plan.state + j))
+    return valid
+
+
 def compile_step(sources: str) -> Any:
     @kept
     def step(
@@ -193,13 +206,7 @@ def compile_step(sources: str) -> Any:
             for _ in range(plan.steps):
                 integrate(w, d, plan, c, e)
             synthesise(w + 8 * plan.state, w, d, plan, c, e)
-            valid = math.isfinite(totals[i])
-            for j in range(plan.n_z):
-                valid &= abs(read(w, plan.state + j)) <= plan.bound
-            if valid:
-                for j in range(plan.n_z):
-                    write(state, j, read(w, plan.state + j))
-            else:
+            if not accept(totals[i], state, w, plan):
                 diverged_step[i] = k
 
     return step

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .equations import Equation
+from .equations import Equation, LinearEquation
 from .integrator import Integrator
 from .kernel import all_finite
+from .propagator import Propagator
 from .supports import indicator_supports
 
 __all__ = ["DIVERGED_COST", "MEAN_FIELD", "EpisodeCosts", "Plant"]
@@ -42,17 +43,19 @@ class EpisodeCosts:
 class Plant:
     """M environments of one equation, advanced in lock-step.
 
-    u_t = F(u, u_x, ...) + sum_j Phi_j(x) a_j(t) on the grid x_i = i L / n_z, with the action held
-    over a sampling time: z_{k+1} = f(z_k, a_k), pseudo-spectral in space and ETDRK4 in time. The
-    result for an environment is the same to the last bit whatever the number of environments, its
-    place among them, the threads and the process. One thread may use a plant at a time.
+    u_t = F(u, u_x, ...) + sum_j Phi_j(x) a_j(t) on the grid x_i = i L / n_x, with the action held
+    over a sampling time: z_{k+1} = f(z_k, a_k), pseudo-spectral in space and ETDRK4 in time, or
+    exact in time for a `LinearEquation`. The result for an environment is the same to the last bit
+    whatever the number of environments, its place among them, the threads and the process. One
+    thread may use a plant at a time.
 
     Parameters
     ----------
     equation
         The PDE.
     n_z
-        Number of grid points, even, at least 8.
+        Size of the state: the number of grid points, even, at least 8, times the number of the
+        equation's components, which stand one after the other in a state.
     n_a
         Number of actuators.
     width
@@ -71,12 +74,12 @@ class Plant:
 
     Attributes
     ----------
-    x : (n_z,)
-        Grid points.
+    x : (n_x,)
+        Grid points; n_x = n_z / components.
     target : (n_z,)
         Field z_r to be tracked.
-    supports : (n_z, n_a)
-        Phi_j(x_i), entries 0 or 1.
+    supports : (n_x, n_a)
+        Phi_j(x_i), entries 0 or 1, on the component ``equation.actuated``.
     compiled_in_seconds : float
         Time the constructor spent on compiling the kernel; 0.0 if it was compiled before.
 
@@ -110,10 +113,12 @@ class Plant:
         self.state_weight = positive("state_weight", state_weight)
         self.action_weight = positive("action_weight", action_weight)
         self.divergence_bound = positive("divergence_bound", divergence_bound)
-        self.supports = indicator_supports(n_z, n_a, positive("width", width))
-        self.x = equation.length * np.arange(n_z) / n_z
-        self.target = checked_field("target", equation.target(self.x), n_z)
-        self._integrator = Integrator(
+        n_x = grid_points(equation, self.n_z)
+        self.supports = indicator_supports(n_x, n_a, positive("width", width))
+        self.x = equation.length * np.arange(n_x) / n_x
+        self.target = self._checked("target", equation.target(self.x))
+        advance = Propagator if isinstance(equation, LinearEquation) else Integrator
+        self._integrator: Integrator | Propagator = advance(
             equation,
             supports=self.supports,
             target=self.target,
@@ -174,7 +179,19 @@ class Plant:
 
     def _initial_field(self, seed: int) -> NDArray[np.float64]:
         rng = None if seed == MEAN_FIELD else np.random.default_rng(seed)
-        return checked_field("initial_field", self.equation.initial_field(self.x, rng), self.n_z)
+        return self._checked("initial_field", self.equation.initial_field(self.x, rng))
+
+    def _checked(self, what: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A field of the equation as a state: one component after the other."""
+        components, n_x = len(self.equation.components), len(self.x)
+        shape = (n_x,) if components == 1 else (components, n_x)
+        values = np.asarray(values, dtype=np.float64)
+        if values.shape != shape or not np.isfinite(values).all():
+            raise ValueError(
+                f"{what} of the equation must return {' x '.join(map(str, shape))} finite numbers "
+                f"for x of shape ({n_x},), got shape {values.shape}"
+            )
+        return values.ravel()
 
     def step(self, actions: NDArray[np.float64]) -> NDArray[np.float64]:
         """Hold the actions for one sampling time, and count the stage cost of the states before it.
@@ -256,6 +273,22 @@ class Plant:
         return EpisodeCosts(mean=mean, total=total, diverged_step=self._diverged_step.copy())
 
 
+def grid_points(equation: Equation, n_z: int) -> int:
+    """Grid points of each component of a state of size n_z."""
+    components = len(equation.components)
+    if components > 1 and not isinstance(equation, LinearEquation):
+        raise ValueError(
+            f"{equation.name} has {components} components, which only a LinearEquation may have"
+        )
+    if n_z % (2 * components) or n_z < 8 * components:
+        near = max(8 * components, n_z + -n_z % (2 * components))
+        raise ValueError(
+            f"n_z must be {components} times an even number of grid points, 8 or more, for the "
+            f"components {', '.join(equation.components)} of {equation.name}, got {n_z}: take {near}"
+        )
+    return n_z // components
+
+
 def whole(name: str, value: int, minimum: int) -> int:
     try:
         number = operator.index(value)
@@ -283,13 +316,3 @@ def internal_steps(sample_time: float, integration_time: float) -> int:
             f"{integration_time!r}: take an integration_time of {sample_time / near:.12g}"
         )
     return steps
-
-
-def checked_field(what: str, values: NDArray[np.float64], n_z: int) -> NDArray[np.float64]:
-    values = np.asarray(values, dtype=np.float64)
-    if values.shape != (n_z,) or not np.isfinite(values).all():
-        raise ValueError(
-            f"{what} of the equation must return {n_z} finite numbers for x of shape ({n_z},), "
-            f"got shape {values.shape}"
-        )
-    return values

@@ -1,6 +1,6 @@
 """Compiled transforms between a state, its spectrum and a field on the dealiased grid.
 
-Spectra are those of u(x) = sum_j X_j exp(2 pi i j x / L), j = -n_z/2..n_z/2: the real FFT over the
+Spectra are those of u(x) = sum_j X_j exp(2 pi i j x / L), j = -n_x/2..n_x/2: the real FFT over the
 number of points. A real sequence of length 2m is transformed as the m complex numbers
 u_2j + i u_2j+1, whose transform Z is `split` from the spectrum X and X `joined` from Z. With
 T_k = -i exp(-pi i k / m),
@@ -127,13 +127,13 @@ def analyse(state: int, w: int, d: int, plan: Any, c: int, e: int) -> None:
     else:
         for k in range(0, plan.modes, 8):
             x = splat(0.0), splat(0.0)
-            for j in range(plan.n_z):
+            for j in range(plan.n_x):
                 u = splat(read(state, j))
                 row = get(c, plan.analysis + j * plan.modes + k, e)
                 x = plus(x, (u * row[0], u * row[1]))
             put(w, plan.x + k, d, x)
     # Lanes beyond the last mode hold whatever was beside the transform.
-    for k in range(plan.n_z // 2 + 1, plan.modes):
+    for k in range(plan.n_x // 2 + 1, plan.modes):
         write(w, plan.x + k, 0.0)
         write(w, plan.x + k + d, 0.0)
 
@@ -141,7 +141,7 @@ def analyse(state: int, w: int, d: int, plan: Any, c: int, e: int) -> None:
 @jit
 def synthesise(state: int, w: int, d: int, plan: Any, c: int, e: int) -> None:
     """The state of the spectrum x, which as for any inverse real FFT has real first and last modes."""
-    t, last = plan.coarse, plan.n_z // 2
+    t, last = plan.coarse, plan.n_x // 2
     write(w, plan.x + d, 0.0)
     write(w, plan.x + d + last, 0.0)
     if t.m:
@@ -151,7 +151,7 @@ def synthesise(state: int, w: int, d: int, plan: Any, c: int, e: int) -> None:
             write(state, 2 * j, read(w, z + j))
             write(state, 2 * j + 1, read(w, z + j + d))
     else:
-        for j in range(plan.n_z):
+        for j in range(plan.n_x):
             u = 0.0
             for k in range(last + 1):
                 at = plan.synthesis + j * plan.modes + k

@@ -11,8 +11,15 @@ from pde_sim_node.equations import (
     EQUATIONS,
     AllenCahn,
     Burgers,
+    CahnHilliard,
+    ConvectionDiffusionReaction,
     Equation,
+    Fisher,
+    GinzburgLandau,
     KortewegDeVries,
+    KuramotoSivashinsky,
+    Schrodinger,
+    Wave,
     load_equation,
 )
 
@@ -38,8 +45,10 @@ def test_a_mean_field_and_seeded_fields(kind: type[Equation]) -> None:
     equation = kind()
     x = grid(equation)
     mean = equation.initial_field(x, None)
-    assert mean.shape == x.shape
-    assert equation.target(x).shape == x.shape
+    components = len(equation.components)
+    assert mean.shape == (x.shape if components == 1 else (components, len(x)))
+    assert equation.target(x).shape == mean.shape
+    assert 0 <= equation.actuated < components
     one, same, other = (equation.initial_field(x, np.random.default_rng(s)) for s in (1, 1, 2))
     assert np.array_equal(one, same)
     assert not np.array_equal(one, other)
@@ -72,27 +81,54 @@ def test_a_wide_domain_does_not_overflow() -> None:
     assert np.isfinite(field).all()
 
 
+def derivatives(equation: Equation, u: np.ndarray, w: float, x: np.ndarray) -> np.ndarray:
+    """u_t of u = 0.3 + sin(w x) (and v = cos(2 w x), where there are two), by hand."""
+    s, c, v = np.sin(w * x), np.cos(w * x), np.cos(2 * w * x)
+    match equation:
+        case Burgers():
+            return -u * w * c - equation.viscosity * w**2 * s
+        case AllenCahn():
+            return -(equation.diffusivity**2) * w**2 * s - equation.potential * (u**3 - u)
+        case KortewegDeVries():
+            return w**3 * c + 6 * u * w * c
+        case KuramotoSivashinsky():
+            return -u * w * c + w**2 * s - w**4 * s
+        case Fisher():
+            return -equation.diffusivity * w**2 * s + equation.reaction * u * (1 - u)
+        case CahnHilliard():
+            u3_xx = 6 * u * w**2 * c**2 - 3 * u**2 * w**2 * s
+            return equation.diffusivity * (u3_xx + w**2 * s - equation.surface_tension * w**4 * s)
+        case GinzburgLandau():
+            return u - u**3 - w**2 * s
+        case ConvectionDiffusionReaction():
+            return (
+                equation.reaction * u - equation.velocity * w * c - equation.diffusivity * w**2 * s
+            )
+        case Wave():
+            return np.stack([v, -(equation.speed**2) * w**2 * s])
+        case Schrodinger():  # i psi_t = -psi_xx/2 for hbar = m = 1, V = 0
+            return np.stack([2 * w**2 * v, -0.5 * w**2 * s])
+    raise AssertionError(f"no derivative of {equation.name} is worked out here")
+
+
 @ALL
 def test_the_operators_give_the_time_derivative(kind: type[Equation]) -> None:
-    """L, m and g together are the right-hand side, worked out by hand for u = 0.3 + sin(2 pi x/L)."""
+    """L, m and g together are the right-hand side."""
     equation = kind()
-    n_z, w = 64, 2 * np.pi / equation.length
-    x = grid(equation, n_z)
-    u, u_x = 0.3 + np.sin(w * x), w * np.cos(w * x)
-    k = w * np.arange(n_z // 2 + 1)
-    g = np.array([equation.nonlinearity(value) for value in u])
-    got = np.fft.irfft(
-        equation.linear_operator(k) * np.fft.rfft(u) + equation.multiplier(k) * np.fft.rfft(g)
-    )
-    if isinstance(equation, Burgers):
-        expected = -u * u_x - equation.viscosity * w**2 * np.sin(w * x)
-    elif isinstance(equation, AllenCahn):
-        expected = -(equation.diffusivity**2) * w**2 * np.sin(w * x) - equation.potential * (
-            u**3 - u
-        )
+    n_x, w = 64, 2 * np.pi / equation.length
+    x = grid(equation, n_x)
+    u = 0.3 + np.sin(w * x)
+    k = w * np.arange(n_x // 2 + 1)
+    linear = equation.linear_operator(k)
+    if len(equation.components) == 1:
+        g = np.array([equation.nonlinearity(value) for value in u])
+        got = np.fft.irfft(linear * np.fft.rfft(u) + equation.multiplier(k) * np.fft.rfft(g))
     else:
-        expected = w**3 * np.cos(w * x) + 6 * u * u_x
-    np.testing.assert_allclose(got, expected, atol=1e-12)
+        both = np.fft.rfft(np.stack([u, np.cos(2 * w * x)]))
+        got = np.fft.irfft(np.einsum("kfg,gk->fk", linear, both))
+    expected = derivatives(equation, u, w, x)
+    roundoff = max(1e-12, 1e-15 * np.abs(linear).max())
+    np.testing.assert_allclose(got, expected, rtol=0, atol=roundoff)
 
 
 @pytest.mark.parametrize(
@@ -175,7 +211,7 @@ def test_an_edited_file_is_loaded_anew(heat: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("wave", "unknown equation 'wave': give one of burgers, allen-cahn, kdv"),
+        ("waves", "unknown equation 'waves': give one of burgers, allen-cahn, kdv"),
         ("", "unknown equation ''"),
         ("{heat}:Cold", "there is no 'Cold'"),
         ("{heat}:NUMBER", "NUMBER must be a subclass of Equation"),

@@ -16,6 +16,7 @@ from loop_interfaces.parameters import (
 from loop_interfaces.parameters import ParameterError as Refused
 from loop_interfaces.problem import load_parameters, shipped_problems
 from pde_sim_node.build import build_plant
+from pde_sim_node.equations import EQUATIONS
 
 SPECS = {spec.name: spec for spec in table()}
 
@@ -59,13 +60,13 @@ def test_an_unknown_name_is_refused_with_the_nearest_known_one():
         check_names(["learning_rat"], SPECS)
 
 
-@pytest.mark.parametrize("name", ["burgers", "allen-cahn", "kdv"])
+@pytest.mark.parametrize("name", shipped_problems())
 def test_shipped_problems_load_and_build(name):
     values = load_parameters(name, {})
     plant = build_plant(values)
     assert plant.n_z == values["n_z"]
-    assert plant.supports.shape == (values["n_z"], values["n_a"])
-    assert set(shipped_problems()) == {"burgers", "allen-cahn", "kdv"}
+    assert plant.supports.shape == (len(plant.x), values["n_a"])
+    assert set(shipped_problems()) == set(EQUATIONS)
 
 
 def test_written_parameters_read_back(tmp_path):
@@ -97,7 +98,9 @@ def test_a_bad_problem_file_is_one_clear_sentence(tmp_path, text, words):
 
 
 def test_an_unknown_problem_lists_the_known_ones():
-    with pytest.raises(Refused, match="'burger'; expected one of allen-cahn, burgers, kdv"):
+    with pytest.raises(
+        Refused, match="'burger'; expected one of allen-cahn, burgers, cahn-hilliard, convection-"
+    ):
         load_parameters("burger", {})
 
 

@@ -11,8 +11,16 @@ import numpy as np
 import pytest
 
 from bringup.bench.kernel import Grid, NumpyPlant
-from pde_sim_node import integrator
-from pde_sim_node.equations import AllenCahn, Burgers, Equation, KortewegDeVries, load_equation
+from pde_sim_node import threads
+from pde_sim_node.equations import (
+    AllenCahn,
+    Burgers,
+    ConvectionDiffusionReaction,
+    Equation,
+    KortewegDeVries,
+    Schrodinger,
+    load_equation,
+)
 from pde_sim_node.integrator import fine_length
 from pde_sim_node.plant import DIVERGED_COST, Plant
 
@@ -21,10 +29,18 @@ DATA = Path(__file__).parent / "data"
 P1 = {"n_z": 128, "n_a": 6, "width": 0.15, "sample_time": 0.05, "integration_time": 0.0025}
 P2 = {"n_z": 256, "n_a": 12, "width": 0.05, "sample_time": 0.01, "integration_time": 0.01}
 P3 = {"n_z": 256, "n_a": 10, "width": 0.05, "sample_time": 0.01, "integration_time": 0.001}
+P9 = {"n_z": 200, "n_a": 8, "width": 0.1, "sample_time": 0.1, "integration_time": 0.1}
+P10 = {"n_z": 256, "n_a": 8, "width": 0.1, "sample_time": 0.001, "integration_time": 0.001}
 PROBLEMS = pytest.mark.parametrize(
     ("equation", "grid"),
-    [(Burgers(), P1), (AllenCahn(), P2), (KortewegDeVries(), P3)],
-    ids=["burgers", "allen-cahn", "kdv"],
+    [
+        (Burgers(), P1),
+        (AllenCahn(), P2),
+        (KortewegDeVries(), P3),
+        (ConvectionDiffusionReaction(), P9),
+        (Schrodinger(), P10),
+    ],
+    ids=["burgers", "allen-cahn", "kdv", "convection-diffusion-reaction", "schrodinger"],
 )
 
 
@@ -176,8 +192,8 @@ def test_batch_place_and_threads_change_no_bit(
         assert all(alone[s] == bits for s, bits in rollout(plant, seeds[:batch]).items())
     shuffled = [int(s) for s in np.random.default_rng(0).permutation(seeds)]
     assert rollout(plant, shuffled) == alone
-    monkeypatch.setattr(integrator, "available_cores", lambda: 3)
-    monkeypatch.setattr(integrator, "POINTS_PER_PIECE", 1)
+    monkeypatch.setattr(threads, "available_cores", lambda: 3)
+    monkeypatch.setattr(threads, "POINTS_PER_PIECE", 1)
     threaded = make(equation, **grid)
     for batch in (3, 7, 64):
         assert all(alone[s] == bits for s, bits in rollout(threaded, shuffled[:batch]).items())
@@ -185,7 +201,12 @@ def test_batch_place_and_threads_change_no_bit(
 
 def digest() -> str:
     found = hashlib.sha256()
-    for equation, grid in ((Burgers(), P1), (AllenCahn(), P2), (KortewegDeVries(), P3)):
+    for equation, grid in (
+        (Burgers(), P1),
+        (AllenCahn(), P2),
+        (KortewegDeVries(), P3),
+        (Schrodinger(), P10),
+    ):
         for bits in rollout(make(equation, **grid), [5, 0, 9]).values():
             found.update(bits)
     return found.hexdigest()

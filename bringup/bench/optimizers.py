@@ -25,10 +25,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bringup.reproduce.experiment import PAPER
 from controller_node.dmdc import identify
 from controller_node.lqt import track
 from controller_node.policy import ProjectedLaw, excitation
-from loop_interfaces.problem import load_parameters, shipped_problems
+from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import Plant
 from tuner_node.optimizers import OPTIMIZERS, Context, Rollout, RolloutResult, Trajectory
@@ -283,7 +284,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             options.attempts,
             settings,
         )
-        for problem in options.problem or list(shipped_problems())
+        for problem in options.problem or list(PAPER)
         for seed in range(options.first_seed, options.first_seed + options.seeds)
     ]
     results = []

@@ -26,7 +26,18 @@ Eigenvalues = NDArray[Any]
 COLOURS = {"none": "#8C8C8C", "lqt": "#0072B2", "lqt_po": "#D55E00", "pure_po": "#009E73"}
 STYLES = {"none": ":", "lqt": "--", "lqt_po": "-", "pure_po": "-."}
 TITLES = {"none": "no control", "lqt": "LQT", "lqt_po": "LQT-PO", "pure_po": "pure PO"}
-PROBLEMS = {"burgers": "Burgers", "allen-cahn": "Allen-Cahn", "kdv": "Korteweg-de Vries"}
+PROBLEMS = {
+    "burgers": "Burgers",
+    "allen-cahn": "Allen-Cahn",
+    "kdv": "Korteweg-de Vries",
+    "kuramoto-sivashinsky": "Kuramoto-Sivashinsky",
+    "fisher": "Fisher-KPP",
+    "cahn-hilliard": "Cahn-Hilliard",
+    "ginzburg-landau": "Ginzburg-Landau",
+    "convection-diffusion-reaction": "convection-diffusion-reaction",
+    "wave": "wave equation",
+    "schrodinger": "Schrödinger",
+}
 FIELD_MAP = "cividis"
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",

@@ -1,0 +1,107 @@
+"""The compiled step of a linear plant: an exact propagator for each wavenumber, no Runge-Kutta.
+
+The spectra v_f of the components f of an environment become
+
+    v_f' = sum_g E_fg v_g + sum_j B_fj a_j
+
+with E and B of `propagator` for a whole sampling time. As in `kernel`, an environment is computed
+alone and by the same instructions whatever stands beside it.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import compiled, fft, kernel, simd, spectra
+from .compiled import fingerprint, jit, kept
+from .kernel import accept, stage_cost
+from .simd import read, splat
+from .spectra import TRANSFORM, analyse, get, plus, product, put, synthesise
+
+__all__ = ["LINEAR_PLAN", "propagate"]
+
+LINEAR_PLAN = np.dtype(
+    [
+        ("constants", np.int64),  # address of c
+        ("constants_apart", np.int64),  # distance e of its planes
+        ("scratch", np.int64),  # address of w
+        ("scratch_apart", np.int64),  # distance d of its planes
+        ("components", np.int64),
+        ("n_x", np.int64),  # grid points
+        ("n_z", np.int64),  # size of the state: components times grid points
+        ("n_a", np.int64),
+        ("modes", np.int64),  # n_x//2 + 1, up to whole lanes
+        ("coarse", TRANSFORM),
+        ("state_weight", np.float64),
+        ("action_weight", np.float64),
+        ("bound", np.float64),
+        # Offsets in c.
+        ("e", np.int64),  # E, components by components by modes
+        ("b", np.int64),  # B, components by n_a by modes
+        ("target", np.int64),
+        ("analysis", np.int64),  # matrices of the transform, n_x by modes
+        ("synthesis", np.int64),
+        # Offsets in w.
+        ("x", np.int64),  # the spectrum to be transformed next
+        ("z1", np.int64),
+        ("z2", np.int64),
+        ("next", np.int64),
+        ("spectra", np.int64),  # of all components
+        ("state", np.int64),
+    ]
+)
+
+
+@jit
+def advance(component: int, action: int, w: int, d: int, plan: Any, c: int, e: int) -> None:
+    """The spectrum x of a component a sampling time later."""
+    for k in range(0, plan.modes, 8):
+        total = splat(0.0), splat(0.0)
+        for g in range(plan.components):
+            at = plan.e + (component * plan.components + g) * plan.modes + k
+            total = plus(total, product(c, at, e, get(w, plan.spectra + g * plan.modes + k, d)))
+        for j in range(plan.n_a):
+            a, at = splat(read(action, j)), plan.b + (component * plan.n_a + j) * plan.modes + k
+            b = get(c, at, e)
+            total = plus(total, (a * b[0], a * b[1]))
+        put(w, plan.x + k, d, total)
+
+
+def compile_propagation(sources: str) -> Any:
+    @kept
+    def propagate(
+        states: NDArray[np.float64],
+        actions: NDArray[np.float64],
+        totals: NDArray[np.float64],
+        diverged_step: NDArray[np.int64],
+        k: int,
+        plans: NDArray[np.void],
+        which: int,
+        begin: int,
+        end: int,
+    ) -> None:
+        """Advance environments begin..end as `kernel.step` does."""
+        sources  # noqa: B018  # closed over to be part of the key on disk
+        plan = plans[which]
+        w, d, c, e = plan.scratch, plan.scratch_apart, plan.constants, plan.constants_apart
+        for i in range(begin, end):
+            if diverged_step[i] >= 0:
+                continue
+            state = states.ctypes.data + 8 * plan.n_z * i
+            action = actions.ctypes.data + 8 * plan.n_a * i
+            totals[i] += stage_cost(state, action, w, plan, c)
+            for f in range(plan.components):
+                analyse(state + 8 * plan.n_x * f, w, d, plan, c, e)
+                for m in range(0, plan.modes, 8):
+                    put(w, plan.spectra + f * plan.modes + m, d, get(w, plan.x + m, d))
+            for f in range(plan.components):
+                advance(f, action, w, d, plan, c, e)
+                synthesise(w + 8 * (plan.state + f * plan.n_x), w, d, plan, c, e)
+            if not accept(totals[i], state, w, plan):
+                diverged_step[i] = k
+
+    return propagate
+
+
+propagate = compile_propagation(fingerprint(compiled, simd, fft, spectra, kernel))
