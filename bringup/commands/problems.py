@@ -20,11 +20,11 @@ def add(commands: Commands) -> None:
 
 
 def _problems(options: argparse.Namespace) -> int:
+    width = max(len(name) for name in shipped_problems())
     for name, path in shipped_problems().items():
         values = read_yaml(path)
         first = path.read_text().splitlines()[0].removeprefix("# ").split("   ")[0]
-        print(
-            f"{name:<12} {first}\n{'':<12} {values['n_z']} points, {values['n_a']} actuators, "
-            f"{values['horizon']} steps of {values['sample_time']:g} s; {path}"
-        )
+        size = f"{values['n_z']} states, {values['n_a']} actuators"
+        steps = f"{values['horizon']} steps of {values['sample_time']:g} s"
+        print(f"{name:<{width}}  {first}\n{'':<{width}}  {size}, {steps}; {path}")
     return 0
