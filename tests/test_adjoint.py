@@ -1,0 +1,177 @@
+"""The adjoint of the plant's step against finite differences of the plant and exact identities."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from bringup.bench.gradients import Gradients
+from loop_interfaces.problem import load_parameters
+from pde_sim_node.adjoint import Adjoint
+from pde_sim_node.build import build_plant
+from pde_sim_node.equations import Burgers
+from pde_sim_node.plant import Plant
+
+PROBLEMS = ("burgers", "allen-cahn", "kdv")
+
+
+def plant_of(problem: str, **changes: object) -> Plant:
+    return build_plant({**load_parameters(problem, {}), **changes})
+
+
+def derivative(f, h: float) -> np.ndarray:
+    """df(s)/ds at 0, with an error of order h^4."""
+    return (8 * (f(h) - f(-h)) - (f(2 * h) - f(-2 * h))) / (12 * h)
+
+
+def somewhere(plant: Plant, batch: int = 3) -> tuple[np.ndarray, np.ndarray, np.random.Generator]:
+    """States off the initial manifold, actions, and a generator for more."""
+    rng = np.random.default_rng(5)
+    states = plant.reset(np.arange(batch)).copy()
+    actions = 0.3 * rng.standard_normal((batch, plant.n_a))
+    for _ in range(3):
+        states, _ = plant.evaluate(states, actions)
+    return states, actions, rng
+
+
+# 100 grid points have no compiled transform of their length: the published grid is a matrix product.
+@pytest.mark.parametrize("problem", PROBLEMS)
+@pytest.mark.parametrize("n_z", [None, 100])
+def test_the_transposed_step_agrees_with_finite_differences_of_the_plant(problem, n_z):
+    plant = plant_of(problem, **({} if n_z is None else {"n_z": n_z}))
+    states, actions, rng = somewhere(plant)
+    y, dz = rng.standard_normal((2, *states.shape))
+    da = rng.standard_normal(actions.shape)
+    on_states, on_actions = Adjoint(plant).pull_back(states, actions, y)
+    for change_z, change_a in ((dz, 0 * da), (0 * dz, da)):
+        moved = derivative(
+            lambda s, z=change_z, a=change_a: plant.evaluate(states + s * z, actions + s * a)[0],
+            1e-4,
+        )
+        expected = (moved * y).sum(axis=1)
+        got = (on_states * change_z).sum(axis=1) + (on_actions * change_a).sum(axis=1)
+        scale = np.linalg.norm(moved, axis=1) * np.linalg.norm(y, axis=1)
+        assert (np.abs(got - expected) <= 1e-9 * scale).all()
+
+
+def test_of_a_linear_plant_it_is_the_transposed_matrix():
+    """With g = 0, f is affine: its matrix, column by column, transposed to rounding."""
+
+    @dataclass(frozen=True, kw_only=True)
+    class Advection(Burgers):
+        name = "advection"
+
+        def linear_operator(self, k):
+            return -0.05 * k**2 - 0.7j * k
+
+        def multiplier(self, k):
+            return np.zeros_like(k)
+
+    plant = Plant(
+        Advection(),
+        n_z=16,
+        n_a=3,
+        width=0.2,
+        sample_time=0.1,
+        integration_time=0.05,
+        horizon=1,
+        state_weight=1.0,
+        action_weight=1.0,
+    )
+    columns = plant.evaluate(np.eye(16), np.zeros((16, 3)))[0].T
+    inputs = plant.evaluate(np.zeros((3, 16)), np.eye(3))[0].T
+    rows, on_actions = Adjoint(plant).pull_back(np.zeros((16, 16)), np.zeros((16, 3)), np.eye(16))
+    np.testing.assert_allclose(rows, columns, atol=1e-14)
+    np.testing.assert_allclose(on_actions, inputs, atol=1e-14)
+
+
+def test_it_is_linear_in_the_covector_and_does_not_depend_on_batch_or_threads():
+    plant = plant_of("burgers")
+    states, actions, rng = somewhere(plant, 5)
+    y1, y2 = rng.standard_normal((2, *states.shape))
+    one = Adjoint(plant)
+    both = one.pull_back(states, actions, 2 * y1 - 3 * y2)
+    first, second = one.pull_back(states, actions, y1), one.pull_back(states, actions, y2)
+    for total, a, b in zip(both, first, second, strict=True):
+        np.testing.assert_allclose(total, 2 * a - 3 * b, rtol=0, atol=1e-11 * np.abs(a).max())
+    threaded = Adjoint(plant, threads=3).pull_back(states, actions, y1)
+    alone = one.pull_back(states[3:4], actions[3:4], y1[3:4])
+    for i in range(2):
+        assert threaded[i].tobytes() == first[i].tobytes()
+        assert alone[i][0].tobytes() == first[i][3].tobytes()
+
+
+def test_a_nonlinearity_without_a_derivative_is_refused_with_the_reason():
+    @dataclass(frozen=True, kw_only=True)
+    class Kinked(Burgers):
+        name = "kinked"
+
+        @staticmethod
+        def nonlinearity(u: float) -> float:
+            return abs(u) * u
+
+    @dataclass(frozen=True, kw_only=True)
+    class Branching(Burgers):
+        name = "branching"
+
+        @staticmethod
+        def nonlinearity(u: float) -> float:
+            return u * u if u > 0 else 0.0
+
+    values = load_parameters("burgers", {})
+    for kind in (Kinked, Branching):
+        plant = Plant(
+            kind(),
+            n_z=32,
+            n_a=2,
+            width=0.2,
+            sample_time=0.05,
+            integration_time=0.0025,
+            horizon=5,
+            state_weight=values["state_weight"],
+            action_weight=values["action_weight"],
+        )
+        with pytest.raises(ValueError, match="complex"):
+            Adjoint(plant)
+
+
+@pytest.mark.parametrize("problem", PROBLEMS)
+def test_gradients_of_whole_episodes_agree_with_finite_differences(problem):
+    plant = plant_of(problem, horizon=25)
+    rng = np.random.default_rng(2)
+    gradients = Gradients(plant)
+    U = np.linalg.qr(rng.standard_normal((plant.n_z, 4)))[0]
+    theta = 0.1 * rng.standard_normal((plant.n_a, 5))
+    fields = [3, 1, 4]
+    direction = rng.standard_normal(theta.shape)
+    cost, gradient = gradients.of_law(U, theta, fields)
+    assert cost == gradients.law(U, theta, fields).costs.mean()
+    slope = derivative(lambda s: gradients.of_law(U, theta + s * direction, fields)[0], 1e-4)
+    assert slope == pytest.approx((gradient * direction).sum(), rel=1e-8)
+    inputs = 0.1 * rng.standard_normal((plant.horizon, 3, plant.n_a))
+    direction = rng.standard_normal(inputs.shape)
+    _, gradient = gradients.of_inputs(inputs, fields)
+    slope = derivative(lambda s: gradients.of_inputs(inputs + s * direction, fields)[0], 1e-4)
+    assert slope == pytest.approx((gradient * direction).sum(), rel=1e-8)
+
+
+def test_the_law_of_a_policy_costs_what_the_controller_makes_it_cost():
+    """theta = [K_a, K_b s_r] is the projected law that runs in the loop."""
+    from bringup.bench.optimizers import run_rollouts
+    from tuner_node.optimizers import Rollout
+
+    plant = plant_of("burgers", horizon=40)
+    rng = np.random.default_rng(3)
+    U = np.linalg.qr(rng.standard_normal((plant.n_z, 3)))[0]
+    policy = 0.2 * rng.standard_normal((plant.n_a, 6))
+    theta = np.column_stack([policy[:, :3], policy[:, 3:] @ (U.T @ plant.target)])
+    measured = [r.cost for r in run_rollouts(plant, U, [Rollout(policy, s) for s in (7, 8)])]
+    np.testing.assert_allclose(Gradients(plant).law(U, theta, [7, 8]).costs, measured, rtol=1e-11)
+
+
+def test_a_rollout_that_diverges_costs_infinity():
+    plant = plant_of("kdv", horizon=30)
+    theta = np.full((plant.n_a, 5), 1e3)
+    U = np.linalg.qr(np.random.default_rng(0).standard_normal((plant.n_z, 4)))[0]
+    cost, gradient = Gradients(plant).of_law(U, theta, [0])
+    assert cost == np.inf and not gradient.any()
