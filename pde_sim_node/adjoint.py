@@ -24,6 +24,7 @@ Trapp, SIAM Review 40 (1998) (the complex step for g').
 
 from __future__ import annotations
 
+import ctypes
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -40,8 +41,20 @@ from .equations import Equation
 from .integrator import aligned
 from .kernel import PLAN, force
 from .plant import Plant
-from .simd import call, load, read, splat, store, write
-from .spectra import analyse, forward, get, inverse, joined, minus, plus, product, put, split
+from .simd import call, load, read, splat, write
+from .spectra import (
+    analyse,
+    forward,
+    get,
+    inverse,
+    joined,
+    minus,
+    plus,
+    product,
+    put,
+    split,
+    synthesise,
+)
 
 __all__ = ["Adjoint"]
 
@@ -55,7 +68,6 @@ PLAN_AND_TAPE = np.dtype(
         # Offsets in w.
         ("tape", np.int64),  # g' on the fine grid, four stages an internal step
         ("covector", np.int64),
-        ("on_a", np.int64),
         ("on_b", np.int64),
         ("on_c", np.int64),
         ("on_force", np.int64),
@@ -135,7 +147,7 @@ def transposed(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> int:
 def pull_back_internal(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> None:
     """Turn the covector of the spectrum after an internal step into that before it."""
     m, factors, modes, x = plan.fine.m, plan.fine.split, plan.modes, plan.x
-    on_v, on_a, on_b, on_c = plan.covector, plan.on_a, plan.on_b, plan.on_c
+    on_v, on_b, on_c = plan.covector, plan.on_b, plan.on_c
     for k in range(0, modes, 8):
         put(w, x + k, d, conjugate_product(c, plan.f3m + k, e, get(w, on_v + k, d)))
     z = transposed(w, d, plan, c, e, tape + 3 * m)
@@ -216,7 +228,7 @@ def compile_pull_back(sources: str) -> Any:
                 write(w, plan.x + k, 0.0)
                 write(w, plan.x + d + k, 0.0)
             write(w, plan.x + last, 2.0 * read(w, plan.x + last))
-            kernel.synthesise(on_states.ctypes.data + 8 * plan.n_z * i, w, d, plan, c, e)
+            synthesise(on_states.ctypes.data + 8 * plan.n_z * i, w, d, plan, c, e)
 
     return pull_back
 
@@ -250,7 +262,7 @@ class Adjoint:
             plan[name] = integrator._plans[0][name]
         offset = int(plan["scratch_apart"])
         sizes = {"tape": 4 * int(plan["steps"]) * int(plan["fine"]["m"])}
-        sizes |= dict.fromkeys(("covector", "on_a", "on_b", "on_c", "on_force"), plan["modes"])
+        sizes |= dict.fromkeys(("covector", "on_b", "on_c", "on_force"), plan["modes"])
         for name, size in sizes.items():
             plan[name] = offset
             offset += int(size)
@@ -284,17 +296,16 @@ class Adjoint:
         if y.shape != z.shape:
             raise ValueError(f"covectors must have the states' shape {z.shape}, got {y.shape}")
         on_states, on_actions = np.empty_like(z), np.empty_like(a)
-        given = (z, a, y, on_states, on_actions, self._plans)
-        if self._pool is None:
-            _pull_back(*given, 0, 0, batch)
-            return on_states, on_actions
         count = len(self._scratch)
-        bounds = [batch * i // count for i in range(count + 1)]
-        parts = [
-            self._pool.submit(_pull_back, *given, i, bounds[i], bounds[i + 1]) for i in range(count)
-        ]
-        for part in parts:
-            part.result()
+
+        def work(part: int) -> None:
+            begin, end = batch * part // count, batch * (part + 1) // count
+            _pull_back(z, a, y, on_states, on_actions, self._plans, part, begin, end)
+
+        if self._pool is None:
+            work(0)
+        else:
+            list(self._pool.map(work, range(count)))
         return on_states, on_actions
 
 
@@ -307,7 +318,7 @@ def derivative_loop(equation: Equation) -> Any:
         g does not compile for a complex number, or is not analytic (|u|, max, ...): then the
         complex step does not agree with a finite difference.
     """
-    g = register_jitable(error_model="numpy")(equation.nonlinearity)
+    g: Any = register_jitable(error_model="numpy")(equation.nonlinearity)
     signature = types.void(types.CPointer(types.float64), types.intp)  # type: ignore[no-untyped-call]
     try:
 
@@ -325,7 +336,7 @@ def derivative_loop(equation: Equation) -> Any:
         ) from error
     points = np.linspace(-2.03, 2.01, 41)
     slopes = points.copy()
-    loop.ctypes(slopes.ctypes.data_as(loop.ctypes.argtypes[0]), slopes.size)
+    loop.ctypes(slopes.ctypes.data_as(ctypes.POINTER(ctypes.c_double)), slopes.size)
     h = 1e-5
     function = equation.nonlinearity
     finite = np.array([(function(u + h) - function(u - h)) / (2 * h) for u in points.tolist()])

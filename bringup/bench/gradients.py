@@ -12,7 +12,7 @@ law a = K_a s + b = theta [s; 1], s = U^T z.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,6 +70,7 @@ class Gradients:
         Parameters
         ----------
         U : (n_z, n_s)
+            Basis.
         theta : (n_a, n_s + 1)
             [K_a b].
         fields
@@ -99,14 +100,14 @@ class Gradients:
             fields, lambda _, states: features(U, self.plant.target, states) @ theta.T
         )
 
-    def _roll(self, fields: Sequence[int], act: object) -> Path:
+    def _roll(self, fields: Sequence[int], act: Callable[[int, Array], Array]) -> Path:
         plant = self.plant
         states = np.empty((plant.horizon, len(fields), plant.n_z))
         actions = np.empty((plant.horizon, len(fields), plant.n_a))
         z = plant.reset(np.array(fields, dtype=np.int64))
         for k in range(plant.horizon):
             states[k] = z
-            actions[k] = act(k, states[k])  # type: ignore[operator]
+            actions[k] = act(k, states[k])
             if not np.isfinite(actions[k]).all():
                 return Path(states, actions, np.full(len(fields), np.inf), False)
             z = plant.step(actions[k])

@@ -15,7 +15,7 @@ def add(commands: Commands) -> None:
     """The command group `bench`."""
     bench = commands.add_parser(
         "bench",
-        help="measure this machine: kernel, round trip, batch, training, pairs, real time",
+        help="measure this machine: kernel, round trip, batch, training, pairs, real time; optimum",
         description="Measure. What is compared runs in turns in one run; figures are medians.",
     )
     programs = bench.add_subparsers(required=True, metavar="PROGRAM")
@@ -49,6 +49,39 @@ def add(commands: Commands) -> None:
     soak.add_argument(
         "--seed", type=int, default=0, metavar="S", help="of faults and trainings [0]"
     )
+    optimum = _add(
+        programs,
+        "optimum",
+        "what the policy class and any controller at all could reach, by exact gradients",
+    )
+    add = optimum.add_argument
+    add("problems", nargs="*", metavar="PROBLEM", help="shipped names or YAML files [all shipped]")
+    add("--seeds", type=int, metavar="N", help="trainings whose basis U is used [6]")
+    add("--first-seed", type=int, metavar="S", help="the first of them [0]")
+    add("--fields", type=int, metavar="M", help="initial fields a law is optimised on [16]")
+    add(
+        "--evaluation-seed",
+        type=int,
+        nargs="+",
+        metavar="S",
+        help="draws of held-out fields to measure on [0, that of a training's evaluation]",
+    )
+    add("--evaluation-fields", type=int, metavar="N", help="fields of each draw [10]")
+    add(
+        "--tolerance",
+        type=float,
+        metavar="SHARE",
+        help="converged when 20 iterations lower the cost by less [1e-4]",
+    )
+    add("--iterations", type=int, metavar="N", help="of L-BFGS, at most [1000]")
+    add("--jobs", type=int, metavar="N", help="processes [one a core]")
+    add(
+        "--no-checks",
+        dest="checks",
+        action="store_false",
+        help="leave out what the first seed gives from zero and with twice the fields",
+    )
+    add("--save", type=Path, metavar="DIR", help="write DIR/PROBLEM.json, which reports read")
     kernel = _add(programs, "kernel", "time of a step beside other implementations")
     kernel.add_argument(
         "--batches", type=int, nargs="+", default=[1, 2, 12, 64], metavar="M", help="[1 2 12 64]"

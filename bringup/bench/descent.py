@@ -1,0 +1,107 @@
+"""Minimise a mean stage cost with exact gradients until it falls no further: L-BFGS.
+
+Source: Liu & Nocedal, Mathematical Programming 45 (1989); Nocedal & Wright, Numerical Optimization,
+section 7.2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+__all__ = ["Descent", "descend"]
+
+Array = NDArray[np.float64]
+MEMORY = 40
+"""Pairs that L-BFGS remembers."""
+WINDOW = 20
+"""Iterations over which the fall is judged."""
+
+
+@dataclass(frozen=True)
+class Descent:
+    """Where a descent ended, and how far it had come.
+
+    x: the argument; cost; iterations; evaluations: of cost and gradient; gradient_norm: |dJ/dx|/J
+    at the end; last_fall: of the last WINDOW iterations, relative to the cost; converged: whether
+    that is below the tolerance (else the iterations were used up).
+    """
+
+    x: Array
+    cost: float
+    iterations: int
+    evaluations: int
+    gradient_norm: float
+    last_fall: float
+    converged: bool
+
+
+def descend(
+    function: Callable[[Array], tuple[float, Array]],
+    x: Array,
+    *,
+    tolerance: float,
+    iterations: int,
+) -> Descent:
+    """Minimise function(x) = (J, dJ/dx) from x on.
+
+    Parameters
+    ----------
+    function
+        Gives J and its gradient, of the shape of x.
+    x
+        Where to begin.
+    tolerance
+        Converged when J falls by less than this share of it in WINDOW iterations.
+    iterations
+        At most.
+
+    Raises
+    ------
+    ValueError
+        J is not finite at the start. Elsewhere, where a rollout diverges, it may be infinite: the
+        line search then turns back.
+    """
+    first, _ = function(x)
+    if not np.isfinite(first):
+        raise ValueError("a descent must begin where the cost is finite, but a rollout diverges")
+    costs = [first]
+
+    def bounded(flat: Array) -> tuple[float, Array]:
+        cost, gradient = function(flat.reshape(x.shape))
+        if not np.isfinite(cost):
+            return 10 * first, np.zeros_like(flat)
+        return cost, gradient.ravel()
+
+    def fall() -> float:
+        return 1 - costs[-1] / costs[max(0, len(costs) - 1 - WINDOW)]
+
+    def after(intermediate_result: object) -> None:
+        costs.append(float(intermediate_result.fun))  # type: ignore[attr-defined]
+        if len(costs) > WINDOW and fall() < tolerance:
+            raise StopIteration
+
+    options = {"maxiter": iterations, "maxfun": 10 * iterations, "maxcor": MEMORY}
+    end = minimize(
+        bounded,
+        x.ravel(),
+        jac=True,
+        method="L-BFGS-B",
+        callback=after,
+        options={**options, "ftol": 0.0, "gtol": 0.0},
+    )
+    _, gradient = bounded(end.x)
+    return Descent(
+        x=end.x.reshape(x.shape),
+        cost=float(end.fun),
+        iterations=len(costs) - 1,
+        evaluations=int(end.nfev) + 2,
+        gradient_norm=float(np.linalg.norm(gradient) / end.fun),
+        last_fall=float(fall()),
+        # A line search that finds nothing lower any more ends a descent before its window is full.
+        converged=bool(fall() < tolerance or len(costs) <= min(WINDOW, iterations)),
+    )
