@@ -323,7 +323,7 @@ def _save(path: Path, result: Mapping[str, Any]) -> None:
 def text(results: Sequence[Mapping[str, Any]]) -> str:
     """A table: means over seeds and held-out fields (worst seed), and how far they converged."""
     lines = [
-        f"{'mean stage cost':<14}{'draw':>6}{'LQT':>18}{'optimum of class':>20}{'open loop':>12}"
+        f"{'mean stage cost':<16}{'draw':>5}{'LQT':>18}{'optimum of class':>20}{'open loop':>12}"
         f"{'cost of the class':>19}"
     ]
     for result in results:
