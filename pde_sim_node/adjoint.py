@@ -38,8 +38,9 @@ from numpy.typing import NDArray
 from . import compiled, fft, kernel, simd, spectra
 from .compiled import fingerprint, jit, kept
 from .equations import Equation
-from .integrator import aligned
+from .integrator import Integrator
 from .kernel import PLAN, force
+from .layout import aligned
 from .plant import Plant
 from .simd import call, load, read, splat, write
 from .spectra import (
@@ -255,11 +256,17 @@ class Adjoint:
     def __init__(self, plant: Plant, threads: int = 1) -> None:
         self._plant = plant
         integrator = plant._integrator
-        self._constants = integrator._constants  # kept alive: the plan has its address
+        if not isinstance(integrator, Integrator):
+            raise ValueError(
+                f"{plant.equation.name} is advanced by an exact propagator; expected an equation "
+                "that is integrated by ETDRK4"
+            )
+        team = integrator._team
+        self._constants = team._constants  # kept alive: the plan has its address
         self._loop = derivative_loop(plant.equation)
         plan = np.zeros(1, PLAN_AND_TAPE)[0]
         for name in PLAN.names or ():
-            plan[name] = integrator._plans[0][name]
+            plan[name] = team._plans[0][name]
         offset = int(plan["scratch_apart"])
         sizes = {"tape": 4 * int(plan["steps"]) * int(plan["fine"]["m"])}
         sizes |= dict.fromkeys(("covector", "on_b", "on_c", "on_force"), plan["modes"])
