@@ -1,8 +1,13 @@
-"""Which plants and controllers serve one tuner: their namespaces, parameters and cores."""
+"""The nodes of a run: which plants and controllers serve one tuner, and what each is told.
+
+`pdeloop train` starts them as processes (bringup.supervisor), `ros2 launch` by the launch files.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from loop_interfaces.affinity import free_cores
 from loop_interfaces.parameters import ParameterError
@@ -12,13 +17,40 @@ MAX_PAIRS = 64
 
 
 @dataclass(frozen=True)
-class PairNode:
-    """A plant or a controller: name of its process, package, parameters NAME:=VALUE, remaps."""
+class LoopNode:
+    """A node of a run: name of its process, package, parameters NAME:=VALUE, remaps FROM:=TO.
+
+    namespace: relative to that of the run; empty: the run's own.
+    """
 
     name: str
     package: str
-    parameters: list[str] = field(default_factory=list)
-    remaps: list[str] = field(default_factory=list)
+    parameters: Sequence[str] = ()
+    remaps: Sequence[str] = ()
+    namespace: str = ""
+
+    def arguments(self, parameter_file: Path) -> list[str]:
+        """Parameters and remaps as ROS arguments, without the namespace."""
+        words = ["--params-file", str(parameter_file)]
+        for value in self.parameters:
+            words += ["-p", value]
+        for remap in self.remaps:
+            words += ["-r", remap]
+        return words
+
+    def ros_arguments(self, parameter_file: Path) -> list[str]:
+        """All that follows `--ros-args` in its command, for a run without a namespace."""
+        own = ["-r", f"__ns:=/{self.namespace}"] if self.namespace else []
+        return [*self.arguments(parameter_file), *own]
+
+
+@dataclass(frozen=True)
+class Recording:
+    """How a run is recorded; required: it stops if the recorder does."""
+
+    storage: str = "mcap"
+    bag_per_episode: bool = False
+    required: bool = False
 
 
 def namespaces(pairs: int) -> list[str]:
@@ -26,10 +58,12 @@ def namespaces(pairs: int) -> list[str]:
     return [f"pair{i}" for i in range(pairs)] if pairs > 1 else [""]
 
 
-def pair_nodes(pairs: int, pin: bool) -> list[PairNode]:
+def pair_nodes(
+    pairs: int, pin: bool, remaps: Mapping[str, Sequence[str]] | None = None
+) -> list[LoopNode]:
     """The nodes of `pairs` pairs; with `pin` each has a core of its own.
 
-    ParameterError when there are too many for this machine.
+    remaps: by package. ParameterError when there are too many for this machine.
     """
     if not 1 <= pairs <= MAX_PAIRS:
         raise ParameterError(f"--pairs is {pairs}; expected a whole number from 1 to {MAX_PAIRS}")
@@ -45,10 +79,45 @@ def pair_nodes(pairs: int, pin: bool) -> list[PairNode]:
             parameters = [f"pin:={cores[2 * number + place]}"] if pin else []
             if number and package == "pde_sim_node":  # /clock is one topic for all
                 parameters.append("publish_clock:=false")
-            remaps = [f"__ns:=/{namespace}"] if namespace else []
             name = f"{package}-{namespace}" if namespace else package
-            nodes.append(PairNode(name, package, parameters, remaps))
+            more = (remaps or {}).get(package, ())
+            nodes.append(LoopNode(name, package, parameters, more, namespace))
     return nodes
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The nodes of one training: `pairs` pairs, `pin`ned or not, their tuner, perhaps a recorder.
+
+    remaps: of plants and controllers, by package.
+    """
+
+    pairs: int = 1
+    pin: bool = False
+    recording: Recording | None = None
+    remaps: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+    def nodes(self, folder: Path, bag: Path | None = None) -> list[LoopNode]:
+        """Who is started for the training in `folder`; the recorder, if any, comes first.
+
+        The folder holds a run that was begun (RunFolder.create), so that a tuner that is started
+        again goes on where it was. bag: the new folder of a recording; None: it is given when the
+        recorder starts.
+        """
+        serving = tuner_parameter(self.pairs)
+        tuner = [f"out:={quoted(folder.resolve())}", "resume:=true"]
+        nodes = pair_nodes(self.pairs, self.pin, self.remaps)
+        recording = self.recording
+        if recording is not None:
+            own = [] if bag is None else [f"bag:={quoted(bag.resolve())}"]
+            own += [
+                f"bag_storage:={recording.storage}",
+                f"bag_per_episode:={str(recording.bag_per_episode).lower()}",
+            ]
+            nodes.insert(0, LoopNode("recorder_node", "recorder_node", [*own, *serving]))
+        wait = "none" if recording is None else "required" if recording.required else "start"
+        nodes.append(LoopNode("tuner_node", "tuner_node", [*tuner, f"recorder:={wait}", *serving]))
+        return nodes
 
 
 def tuner_parameter(pairs: int) -> list[str]:

@@ -19,7 +19,7 @@ from typing import Any
 from bringup.display import Display, ProgressFile, summary_text
 from bringup.domain import own_domain
 from bringup.in_process import LocalPair, train
-from bringup.pairs import PairNode, pair_nodes, quoted, tuner_parameter
+from bringup.pairs import Layout, Recording, pair_nodes, quoted
 from bringup.supervisor import Child, NodeError, Supervisor, node_command
 from loop_interfaces.isolation import NETWORK, loopback_environment
 from loop_interfaces.parameters import ParameterError, check, table
@@ -56,15 +56,6 @@ def resolve(problem: str, options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Recording:
-    """How a run is recorded; required: it stops if the recorder does."""
-
-    storage: str = "mcap"
-    bag_per_episode: bool = False
-    required: bool = False
-
-
-@dataclass(frozen=True)
 class Transport:
     """How a training is carried out; nothing of this changes its results.
 
@@ -93,6 +84,11 @@ class Transport:
         if self.faulty_line is not None:
             self.line_arguments()
 
+    def layout(self) -> Layout:
+        """The nodes of the training."""
+        remaps = {"pde_sim_node": ["state:=state_sent"], "controller_node": ["action:=action_sent"]}
+        return Layout(self.pairs, self.pin, self.recording, remaps if self.faulty_line else {})
+
     def line_arguments(self) -> list[str]:
         """The relay's ROS parameters."""
         words = (self.faulty_line or "").split(",")
@@ -109,23 +105,35 @@ class Transport:
         return [f"{name}:={number}" for name, number in zip(names, numbers, strict=True)]
 
 
+def begin(
+    problem: str, options: Mapping[str, Any], out: Path | None
+) -> tuple[Path, dict[str, Any]]:
+    """Folder and parameters of a new training, of which nothing has been done yet."""
+    values = resolve(problem, options)
+    folder = out or Path("runs") / f"{values['problem']}-{timestamp()}"
+    RunFolder(folder).create(values)
+    return folder, values
+
+
+def reopen(folder: Path) -> dict[str, Any]:
+    """The parameters of the unfinished training in `folder`; RunFolderError if there is none."""
+    given = RunFolder(folder).parameters()
+    if (folder / "result.json").exists():
+        raise RunFolderError(f"the run in {folder} is complete; there is nothing to continue")
+    return {**given, **check(table(), given)}
+
+
 def run_new(
     problem: str, options: Mapping[str, Any], out: Path | None, transport: Transport
 ) -> int:
     """Train from the start in a new folder; returns the exit code."""
-    values = resolve(problem, options)
-    folder = out or Path("runs") / f"{values['problem']}-{timestamp()}"
-    RunFolder(folder).create(values)
+    folder, values = begin(problem, options, out)
     return _run(folder, values, transport)
 
 
 def run_again(folder: Path, transport: Transport) -> int:
     """Continue the training in `folder`; returns the exit code."""
-    given = RunFolder(folder).parameters()
-    values = {**given, **check(table(), given)}
-    if (folder / "result.json").exists():
-        raise RunFolderError(f"the run in {folder} is complete; there is nothing to continue")
-    return _run(folder, values, transport)
+    return _run(folder, reopen(folder), transport)
 
 
 def _run(folder: Path, values: dict[str, Any], transport: Transport) -> int:
@@ -178,40 +186,16 @@ def _train_holding(folder: Path, values: dict[str, Any], display: Display) -> No
 
 
 def _train_over_topics(folder: Path, display: Display, transport: Transport) -> None:
-    recording = transport.recording
     logs = folder / "logs"
     logs.mkdir(exist_ok=True)
-    parameters = ["--params-file", str(folder / "parameters.yaml")]
-    own = {
-        "tuner_node": [f"out:={quoted(folder.resolve())}", "resume:=true", "recorder:=none"],
-        "recorder_node": [],
-    }
-    remaps: dict[str, list[str]] = {}
-    names = [*pair_nodes(transport.pairs, transport.pin), PairNode("tuner_node", "tuner_node")]
-    for name in own:
-        own[name] += tuner_parameter(transport.pairs)
-    if recording is not None:
-        names.insert(0, PairNode("recorder_node", "recorder_node"))
-        own["recorder_node"] += [
-            f"bag_storage:={recording.storage}",
-            f"bag_per_episode:={str(recording.bag_per_episode).lower()}",
-        ]
-        own["tuner_node"].append(f"recorder:={'required' if recording.required else 'start'}")
-    if transport.faulty_line is not None:
-        remaps = {"pde_sim_node": ["state:=state_sent"], "controller_node": ["action:=action_sent"]}
     children = {
         node.name: Child(
             node.name,
-            node_command(
-                node.package,
-                *parameters,
-                *(w for v in (*node.parameters, *own.get(node.package, [])) for w in ("-p", v)),
-                *(w for r in (*node.remaps, *remaps.get(node.package, [])) for w in ("-r", r)),
-            ),
+            node_command(node.package, *node.ros_arguments(folder / "parameters.yaml")),
             logs / f"{node.name}.log",
             optional=node.package == "recorder_node",
         )
-        for node in names
+        for node in transport.layout().nodes(folder)
     }
     if transport.faulty_line is not None:
         arguments = [word for value in transport.line_arguments() for word in ("-p", value)]
@@ -263,14 +247,14 @@ def _go_on_unrecorded(tuner: Child) -> None:
 
 def _into_new_bag(recorder: Child, folder: Path, bags: list[Path]) -> None:
     """A recorder that is started again writes another bag, and leaves the unfinished one alone."""
-    bags.append(_unused(folder / "bag"))
+    bags.append(unused(folder / "bag"))
     kept = [word for word in recorder.arguments if not word.startswith("bag:=")]
     if kept[-1] == "-p":
         kept.pop()
     recorder.arguments = [*kept, "-p", f"bag:={quoted(bags[-1].resolve())}"]
 
 
-def _unused(path: Path) -> Path:
+def unused(path: Path) -> Path:
     """`path`, or the first of path-2, path-3, ... that does not exist."""
     numbered = (path.with_name(f"{path.name}-{n}") for n in itertools.count(2))
     return next(p for p in itertools.chain([path], numbered) if not p.exists())

@@ -102,7 +102,10 @@ def node_main(name: str, args: list[str] | None, make: Callable[[Node, NodeLoop]
 
 def _refuse_other_words(name: str, args: list[str] | None) -> None:
     """Words that are not ROS arguments would be ignored in silence; `--help` among them."""
-    words = remove_ros_args(args)[1:] if args is None else remove_ros_args(args)
+    try:
+        words = remove_ros_args(args)[1:] if args is None else remove_ros_args(args)
+    except Exception as error:  # a parameter file that is not there, a rule that cannot be read
+        raise ConfigurationError(_first_line(error)) from error
     if any(word in ("-h", "--help") for word in words):
         print(
             f"usage: {name} [--ros-args -p PARAMETER:=VALUE ... --params-file FILE -r __ns:=/NAME]"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sysconfig
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,11 +11,15 @@ from loop_interfaces.parameters import ParameterError, check, check_names, read_
 
 
 def config_folder() -> Path:
-    """The folder of the shipped configuration: beside the sources, or share/pdeloop/config."""
-    beside = Path(__file__).resolve().parent.parent / "config"
-    if beside.is_dir():
-        return beside
-    return Path(sysconfig.get_path("data")) / "share" / "pdeloop" / "config"
+    """The folder of the shipped configuration.
+
+    Beside the sources, or PREFIX/share/pdeloop/config of an installation under PREFIX: a virtual
+    environment, or the install folder of a colcon workspace, which Python does not know as a prefix.
+    """
+    here = Path(__file__).resolve()
+    beside = here.parent.parent / "config"
+    installed = (prefix / "share" / "pdeloop" / "config" for prefix in here.parents)
+    return next((f for f in (beside, *installed) if (f / "problems").is_dir()), beside)
 
 
 def shipped_problems() -> dict[str, Path]:

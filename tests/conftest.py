@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.colcon_workspace import Workspace, build
 from tests.loop_harness import Processes, processes
 
 
@@ -32,3 +33,9 @@ def loop(tmp_path: Path) -> Iterator[Processes]:
         yield running
     assert running.left_behind() == []
     assert shared_memory() <= before
+
+
+@pytest.fixture(scope="session")
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+    """The package as `colcon build` installs it."""
+    return build(tmp_path_factory.mktemp("colcon"))

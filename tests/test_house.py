@@ -19,6 +19,7 @@ WITH_ROS = {
     "endpoints.py",
     "introspection.py",
     "ros_parameters.py",
+    "launch_actions.py",
 }
 """Files that may import rclpy or messages."""
 ROS = (
@@ -30,6 +31,8 @@ ROS = (
     "diagnostic_msgs",
     "sensor_msgs",
     "visualization_msgs",
+    "launch",
+    "launch_ros",
 )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +19,8 @@ from loop_interfaces.parameters import ParameterError
 def test_one_pair_has_no_namespace_and_several_share_one_clock() -> None:
     plant, controller = pairs.pair_nodes(1, pin=False)
     assert (plant.name, controller.name) == ("pde_sim_node", "controller_node")
-    assert plant.remaps == controller.remaps == plant.parameters == []
+    assert plant.namespace == controller.namespace == ""
+    assert plant.ros_arguments(Path("f")) == ["--params-file", "f"]
     assert pairs.tuner_parameter(1) == ["pairs:=['']"]
     nodes = pairs.pair_nodes(3, pin=False)
     assert len({node.name for node in nodes}) == 6

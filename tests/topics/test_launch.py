@@ -1,0 +1,183 @@
+"""The package as colcon installs it, over real topics: by its executables, and by its launch files.
+
+The tests that need ROS's own `launch` and `launch_ros`, which are not on PyPI, run where an
+installation of ROS is.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from bringup.launch_plan import train_plan
+from tests.colcon_workspace import Workspace
+from tests.loop_harness import Processes, until
+from tests.small import SMALL
+from tests.topics.test_loop import LIMIT, assert_same_training, in_process
+
+LAUNCH = importlib.util.find_spec("launch_ros") is not None
+pytestmark = pytest.mark.topics
+needs_launch = pytest.mark.skipif(not LAUNCH, reason="needs launch_ros, of an installed ROS 2")
+
+RUN = """
+import sys
+from launch import LaunchDescription, LaunchService
+from launch.actions import IncludeLaunchDescription
+from launch.launch_description_sources import AnyLaunchDescriptionSource
+
+path, *words = sys.argv[1:]
+service = LaunchService(argv=words, noninteractive=True)
+source = AnyLaunchDescriptionSource(path)
+arguments = [tuple(word.split(":=", 1)) for word in words]
+include = IncludeLaunchDescription(source, launch_arguments=arguments)
+service.include_launch_description(LaunchDescription([include]))
+sys.exit(service.run())
+"""
+"""What `ros2 launch FILE ARGUMENTS...` does."""
+
+
+@pytest.fixture(scope="module")
+def compiled(workspace: Workspace, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
+    """The workspace with its kernels compiled: once, not by every node at the same time."""
+    words = ("train", str(SMALL), "--in-process", "--iterations", "1")
+    done = workspace.run("pdeloop", *words, cwd=tmp_path_factory.mktemp("compile"))
+    assert done.returncode == 0, done.stderr
+    return workspace
+
+
+@pytest.fixture
+def installed(loop: Processes, compiled: Workspace) -> Processes:
+    """Processes that run the installed code, not the sources."""
+    path = compiled.environment["PYTHONPATH"]
+    given = os.environ.get("PYTHONPATH", "")  # where launch may come from
+    loop.environment |= compiled.environment | {"PYTHONPATH": f"{path}{os.pathsep}{given}"}
+    return loop
+
+
+def test_installed_executables_train_with_the_arguments_of_the_launch_file(
+    installed: Processes, workspace: Workspace, tmp_path: Path
+) -> None:
+    texts = {"problem": str(SMALL), "out": str(tmp_path / "run"), "pairs": "2", "record": "true"}
+    plan = train_plan({**texts, "iterations": "20"})
+    started = {
+        node.name: installed.start(
+            str(workspace.executable(node.package)),
+            "--ros-args",
+            *node.ros_arguments(plan.parameter_file),
+            name=node.name,
+        )
+        for node in plan.nodes
+    }
+    assert len(started) == 6
+    installed.wait(started.pop("tuner_node"), LIMIT)
+    assert_same_training(tmp_path / "run", in_process())
+    for name, process in started.items():
+        process.send_signal(signal.SIGINT)
+        installed.wait(process, 20.0, code=0)
+        assert "Traceback" not in installed.output(process), name
+    assert (tmp_path / "run" / "bag" / "metadata.yaml").is_file()
+
+
+def launch(installed: Processes, workspace: Workspace, file: str, **arguments: object):
+    path = workspace.prefix / "share" / "pdeloop" / "launch" / file
+    words = [f"{name}:={value}" for name, value in arguments.items()]
+    return installed.start("-c", RUN, str(path), *words, name="launch")
+
+
+@needs_launch
+def test_a_launched_training_ends_with_its_tuner(
+    installed: Processes, workspace: Workspace, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    started = launch(
+        installed,
+        workspace,
+        "train.launch.py",
+        problem=SMALL,
+        iterations=20,
+        pairs=2,
+        record="true",
+        namespace="lab",
+        out=run,
+    )
+    said = installed.wait(started, LIMIT)
+    assert_same_training(run, in_process())
+    assert "lab.pair1.controller_node" in said
+    assert "Traceback" not in said
+    assert (run / "bag" / "metadata.yaml").is_file()
+
+
+@needs_launch
+def test_nodes_that_are_killed_in_a_launched_training_are_started_again(
+    installed: Processes, workspace: Workspace, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    started = launch(
+        installed, workspace, "train.launch.py", problem=SMALL, iterations=400, out=run
+    )
+    for name in ("pde_sim_node", "controller_node", "tuner_node"):
+        rows = progress(run)
+        until(lambda rows=rows: progress(run) > rows + 5, LIMIT, "progress")
+        for pid in pids(installed, name):
+            os.kill(pid, signal.SIGKILL)
+    said = installed.wait(started, LIMIT)
+    assert said.count("ended with code -9; starting it again") == 3
+    assert_same_training(run, in_process(iterations=400))
+
+
+@needs_launch
+def test_what_cannot_be_launched_is_one_sentence_and_a_failure(
+    installed: Processes, workspace: Workspace, tmp_path: Path
+) -> None:
+    for words, sentence in (
+        ({"problem": "stokes"}, "unknown problem 'stokes'"),
+        ({"iterations": "0"}, "'iterations' is 0; expected"),
+        ({"optimizer": "adam"}, "optimizer"),
+    ):
+        started = launch(installed, workspace, "train.launch.py", out=tmp_path / "run", **words)
+        said = installed.wait(started, LIMIT, code=1)
+        assert sentence in said
+        assert "process started" not in said
+
+
+@needs_launch
+def test_a_launched_loop_serves_a_tuner_and_ends_by_an_interrupt(
+    installed: Processes, workspace: Workspace, tmp_path: Path
+) -> None:
+    started = launch(installed, workspace, "loop.launch.py", problem=SMALL, namespace="lab")
+    tuner = installed.node(
+        "tuner_node",
+        *("--params-file", str(SMALL), "-r", "__ns:=/lab"),
+        *("-p", f"out:={tmp_path / 'run'}", "-p", "iterations:=20"),
+    )
+    installed.wait(tuner, LIMIT)
+    assert_same_training(tmp_path / "run", in_process())
+    os.killpg(started.pid, signal.SIGINT)  # as Ctrl-C does: to launch and to the nodes
+    said = installed.wait(started, 20.0, code=0)
+    assert "Traceback" not in said
+    assert "escalating" not in said
+
+
+def progress(run: Path) -> int:
+    """Iterations so far."""
+    try:
+        rows = (run / "progress.jsonl").read_text().splitlines()
+    except OSError:
+        return 0
+    return sum(json.loads(row).get("event") == "iteration" for row in rows[:-1])
+
+
+def pids(processes: Processes, executable: str) -> list[int]:
+    """Processes of this test that run the installed `executable`."""
+    found = []
+    for pid in processes.left_behind():
+        command = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+        if any(word.endswith(f"/lib/pdeloop/{executable}".encode()) for word in command):
+            found.append(pid)
+    assert found, executable
+    return found
