@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bringup.training_run import resolve
 from controller_node.dmdc import ReducedModel
 from controller_node.lqt import track
+from tests.small import train_here
 from tuner_node.optimizers import Context, GaussNewton, Rollout, RolloutResult, Trajectory
 
 N_Z, N_S, N_A, T = 7, 4, 2, 80
@@ -291,3 +293,12 @@ def test_a_target_outside_of_the_basis_leaves_the_constant_part_alone() -> None:
 def test_refuses_bad_parameters(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make(Plant(), **changes)
+
+
+def test_a_reduced_model_larger_than_the_default_number_of_modes_is_adapted() -> None:
+    values = resolve("wave", {"iterations": 10, "optimizer": "gauss_newton"})
+    values |= {"dmdc_rank": 50, "reduced_order": 40, "horizon": 120, "evaluation_fields": 2}
+    training = train_here(values)
+    assert training.policies().shape == (1, 8, 80)
+    _, lqt, adapted = training.evaluation.mean(axis=2)[0]
+    assert adapted < lqt

@@ -46,6 +46,7 @@ __all__ = ["GaussNewton"]
 
 _DAMPING = (1e-4, 1.0, 100.0)  # smallest, first, largest after a rejection
 _ABORT = 1.05
+_MODES = 32
 _MEMORY = 40
 _NONE = -1
 # Attributes that a checkpoint holds besides the policies and the records.
@@ -69,8 +70,8 @@ class GaussNewton:
     fields : int
         M, initial fields that judge a policy: more fit the distribution better, at M rollouts a
         step.
-    modes : int
-        Coordinates of the fitted model, at least n_s.
+    modes : int, optional
+        Coordinates of the fitted model, at least n_s; 32 by default, or n_s where that is more.
     learning_rate, smoothing_radius : float, optional
         Not used; every optimiser takes them.
     """
@@ -86,13 +87,16 @@ class GaussNewton:
         iterations: int,
         context: Context,
         fields: int = 3,
-        modes: int = 32,
+        modes: int | None = None,
         learning_rate: float | None = None,
         smoothing_radius: float | None = None,
     ) -> None:
         require_positive(iterations=iterations, fields=fields)
         self._policy = checked_policy(policy0)
-        self._proposer = Proposer(context, self._policy, modes)
+        n_s = self._policy.shape[1] // 2
+        self._proposer = Proposer(
+            context, self._policy, max(_MODES, n_s) if modes is None else modes
+        )
         self._seed = seed
         self._budget = 2 * iterations
         self._fields = np.arange(fields, dtype=np.int64)
