@@ -6,9 +6,9 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from bringup.commands import bag, bench, evaluate, problems, reproduce, secure, train
+from bringup.commands import bag, bench, evaluate, monitor, problems, reproduce, secure, train
 
-_EXTRAS = {"rosbags": "record", "mcap": "record", "matplotlib": "report"}
+_EXTRAS = {"rosbags": "record", "mcap": "record", "matplotlib": "report", "aiohttp": "monitor"}
 """Modules that only some commands need, and the extra that installs them."""
 
 
@@ -48,7 +48,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Reduce, design and adapt controllers of PDEs over ROS 2 topics.",
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for module in (train, evaluate, bag, reproduce, bench, secure, problems):
+    for module in (train, evaluate, bag, monitor, reproduce, bench, secure, problems):
         module.add(commands)
     return parser
 

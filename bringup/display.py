@@ -12,6 +12,9 @@ from typing import Any, TextIO
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+_MOST_AT_ONCE = 4_000_000
+"""Bytes of progress.jsonl that are read in one go."""
+
 
 class Display:
     """Shows progress rows: a live bar on a terminal, plain lines elsewhere."""
@@ -95,19 +98,22 @@ class Display:
 
 
 class ProgressFile:
-    """Follows a progress.jsonl that another process appends to."""
+    """Follows a progress.jsonl that another process appends to.
 
-    def __init__(self, path: Path) -> None:
+    past: also what is in it already.
+    """
+
+    def __init__(self, path: Path, *, past: bool = False) -> None:
         self._path = path
-        self._position = path.stat().st_size if path.exists() else 0
+        self._position = path.stat().st_size if path.exists() and not past else 0
         self._rest = b""
 
     def rows(self) -> list[dict[str, Any]]:
-        """The complete lines since the last call."""
+        """The complete lines since the last call, of very much the first part."""
         try:
             with self._path.open("rb") as file:
                 file.seek(self._position)
-                new = file.read()
+                new = file.read(_MOST_AT_ONCE)
         except FileNotFoundError:
             return []
         self._position += len(new)

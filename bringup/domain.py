@@ -13,10 +13,22 @@ from pathlib import Path
 
 DOMAINS = range(1, 101)
 """Domains whose ports lie outside the ephemeral range on Linux; 0 is everybody's default."""
+DOMAINS_FOLDER = Path(tempfile.gettempdir()) / f"pdeloop-domains-{os.getuid()}"
+"""Locks of the domains in use, and who uses them (bringup.live)."""
 
 
 class DomainError(RuntimeError):
     """No free ROS domain."""
+
+
+def given_domain() -> int | None:
+    """ROS_DOMAIN_ID, None if the user has not set it."""
+    chosen = os.environ.get("ROS_DOMAIN_ID")
+    if not chosen:
+        return None
+    if not chosen.isdigit() or int(chosen) > 232:
+        raise DomainError(f"ROS_DOMAIN_ID is {chosen!r}; expected a whole number from 0 to 232")
+    return int(chosen)
 
 
 @contextlib.contextmanager
@@ -26,16 +38,13 @@ def own_domain() -> Iterator[int]:
     A domain is free when no other run holds its lock and nobody is bound to its first participant's
     discovery port (7410 + 250 d on loopback).
     """
-    chosen = os.environ.get("ROS_DOMAIN_ID")
-    if chosen:
-        if not chosen.isdigit() or int(chosen) > 232:
-            raise DomainError(f"ROS_DOMAIN_ID is {chosen!r}; expected a whole number from 0 to 232")
-        yield int(chosen)
+    chosen = given_domain()
+    if chosen is not None:
+        yield chosen
         return
-    folder = Path(tempfile.gettempdir()) / f"pdeloop-domains-{os.getuid()}"
-    folder.mkdir(exist_ok=True)
+    DOMAINS_FOLDER.mkdir(exist_ok=True)
     for domain in random.sample(DOMAINS, len(DOMAINS)):
-        with (folder / str(domain)).open("w") as lock:
+        with (DOMAINS_FOLDER / str(domain)).open("w") as lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:

@@ -19,6 +19,7 @@ from typing import Any
 from bringup.display import Display, ProgressFile, summary_text
 from bringup.domain import own_domain
 from bringup.in_process import LocalPair, train
+from bringup.live import announced
 from bringup.pairs import Layout, Recording, pair_nodes, quoted
 from bringup.supervisor import Child, NodeError, Supervisor, node_command
 from loop_interfaces.isolation import NETWORK, loopback_environment
@@ -207,7 +208,7 @@ def _train_over_topics(folder: Path, display: Display, transport: Transport) -> 
         recorder.before_start = partial(_into_new_bag, recorder, folder, bags)
     progress = ProgressFile(folder / "progress.jsonl")
     begun = False
-    with own_domain() as domain:
+    with own_domain() as domain, announced(domain, folder, network=transport.network):
         display.line(f"start (ROS_DOMAIN_ID={domain}{', on the network' * transport.network})")
         supervisor = Supervisor(
             list(children.values()),

@@ -1,0 +1,380 @@
+"""The monitor as a ROS 2 node: reads the loop's topics now and then, calls its services when asked.
+
+Subscribes  episode/start, policy, episode/cost, target, /diagnostics;
+            state and action while somebody looks, and no more of them than monitor.attention allows
+Calls       NODE/pause, resume, step, stop (std_srvs/Trigger) of the loop's nodes
+What it learns goes into monitor.view.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import signal
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.node import Node
+from rclpy.subscription import Subscription
+from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import Trigger
+
+from bringup.display import ProgressFile
+from bringup.live import Live
+from bringup.monitor.attention import Attention
+from bringup.monitor.commands import VERBS, Call, Commands, Watch
+from bringup.monitor.finder import Finder, run_id
+from bringup.monitor.health import ROLES, Endpoint
+from bringup.monitor.view import View
+from loop_interfaces.frames import ArrayCodec, Frame
+from loop_interfaces.isolation import keep_on_this_machine
+from loop_interfaces.node_loop import (
+    ConfigurationError,
+    NodeLoop,
+    OutsideExecutor,
+    observer_qos,
+    qos,
+    ros_node,
+)
+from loop_interfaces.ros_parameters import RemoteParameters
+from loop_interfaces.topics import ACTION, COST, POLICY, START, STATE, TARGET, Topic
+
+DRAIN = 0.03
+"""Seconds between two looks at what has come in."""
+REFRESH = 0.5
+"""Seconds between two looks at rates and at the progress of the run."""
+LOOK = 1.0
+"""Seconds between two looks at the graph and at which loop runs."""
+PATIENCE = 5.0
+"""Seconds in which a service must answer."""
+SEVERAL = 8
+"""Samples of a latched topic that may wait."""
+
+
+class _Reader:
+    """Takes frames of one topic when it is told to."""
+
+    def __init__(
+        self, node: Node, topic: Topic, name: str, handle: Callable[[Frame, float], None]
+    ) -> None:
+        self._node, self._handle = node, handle
+        self._decode = ArrayCodec(topic.labels).decode
+        profile = qos(topic, SEVERAL) if topic.latched else observer_qos(topic)
+        self.subscription: Subscription = node.create_subscription(
+            Float64MultiArray,
+            name,
+            lambda _: None,  # never called: see OutsideExecutor
+            profile,
+            callback_group=OutsideExecutor(),
+            raw=True,
+        )
+
+    def take(self) -> list[bytes]:
+        """What has come in."""
+        take, found = self.subscription.handle.take_message, []
+        while (taken := take(Float64MultiArray, True)) is not None:
+            found.append(taken[0])
+        return found
+
+    def handle(self, messages: list[bytes]) -> None:
+        """Hand messages on."""
+        now = time.monotonic()
+        for raw in messages:
+            with contextlib.suppress(ValueError):  # the loop's nodes report what they refuse
+                self._handle(self._decode(raw), now)
+
+    def close(self) -> None:
+        self._node.destroy_subscription(self.subscription)
+
+
+class _Pending:
+    """A call of a service that is under way."""
+
+    def __init__(self, node: Node, call: Call) -> None:
+        self.call, self._node, self._since = call, node, time.monotonic()
+        self._client = node.create_client(Trigger, f"{call.node}/{call.verb}")
+        self._future: Any = None
+
+    def poll(self, view: View) -> bool:
+        """Go on; True when it is over."""
+        now = time.monotonic()
+        if self._future is None and self._client.service_is_ready():
+            self._future = self._client.call_async(Trigger.Request())
+        done = self._future is not None and self._future.done()
+        if done:
+            answer = self._future.result()
+            if answer.success:
+                view.answered(self.call.node, self.call.verb, now)
+            self.call.tell(bool(answer.success), str(answer.message))
+        elif now - self._since > PATIENCE:
+            self.call.fail(
+                f"{self.call.node}/{self.call.verb} did not answer within {PATIENCE:g} s"
+            )
+        else:
+            return False
+        self._node.destroy_client(self._client)
+        return True
+
+
+class MonitorNode:
+    """Watches one loop in one ROS domain.
+
+    namespace: of the pair to watch; None: the first one that is found. watched: whether somebody
+    looks at the page.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        loop: NodeLoop,
+        view: View,
+        live: Live,
+        *,
+        finder: Finder,
+        namespace: str | None,
+        commands: Commands,
+        watched: Callable[[], bool],
+    ) -> None:
+        self._node, self._loop, self._view, self._live = node, loop, view, live
+        self._finder, self._commands, self._watched = finder, commands, watched
+        self._namespace = namespace
+        self._given = namespace is not None
+        self._attention = Attention()
+        self._latched: list[_Reader] = []
+        self._samples: list[_Reader] = []
+        self._calls: list[_Pending] = []
+        self._asked: dict[bytes, RemoteParameters] = {}
+        self._progress: ProgressFile | None = None
+        self._out: Path | None = None
+        self._refresh_at = self._look_at = 0.0
+        node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+        self._begin(namespace)
+
+    def run(self) -> str:
+        """Watch until a signal comes, or another loop is to be watched; the reason."""
+        return self._loop.run(
+            tick=self._tick, deadline=lambda: 0.0, housekeeping=self._housekeeping
+        )
+
+    def _begin(self, namespace: str | None) -> None:
+        """Watch the loop in `namespace`."""
+        for reader in (*self._latched, *self._samples):
+            reader.close()
+        self._latched, self._samples, self._attention = [], [], Attention()
+        self._namespace = namespace
+        folder = self._live.folder
+        self._progress = _progress(folder)
+        place: dict[str, Any] = {
+            "domain": self._live.domain,
+            "folder": None if folder is None else _short(folder),
+            "namespace": namespace,
+            "namespaces": [],
+        }
+        self._view.watch(place, run=self._finder.only_run, from_topics=self._progress is None)
+        if namespace is not None:
+            view = self._view
+            handlers = {
+                START: view.start,
+                POLICY: view.policy,
+                COST: view.cost,
+                TARGET: view.target,
+            }
+            self._latched = [self._reader(topic, h) for topic, h in handlers.items()]
+
+    def _reader(self, topic: Topic, handle: Callable[[Frame, float], None]) -> _Reader:
+        return _Reader(self._node, topic, self._name(topic), handle)
+
+    def _name(self, topic: Topic | str) -> str:
+        name = topic if isinstance(topic, str) else topic.name
+        return f"{(self._namespace or '').rstrip('/')}/{name}"
+
+    def _tick(self, now: float) -> None:
+        time.sleep(DRAIN)
+        # Taken in one order and handled in another: when a cost has come in, so have all samples of its
+        # episode and the start; and a state is there before its action.
+        costs = [(reader, reader.take()) for reader in self._latched[2:]]
+        for reader in (*self._latched[:2], *self._samples):
+            messages = reader.take()
+            reader.handle(messages)
+            if reader in self._samples:
+                self._attention.took(len(messages), sum(map(len, messages)))
+        for reader, messages in costs:
+            reader.handle(messages)
+        before = bool(self._samples)
+        wanted = self._namespace is not None and self._attention.decide(
+            now, watched=self._watched(), complete=self._view.complete
+        )
+        if wanted and not before:
+            view = self._view
+            self._samples = [self._reader(STATE, view.state), self._reader(ACTION, view.action)]
+        elif before and not wanted:
+            for reader in self._samples:
+                reader.close()
+            self._samples = []
+
+    def _housekeeping(self, now: float) -> None:
+        self._obey()
+        self._calls = [call for call in self._calls if not call.poll(self._view)]
+        for parameters in self._asked.values():
+            if parameters.values is None:
+                parameters.poll()
+                if parameters.values is not None:
+                    self._learn(parameters.values)
+        if now >= self._look_at:
+            self._look_at = now + LOOK
+            self._look()
+            if self._finder.find() != self._live:
+                self._loop.stop("moved")
+        if now >= self._refresh_at:
+            self._refresh_at = now + REFRESH
+            self._follow()
+            if self._progress is not None:
+                self._view.progress(self._progress.rows())
+            self._view.refresh(now)
+
+    def _obey(self) -> None:
+        """Take what the page asks for."""
+        while True:
+            try:
+                command = self._commands.get_nowait()
+            except queue.Empty:
+                return
+            if isinstance(command, Watch):
+                self._given = True
+                self._begin(command.namespace)
+                self._look_at = 0.0
+            else:
+                self._calls.append(_Pending(self._node, command))
+
+    def _look(self) -> None:
+        found = self._namespaces()
+        if not self._given and found and self._namespace not in found:
+            self._begin(found[0])
+        self._view.namespaces(found)
+        by_role: dict[str, list[Endpoint]] = {}
+        for role, topic in ROLES.items():
+            by_role[role] = []
+            for endpoint in self._node.get_publishers_info_by_topic(self._name(topic)):
+                name = f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
+                process = bytes(endpoint.endpoint_gid)[:12]
+                by_role[role].append(Endpoint(name, process))
+                if role != "controller" and process not in self._asked:
+                    self._asked[process] = RemoteParameters(self._node, name)
+        alive = {endpoint.process for found in by_role.values() for endpoint in found}
+        for process in set(self._asked) - alive:
+            self._asked.pop(process).close()
+        self._view.look(by_role, self._controls(by_role))
+
+    def _namespaces(self) -> list[str]:
+        """Namespaces in which somebody publishes what a node of a loop does."""
+        found = set()
+        for name, _ in self._node.get_topic_names_and_types():
+            for topic in ROLES.values():
+                if name.endswith(f"/{topic}") and self._node.count_publishers(name):
+                    found.add(name.removesuffix(f"/{topic}") or "/")
+        return sorted(found)
+
+    def _controls(self, by_role: dict[str, list[Endpoint]]) -> list[dict[str, Any]]:
+        """Which services the nodes of the loop offer."""
+        offered: dict[str, set[str]] = {}
+        for name, types in self._node.get_service_names_and_types():
+            node, _, verb = name.rpartition("/")
+            if verb in VERBS and "std_srvs/srv/Trigger" in types:
+                offered.setdefault(node, set()).add(verb)
+        return [
+            {"role": role, "node": name, "verbs": [v for v in VERBS if v in offered[name]]}
+            for role, endpoints in by_role.items()
+            for name in sorted({endpoint.name for endpoint in endpoints})
+            if name in offered
+        ]
+
+    def _learn(self, values: dict[str, Any]) -> None:
+        """Take a node's parameters; the tuner's may say where its run's folder is."""
+        self._view.parameters(values)
+        out = values.get("out")
+        self._out = Path(out) if isinstance(out, str) and out else self._out
+
+    def _follow(self) -> None:
+        """Take the curve from the folder that the tuner told, if its run is the one on the topics."""
+        if self._progress is None and self._out is not None:
+            run = self._view.run
+            if run and run_id(self._out) == run:
+                self._progress = _progress(self._out)
+                self._view.follow(_short(self._out))
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        now = time.monotonic()
+        for status in message.status:
+            values = [(str(v.key), str(v.value)) for v in status.values]
+            level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
+            self._view.diagnosis(str(status.name), level, str(status.message), values, now)
+
+
+def _progress(folder: Path | None) -> ProgressFile | None:
+    """The progress of the run in `folder`, if there is a run."""
+    if folder is None or run_id(folder) is None:
+        return None
+    return ProgressFile(folder / "progress.jsonl", past=True)
+
+
+def _short(folder: Path) -> str:
+    with contextlib.suppress(ValueError):
+        return str(folder.resolve().relative_to(Path.cwd()))
+    return str(folder)
+
+
+def stand_back() -> None:
+    """Let the loop's processes go first: a message that arrives here must not preempt its sender."""
+    with contextlib.suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+        os.nice(5)
+
+
+def watch(
+    view: View,
+    finder: Finder,
+    commands: Commands,
+    *,
+    namespace: str | None,
+    watched: Callable[[], bool],
+    network: bool,
+) -> None:
+    """Watch what `finder` finds, one loop after the other, until SIGINT or SIGTERM."""
+    stop = threading.Event()
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        stop.set()
+
+    while not stop.is_set():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, on_signal)
+        live = finder.find()
+        if live is None:
+            view.refresh(time.monotonic())
+            stop.wait(REFRESH)
+            continue
+        if not (network or live.network):
+            keep_on_this_machine()
+        os.environ["ROS_DOMAIN_ID"] = str(live.domain)
+        with ros_node("monitor", ["--ros-args", "--disable-external-lib-logs"]) as (node, loop):
+            body = MonitorNode(
+                node,
+                loop,
+                view,
+                live,
+                finder=finder,
+                namespace=namespace,
+                commands=commands,
+                watched=watched,
+            )
+            if body.run().startswith("SIG"):
+                return
+
+
+__all__ = ["ConfigurationError", "MonitorNode", "stand_back", "watch"]

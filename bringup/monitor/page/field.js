@@ -1,0 +1,179 @@
+// What was seen of the shown episode, and its picture in space and time.
+
+import { CIVIDIS, css } from "./cividis.js";
+import { Plot, colour, text } from "./plot.js";
+
+const BAR = 12; // width of the colour bar
+
+// The samples of the shown episode: columns are steps, rows grid points.
+export class Episode {
+  constructor() {
+    this.header = null;
+    this.fields = new Float32Array(0);
+    this.actions = new Float32Array(0);
+    this.latest = new Float32Array(0);
+    this.target = new Float32Array(0);
+    this.changed = 0; // the first column that is new since the last picture
+  }
+
+  take(header, numbers) {
+    const { rows, actions, first, columns } = header;
+    if (header.new || !this.header) {
+      this.fields = new Float32Array(0);
+      this.actions = new Float32Array(0);
+      this.changed = 0;
+    }
+    const split = rows * columns;
+    const end = split + actions * columns;
+    this.fields = put(this.fields, numbers.subarray(0, split), first * rows);
+    this.actions = put(this.actions, numbers.subarray(split, end), first * actions);
+    this.latest = numbers.slice(end);
+    this.changed = Math.min(this.changed, first);
+    this.header = header;
+  }
+
+  get columns() {
+    return this.header ? this.header.first + this.header.columns : 0;
+  }
+
+  // Time since the start of the episode of a step; steps where the time is not known.
+  time(step) {
+    return step * (this.header?.sample_time || 1);
+  }
+
+  get timeLabel() {
+    return this.header?.sample_time ? "t (s)" : "step";
+  }
+
+  step(column) {
+    return this.header.begin + column * this.header.stride;
+  }
+
+  // [first, last] time of the axis: to the horizon where it is known.
+  span(horizon) {
+    const { begin, last, ended } = this.header;
+    const end = ended ? last : Math.max(last, horizon || 1.25 * last, begin + 1);
+    return [this.time(begin), this.time(Math.max(end, begin + 1))];
+  }
+
+  value(column, row) {
+    return this.fields[column * this.header.rows + row];
+  }
+}
+
+function put(all, part, at) {
+  const size = Math.max(all.length, at + part.length);
+  let grown = all;
+  if (size > all.length) {
+    grown = new Float32Array(size);
+    grown.set(all);
+  }
+  grown.set(part, at);
+  return grown;
+}
+
+export function fieldPlot(episode, facts) {
+  const picture = document.createElement("canvas");
+  const paint = picture.getContext("2d");
+
+  // One pixel a sample; only new columns are painted, unless the colours have changed.
+  let painted = "";
+  function render() {
+    const { rows, range, run, episode: number, environment, stride } = episode.header;
+    const [low, high] = range;
+    const scheme = colour("blank");
+    const what = JSON.stringify([rows, range, run, number, environment, stride, scheme]);
+    const columns = episode.columns;
+    let from = episode.changed;
+    if (what !== painted || picture.width < columns || picture.height !== rows) {
+      picture.width = Math.max(512, columns);
+      picture.height = rows;
+      from = 0;
+      painted = what;
+    }
+    if (from === 0) paint.clearRect(0, 0, picture.width, rows);
+    episode.changed = columns;
+    if (columns <= from) return;
+    const image = paint.createImageData(columns - from, rows);
+    const pixels = image.data;
+    const scale = 256 / (high - low);
+    for (let i = from; i < columns; i++) {
+      for (let r = 0; r < rows; r++) {
+        const u = episode.fields[i * rows + r];
+        if (Number.isNaN(u)) continue;
+        const k = 3 * Math.max(0, Math.min(255, Math.floor((u - low) * scale)));
+        const p = 4 * ((rows - 1 - r) * (columns - from) + (i - from));
+        pixels[p] = CIVIDIS[k];
+        pixels[p + 1] = CIVIDIS[k + 1];
+        pixels[p + 2] = CIVIDIS[k + 2];
+        pixels[p + 3] = 255;
+      }
+    }
+    paint.putImageData(image, from, 0);
+  }
+
+  function bar(plot) {
+    const { context: c, box } = plot;
+    const left = box.right + 12;
+    const height = box.bottom - box.top;
+    for (let y = 0; y < height; y++) {
+      c.fillStyle = css(1 - y / height);
+      c.fillRect(left, box.top + y, BAR, 1.5);
+    }
+    const [low, high] = episode.header.range;
+    c.fillStyle = colour("muted");
+    c.textAlign = "left";
+    for (const share of [0, 0.25, 0.5, 0.75, 1]) {
+      c.textBaseline = share === 0 ? "bottom" : share === 1 ? "top" : "middle";
+      const u = low + share * (high - low);
+      c.fillText(text(u, (high - low) / 40), left + BAR + 5, box.bottom - share * height);
+    }
+  }
+
+  function draw(plot) {
+    const { header } = episode;
+    plot.y = [0, facts.length || Math.max(1, header ? header.rows - 1 : 1)];
+    plot.x = header ? episode.span(facts.horizon) : [0, 1];
+    const yLabel = facts.length ? "x (m)" : "grid point";
+    if (!header) {
+      plot.frame("t (s)", yLabel, { grid: false });
+      plot.message("no state has come yet");
+      plot.caption = "";
+      plot.say("Field in space and time: nothing yet");
+      return;
+    }
+    render();
+    const { context: c, box } = plot;
+    c.fillStyle = colour("blank");
+    c.fillRect(box.left, box.top, box.right - box.left, box.bottom - box.top);
+    const columns = episode.columns;
+    const start = plot.px(episode.time(episode.step(0)));
+    const end = plot.px(episode.time(episode.step(columns)));
+    c.imageSmoothingEnabled = false;
+    plot.clip(() =>
+      c.drawImage(picture, 0, 0, columns, header.rows, start, box.top, end - start, box.bottom - box.top),
+    );
+    plot.frame(episode.timeLabel, yLabel, { grid: false });
+    bar(plot);
+    const kind = facts.explores ? "exploration" : "policy";
+    const number = header.episode % 2 ** 32;
+    plot.caption = `episode ${number} (${kind}), step ${header.last}`;
+    plot.say(
+      `Field u(x, t) of episode ${number}, environment ${header.environment}, up to step ` +
+        `${header.last}, values from ${text(header.range[0])} to ${text(header.range[1])}`,
+    );
+  }
+
+  function describe(t, x) {
+    if (!episode.header) return "";
+    const { rows, begin, stride, sample_time: dt } = episode.header;
+    const column = Math.floor((t / (dt || 1) - begin) / stride);
+    const row = Math.min(rows - 1, Math.floor((x / (facts.length || rows)) * rows));
+    if (column < 0 || column >= episode.columns || row < 0) return "";
+    return `t ${text(t)}, x ${text(x)}: u = ${text(episode.value(column, row))}`;
+  }
+
+  const plot = new Plot("field", draw, describe);
+  plot.margin.right = 74;
+  return plot;
+}

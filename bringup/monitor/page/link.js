@@ -1,0 +1,71 @@
+// The connection to the monitor: a WebSocket that comes back by itself, and requests with its token.
+
+const FIRST = 500; // ms before the first attempt to come back, doubled up to LAST
+const LAST = 4000;
+const JSON_START = 4;
+
+export class Link {
+  constructor(take, tell) {
+    this.take = take; // called with (header, numbers) of every message
+    this.tell = tell; // called with true and false as the connection comes and goes
+    this.token = "";
+    this.wait = FIRST;
+    // A page that nobody looks at costs the loop nothing.
+    document.addEventListener("visibilitychange", () => this.look());
+    this.look();
+  }
+
+  look() {
+    if (document.hidden) {
+      clearTimeout(this.timer);
+      this.socket?.close();
+    } else if (!this.socket) {
+      this.open();
+    }
+  }
+
+  open() {
+    clearTimeout(this.timer);
+    const socket = new WebSocket(`ws://${location.host}/ws`);
+    socket.binaryType = "arraybuffer";
+    this.socket = socket;
+    socket.onopen = () => {
+      this.wait = FIRST;
+      this.tell(true);
+    };
+    socket.onmessage = (event) => this.read(event.data);
+    socket.onclose = () => {
+      this.socket = null;
+      if (document.hidden) return;
+      this.tell(false);
+      this.timer = setTimeout(() => this.look(), this.wait);
+      this.wait = Math.min(2 * this.wait, LAST);
+    };
+  }
+
+  read(data) {
+    if (typeof data === "string") {
+      const message = JSON.parse(data);
+      if (message.part === "hello") this.token = message.token;
+      else this.take(message, null);
+      return;
+    }
+    const length = new DataView(data).getUint32(0, true);
+    const header = JSON.parse(new TextDecoder().decode(new Uint8Array(data, JSON_START, length)));
+    this.take(header, new Float32Array(data, JSON_START + length));
+  }
+
+  async post(path, content) {
+    try {
+      const answer = await fetch(path, {
+        method: "POST",
+        headers: { "Content-Type": "application/json", "X-Pdeloop-Token": this.token },
+        body: JSON.stringify(content),
+      });
+      if (!answer.ok) return { success: false, message: await answer.text() };
+      return await answer.json();
+    } catch {
+      return { success: false, message: "the monitor does not answer" };
+    }
+  }
+}

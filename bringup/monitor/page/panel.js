@@ -1,0 +1,211 @@
+// What is text on the page: title, state, figures, nodes, buttons.
+
+import { text } from "./plot.js";
+
+const STATES = {
+  searching: ["", "looking for a training", "No training runs on this machine. Start one: pdeloop train burgers"],
+  empty: ["warn", "no nodes", "Nobody publishes the loop's topics in this domain and namespace."],
+  waiting: ["warn", "waiting", ""],
+  running: ["good", "running", ""],
+  silent: ["warn", "silent", ""],
+  paused: ["warn", "paused", ""],
+  ended: ["", "ended", ""],
+};
+const BUTTONS = [
+  ["plant", "plant", [["pause", "Pause"], ["resume", "Resume"], ["step", "Step"]]],
+  ["tuner", "training", [["pause", "Pause"], ["resume", "Resume"], ["stop", "Stop"]]],
+];
+const TITLES = {
+  pause: "hold it where it is",
+  resume: "go on",
+  step: "one step, then pause again",
+  stop: "end after this iteration",
+};
+const NAMES = { burgers: "Burgers", "allen-cahn": "Allen-Cahn", kdv: "Korteweg-de Vries" };
+const LEVELS = ["good", "warn", "bad", "warn"];
+const SURE = 3000; // ms in which a second click confirms
+
+const find = (id) => document.getElementById(id);
+
+function make(tag, words = "", className = "") {
+  const made = document.createElement(tag);
+  made.textContent = words;
+  if (className) made.className = className;
+  return made;
+}
+
+function put(element, words) {
+  if (element.textContent !== words) element.textContent = words;
+}
+
+export class Panel {
+  constructor(link) {
+    this.link = link;
+    this.buttons = new Map();
+    for (const [role, name, verbs] of BUTTONS) this.group(role, name, verbs);
+    this.choice("environment", (value) => ({ environment: Number(value) }));
+    this.choice("pair", (value) => ({ namespace: value }));
+  }
+
+  group(role, name, verbs) {
+    const group = make("div", "", "group");
+    group.append(make("span", name));
+    for (const [verb, words] of verbs) {
+      const button = make("button", words);
+      button.id = `${role}-${verb}`;
+      button.disabled = true;
+      button.setAttribute("aria-label", `${words} ${name}: ${TITLES[verb]}`);
+      button.addEventListener("click", () => this.click(button, role, verb, words));
+      this.buttons.set(`${role}/${verb}`, button);
+      group.append(button);
+    }
+    find("controls").append(group);
+  }
+
+  async click(button, role, verb, words) {
+    if (verb === "stop" && !button.classList.contains("sure")) {
+      button.classList.add("sure");
+      button.textContent = "Really stop?";
+      setTimeout(() => this.calm(button, words), SURE);
+      return;
+    }
+    this.calm(button, words);
+    const answer = await this.link().post("/api/call", { node: button.dataset.node, verb });
+    this.notice(answer.success ? "" : `${role} ${verb}: ${answer.message}`);
+  }
+
+  calm(button, words) {
+    button.classList.remove("sure");
+    button.textContent = words;
+  }
+
+  choice(id, request) {
+    find(id).addEventListener("change", async (event) => {
+      const answer = await this.link().post("/api/watch", request(event.target.value));
+      this.notice(answer.success ? "" : answer.message);
+    });
+  }
+
+  notice(words) {
+    put(find("notice"), words);
+    find("notice").hidden = !words;
+  }
+
+  connected(yes) {
+    this.offline = !yes;
+    if (yes) return;
+    this.pill("bad", "no connection to the monitor");
+    for (const button of this.buttons.values()) button.disabled = true;
+  }
+
+  pill(className, words) {
+    find("state").className = `pill ${className}`;
+    put(find("state"), words);
+  }
+
+  status(status, curve) {
+    const { place, parameters, controls } = status;
+    const [className, words, hint] = STATES[status.state] ?? ["", status.state, ""];
+    this.pill(className, words);
+    if (hint || find("notice").dataset.hint) {
+      this.notice(hint);
+      find("notice").dataset.hint = hint;
+    }
+    const problem = NAMES[parameters.problem] ?? parameters.problem ?? "pdeloop";
+    put(find("problem"), problem);
+    document.title = `${problem} – ${words} – pdeloop`;
+    const where = [];
+    if (place.folder) where.push(place.folder);
+    if (place.domain !== null) where.push(`ROS domain ${place.domain}`);
+    if (place.namespace && place.namespace !== "/") where.push(place.namespace);
+    put(find("place"), where.join(" · "));
+    this.figures(status, curve);
+    this.nodes(status);
+    for (const [key, button] of this.buttons) {
+      const [role, verb] = key.split("/");
+      const offer = controls.find((c) => c.role === role && c.verbs.includes(verb));
+      button.disabled = !offer || this.offline;
+      button.dataset.node = offer ? offer.node : "";
+      button.title = offer ? `${TITLES[verb]} (${offer.node}/${verb})` : `no ${role} offers the service ~/${verb}`;
+    }
+    this.options("environment", status.environments, status.environment);
+    const pairs = place.namespaces ?? [];
+    find("pair-label").hidden = pairs.length < 2;
+    this.list("pair", pairs, place.namespace);
+  }
+
+  options(id, count, chosen) {
+    const most = Math.min(count, 4096);
+    this.list(id, Array.from({ length: most }, (_, i) => String(i)), String(Math.min(chosen, most - 1)));
+    find(`${id}-label`).hidden = count < 2;
+  }
+
+  list(id, names, chosen) {
+    const select = find(id);
+    const now = names.join("\n");
+    if (select.dataset.names !== now) {
+      select.dataset.names = now;
+      select.replaceChildren(...names.map((name) => new Option(name, name)));
+    }
+    if (document.activeElement !== select && select.value !== chosen) select.value = chosen;
+  }
+
+  figures(status, curve) {
+    const { points, references, total, axis, phase } = curve.told;
+    const last = points.length ? points[points.length - 1] : null;
+    const cost = last ? last[1] : null;
+    const rows = [["phase", phase || "–", ""]];
+    rows.push([axis, last ? String(last[0]) : "–", total ? ` of ${total}` : ""]);
+    rows.push(["cost now", text(cost), ""]);
+    const best = points.reduce((m, p) => (p[1] !== null && p[1] < m ? p[1] : m), Infinity);
+    const lqt = references.lqt;
+    const share = lqt && cost !== null ? 100 * (1 - cost / lqt) : null;
+    rows.push(["lowest", text(best), ""]);
+    const side = share === null ? "" : share >= 0 ? " % below" : " % above";
+    rows.push(["against LQT", share === null ? "–" : Math.abs(share).toFixed(1), side]);
+    rows.push(["rounds", text(status.rounds < 10 ? status.rounds : Math.round(status.rounds)), " 1/s"]);
+    rows.push(["episodes", text(status.episodes), " 1/s"]);
+    const list = find("figures");
+    if (list.children.length !== rows.length) {
+      list.replaceChildren(
+        ...rows.map(() => {
+          const row = make("div");
+          const value = make("dd");
+          value.append(make("span"), make("small"));
+          row.append(make("dt"), value);
+          return row;
+        }),
+      );
+    }
+    rows.forEach(([name, value, unit], i) => {
+      const row = list.children[i];
+      put(row.firstChild, name);
+      put(row.lastChild.firstChild, value);
+      put(row.lastChild.lastChild, unit);
+    });
+  }
+
+  nodes(status) {
+    const cards = status.nodes.map((node) => {
+      const card = make("article", "", "card");
+      card.dataset.role = node.role;
+      card.dataset.present = String(node.present);
+      const level = node.present ? (LEVELS[node.level ?? 0] ?? "warn") : node.name ? "bad" : "muted";
+      const title = make("h3");
+      title.append(make("span", "", `dot ${level}`), make("span", node.role), make("span", node.name, "muted"));
+      const facts = [node.present ? "there" : node.name ? "gone" : "not seen"];
+      if (node.heard !== null) facts.push(node.heard < 1.5 ? "heard now" : `last heard ${text(Math.round(node.heard))} s ago`);
+      if (node.restarts) facts.push(node.restarts === 1 ? "started again once" : `started again ${node.restarts} times`);
+      if (node.rivals) facts.push(`${node.rivals + 1} processes publish its topic`);
+      card.append(title, make("p", facts.join(", ")));
+      if (node.message) card.append(make("p", node.message));
+      if (node.values?.length) {
+        const list = make("dl");
+        for (const [key, value] of node.values) list.append(make("dt", key), make("dd", value));
+        card.append(list);
+      }
+      return card;
+    });
+    find("nodes").replaceChildren(...cards);
+  }
+}
