@@ -7,8 +7,9 @@ import json
 from pathlib import Path
 
 from bringup.commands.common import Commands
+from loop_interfaces.parameters import ParameterError
 
-_BAG = "Look into a bag that --record or recorder_node wrote, verify it, or recover it."
+_BAG = "Look into a bag that --record or recorder_node wrote, verify it, recover it, or play it."
 
 
 def add(commands: Commands) -> None:
@@ -19,7 +20,7 @@ def add(commands: Commands) -> None:
 
 def _add_bag(commands: Commands) -> None:
     bag = commands.add_parser(
-        "bag", help="look into a recorded bag, verify it, recover it", description=_BAG
+        "bag", help="look into a recorded bag, verify it, recover it, play it", description=_BAG
     )
     actions = bag.add_subparsers(required=True, metavar="ACTION")
     for name, command, text in (
@@ -44,6 +45,28 @@ def _add_bag(commands: Commands) -> None:
             )
         if name == "recover":
             action.add_argument("--out", type=Path, metavar="DIR", help="[BAG-recovered]")
+    _add_play(actions)
+
+
+def _add_play(actions: Commands) -> None:
+    play = actions.add_parser(
+        "play",
+        help="publish a bag's messages over topics",
+        description="Publish a bag's messages again: the recorded bytes under the recorded names and "
+        "quality of service, in the recorded time. In a ROS domain of its own (pdeloop monitor finds "
+        "it), or in ROS_DOMAIN_ID if that is set; never beside a live loop.",
+        epilog="example: pdeloop bag play runs/lab/bag --rate 0.1 --wait",
+    )
+    play.add_argument("bag", type=Path, metavar="BAG", help="folder of a bag or of a run")
+    play.add_argument("--rate", type=float, default=1.0, metavar="R", help="times as fast [1]")
+    play.add_argument("--loop", action="store_true", help="begin again at the end, until Ctrl-C")
+    play.add_argument("--wait", action="store_true", help="begin when somebody subscribes")
+    play.add_argument(
+        "--network",
+        action="store_true",
+        help="let messages leave this machine (default: loopback interface only)",
+    )
+    play.set_defaults(command=_bag_play)
 
 
 def _add_identify(commands: Commands) -> None:
@@ -88,6 +111,21 @@ def _bag_recover(options: argparse.Namespace) -> int:
     path, messages = recover(options.bag, options.out)
     print(f"{messages} messages in {path}")
     return 0
+
+
+def _bag_play(options: argparse.Namespace) -> int:
+    from bringup.bags.player.node import play
+
+    if not 1e-6 <= options.rate <= 1e6:
+        raise ParameterError(f"--rate is {options.rate:g}; expected a number from 1e-6 to 1e6")
+    return play(
+        options.bag,
+        rate=options.rate,
+        again=options.loop,
+        wait=options.wait,
+        network=options.network,
+        tell=lambda text: print(text, flush=True),
+    )
 
 
 def _identify(options: argparse.Namespace) -> int:

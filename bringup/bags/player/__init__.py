@@ -1,0 +1,1 @@
+"""A node that publishes what a bag holds."""
