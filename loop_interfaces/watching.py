@@ -81,6 +81,12 @@ class Watcher:
                     break
                 yield kind, taken[1]["received_timestamp"], taken[0]
 
+    def close(self) -> None:
+        """Stop reading; the plant then keeps no samples for this one."""
+        for subscription in (self._bundles, *self._singles.values()):
+            self._node.destroy_subscription(subscription)
+        self._singles, self.handles = {}, []
+
     def _subscribe(self, message_type: Any, name: str, qos: Any) -> Subscription:
         return self._node.create_subscription(
             message_type,

@@ -101,10 +101,12 @@ class Health:
             rows.append(row)
         return rows
 
-    def value(self, role: str, key: str) -> str | None:
-        """What the node in `role` last said of itself under `key` in /diagnostics."""
+    def value(self, role: str, key: str, since: float) -> str | None:
+        """What the node in `role` said of itself under `key` in /diagnostics, if not before `since`."""
         known = self._diagnoses.get(self.peers[role].name.strip("/"))
-        return None if known is None else dict(known.values).get(key)
+        if known is None or known.when < since:
+            return None
+        return dict(known.values).get(key)
 
 
 class Rate:

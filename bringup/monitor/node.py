@@ -1,7 +1,8 @@
 """The monitor as a ROS 2 node: reads the loop's topics now and then, calls its services when asked.
 
-Subscribes  episode/start, policy, episode/cost, target, /diagnostics;
-            state and action while somebody looks, and no more of them than monitor.attention allows
+Subscribes  episode/start, policy, episode/cost, episode/paused, target, /diagnostics;
+            samples (of a plant without them state and action) while somebody looks, and no more of
+            them than monitor.attention allows
 Calls       NODE/pause, resume, step, stop (std_srvs/Trigger) of the loop's nodes
 What it learns goes into monitor.view.
 """
@@ -32,18 +33,15 @@ from bringup.monitor.commands import VERBS, Call, Commands, Watch
 from bringup.monitor.finder import Finder, run_id
 from bringup.monitor.health import ROLES, Endpoint
 from bringup.monitor.view import View
+from loop_interfaces.endpoints import OutsideExecutor, reader_qos
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.node_loop import (
-    ConfigurationError,
-    NodeLoop,
-    OutsideExecutor,
-    observer_qos,
-    qos,
-    ros_node,
-)
+from loop_interfaces.node_loop import NodeLoop
+from loop_interfaces.node_main import ConfigurationError, ros_node
 from loop_interfaces.ros_parameters import RemoteParameters
-from loop_interfaces.topics import ACTION, COST, POLICY, START, STATE, TARGET, Topic
+from loop_interfaces.samples import ACTION_KIND, STATE_KIND
+from loop_interfaces.topics import ACTION, COST, PAUSED, POLICY, START, STATE, TARGET, Topic
+from loop_interfaces.watching import Watcher
 
 DRAIN = 0.03
 """Seconds between two looks at what has come in."""
@@ -53,31 +51,29 @@ LOOK = 1.0
 """Seconds between two looks at the graph and at which loop runs."""
 PATIENCE = 5.0
 """Seconds in which a service must answer."""
-SEVERAL = 8
-"""Samples of a latched topic that may wait."""
+NAMELESS = "_NODE_NAME_UNKNOWN_"
+"""What the graph says of an endpoint whose node it has not heard of yet."""
+_Handler = Callable[[Frame, float], None]
 
 
 class _Reader:
-    """Takes frames of one topic when it is told to."""
+    """Takes frames of one latched topic when it is told to."""
 
-    def __init__(
-        self, node: Node, topic: Topic, name: str, handle: Callable[[Frame, float], None]
-    ) -> None:
+    def __init__(self, node: Node, topic: Topic, name: str, handle: _Handler) -> None:
         self._node, self._handle = node, handle
         self._decode = ArrayCodec(topic.labels).decode
-        profile = qos(topic, SEVERAL) if topic.latched else observer_qos(topic)
-        self.subscription: Subscription = node.create_subscription(
+        self._subscription: Subscription = node.create_subscription(
             Float64MultiArray,
             name,
             lambda _: None,  # never called: see OutsideExecutor
-            profile,
+            reader_qos(topic),
             callback_group=OutsideExecutor(),
             raw=True,
         )
 
     def take(self) -> list[bytes]:
         """What has come in."""
-        take, found = self.subscription.handle.take_message, []
+        take, found = self._subscription.handle.take_message, []
         while (taken := take(Float64MultiArray, True)) is not None:
             found.append(taken[0])
         return found
@@ -90,7 +86,33 @@ class _Reader:
                 self._handle(self._decode(raw), now)
 
     def close(self) -> None:
-        self._node.destroy_subscription(self.subscription)
+        self._node.destroy_subscription(self._subscription)
+
+
+class _Samples:
+    """Takes states and actions, from when it is made until it is closed."""
+
+    def __init__(self, node: Node, namespace: str, view: View) -> None:
+        self._watcher = Watcher(node, namespace)
+        self._watcher.look()
+        self._handlers: dict[int, tuple[Callable[[bytes], Frame], _Handler]] = {
+            STATE_KIND: (ArrayCodec(STATE.labels).decode, view.state),
+            ACTION_KIND: (ArrayCodec(ACTION.labels).decode, view.action),
+        }
+        self.look, self.close = self._watcher.look, self._watcher.close
+
+    def drain(self) -> tuple[int, int]:
+        """Handle what has come in; how many messages, and their bytes."""
+        count = size = 0
+        now = time.monotonic()
+        with contextlib.suppress(ValueError):
+            for kind, _, raw in self._watcher.drain():
+                count, size = count + 1, size + len(raw)
+                if kind in self._handlers:
+                    decode, handle = self._handlers[kind]
+                    with contextlib.suppress(ValueError):
+                        handle(decode(raw), now)
+        return count, size
 
 
 class _Pending:
@@ -147,7 +169,7 @@ class MonitorNode:
         self._given = namespace is not None
         self._attention = Attention()
         self._latched: list[_Reader] = []
-        self._samples: list[_Reader] = []
+        self._samples: _Samples | None = None
         self._calls: list[_Pending] = []
         self._asked: dict[bytes, RemoteParameters] = {}
         self._progress: ProgressFile | None = None
@@ -164,9 +186,10 @@ class MonitorNode:
 
     def _begin(self, namespace: str | None) -> None:
         """Watch the loop in `namespace`."""
-        for reader in (*self._latched, *self._samples):
+        for reader in self._latched:
             reader.close()
-        self._latched, self._samples, self._attention = [], [], Attention()
+        self._stop_reading()
+        self._latched, self._attention = [], Attention()
         self._namespace = namespace
         folder = self._live.folder
         self._progress = _progress(folder)
@@ -179,16 +202,22 @@ class MonitorNode:
         self._view.watch(place, run=self._finder.only_run, from_topics=self._progress is None)
         if namespace is not None:
             view = self._view
-            handlers = {
+            handlers: dict[Topic, _Handler] = {
                 START: view.start,
                 POLICY: view.policy,
+                PAUSED: view.paused,
                 COST: view.cost,
                 TARGET: view.target,
             }
-            self._latched = [self._reader(topic, h) for topic, h in handlers.items()]
+            self._latched = [
+                _Reader(self._node, topic, self._name(topic), handle)
+                for topic, handle in handlers.items()
+            ]
 
-    def _reader(self, topic: Topic, handle: Callable[[Frame, float], None]) -> _Reader:
-        return _Reader(self._node, topic, self._name(topic), handle)
+    def _stop_reading(self) -> None:
+        if self._samples is not None:
+            self._samples.close()
+            self._samples = None
 
     def _name(self, topic: Topic | str) -> str:
         name = topic if isinstance(topic, str) else topic.name
@@ -196,30 +225,28 @@ class MonitorNode:
 
     def _tick(self, now: float) -> None:
         time.sleep(DRAIN)
-        # Taken in one order and handled in another: when a cost has come in, so have all samples of its
-        # episode and the start; and a state is there before its action.
-        costs = [(reader, reader.take()) for reader in self._latched[2:]]
-        for reader in (*self._latched[:2], *self._samples):
-            messages = reader.take()
-            reader.handle(messages)
-            if reader in self._samples:
-                self._attention.took(len(messages), sum(map(len, messages)))
+        # Taken in one order and handled in another: when a cost has come in, so have all samples of
+        # its episode, and its start.
+        costs = [(reader, reader.take()) for reader in self._latched[3:]]
+        for reader in self._latched[:3]:
+            reader.handle(reader.take())
+        if self._samples is not None:
+            self._attention.took(*self._samples.drain())
         for reader, messages in costs:
             reader.handle(messages)
-        before = bool(self._samples)
-        wanted = self._namespace is not None and self._attention.decide(
+        namespace = self._namespace
+        wanted = namespace is not None and self._attention.decide(
             now, watched=self._watched(), complete=self._view.complete
         )
-        if wanted and not before:
-            view = self._view
-            self._samples = [self._reader(STATE, view.state), self._reader(ACTION, view.action)]
-        elif before and not wanted:
-            for reader in self._samples:
-                reader.close()
-            self._samples = []
+        if not wanted:
+            self._stop_reading()
+        elif self._samples is None and namespace is not None:
+            self._samples = _Samples(self._node, namespace, self._view)
 
     def _housekeeping(self, now: float) -> None:
         self._obey()
+        if self._samples is not None:
+            self._samples.look()
         self._calls = [call for call in self._calls if not call.poll(self._view)]
         for parameters in self._asked.values():
             if parameters.values is None:
@@ -261,6 +288,8 @@ class MonitorNode:
         for role, topic in ROLES.items():
             by_role[role] = []
             for endpoint in self._node.get_publishers_info_by_topic(self._name(topic)):
+                if endpoint.node_name == NAMELESS:
+                    continue
                 name = f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
                 process = bytes(endpoint.endpoint_gid)[:12]
                 by_role[role].append(Endpoint(name, process))

@@ -66,6 +66,8 @@ class _Loop:
     rounds: Rate = field(default_factory=Rate)
     episodes: Rate = field(default_factory=Rate)
     open: _Open = field(default_factory=_Open)
+    kinds: dict[tuple[int, int], str] = field(default_factory=dict)
+    """What the newest episodes are, by run and number."""
     shown: Episode | None = None
     pending: Episode | None = None
     pending_since: float = 0.0
@@ -73,7 +75,9 @@ class _Loop:
     targets: dict[int, NDArray[np.float64]] = field(default_factory=dict)
     parameters: dict[str, Any] = field(default_factory=dict)
     controls: list[dict[str, Any]] = field(default_factory=list)
+    plant_paused: bool = False
     paused: dict[str, float] = field(default_factory=dict)
+    answered: dict[str, float] = field(default_factory=dict)
     heard: float | None = None
     ended: bool = False
     run: int = 0
@@ -151,11 +155,7 @@ class View:
             else:
                 loop.pending, loop.pending_since = Episode.begin(frame, self._environment), now
                 loop.pending.state(frame)
-            if loop.pending is not None and (
-                loop.pending.whole or loop.shown is None or now - loop.pending_since > JOIN
-            ):
-                loop.shown, loop.pending = loop.pending, None
-                self._versions["begun"] += 1
+            self._join(now)
             self._count(key, frame.step, now)
 
     def action(self, frame: Frame, now: float) -> None:
@@ -175,6 +175,11 @@ class View:
             self._loop.ended = not len(frame.values)
             if len(frame.values):
                 self._loop.open.start = frame
+                explores = (frame.values[:, StartColumn.EXCITATION] >= 0).any()
+                kinds = self._loop.kinds
+                kinds[frame.run, frame.episode] = "exploration" if explores else "policy"
+                if len(kinds) > 100:
+                    del kinds[next(iter(kinds))]
 
     def policy(self, frame: Frame, now: float) -> None:
         """Take the gains of an episode."""
@@ -204,6 +209,12 @@ class View:
                 return
             known = policy is not None and (policy.run, policy.episode) == ids
             loop.curve.rollouts(start, policy if known else None, frame)
+
+    def paused(self, frame: Frame, now: float) -> None:
+        """Take whether an operator holds the plant."""
+        with self._lock:
+            self._loop.health.heard(now, "plant")
+            self._loop.plant_paused = bool(frame.values.any())
 
     def target(self, frame: Frame, now: float) -> None:
         """Take z_r of a plant."""
@@ -246,6 +257,7 @@ class View:
     def answered(self, node: str, verb: str, now: float) -> None:
         """A node did what it was asked to."""
         with self._lock:
+            self._loop.answered[node] = now
             if verb == "pause":
                 self._loop.paused[node] = now
             elif verb in ("resume", "stop"):
@@ -273,11 +285,9 @@ class View:
     def refresh(self, now: float) -> None:
         """Put the status together again; call it now and then."""
         with self._lock:
-            loop, shown = self._loop, self._loop.shown
-            start = loop.open.start
-            explores = start is not None and bool(
-                (start.values[:, StartColumn.EXCITATION] >= 0).any()
-            )
+            loop = self._loop
+            self._join(now)
+            shown = loop.shown
             names = ("problem", "length", "n_z", "n_a", "horizon", "sample_time", "optimizer")
             status = {
                 "part": "status",
@@ -290,11 +300,11 @@ class View:
                 },
                 "environment": self._environment,
                 "environments": 0 if shown is None else shown.batch,
-                "explores": explores,
                 "rounds": round(loop.rounds.per_second(now), 2),
                 "episodes": round(loop.episodes.per_second(now), 2),
                 "nodes": loop.health.told(now),
-                "controls": [{**c, "paused": c["node"] in loop.paused} for c in loop.controls],
+                "controls": loop.controls,
+                "paused": self._paused(),
             }
             text = json.dumps(status).encode()
             if text != self._status:
@@ -348,6 +358,7 @@ class View:
             "new": not same,
             "run": shown.key[0],
             "episode": shown.key[1],
+            "kind": self._loop.kinds.get(shown.key[:2], ""),
             "environment": shown.environments[row],
             "first": first,
             "columns": len(fields),
@@ -372,6 +383,15 @@ class View:
         loop.health.heard(now, role)
         loop.heard, loop.run = now, frame.run
         return True
+
+    def _join(self, now: float) -> None:
+        """Show an episode of which the beginning was seen, or any if there is no better for long."""
+        loop = self._loop
+        if loop.pending is not None and (
+            loop.pending.whole or loop.shown is None or now - loop.pending_since > JOIN
+        ):
+            loop.shown, loop.pending = loop.pending, None
+            self._versions["begun"] += 1
 
     def _count(self, key: Key, step: int, now: float) -> None:
         """Count rounds, of which not every one was seen: an episode's last step says how many."""
@@ -402,6 +422,17 @@ class View:
         if abs(low - old_low) > 0.15 * size or abs(high - old_high) > 0.15 * size:
             self._range = low, high  # small changes would only make the colours flicker
 
+    def _paused(self) -> list[str]:
+        """The roles of the nodes that somebody holds."""
+        loop, found = self._loop, []
+        for role in ("plant", "tuner"):
+            name = loop.health.peers[role].name
+            told = loop.health.value(role, "paused", since=loop.answered.get(name, 0.0))
+            held = loop.plant_paused and role == "plant"
+            if held or name in loop.paused or told == "yes":
+                found.append(role)
+        return found
+
     def _state(self, now: float) -> str:
         loop = self._loop
         if self._place.get("domain") is None:
@@ -410,9 +441,7 @@ class View:
             return "ended"
         if not any(peer.present for peer in loop.health.peers.values()):
             return "empty"
-        if loop.paused or "true" in (
-            (loop.health.value(role, "paused") or "").lower() for role in ("plant", "tuner")
-        ):
+        if self._paused():
             return "paused"
         if loop.heard is None:
             return "waiting"

@@ -24,7 +24,9 @@ from bringup.bags.reader import Bag
 from bringup.domain import own_domain
 from bringup.live import announced
 from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.node_loop import ConfigurationError, NodeLoop, ros_node
+from loop_interfaces.node_loop import NodeLoop
+from loop_interfaces.node_main import ConfigurationError, ros_node
+from tuner_node.results import TRANSIENT
 
 NAME = "bag_player"
 LOOK_FOR = 2.5
@@ -140,9 +142,9 @@ class PlayerNode:
             )
 
     def _recorded_parameters(self) -> dict[str, Any]:
-        """The parameters of the last run in the bag, as far as it knows them."""
+        """What defines the last run in the bag, as far as it knows: not its folders and the like."""
         runs = list(self._bag.parameters().values())
-        known = runs[-1] if runs else {}
+        known = {} if not runs else {k: v for k, v in runs[-1].items() if k not in TRANSIENT}
         return {k: v for k, v in known.items() if isinstance(v, str | bool | int | float)}
 
 

@@ -8,11 +8,6 @@ const LINES = ["#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00"]
 const DOTTED = [2, 3];
 const DASHED = [7, 4];
 
-function wider([low, high], share) {
-  const room = share * (high - low) || 0.5 * Math.max(Math.abs(high), 1e-3);
-  return [low - room, high + room];
-}
-
 function extent(...lists) {
   let [low, high] = [Infinity, -Infinity];
   for (const list of lists) {
@@ -25,7 +20,10 @@ function extent(...lists) {
 }
 
 export function actionsPlot(episode, facts) {
-  const style = (j, count) => (count <= LINES.length ? LINES[j] : css((j + 0.5) / count));
+  const dark = matchMedia("(prefers-color-scheme: dark)");
+  // Of cividis the part that stands out from the background.
+  const along = (share) => css(dark.matches ? 0.35 + 0.65 * share : 0.8 * share);
+  const style = (j, count) => (count <= LINES.length ? LINES[j] : along((j + 0.5) / count));
 
   function draw(plot) {
     const { header } = episode;
@@ -33,7 +31,7 @@ export function actionsPlot(episode, facts) {
     plot.x = header ? episode.span(facts.horizon) : [0, 1];
     const [low, high] = extent(episode.actions);
     const largest = Math.max(Math.abs(low), Math.abs(high)) || 1;
-    plot.y = count ? [-1.1 * largest, 1.1 * largest] : [-1, 1];
+    plot.y = count ? [-1.1 * largest, 1.35 * largest] : [-1, 1];
     plot.frame(episode.timeLabel, "action");
     if (!count) {
       plot.message("no action has come yet");
@@ -88,7 +86,8 @@ export function profilePlot(episode, facts) {
       return;
     }
     const initial = header.begin === 0 ? episode.fields.subarray(0, header.rows) : [];
-    plot.y = wider(extent(latest, target, initial, header.range), 0.12);
+    const [low, high] = extent(latest, target, initial, header.range);
+    plot.y = [low - 0.08 * (high - low), high + 0.28 * (high - low)]; // with room for the legend
     plot.frame(label, "u");
     plot.clip(() => {
       if (initial.length) plot.line(grid(initial.length), initial, colour("none"), { dash: DOTTED, width: 1.3 });
@@ -128,7 +127,7 @@ export function curvePlot(curve) {
     let [low, high] = extent(costs);
     // What it is compared with is shown unless it would squeeze the curve flat.
     for (const value of Object.values(references)) {
-      if (!costs.length || (value < 2 * high && value > low / 2)) {
+      if (!costs.length || (value < 1.6 * high && value > low / 1.6)) {
         [low, high] = [Math.min(low, value), Math.max(high, value)];
         if (!costs.length) [low, high] = extent(Object.values(references));
       }
@@ -145,7 +144,8 @@ export function curvePlot(curve) {
     plot.x = [first, total ? Math.max(Math.min(end, total), last, first + 1) : end];
     const [low, high] = range(points, references);
     plot.log = low > 0 && high / low > 6;
-    plot.y = plot.log ? [low / 1.25, high * 1.4] : wider([low, high], 0.12);
+    const room = 0.12 * (high - low) || 0.5 * Math.abs(high) || 1;
+    plot.y = plot.log ? [low / 1.25, high * 1.6] : [low - room, high + 2 * room];
     plot.frame(axis, "mean stage cost", { whole: true });
     plot.clip(() => {
       for (const [name, dash] of Object.entries(REFERENCES)) {

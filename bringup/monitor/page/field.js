@@ -155,9 +155,9 @@ export function fieldPlot(episode, facts) {
     );
     plot.frame(episode.timeLabel, yLabel, { grid: false });
     bar(plot);
-    const kind = facts.explores ? "exploration" : "policy";
-    const number = header.episode % 2 ** 32;
-    plot.caption = `episode ${number} (${kind}), step ${header.last}`;
+    const number = header.episode % 2 ** 32; // the rest counts the restarts of the tuner
+    const kind = header.kind ? ` (${header.kind})` : "";
+    plot.caption = `episode ${number}${kind}, step ${header.last}`;
     plot.say(
       `Field u(x, t) of episode ${number}, environment ${header.environment}, up to step ` +
         `${header.last}, values from ${text(header.range[0])} to ${text(header.range[1])}`,

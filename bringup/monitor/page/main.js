@@ -8,7 +8,7 @@ import { Panel } from "./panel.js";
 const EMPTY = { axis: "iteration", phase: "", total: 0, band: "seeds", references: {}, points: [] };
 
 const episode = new Episode();
-const facts = { length: 0, horizon: 0, n_a: 0, explores: false }; // of the loop, as far as its nodes told
+const facts = { length: 0, horizon: 0, n_a: 0 }; // of the loop, as far as its nodes told
 const curve = { told: EMPTY };
 let status = null;
 
@@ -29,7 +29,7 @@ const take = {
     status = message;
     const { length = 0, horizon = 0, n_a = 0 } = message.parameters;
     const changed = facts.length !== length || facts.horizon !== horizon;
-    Object.assign(facts, { length, horizon, n_a, explores: message.explores });
+    Object.assign(facts, { length, horizon, n_a });
     panel.status(message, curve);
     if (moved) Object.assign(episode, new Episode());
     if (changed || moved) redraw(ofEpisode);

@@ -22,6 +22,7 @@ const TITLES = {
   stop: "end after this iteration",
 };
 const NAMES = { burgers: "Burgers", "allen-cahn": "Allen-Cahn", kdv: "Korteweg-de Vries" };
+const PAUSED = { plant: "plant", tuner: "training" };
 const LEVELS = ["good", "warn", "bad", "warn"];
 const SURE = 3000; // ms in which a second click confirms
 
@@ -42,6 +43,7 @@ export class Panel {
   constructor(link) {
     this.link = link;
     this.buttons = new Map();
+    this.cards = {};
     for (const [role, name, verbs] of BUTTONS) this.group(role, name, verbs);
     this.choice("environment", (value) => ({ environment: Number(value) }));
     this.choice("pair", (value) => ({ namespace: value }));
@@ -105,7 +107,8 @@ export class Panel {
 
   status(status, curve) {
     const { place, parameters, controls } = status;
-    const [className, words, hint] = STATES[status.state] ?? ["", status.state, ""];
+    let [className, words, hint] = STATES[status.state] ?? ["", status.state, ""];
+    if (status.state === "paused") words = `${status.paused.map((r) => PAUSED[r] ?? r).join(" and ")} paused`;
     this.pill(className, words);
     if (hint || find("notice").dataset.hint) {
       this.notice(hint);
@@ -186,26 +189,58 @@ export class Panel {
   }
 
   nodes(status) {
-    const cards = status.nodes.map((node) => {
-      const card = make("article", "", "card");
-      card.dataset.role = node.role;
-      card.dataset.present = String(node.present);
-      const level = node.present ? (LEVELS[node.level ?? 0] ?? "warn") : node.name ? "bad" : "muted";
-      const title = make("h3");
-      title.append(make("span", "", `dot ${level}`), make("span", node.role), make("span", node.name, "muted"));
-      const facts = [node.present ? "there" : node.name ? "gone" : "not seen"];
-      if (node.heard !== null) facts.push(node.heard < 1.5 ? "heard now" : `last heard ${text(Math.round(node.heard))} s ago`);
-      if (node.restarts) facts.push(node.restarts === 1 ? "started again once" : `started again ${node.restarts} times`);
-      if (node.rivals) facts.push(`${node.rivals + 1} processes publish its topic`);
-      card.append(title, make("p", facts.join(", ")));
-      if (node.message) card.append(make("p", node.message));
-      if (node.values?.length) {
-        const list = make("dl");
-        for (const [key, value] of node.values) list.append(make("dt", key), make("dd", value));
-        card.append(list);
-      }
-      return card;
-    });
-    find("nodes").replaceChildren(...cards);
+    const all = find("nodes");
+    for (const node of status.nodes) {
+      this.cards[node.role] ??= new Card(all, node.role);
+      this.cards[node.role].show(node, status.state === "ended");
+    }
+  }
+}
+
+// One node: who it is, whether it is there, what it says of itself.
+class Card {
+  constructor(all, role) {
+    this.card = make("article", "", "card");
+    this.card.dataset.role = role;
+    this.dot = make("span", "", "dot");
+    this.name = make("span", "", "muted");
+    this.facts = make("p");
+    this.message = make("p");
+    this.details = make("details");
+    this.summary = make("summary");
+    this.list = make("dl");
+    const title = make("h3");
+    title.append(this.dot, make("span", role), this.name);
+    this.details.append(this.summary, this.list);
+    this.card.append(title, this.facts, this.message, this.details);
+    all.append(this.card);
+  }
+
+  show(node, ended) {
+    const lost = node.name && !ended ? "bad" : "muted";
+    const level = node.present ? (LEVELS[node.level ?? 0] ?? "warn") : lost;
+    this.card.dataset.present = String(node.present);
+    this.dot.className = `dot ${level}`;
+    put(this.name, node.name);
+    put(this.facts, Card.facts(node));
+    put(this.message, node.message ?? "");
+    const values = node.values ?? [];
+    this.details.hidden = !values.length;
+    put(this.summary, `${values.length} values`);
+    if (this.list.children.length !== 2 * values.length) {
+      this.list.replaceChildren(...values.flatMap(() => [make("dt"), make("dd")]));
+    }
+    values.flat().forEach((words, i) => put(this.list.children[i], words));
+  }
+
+  static facts(node) {
+    const facts = [node.present ? "there" : node.name ? "gone" : "not seen"];
+    if (node.heard !== null) {
+      const ago = Math.round(node.heard);
+      facts.push(node.heard < 1.5 ? "heard now" : `last heard ${ago} s ago`);
+    }
+    if (node.restarts) facts.push(node.restarts === 1 ? "joined again once" : `joined again ${node.restarts} times`);
+    if (node.rivals) facts.push(`${node.rivals + 1} processes publish its topic`);
+    return facts.join(", ");
   }
 }
