@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -50,6 +51,8 @@ class Curve:
     references: dict[str, float] = field(default_factory=dict)
     points: dict[int, Point] = field(default_factory=dict)
     version: int = 0
+    number: int = field(default_factory=itertools.count().__next__)
+    """Tells one curve from another."""
     _checked: dict[int, tuple[float, float]] = field(default_factory=dict)
     _evaluated: dict[int, dict[str, float]] = field(default_factory=dict)
 

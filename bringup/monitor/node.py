@@ -22,26 +22,20 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
-from rclpy.subscription import Subscription
-from std_msgs.msg import Float64MultiArray
-from std_srvs.srv import Trigger
 
 from bringup.display import ProgressFile
 from bringup.live import Live
 from bringup.monitor.attention import Attention
-from bringup.monitor.commands import VERBS, Call, Commands, Watch
+from bringup.monitor.commands import VERBS, Commands, Watch
+from bringup.monitor.endpoints import Handler, Reader, Samples, ServiceCall
 from bringup.monitor.finder import Finder, run_id
 from bringup.monitor.health import ROLES, Endpoint
 from bringup.monitor.view import View
-from loop_interfaces.endpoints import OutsideExecutor, reader_qos
-from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.node_loop import NodeLoop
 from loop_interfaces.node_main import ConfigurationError, ros_node
 from loop_interfaces.ros_parameters import RemoteParameters
-from loop_interfaces.samples import ACTION_KIND, STATE_KIND
-from loop_interfaces.topics import ACTION, COST, PAUSED, POLICY, START, STATE, TARGET, Topic
-from loop_interfaces.watching import Watcher
+from loop_interfaces.topics import COST, PAUSED, POLICY, START, TARGET, Topic
 
 DRAIN = 0.03
 """Seconds between two looks at what has come in."""
@@ -49,99 +43,8 @@ REFRESH = 0.5
 """Seconds between two looks at rates and at the progress of the run."""
 LOOK = 1.0
 """Seconds between two looks at the graph and at which loop runs."""
-PATIENCE = 5.0
-"""Seconds in which a service must answer."""
 NAMELESS = "_NODE_NAME_UNKNOWN_"
 """What the graph says of an endpoint whose node it has not heard of yet."""
-_Handler = Callable[[Frame, float], None]
-
-
-class _Reader:
-    """Takes frames of one latched topic when it is told to."""
-
-    def __init__(self, node: Node, topic: Topic, name: str, handle: _Handler) -> None:
-        self._node, self._handle = node, handle
-        self._decode = ArrayCodec(topic.labels).decode
-        self._subscription: Subscription = node.create_subscription(
-            Float64MultiArray,
-            name,
-            lambda _: None,  # never called: see OutsideExecutor
-            reader_qos(topic),
-            callback_group=OutsideExecutor(),
-            raw=True,
-        )
-
-    def take(self) -> list[bytes]:
-        """What has come in."""
-        take, found = self._subscription.handle.take_message, []
-        while (taken := take(Float64MultiArray, True)) is not None:
-            found.append(taken[0])
-        return found
-
-    def handle(self, messages: list[bytes]) -> None:
-        """Hand messages on."""
-        now = time.monotonic()
-        for raw in messages:
-            with contextlib.suppress(ValueError):  # the loop's nodes report what they refuse
-                self._handle(self._decode(raw), now)
-
-    def close(self) -> None:
-        self._node.destroy_subscription(self._subscription)
-
-
-class _Samples:
-    """Takes states and actions, from when it is made until it is closed."""
-
-    def __init__(self, node: Node, namespace: str, view: View) -> None:
-        self._watcher = Watcher(node, namespace)
-        self._watcher.look()
-        self._handlers: dict[int, tuple[Callable[[bytes], Frame], _Handler]] = {
-            STATE_KIND: (ArrayCodec(STATE.labels).decode, view.state),
-            ACTION_KIND: (ArrayCodec(ACTION.labels).decode, view.action),
-        }
-        self.look, self.close = self._watcher.look, self._watcher.close
-
-    def drain(self) -> tuple[int, int]:
-        """Handle what has come in; how many messages, and their bytes."""
-        count = size = 0
-        now = time.monotonic()
-        with contextlib.suppress(ValueError):
-            for kind, _, raw in self._watcher.drain():
-                count, size = count + 1, size + len(raw)
-                if kind in self._handlers:
-                    decode, handle = self._handlers[kind]
-                    with contextlib.suppress(ValueError):
-                        handle(decode(raw), now)
-        return count, size
-
-
-class _Pending:
-    """A call of a service that is under way."""
-
-    def __init__(self, node: Node, call: Call) -> None:
-        self.call, self._node, self._since = call, node, time.monotonic()
-        self._client = node.create_client(Trigger, f"{call.node}/{call.verb}")
-        self._future: Any = None
-
-    def poll(self, view: View) -> bool:
-        """Go on; True when it is over."""
-        now = time.monotonic()
-        if self._future is None and self._client.service_is_ready():
-            self._future = self._client.call_async(Trigger.Request())
-        done = self._future is not None and self._future.done()
-        if done:
-            answer = self._future.result()
-            if answer.success:
-                view.answered(self.call.node, self.call.verb, now)
-            self.call.tell(bool(answer.success), str(answer.message))
-        elif now - self._since > PATIENCE:
-            self.call.fail(
-                f"{self.call.node}/{self.call.verb} did not answer within {PATIENCE:g} s"
-            )
-        else:
-            return False
-        self._node.destroy_client(self._client)
-        return True
 
 
 class MonitorNode:
@@ -168,9 +71,9 @@ class MonitorNode:
         self._namespace = namespace
         self._given = namespace is not None
         self._attention = Attention()
-        self._latched: list[_Reader] = []
-        self._samples: _Samples | None = None
-        self._calls: list[_Pending] = []
+        self._latched: list[Reader] = []
+        self._samples: Samples | None = None
+        self._calls: list[ServiceCall] = []
         self._asked: dict[bytes, RemoteParameters] = {}
         self._progress: ProgressFile | None = None
         self._out: Path | None = None
@@ -202,7 +105,7 @@ class MonitorNode:
         self._view.watch(place, run=self._finder.only_run, from_topics=self._progress is None)
         if namespace is not None:
             view = self._view
-            handlers: dict[Topic, _Handler] = {
+            handlers: dict[Topic, Handler] = {
                 START: view.start,
                 POLICY: view.policy,
                 PAUSED: view.paused,
@@ -210,7 +113,7 @@ class MonitorNode:
                 TARGET: view.target,
             }
             self._latched = [
-                _Reader(self._node, topic, self._name(topic), handle)
+                Reader(self._node, topic, self._name(topic), handle)
                 for topic, handle in handlers.items()
             ]
 
@@ -241,7 +144,7 @@ class MonitorNode:
         if not wanted:
             self._stop_reading()
         elif self._samples is None and namespace is not None:
-            self._samples = _Samples(self._node, namespace, self._view)
+            self._samples = Samples(self._node, namespace, self._view)
 
     def _housekeeping(self, now: float) -> None:
         self._obey()
@@ -276,8 +179,8 @@ class MonitorNode:
                 self._given = True
                 self._begin(command.namespace)
                 self._look_at = 0.0
-            else:
-                self._calls.append(_Pending(self._node, command))
+            elif not command.answer.cancelled():  # nobody waits for it any more
+                self._calls.append(ServiceCall(self._node, command))
 
     def _look(self) -> None:
         found = self._namespaces()

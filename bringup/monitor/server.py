@@ -26,7 +26,8 @@ from typing import Any
 from aiohttp import WSMsgType, web
 
 from bringup.monitor.commands import VERBS, Call, Commands, Watch
-from bringup.monitor.view import Cursor, View
+from bringup.monitor.messages import Cursor
+from bringup.monitor.view import View
 
 FRAMES = 20.0
 """Pictures a second at the most."""

@@ -1,0 +1,583 @@
+"""The live page's pure parts: what is kept, what is told, when the loop is left alone, who may ask."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import numpy as np
+import pytest
+
+from bringup.live import Live, announced, running
+from bringup.monitor.attention import Attention
+from bringup.monitor.commands import Call, Commands, Watch
+from bringup.monitor.curve import MOST, Curve
+from bringup.monitor.episode import COLUMNS, ROWS, Episode, rows_of
+from bringup.monitor.finder import Finder
+from bringup.monitor.health import Endpoint, Health, Rate
+from bringup.monitor.messages import Cursor
+from bringup.monitor.server import PAGE, TOKEN, TYPES, Server
+from bringup.monitor.view import View
+from bringup.monitor.watched import Watched
+from loop_interfaces.frames import Frame
+from loop_interfaces.topics import COMPLETED, VOID
+
+PLANT = 7
+
+
+def frame(values: Any, *, step: int = 0, episode: int = 1, run: int = 5, dt: float = 0.1) -> Frame:
+    array = np.array(values, dtype=np.float64)
+    return Frame(run, episode, step, dt * step, array, PLANT)
+
+
+def state(step: int, *, batch: int = 2, n_z: int = 4, episode: int = 1, run: int = 5) -> Frame:
+    """u = 100 environment + step + point / 10: every number says where it belongs."""
+    m, i = np.ogrid[:batch, :n_z]
+    return frame(100 * m + step + i / 10, step=step, episode=episode, run=run)
+
+
+def start(rows: Any, *, episode: int = 1, run: int = 5) -> Frame:
+    return frame(rows, episode=episode, run=run)
+
+
+def cost(
+    means: Any, *, ended: int = COMPLETED, episode: int = 1, step: int = 3, run: int = 5
+) -> Frame:
+    rows = [[mean, step * mean, ended] for mean in means]
+    return frame(rows, step=step, episode=episode, run=run)
+
+
+def unpacked(message: bytes) -> tuple[dict[str, Any], np.ndarray]:
+    """What the page makes of a message."""
+    if message.startswith(b"{"):
+        return json.loads(message), np.empty(0)
+    (length,) = struct.unpack_from("<I", message)
+    return json.loads(message[4 : 4 + length]), np.frombuffer(message, "<f4", offset=4 + length)
+
+
+# An episode in a fixed room.
+
+
+def test_an_episode_keeps_every_state_and_action_while_there_is_room():
+    episode = Episode.begin(state(0), 0)
+    for k in range(10):
+        episode.state(state(k))
+        episode.action(frame([[k, -k], [10 + k, -k]], step=k))
+    assert episode.columns == 10 and episode.stride == 1 and episode.whole
+    expected = np.arange(10)[:, None] + np.arange(4) / 10
+    np.testing.assert_allclose(episode.fields[0, :10], expected, rtol=1e-6)
+    np.testing.assert_allclose(episode.fields[1, :10], expected + 100, rtol=1e-6)
+    np.testing.assert_array_equal(episode.actions[1, :10, 0], 10 + np.arange(10))
+    assert np.isnan(episode.fields[:, 10:]).all()
+    assert episode.sample_time == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("steps", [COLUMNS, COLUMNS + 1, 3 * COLUMNS + 7, 9 * COLUMNS])
+def test_a_long_episode_is_thinned_evenly_and_each_column_shows_a_step_of_its_own(steps):
+    episode = Episode.begin(state(0), 0)
+    for k in range(steps):
+        episode.state(state(k))
+    stride = episode.stride
+    assert stride == 2 ** int(np.ceil(np.log2(steps / COLUMNS)))
+    shown = episode.fields[0, : episode.columns, 0]
+    column = np.arange(episode.columns)
+    assert (shown // stride == column).all()
+    assert shown[-1] == steps - 1
+    assert np.isnan(episode.fields[0, episode.columns :]).all()
+
+
+def test_missed_steps_stay_blank():
+    episode = Episode.begin(state(0), 0)
+    for k in (0, 1, 5):
+        episode.state(state(k))
+    assert np.isnan(episode.fields[0, 2:5]).all() and not np.isnan(episode.fields[0, 5]).any()
+
+
+def test_of_a_batch_that_is_too_large_only_the_chosen_environment_is_kept():
+    episode = Episode.begin(state(0, batch=500, n_z=300), 321)
+    episode.state(state(0, batch=500, n_z=300))
+    assert episode.environments == [321] and episode.batch == 500
+    assert episode.fields.shape == (1, COLUMNS, ROWS)
+    assert episode.fields[0, 0, 0] == 32100 and episode.latest[0, -1] == pytest.approx(32129.9)
+    assert episode.row(321) == 0 and episode.row(4) == 0
+
+
+def test_a_state_of_another_batch_or_before_the_first_one_is_left_out():
+    episode = Episode.begin(state(3), 0)
+    episode.state(state(3))
+    before = episode.fields.copy()
+    episode.state(state(2))
+    episode.state(state(4, batch=3))
+    np.testing.assert_array_equal(episode.fields, before)
+    assert not episode.whole
+
+
+@pytest.mark.parametrize(("n", "most"), [(4, 256), (256, 256), (257, 256), (65536, 256), (1, 5)])
+def test_rows_are_evenly_spaced_from_the_first_point_to_the_last(n, most):
+    rows = rows_of(n, most)
+    assert len(rows) == min(n, most) and rows[0] == 0 and rows[-1] == n - 1
+    assert n == 1 or np.ptp(np.diff(rows)) <= 1
+
+
+# When to read.
+
+
+def test_a_slow_loop_is_read_all_the_time():
+    attention = Attention()
+    for tick in range(10_000):
+        assert attention.decide(0.03 * tick, watched=True, complete=tick % 20 == 0)
+        attention.took(12)
+
+
+def test_a_fast_loop_is_read_an_episode_at_a_time_within_the_budget():
+    attention, read, seconds, pauses, before = Attention(), 0, 60.0, 0, True
+    rate, tick = 10_000, 0.03
+    for i in range(int(seconds / tick)):
+        listening = attention.decide(i * tick, watched=True, complete=i % 3 == 0)
+        pauses += before and not listening
+        before = listening
+        if listening:
+            attention.took(int(rate * tick))
+            read += int(rate * tick)
+    assert read / seconds < 1.2 * attention.budget
+    assert read / seconds > 0.5 * attention.budget
+    assert pauses > 10
+
+
+def test_nothing_is_read_while_nobody_looks():
+    attention = Attention()
+    assert not attention.decide(0.0, watched=False, complete=False)
+    assert attention.decide(0.1, watched=True, complete=False)
+    assert not attention.decide(0.2, watched=False, complete=False)
+
+
+def test_an_endless_episode_and_large_messages_do_not_escape_the_budget():
+    attention = Attention()
+    assert attention.decide(0.0, watched=True, complete=False)
+    attention.took(100, size=100_000_000)
+    assert not attention.decide(0.01, watched=True, complete=False)
+
+
+# The curve.
+
+
+def iteration(seed: int, k: int, cost: float, **more: Any) -> dict[str, Any]:
+    return {"event": "iteration", "seed": seed, "iteration": k, "cost": cost, "diverged": 0, **more}
+
+
+def test_the_band_of_several_seeds_is_over_the_seeds_and_of_one_over_its_rollouts():
+    several, one = Curve(), Curve()
+    for seed, value in enumerate((1.0, 2.0, 6.0)):
+        several.row(iteration(seed, 1, value, cost_plus=value + 9, cost_minus=value - 9))
+    one.row(iteration(0, 1, 2.0, cost_plus=2.5, cost_minus=1.5))
+    assert several.told()["points"] == [[1, 3.0, 1.0, 6.0, 0]] and several.told()["band"] == "seeds"
+    assert one.told()["points"] == [[1, 2.0, 1.5, 2.5, 0]] and one.told()["band"] == "rollouts"
+
+
+def test_a_diverged_iteration_is_a_gap_and_broken_lines_are_left_out():
+    curve = Curve()
+    curve.row({"event": "iteration", "seed": 0, "iteration": 1, "diverged": 2})
+    for line in ({}, {"event": "iteration"}, {"event": "iteration", "seed": "x", "iteration": 1}):
+        curve.row(line)
+    assert curve.told()["points"] == [[1, None, None, None, 2]]
+    json.dumps(curve.told(), allow_nan=False)
+
+
+def test_references_are_those_of_the_check_and_then_of_the_evaluation():
+    curve = Curve()
+    curve.row({"event": "checked", "seed": 0, "none": 9.0, "lqt": 99.0, "accepted": False})
+    assert curve.references == {}
+    for seed, lqt in ((0, 2.0), (1, 4.0)):
+        curve.row({"event": "checked", "seed": seed, "none": 9.0, "lqt": lqt, "accepted": True})
+    assert curve.references == {"none": 9.0, "lqt": 3.0}
+    curve.row({"event": "evaluated", "seed": 0, "none": 8.0, "lqt": 2.5, "adapted": 1.5})
+    assert curve.references == {"none": 8.0, "lqt": 2.5, "adapted": 1.5}
+
+
+def test_a_long_training_stays_within_bounds():
+    curve = Curve()
+    for k in range(1, MOST + 101):
+        curve.row(iteration(0, k, 1.0))
+    assert len(curve.points) == MOST
+    points = curve.told()["points"]
+    assert len(points) <= 1000 and points[-1][0] == MOST + 100
+
+
+def test_from_the_topics_alone_policies_are_points_and_a_row_without_control_is_a_reference():
+    curve, acts = Curve(), [[3, -1, 0, 0], [3, -1, 0, 0], [4, -1, 0, 1], [4, -1, 0, 1]]
+    gains = np.ones((4, 2, 3))
+    curve.rollouts(start(acts), frame(gains), cost([1.0, 3.0, 5.0, 7.0]))
+    assert curve.told()["points"] == [[1, 4.0, 2.0, 6.0, 0]]
+    gains[:2] = 0.0
+    curve.rollouts(start(acts), frame(gains), cost([8.0, 10.0, 1.0, 1.0]))
+    assert curve.references == {"none": 9.0} and len(curve.points) == 1
+    curve.rollouts(start([[3, 17, 0.1, 0]]), None, cost([50.0]))
+    curve.rollouts(start(acts), frame(np.ones((4, 2, 3))), cost([1, 1, 1, 1], ended=VOID))
+    assert len(curve.points) == 1 and curve.phase == "identify"
+    curve.rollouts(start(acts), None, cost([1e9, 1e9, 2.0, 2.0], ended=12))
+    assert curve.told()["points"][-1] == [2, None, None, None, 4]
+
+
+# Nodes.
+
+
+def test_a_node_that_comes_again_is_counted_and_one_that_is_only_seen_late_is_not():
+    health = Health()
+    first, second = Endpoint("/pde_sim_node", b"a"), Endpoint("/pde_sim_node", b"b")
+    for found in ([first], [], [first], [first, second], [second]):
+        health.look({"plant": found})
+    (plant, controller, _) = health.told(0.0)
+    assert plant["restarts"] == 1 and plant["present"] and plant["rivals"] == 0
+    assert not controller["present"] and controller["name"] == ""
+
+
+def test_diagnostics_belong_to_the_node_they_name_and_are_forgotten_when_they_stop():
+    health = Health()
+    health.look({"plant": [Endpoint("/lab/pde_sim_node", b"a")]})
+    values = [("paused", "yes"), ("step", "4")]
+    health.diagnosis("lab/pde_sim_node: lock-step", 1, "paused", values, 10.0)
+    health.diagnosis("lab/other: lock-step", 2, "no", [], 10.0)
+    assert health.told(11.0)[0]["message"] == "paused" and health.told(11.0)[0]["level"] == 1
+    assert health.value("plant", "paused", since=9.0) == "yes"
+    assert health.value("plant", "paused", since=10.5) is None
+    assert "message" not in health.told(30.0)[0]
+
+
+def test_a_rate_is_that_of_the_last_seconds():
+    rate = Rate()
+    for i in range(101):
+        rate.add(10, i * 0.1)
+    assert rate.per_second(10.0) == pytest.approx(100.0, rel=0.1)
+    assert rate.per_second(10.0 + 60.0) == pytest.approx(0.0, abs=1.0)
+
+
+# What is watched.
+
+
+def test_an_episode_is_shown_from_its_beginning_or_else_after_a_while():
+    watched = Watched()
+    for k in (5, 6):
+        watched.state(state(k, episode=1), 0.0, 0)
+    assert watched.shown is not None and watched.shown.first == 5  # better than nothing
+    watched.state(state(2, episode=2), 0.1, 0)
+    assert watched.shown.key[1] == 1
+    watched.state(state(0, episode=3), 0.2, 0)
+    assert watched.shown.key[1] == 3
+    watched.state(state(7, episode=4), 0.3, 0)
+    watched.join(0.9)  # a plant that is held in the middle of an episode
+    assert watched.shown.key[1] == 4
+
+
+def test_a_plant_that_begins_the_same_episode_again_is_shown_from_the_beginning():
+    watched = Watched()
+    for k in (0, 0, 1, 2):  # the first is repeated: that is no new beginning
+        watched.state(state(k), 0.0, 0)
+    assert watched.begun == 1
+    watched.state(state(0), 1.0, 0)
+    assert watched.begun == 2 and watched.shown is not None and watched.shown.last == 0
+
+
+def test_rounds_are_counted_though_only_some_are_seen():
+    watched = Watched()
+    for episode in range(1, 31):
+        watched.start(start([[0, -1, 0, 0]], episode=episode), 0.1 * episode)
+        watched.cost(cost([1.0], episode=episode, step=50), 0.1 * episode)
+        watched.cost(cost([1.0], episode=episode, step=50), 0.1 * episode)  # repeated
+    assert watched.rounds.per_second(3.0) == pytest.approx(500, rel=0.1)
+    assert watched.episodes.per_second(3.0) == pytest.approx(10, rel=0.1)
+
+
+def test_only_the_asked_run_is_shown():
+    watched = Watched(only=5)
+    watched.state(state(0, run=6), 0.0, 0)
+    assert watched.shown is None
+    watched.state(state(0, run=5), 0.0, 0)
+    assert watched.shown is not None
+
+
+def test_who_holds_the_loop_is_told_by_the_plant_by_diagnostics_or_by_the_answer():
+    watched = Watched()
+    roles = {"plant": [Endpoint("/p", b"p")], "tuner": [Endpoint("/t", b"t")]}
+    watched.health.look(roles)
+    watched.state(state(0), 0.0, 0)
+    assert watched.doing(0.1) == "running" and watched.doing(9.0) == "silent"
+    watched.paused(frame([1.0]), 1.0)
+    assert watched.held() == ["plant"] and watched.doing(1.0) == "paused"
+    watched.paused(frame([0.0]), 1.0)
+    watched.health.diagnosis("t: training", 1, "", [("paused", "yes")], 2.0)
+    assert watched.held() == ["tuner"]
+    watched.answered("/t", "resume", 2.5)  # what it said before that no longer counts
+    assert watched.held() == []
+    watched.answered("/p", "pause", 3.0)
+    assert watched.held() == ["plant"]
+    watched.state(state(1), 9.0, 0)  # somebody else has resumed it
+    assert watched.held() == []
+    watched.start(frame(np.empty((0, 4))), 9.0)
+    assert watched.doing(9.0) == "ended"
+
+
+# The messages to a page.
+
+
+def test_a_page_that_puts_the_messages_together_has_the_whole_episode():
+    view, cursor = View(environment=1), Cursor()
+    columns: dict[int, np.ndarray] = {}
+    actions: dict[int, np.ndarray] = {}
+    for k in range(50):
+        view.state(state(k), 0.0)
+        for message in view.updates(cursor) if k % 7 == 3 else []:
+            take_columns(message, columns, actions)
+        if k != 20:  # an action that never comes
+            view.action(frame([[k, 0], [100 + k, 0]], step=k), 0.0)
+    for message in view.updates(cursor):
+        take_columns(message, columns, actions)
+    assert sorted(columns) == list(range(50))
+    for k in range(50):
+        np.testing.assert_allclose(columns[k], 100 + k + np.arange(4) / 10, rtol=1e-6)
+        assert np.isnan(actions[k]).all() if k == 20 else actions[k][0] == 100 + k
+    assert view.updates(cursor) == []
+
+
+def take_columns(
+    message: bytes, columns: dict[int, np.ndarray], actions: dict[int, np.ndarray]
+) -> None:
+    header, numbers = unpacked(message)
+    if header["part"] != "episode":
+        return
+    if header["new"]:
+        columns.clear()
+        actions.clear()
+    rows, count, n_a = header["rows"], header["columns"], header["actions"]
+    assert len(numbers) == (rows + n_a) * count + rows
+    for i in range(count):
+        columns[header["first"] + i] = numbers[i * rows : (i + 1) * rows]
+        at = rows * count + i * n_a
+        actions[header["first"] + i] = numbers[at : at + n_a]
+
+
+def test_another_environment_and_another_loop_are_told_from_the_beginning():
+    view, cursor = View(), Cursor()
+    view.target(frame([1.0, 2.0, 3.0, 4.0]), 0.0)
+    for k in range(5):
+        view.state(state(k), 0.0)
+    parts = {h["part"]: (h, n) for h, n in map(unpacked, view.updates(cursor))}
+    np.testing.assert_array_equal(parts["target"][1], [1, 2, 3, 4])
+    assert parts["episode"][0]["environment"] == 0
+    view.choose(1)
+    ((header, numbers),) = map(unpacked, view.updates(cursor))
+    assert header["new"] and header["environment"] == 1 and numbers[0] == 100
+    view.watch({"domain": 3, "namespace": "/"}, run=None, from_topics=True)
+    view.refresh(0.0)
+    view.state(state(0), 0.0)
+    headers = [unpacked(message)[0] for message in view.updates(cursor)]
+    assert [h["part"] for h in headers] == ["status", "curve", "target", "episode"]
+    assert headers[-1]["new"] and headers[0]["place"]["domain"] == 3
+
+
+def test_the_colours_span_the_field_and_the_target_and_do_not_flicker():
+    view, cursor = View(), Cursor()
+    view.target(frame([-10.0, 0.0, 0.0, 0.0]), 0.0)
+
+    def colours(k: int) -> Any:
+        view.state(state(k), 0.0)
+        view.refresh(10.0 * k)
+        return unpacked(view.updates(cursor)[-1])[0]["range"]
+
+    first = colours(0)
+    assert first == [-10.0, pytest.approx(0.3, abs=0.01)]
+    assert colours(1) == first
+    assert colours(90)[1] > 80
+
+
+# Which loop.
+
+
+def test_a_loop_is_found_as_long_as_it_runs(tmp_path, monkeypatch):
+    monkeypatch.setattr("bringup.live.DOMAINS_FOLDER", tmp_path / "domains")
+    assert running() == []
+    with announced(17, tmp_path / "first"):
+        (live,) = running()
+        assert live.domain == 17 and live.folder == (tmp_path / "first").resolve()
+        with announced(18, tmp_path / "second"):
+            assert [live.domain for live in running()] == [18, 17]
+        assert [live.domain for live in running()] == [17]
+    assert running() == [] and list((tmp_path / "domains").iterdir()) == []
+
+
+def test_what_a_killed_loop_left_behind_is_not_found_and_goes_away(tmp_path, monkeypatch):
+    monkeypatch.setattr("bringup.live.DOMAINS_FOLDER", tmp_path)
+    left = tmp_path / "live-1-17"
+    left.write_text(json.dumps({"domain": 17, "folder": "x", "started": 1, "network": False}))
+    assert running() == [] and not left.exists()
+
+
+def live(domain: int, folder: str, started: float) -> Live:
+    return Live(domain, Path(folder).resolve(), started)
+
+
+def test_the_finder_stays_with_a_training_until_it_ends_and_takes_the_newest_next():
+    found = [live(1, "a", 1.0)]
+    finder = Finder(None, None, lambda: found)
+    assert finder.find() == live(1, "a", 1.0)
+    found.insert(0, live(2, "b", 2.0))
+    assert finder.find() == live(1, "a", 1.0)
+    del found[1]
+    assert finder.find() == live(2, "b", 2.0)
+    del found[0]
+    assert finder.find() == live(2, "b", 2.0)  # what it was stays on the page
+
+
+def test_a_given_folder_or_domain_is_the_only_one():
+    found = [live(2, "b", 2.0), live(1, "a", 1.0)]
+    assert Finder(Path("a"), None, lambda: found).find() == live(1, "a", 1.0)
+    assert Finder(Path("c"), None, lambda: found).find() is None
+    assert Finder(None, 1, lambda: found).find() == live(1, "a", 1.0)
+    assert Finder(None, 9, lambda: found).find() == Live(9, None, 0.0)
+
+
+# The server.
+
+
+@contextlib.contextmanager
+def served() -> Iterator[tuple[Server, Commands, View]]:
+    view, commands = View(), Commands()
+    view.look({}, [{"role": "plant", "node": "/p", "verbs": ["pause"]}])
+    server = Server(view, commands, 0)
+    server.start()
+    try:
+        yield server, commands, view
+    finally:
+        server.stop()
+
+
+async def ask(
+    server: Server, method: str, path: str, *, json: Any = None, **headers: str
+) -> tuple[int, str]:
+    url = f"http://127.0.0.1:{server.port}{path}"
+    headers = {name.replace("_", "-"): value for name, value in headers.items()}
+    async with (
+        aiohttp.ClientSession() as session,
+        session.request(method, url, json=json, headers=headers) as answer,
+    ):
+        return answer.status, await answer.text()
+
+
+async def connected(server: Server, origin: str) -> dict[str, Any]:
+    """The first message of the WebSocket to a page of `origin`."""
+    async with aiohttp.ClientSession() as session:
+        url = f"http://127.0.0.1:{server.port}/ws"
+        async with session.ws_connect(url, headers={"Origin": origin}) as page:
+            first: dict[str, Any] = await page.receive_json(timeout=10)
+            return first
+
+
+def test_every_file_of_the_page_is_served_and_nothing_else():
+    with served() as (server, _, _):
+        for name in ("", *TYPES):
+            status, text = asyncio.run(ask(server, "GET", f"/{name}"))
+            assert status == 200 and text == (PAGE / (name or "index.html")).read_text()
+        for name in ("node.py", "%2e%2e%2fserver.py", "server.py", "page", "style.css/x"):
+            status, _ = asyncio.run(ask(server, "GET", f"/{name}"))
+            assert status in (403, 404), name
+    assert sorted(path.name for path in PAGE.iterdir()) == sorted(TYPES)
+
+
+def test_a_foreign_host_name_or_page_is_refused():
+    with served() as (server, commands, _):
+        own = f"http://127.0.0.1:{server.port}"
+        token = asyncio.run(connected(server, own))["token"]
+        body = {"node": "/p", "verb": "pause"}
+        allowed = {"Origin": own, TOKEN: token}
+        for wrong in (
+            {"Host": f"evil.example:{server.port}"},
+            {"Host": "127.0.0.1"},
+            {"Origin": "http://evil.example"},
+            {"Origin": "null"},
+            {"Origin": f"https://127.0.0.1:{server.port}"},
+            {TOKEN: "x" * 43},
+            {TOKEN: ""},
+        ):
+            status, _ = asyncio.run(
+                ask(server, "POST", "/api/call", json=body, **{**allowed, **wrong})
+            )
+            assert status == 403, wrong
+        without = {TOKEN: token}
+        assert asyncio.run(ask(server, "POST", "/api/call", json=body, **without))[0] == 403
+        for wrong in ({"Host": "evil.example"}, {"Origin": "http://evil.example"}):
+            assert asyncio.run(ask(server, "GET", "/", **wrong))[0] == 403
+        assert commands.empty()
+        for origin in ("http://evil.example", "null", ""):
+            with pytest.raises(aiohttp.WSServerHandshakeError):
+                asyncio.run(connected(server, origin))
+
+
+def test_a_page_of_ours_reaches_the_nodes_and_nothing_but_what_they_offer():
+    with served() as (server, commands, view):
+        own = f"http://localhost:{server.port}"
+        allowed = {"Origin": own, TOKEN: asyncio.run(connected(server, own))["token"]}
+
+        async def call() -> tuple[int, str]:
+            asking = asyncio.create_task(
+                ask(server, "POST", "/api/call", json={"node": "/p", "verb": "pause"}, **allowed)
+            )
+            command = await asyncio.to_thread(commands.get, timeout=10)
+            assert isinstance(command, Call) and (command.node, command.verb) == ("/p", "pause")
+            command.tell(True, "held")
+            return await asking
+
+        assert asyncio.run(call()) == (200, '{"success": true, "message": "held"}')
+        for body in (
+            {"node": "/p", "verb": "stop"},
+            {"node": "/q", "verb": "pause"},
+            {"node": ["/p"], "verb": "pause"},
+            [],
+            None,
+        ):
+            assert asyncio.run(ask(server, "POST", "/api/call", json=body, **allowed))[0] == 400
+        view.watch({"domain": 1, "namespaces": ["/", "/lab"]}, run=None, from_topics=True)
+        watch = "/api/watch"
+        for body, status in (
+            ({"namespace": "/lab"}, 200),
+            ({"namespace": "/other"}, 400),
+            ({"environment": 3}, 200),
+            ({"environment": -1}, 400),
+            ({"environment": True}, 400),
+        ):
+            assert asyncio.run(ask(server, "POST", watch, json=body, **allowed))[0] == status, body
+        assert commands.get(timeout=10) == Watch("/lab") and commands.empty()
+
+
+def test_the_headers_allow_nothing_from_elsewhere_and_no_inline_script():
+    async def headers(server: Server) -> Any:
+        async with (
+            aiohttp.ClientSession() as session,
+            session.get(server.url) as answer,
+        ):
+            return answer.headers
+
+    with served() as (server, _, _):
+        found = asyncio.run(headers(server))
+    policy = found["Content-Security-Policy"]
+    assert "default-src 'none'" in policy and "script-src 'self'" in policy
+    assert "unsafe" not in policy and "http" not in policy
+    assert found["X-Content-Type-Options"] == "nosniff"
+    for name in TYPES:
+        text = (PAGE / name).read_text().replace("http://www.w3.org/2000/svg", "")
+        assert "https://" not in text and "http://" not in text and "eval(" not in text, name
+
+
+def test_the_colour_map_is_that_of_the_report():
+    from matplotlib import colormaps
+
+    from bringup.report.figures import FIELD_MAP
+
+    text = "".join((PAGE / "cividis.js").read_text().split('"')[1::2])
+    ours = np.frombuffer(bytes.fromhex(text), np.uint8).reshape(-1, 3)
+    theirs = (colormaps[FIELD_MAP](np.arange(256))[:, :3] * 255).round()
+    np.testing.assert_array_equal(ours, theirs)
