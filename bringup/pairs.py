@@ -11,6 +11,8 @@ from pathlib import Path
 
 from loop_interfaces.affinity import free_cores
 from loop_interfaces.parameters import ParameterError
+from pde_sim_node.build import fingerprint
+from tuner_node.results import RunFolder
 
 MAX_PAIRS = 64
 """On one machine; on several, start the pairs by hand (docs/scaling.md)."""
@@ -106,6 +108,7 @@ class Layout:
         """
         serving = tuner_parameter(self.pairs)
         tuner = [f"out:={quoted(folder.resolve())}", "resume:=true"]
+        tuner.append(f"plant:={fingerprint(RunFolder(folder).values())}")
         nodes = pair_nodes(self.pairs, self.pin, self.remaps)
         recording = self.recording
         if recording is not None:

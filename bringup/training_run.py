@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
 import signal
 import sys
 import threading
@@ -22,8 +23,8 @@ from bringup.in_process import LocalPair, train
 from bringup.live import announced
 from bringup.pairs import Layout, Recording, pair_nodes, quoted
 from bringup.supervisor import Child, NodeError, Supervisor, node_command
-from loop_interfaces.isolation import NETWORK, loopback_environment
-from loop_interfaces.parameters import ParameterError, check, table
+from loop_interfaces.isolation import NETWORK, PROFILE, loopback_environment
+from loop_interfaces.parameters import ParameterError
 from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_equation, build_plant
 from tuner_node.build import build_training
@@ -77,6 +78,11 @@ class Transport:
             raise ParameterError(
                 "--record, --network and --faulty-line are about topics; leave out --in-process"
             )
+        if self.network and os.environ.get(PROFILE):
+            raise ParameterError(
+                f"--network and {PROFILE}={os.environ[PROFILE]} both say where messages go; leave "
+                "out --network to use that profile, or unset the variable"
+            )
         if self.in_process and (self.pairs > 1 or self.pin):
             raise ParameterError("--pairs and --pin are about nodes; leave out --in-process")
         if self.pairs > 1 and self.faulty_line:
@@ -118,10 +124,10 @@ def begin(
 
 def reopen(folder: Path) -> dict[str, Any]:
     """The parameters of the unfinished training in `folder`; RunFolderError if there is none."""
-    given = RunFolder(folder).parameters()
+    values = RunFolder(folder).values()
     if (folder / "result.json").exists():
         raise RunFolderError(f"the run in {folder} is complete; there is nothing to continue")
-    return {**given, **check(table(), given)}
+    return values
 
 
 def run_new(

@@ -23,15 +23,12 @@ from loop_interfaces.protocol import ModelFailure, Send, Tally
 from loop_interfaces.topics import (
     ACTION,
     COMPLETED,
+    MAX_GAIN,
     MODEL_IDENTIFIED,
     VOID,
     CostColumn,
     StartColumn,
 )
-
-MAX_GAIN = 1e9
-"""Largest gain accepted: with fields below the divergence bound no action can overflow."""
-
 
 MAX_KEPT = 8
 """Runs, and plants, whose messages are kept apart. The longest unheard one is forgotten first, but

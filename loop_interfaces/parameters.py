@@ -240,6 +240,13 @@ TUNER = (
     ),
     Spec("out", "", "folder of the results and the checkpoint; empty: keep nothing"),
     Spec("resume", False, "continue the run whose checkpoint is in 'out'"),
+    Spec(
+        "plant",
+        0,
+        "fingerprint of the plant that is to be trained; 0: the first one that answers",
+        0,
+        2**53 - 1,
+    ),
     Spec("max_batch", 1024, "environments of one episode at the most", 1, 65536, live=True),
     Spec(
         "episode_timeout",

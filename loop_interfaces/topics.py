@@ -52,6 +52,10 @@ WRITER_DEPTH = 1
 READER_DEPTH = 8
 """A message of ours must not be pushed out by one of a node that should not be there."""
 
+MAX_GAIN = 1e9
+"""Largest gain that is published or accepted: with fields below the divergence bound no action can
+overflow, and a law with such gains diverges anyway."""
+
 COMPLETED = -1
 VOID = -2
 

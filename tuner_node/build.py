@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner_node.optimizers import NEED_TRAJECTORIES, OPTIMIZERS, Context, Optimizer
-from tuner_node.training import Training, TrainingSettings
+from tuner_node.training import UNKNOWN_PLANT, Training, TrainingSettings
 
 
 def build_training(values: Mapping[str, Any]) -> Training:
@@ -53,4 +53,4 @@ def build_training(values: Mapping[str, Any]) -> Training:
         action_weight=values["action_weight"],
         trajectories=values["optimizer"] in NEED_TRAJECTORIES,
     )
-    return Training(settings, make_optimizer)
+    return Training(settings, make_optimizer, plant=values["plant"] or UNKNOWN_PLANT)

@@ -34,7 +34,9 @@ from loop_interfaces.parameters import (
     PLANT,
     RECORDER,
     ParameterError,
+    check,
     read_yaml,
+    table,
     yaml_text,
 )
 from loop_interfaces.topics import COMPLETED
@@ -42,7 +44,16 @@ from tuner_node import checkpoint
 from tuner_node.training import CONTROLLERS, Training
 
 TRANSIENT = (
-    *("out", "resume", "pairs", "max_batch", "episode_timeout", "max_attempts", "recorder"),
+    *(
+        "out",
+        "resume",
+        "pairs",
+        "max_batch",
+        "episode_timeout",
+        "max_attempts",
+        "recorder",
+        "plant",
+    ),
     *(spec.name for spec in (*PLANT, *EXECUTION, *RECORDER)),
 )
 """Parameters that change how a training is carried out, not what comes out of it."""
@@ -110,6 +121,11 @@ class RunFolder:
             return read_yaml(path)
         except ParameterError as error:
             raise RunFolderError(str(error)) from error
+
+    def values(self) -> dict[str, Any]:
+        """The parameters of the training here, with the present defaults of what is not in its file."""
+        given = self.parameters()
+        return {**given, **check(table(), given)}
 
     def _check_same(self, known: Mapping[str, Any], now: Mapping[str, Any]) -> None:
         """RunFolderError showing every difference that would change the results."""

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces import model_rows
-from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn
+from loop_interfaces.topics import COMPLETED, MAX_GAIN, CostColumn, StartColumn
 from tuner_node.optimizers import Context, Optimizer, Rollout, RolloutResult, Trajectory
 from tuner_node.seeds import Purpose, derive
 
@@ -387,4 +387,5 @@ def _batch(wanted: Sequence[tuple[int, Rollout]], trajectories: bool = False) ->
     rows = np.empty((len(wanted), len(StartColumn)))
     for row, (model, rollout) in zip(rows, wanted, strict=True):
         row[:] = (rollout.field_seed, -1, 0.0, model)
-    return Batch(rows, np.stack([rollout.policy for _, rollout in wanted]), trajectories)
+    policies = np.stack([rollout.policy for _, rollout in wanted])
+    return Batch(rows, np.clip(policies, -MAX_GAIN, MAX_GAIN), trajectories)

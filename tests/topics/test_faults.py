@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pde_sim_node.build import fingerprint
 from tests.loop_harness import Processes, until
-from tests.small import SMALL
+from tests.small import SMALL, parameters
 from tests.topics.test_loop import (
     LIMIT,
     assert_same_training,
@@ -144,6 +145,17 @@ def test_a_second_plant_with_other_parameters_never_mixes_in(loop, tmp_path):
     loop.node("pde_sim_node", *PARAMETERS, "-p", "physical.viscosity:=0.02")
     text = loop.wait(tuner, LIMIT)
     assert_same_training(out, in_process(iterations=800))
+    assert "plant with other parameters" in text
+
+
+def test_of_two_plants_there_from_the_start_the_one_that_was_asked_for_is_trained(loop, tmp_path):
+    values = parameters(iterations=100)
+    loop.node("pde_sim_node", *PARAMETERS, "-p", "physical.viscosity:=0.02")
+    start_pair(loop)
+    out = tmp_path / "run"
+    tuner = start_tuner(loop, out, iterations=100, plant=fingerprint(values))
+    text = loop.wait(tuner, LIMIT)
+    assert_same_training(out, in_process(iterations=100))
     assert "plant with other parameters" in text
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from loop_interfaces.parameters import yaml_text
+from loop_interfaces.topics import MAX_GAIN
 from tests.loop_harness import Processes, until
 from tests.small import SMALL, parameters, same_bits, train_here
 from tuner_node.training import Training
@@ -162,6 +163,17 @@ def test_a_rollout_that_diverges_is_marked_and_the_training_goes_on(loop: Proces
     assert sum(row["diverged"] for row in result["history"]) > 0
     with np.load(out / "policy.npz") as arrays:
         assert np.isfinite(arrays["policy"]).all()
+
+
+def test_gains_beyond_what_the_topics_take_end_the_same_as_in_one_process(loop, tmp_path):
+    loop.node("pde_sim_node", "--params-file", str(SMALL))
+    loop.node("controller_node", "--params-file", str(SMALL))
+    arguments = tuner_arguments(tmp_path / "run", iterations=3, learning_rate=1e13)
+    tuner = loop.node("tuner_node", "--params-file", str(SMALL), *arguments)
+    loop.wait(tuner, LIMIT)
+    training = train_here(parameters(iterations=3, learning_rate=1e13))
+    assert np.abs(training.policies()).max() > MAX_GAIN
+    assert_same_training(tmp_path / "run", training)
 
 
 DIVERGING = {
