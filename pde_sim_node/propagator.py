@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm
 
 from .equations import Equation, Spectrum
 from .fft import plane_size
@@ -49,6 +48,8 @@ def exact_propagator(linear: Spectrum, time: float) -> tuple[Spectrum, Spectrum]
             n, c, _ = linear.shape
             blocks = np.zeros((n, 2 * c, 2 * c), dtype=linear.dtype)
             blocks[:, :c, :c], blocks[:, :c, c:] = time * linear, time * np.eye(c)
+            from scipy.linalg import expm  # 14 MB that only these plants need
+
             whole = expm(blocks)
             e, f = whole[:, :c, :c], whole[:, :c, c:]
     if not (np.isfinite(e).all() and np.isfinite(f).all()):
