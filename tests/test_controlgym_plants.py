@@ -45,7 +45,8 @@ def test_a_linear_plant_moves_as_controlgyms_does_between_its_actions(name: str)
         kick[plant.equation.actuated * n_x :][:n_x] = plant.supports @ action
         np.testing.assert_allclose(free[0] + kick, golden["states"][k + 1], rtol=0, atol=1e-11)
         _, cost = plant.evaluate(z, action[None])
-        np.testing.assert_allclose(cost[0], golden["stage_costs"][k], rtol=1e-12)
+        action_part = (1 - plant.action_weight) * action @ action
+        np.testing.assert_allclose(cost[0] + action_part, golden["stage_costs"][k], rtol=1e-12)
 
 
 @pytest.mark.parametrize("name", SEMILINEAR + LINEAR)
@@ -78,5 +79,7 @@ def test_the_shipped_problems_have_controlgyms_sizes(
     assert values["length"] == length
     assert (values["sample_time"], values["horizon"], values["n_z"]) == (sample_time, horizon, n_z)
     assert (values["n_a"], values["actuator_width"]) == (8, 0.1)
-    assert (values["state_weight"], values["action_weight"]) == (1.0, 1.0)
+    # controlgym's linear plants take an action as an impulse, which is sample_time times a held one.
+    weight = sample_time**2 if name in LINEAR else 1.0
+    assert (values["state_weight"], values["action_weight"]) == (1.0, pytest.approx(weight))
     assert not [key for key in values if key.startswith("physical.")], "the equation's defaults"

@@ -53,7 +53,8 @@ class ProblemData:
     """A problem's part of a report.
 
     costs: (S, fields) by controller; curves; policies: by controller, of the shown seed; models: of
-    all seeds, with the adapted policies; shown: the seed whose behaviour is shown.
+    all seeds, with the adapted policies; shown: the seed whose behaviour is shown; components: the
+    names of the fields that a state consists of.
     """
 
     name: str
@@ -68,6 +69,7 @@ class ProblemData:
     behaviours: list[Behaviour]
     x: Array
     target: Array
+    components: tuple[str, ...]
 
     @property
     def seeds(self) -> int:
@@ -179,6 +181,7 @@ def _problem(
         behaviours=_behaviours(plant, trained.models[shown], policies),
         x=plant.x,
         target=plant.target,
+        components=plant.equation.components,
     )
 
 

@@ -155,43 +155,63 @@ def bars(problems: Sequence[ProblemData]) -> Figure:
 
 
 def behaviour(problem: ProblemData) -> Figure:
-    """From the mean initial field: the field in space and time, the actions, the final profile."""
-    shown = problem.behaviours
-    count = len(shown)
-    figure = Figure(figsize=(2.05 * count + 0.9, 5.9))
+    """From the mean initial field: the fields in space and time, the actions, the final profiles."""
+    shown, components = problem.behaviours, problem.components
+    count, fields = len(shown), len(components)
+    figure = Figure(figsize=(2.05 * count + 0.9, 1.3 + 2.0 * fields + 1.3 * (1 + fields)))
     grid = figure.subplots(
-        3, count, sharex="row", sharey="row", squeeze=False, height_ratios=(1.25, 1, 1)
+        2 * fields + 1,
+        count,
+        sharex="row",
+        sharey="row",
+        squeeze=False,
+        height_ratios=(1.25,) * fields + (1,) * (1 + fields),
     )
-    everything = np.stack([b.states for b in shown])
-    # A few extreme points, a shock's tip, would leave no contrast to the rest.
-    low, high = (float(v) for v in np.percentile(everything, (0.3, 99.7)))
     largest = max(float(np.abs(b.actions).max()) for b in shown) or 1.0
-    length = float(problem.values["length"])
     for column, b in enumerate(shown):
-        top, middle, bottom = grid[:, column]
-        image = _field(top, problem, b, low, high)
+        top = grid[0, column]
         top.set_title(f"{TITLES[b.controller]}\nmean stage cost {b.cost:.3g}")
         if b.diverged >= 0:
             top.set_title(f"{TITLES[b.controller]}\ndiverged at step {b.diverged}")
-        _actions(middle, b, largest)
-        bottom.plot(problem.x, problem.target, color="black", linewidth=0.9, label="target")
-        bottom.plot(problem.x, b.states[-1], color=COLOURS[b.controller], label="final field")
-        bottom.set_xlim(0, length)
-        bottom.xaxis.set_major_locator(MaxNLocator(3))
-        middle.xaxis.set_major_locator(MaxNLocator(3))
-        top.xaxis.set_major_locator(MaxNLocator(3))
-        bottom.set_xlabel("x (m)")
-        middle.set_xlabel("t (s)")
-        top.set_xlabel("t (s)")
-    grid[0, 0].set_ylabel("x (m)")
-    grid[1, 0].set_ylabel("actions $a_j$")
-    grid[2, 0].set_ylabel("u(x, T)")
-    _room_for_legend(grid[2, 0], shown, problem.target)
-    grid[2, 0].legend(loc="upper left", ncols=1, handlelength=1.4)
-    figure.colorbar(
-        image, ax=grid[0, :].tolist(), label="u(x, t)", aspect=14, pad=0.01, extend="both"
-    )
+        _actions(grid[fields, column], b, largest)
+        grid[fields, column].set_xlabel("t (s)")
+        for ax in grid[:, column]:
+            ax.xaxis.set_major_locator(MaxNLocator(3))
+    grid[fields, 0].set_ylabel("actions $a_j$")
+    for i, name in enumerate(components):
+        _component(figure, problem, i, grid[i], grid[fields + 1 + i], name)
     return figure
+
+
+def _component(
+    figure: Figure,
+    problem: ProblemData,
+    index: int,
+    maps: Sequence[Axes],
+    profiles: Sequence[Axes],
+    name: str,
+) -> None:
+    """A component of the state: its maps in space and time, and its final profiles."""
+    n_x = len(problem.x)
+    own = slice(index * n_x, (index + 1) * n_x)
+    fields = [b.states[:, own] for b in problem.behaviours]
+    target = problem.target[own]
+    # A few extreme points, a shock's tip, would leave no contrast to the rest.
+    low, high = (float(v) for v in np.percentile(np.stack(fields), (0.3, 99.7)))
+    length = float(problem.values["length"])
+    for b, field, top, bottom in zip(problem.behaviours, fields, maps, profiles, strict=True):
+        image = _field(top, length, float(b.t[-1]), field, low, high)
+        top.set_xlabel("t (s)")
+        bottom.plot(problem.x, target, color="black", linewidth=0.9, label="target")
+        bottom.plot(problem.x, field[-1], color=COLOURS[b.controller], label="final field")
+        bottom.set_xlim(0, length)
+        bottom.set_xlabel("x (m)")
+    maps[0].set_ylabel("x (m)")
+    profiles[0].set_ylabel(f"{name}(x, T)")
+    if index == 0:
+        _room_for_legend(profiles[0], [field[-1] for field in fields], target)
+        profiles[0].legend(loc="upper left", ncols=1, handlelength=1.4)
+    figure.colorbar(image, ax=list(maps), label=f"{name}(x, t)", aspect=14, pad=0.01, extend="both")
 
 
 def gains(problem: ProblemData) -> Figure:
@@ -309,18 +329,20 @@ def _legend_above(figure: Figure, axes: Sequence[Axes]) -> None:
     )
 
 
-def _field(ax: Axes, problem: ProblemData, b: Behaviour, low: float, high: float) -> AxesImage:
+def _field(
+    ax: Axes, length: float, duration: float, field: Array, low: float, high: float
+) -> AxesImage:
     for side in ("top", "right"):
         ax.spines[side].set_visible(True)
     return ax.imshow(
-        b.states.T,
+        field.T,
         origin="lower",
         aspect="auto",
         cmap=FIELD_MAP,
         vmin=low,
         vmax=high,
         interpolation="nearest",
-        extent=(0.0, float(b.t[-1]), 0.0, float(problem.values["length"])),
+        extent=(0.0, duration, 0.0, length),
     )
 
 
@@ -332,9 +354,9 @@ def _actions(ax: Axes, b: Behaviour, largest: float) -> None:
     ax.set_ylim(-1.08 * largest, 1.08 * largest)
 
 
-def _room_for_legend(ax: Axes, shown: Sequence[Behaviour], target: Array) -> None:
-    low = min(float(target.min()), *(float(b.states[-1].min()) for b in shown))
-    high = max(float(target.max()), *(float(b.states[-1].max()) for b in shown))
+def _room_for_legend(ax: Axes, finals: Sequence[Array], target: Array) -> None:
+    low = min(float(target.min()), *(float(final.min()) for final in finals))
+    high = max(float(target.max()), *(float(final.max()) for final in finals))
     span = (high - low) or 1.0
     ax.set_ylim(low - 0.06 * span, high + 0.7 * span)
 
