@@ -56,8 +56,11 @@ class Browser:
         return self._run(self._send(method, parameters))
 
     def go(self, url: str) -> None:
-        """Open a page."""
-        self.send("Page.navigate", url=url)
+        """Open a page and wait until it is there."""
+        answer = self.send("Page.navigate", url=url)
+        assert "errorText" not in answer, answer
+        there = f"document.readyState === 'complete' && location.href === {json.dumps(url)}"
+        self.until(there, PATIENCE)
 
     def size(self, width: int, height: int, scale: float = 1.0) -> None:
         self.send(

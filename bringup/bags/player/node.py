@@ -33,6 +33,10 @@ LOOK_FOR = 2.5
 """Seconds in which a live loop in this domain is found."""
 LOOK = 1.0
 """Seconds between two looks for one while playing."""
+UNKNOWN = 1.0
+"""Seconds in which the name of a publisher's node should come."""
+NAMELESS = "_NODE_NAME_UNKNOWN_"
+"""What the graph says of an endpoint whose node it has not heard of yet."""
 NAP = 0.02
 """Longest sleep, so that signals are noticed."""
 LINGER = 0.5
@@ -72,6 +76,7 @@ class PlayerNode:
         self._publishers: dict[str, Publisher] = {}
         self._until = loop.now() + LOOK_FOR
         self._look_at = 0.0
+        self._seen_at: float | None = None
         self._linger: float | None = None
         for name, value in self._recorded_parameters().items():
             node.declare_parameter(name, value, ParameterDescriptor(read_only=True))
@@ -100,15 +105,15 @@ class PlayerNode:
 
     def _housekeeping(self, now: float) -> None:
         if not self._publishers:
-            self._refuse_company()
-            if now >= self._until:
+            self._refuse_company(now)
+            if now >= self._until and self._seen_at is None:
                 self._create()
                 if self._left is not None:
                     self._playback.delay(now - self._left)
                     self._left = None
         elif now >= self._look_at:
             self._look_at = now + LOOK
-            self._refuse_company()
+            self._refuse_company(now)
 
     def _create(self) -> None:
         for channel in self._channels:
@@ -124,7 +129,7 @@ class PlayerNode:
         if not self._publishers:
             raise PlayerError(f"{self._bag.path} holds nothing that can be published here")
 
-    def _refuse_company(self) -> None:
+    def _refuse_company(self, now: float) -> None:
         """A live loop must not be told what happened long ago."""
         for channel in self._channels:
             topic = channel.topic
@@ -133,13 +138,19 @@ class PlayerNode:
             names = [
                 f"{info.node_namespace.rstrip('/')}/{info.node_name}"
                 for info in self._node.get_publishers_info_by_topic(topic)
+                if info.node_name != NAMELESS
             ]
             others = [name for name in names if name != f"/{NAME}"]
+            self._seen_at = self._seen_at or now
+            if not others and now - self._seen_at < UNKNOWN:
+                return  # the name comes a little later than the publisher
+            who = others[0] if others else "another node"
             raise PlayerError(
-                f"{(others or names)[0]} publishes {topic} in this ROS domain; a bag is not played "
-                "beside a live loop, which would take its messages for its own. Stop that loop (what "
-                "was killed is seen for 3 s more), or play in another ROS_DOMAIN_ID"
+                f"{who} publishes {topic} in this ROS domain; a bag is not played beside a live loop, "
+                "which would take its messages for its own. Stop that loop (what was killed is seen "
+                "for 3 s more), or play in another ROS_DOMAIN_ID"
             )
+        self._seen_at = None
 
     def _recorded_parameters(self) -> dict[str, Any]:
         """What defines the last run in the bag, as far as it knows: not its folders and the like."""

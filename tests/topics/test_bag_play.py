@@ -1,0 +1,156 @@
+"""A bag played over topics: the same bytes in the same order and time, never beside a loop."""
+
+from __future__ import annotations
+
+import re
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from bringup.bags.playback import Playback, channels
+from bringup.bags.reader import Bag, Message
+from tests.browser import browser
+from tests.loop_harness import Processes, processes, until
+from tests.small import SMALL
+from tests.topics.test_loop import LIMIT
+from tests.topics.test_monitor import FIELD, ITERATION, PAINTED, STATE, address, card
+
+pytestmark = pytest.mark.topics
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory) -> Path:
+    """The folder of a small recorded run."""
+    folder = tmp_path_factory.mktemp("played")
+    with processes(folder) as loop:
+        options = ("--iterations", "3", "--optimizer", "two_point", "--record")
+        run = loop.pdeloop("train", str(SMALL), *options, "--out", str(folder / "run"))
+        loop.wait(run, LIMIT)
+    return folder / "run"
+
+
+def by_topic(messages: list[Message]) -> dict[str, list[bytes]]:
+    found: dict[str, list[bytes]] = {}
+    for message in messages:
+        found.setdefault(message.topic, []).append(message.data)
+    return found
+
+
+def slowness(original: Bag, bag: Bag) -> float:
+    """How much longer the states took in `bag`."""
+    times = [
+        [message.when for message in b.messages() if message.topic == "/state"]
+        for b in (original, bag)
+    ]
+    return (times[1][-1] - times[1][0]) / (times[0][-1] - times[0][0])
+
+
+def test_what_is_played_can_be_recorded_again_to_the_byte(loop: Processes, tmp_path, bag):
+    original = Bag(bag)
+    seconds = (lambda m: (m[-1].when - m[0].when) / 1e9)(list(original.messages()))
+    rate = seconds / 8.0  # so slowly that a busy machine loses nothing
+    player = loop.pdeloop("bag", "play", str(bag), "--wait", "--rate", str(rate))
+    until(lambda: "waiting for somebody" in loop.output(player), LIMIT, "player")
+    recorder = loop.node("recorder_node", "-p", f"bag:={tmp_path / 'again'}")
+    loop.wait(player, LIMIT)
+    recorder.send_signal(signal.SIGINT)
+    loop.wait(recorder, LIMIT)
+    again, before = (
+        by_topic(list(Bag(tmp_path / "again").messages())),
+        by_topic(list(original.messages())),
+    )
+    assert set(again) == set(before)
+    for topic, messages in before.items():
+        # The first ones may have gone before the recorder knew of the publisher, but nothing after.
+        missing = len(messages) - len(again[topic])
+        assert 0 <= missing < 0.2 * len(messages) + 1, topic
+        assert again[topic] == messages[missing:], topic
+    assert 0.5 < slowness(original, Bag(tmp_path / "again")) * rate < 2.0
+
+
+def test_a_bag_is_not_played_beside_a_live_loop_nor_further_when_one_appears(loop, bag):
+    plant = loop.node("pde_sim_node", "--params-file", str(SMALL))
+    until(lambda: "4 actuators" in loop.output(plant), LIMIT, "plant")
+    text = loop.wait(loop.pdeloop("bag", "play", str(bag)), LIMIT, code=1)
+    assert "/pde_sim_node publishes /" in text and "live loop" in text
+    assert "Traceback" not in text and "messages published" not in text
+    plant.send_signal(signal.SIGINT)
+    loop.wait(plant, LIMIT)
+
+    player = loop.pdeloop("bag", "play", str(bag), "--loop", "--rate", "0.01")
+    time.sleep(6.0)  # it has looked for a loop, and plays
+    assert player.poll() is None, loop.output(player)
+    loop.node("controller_node", "--params-file", str(SMALL))
+    text = loop.wait(player, LIMIT, code=1)
+    assert "/controller_node publishes /action" in text
+
+
+def test_the_monitor_shows_a_bag_that_is_played(loop: Processes, tmp_path, bag):
+    del loop.environment["ROS_DOMAIN_ID"]
+    loop.environment["TMPDIR"] = str(tmp_path)
+    player = loop.pdeloop("bag", "play", str(bag), "--loop", "--rate", "0.05", "--wait")
+    monitor = loop.pdeloop("monitor", "--port", "0")
+    with browser(tmp_path) as page:
+        page.go(address(loop, monitor))
+        page.until(f"{STATE} === 'running'", LIMIT)
+        page.until(f"{ITERATION} >= 2", LIMIT)
+        page.wait_for(lambda: page.ask(PAINTED % "field") > 250, LIMIT, "picture of the field")
+        page.until(f"/episode \\d+ \\((policy|exploration)\\)/.test({FIELD})", LIMIT)
+        assert "/bag_player" in card(page, "plant")
+        assert page.ask("document.querySelector('#problem').textContent") == "small"
+        assert page.ask("document.querySelector('#plant-pause').disabled")
+        assert page.console == []
+    player.send_signal(signal.SIGINT)
+    text = loop.wait(player, LIMIT, code=130)
+    assert re.search(r"\d+ messages published, stopped by SIGINT", text)
+
+
+def test_a_bag_that_is_none_is_told_in_one_line(loop: Processes, tmp_path):
+    text = loop.wait(loop.pdeloop("bag", "play", str(tmp_path / "none")), LIMIT, code=1)
+    assert "no bag at" in text and len(text.strip().splitlines()) == 1
+    text = loop.wait(loop.pdeloop("bag", "play", str(tmp_path), "--rate", "0"), LIMIT, code=1)
+    assert "--rate" in text
+
+
+def test_the_recorded_quality_of_service_is_that_of_the_loop(bag):
+    found = {channel.topic: channel for channel in channels(Bag(bag))}
+    assert found["/target"].latched and found["/episode/cost"].latched
+    assert not found["/state"].latched and found["/state"].reliable
+    assert found["/clock"].type == "rosgraph_msgs/msg/Clock"
+    # Of an unfinished bag, which has no metadata, it is that of the loop's table.
+    unfinished = bag.parent / "unfinished"
+    unfinished.mkdir()
+    (source,) = (bag / "bag").glob("*.mcap")
+    (unfinished / source.name).write_bytes(source.read_bytes())
+    again = {channel.topic: channel for channel in channels(Bag(unfinished))}
+    assert len(again) > 6
+    for topic, channel in again.items():
+        assert (channel.type, channel.latched) == (found[topic].type, found[topic].latched)
+
+
+@pytest.mark.parametrize("rate", [1.0, 4.0])
+def test_messages_are_due_in_the_recorded_time(bag, rate):
+    messages = list(Bag(bag).messages())
+    playback = Playback(Bag(bag), rate=rate, again=False)
+    playback.begin(100.0)
+    now, taken = 100.0, []
+    while not playback.over:
+        taken += [(now, message) for message in playback.take(now)]
+        now = playback.due or now
+    assert [message for _, message in taken] == messages
+    for when, message in taken:
+        assert when - 100.0 == pytest.approx(
+            (message.when - messages[0].when) / 1e9 / rate, abs=1e-6
+        )
+    assert playback.published == len(messages)
+
+
+def test_a_loop_begins_again_at_the_end(bag):
+    messages = list(Bag(bag).messages())
+    playback = Playback(Bag(bag), rate=1.0, again=True)
+    playback.begin(0.0)
+    first, second = (list(playback.take(t)) for t in (1e6, 2e6))
+    assert first == second == messages
+    assert not playback.over and playback.due == 2e6

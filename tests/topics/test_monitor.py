@@ -1,0 +1,224 @@
+"""The live page in a real browser, beside a real loop over topics."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.browser import Browser, browser
+from tests.loop_harness import Processes, until
+from tests.small import SMALL
+from tests.topics.test_loop import LIMIT
+
+pytestmark = pytest.mark.topics
+SLOW = ("-p", "real_time_factor:=4.0")
+"""80 rounds a second: an episode of the small problem takes 0.4 s."""
+STATE = "document.querySelector('#state').textContent"
+ITERATION = "Number(document.querySelectorAll('#figures dd span')[1].textContent) || 0"
+FIELD = "document.querySelector('#field-text').textContent"
+"""What the page says of the field: the number of the episode, what it is, the step."""
+PAINTED = """
+(() => {
+  const canvas = document.getElementById(%r);
+  const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d");
+  copy.drawImage(canvas, 0, 0);
+  const { data } = copy.getImageData(0, 0, canvas.width, canvas.height);
+  return new Set(new Uint32Array(data.buffer)).size;
+})()
+"""
+"""How many different colours a canvas shows."""
+REFUSED = "WebSocket connection to"
+"""What a browser always writes to the console while a server is away."""
+
+
+@pytest.fixture
+def page(tmp_path: Path) -> Iterator[Browser]:
+    with browser(tmp_path) as tab:
+        tab.size(1300, 900)
+        yield tab
+
+
+def address(loop: Processes, monitor: subprocess.Popen[bytes]) -> str:
+    """Where the monitor serves its page."""
+    found = lambda: re.search(r"http://127\.0\.0\.1:\d+/", loop.output(monitor))  # noqa: E731
+    until(found, LIMIT, "address of the page")
+    match = found()
+    assert match is not None
+    return match.group(0)
+
+
+def start_loop(loop: Processes, out: Path, *tuner: str) -> dict[str, subprocess.Popen[bytes]]:
+    """The three nodes by hand, with a plant of which a person can see the steps."""
+    given = ("--params-file", str(SMALL))
+    last = ("-p", "iterations:=100000", "-p", f"out:={out}", "-p", "optimizer:=two_point", *tuner)
+    return {
+        "plant": loop.node("pde_sim_node", *given, *SLOW),
+        "controller": loop.node("controller_node", *given),
+        "tuner": loop.node("tuner_node", *given, *last),
+    }
+
+
+def card(page: Browser, role: str) -> str:
+    """What the page says of a node."""
+    text: str = page.ask(f"document.querySelector('.card[data-role={role}]').innerText")
+    return text
+
+
+def present(page: Browser, role: str) -> Any:
+    return page.ask(f"document.querySelector('.card[data-role={role}]').dataset.present")
+
+
+def test_the_page_shows_a_running_loop_and_survives_a_restart_of_the_plant(loop, page, tmp_path):
+    nodes = start_loop(loop, tmp_path / "run")
+    monitor = loop.pdeloop("monitor", "--port", "0")
+    url = address(loop, monitor)
+    page.go(url)
+    page.until(f"{STATE} === 'running'", LIMIT)
+    for name in ("field", "actions", "profile", "curve"):
+        # Axes, labels and the edges of letters alone make some; a field has many.
+        page.wait_for(
+            lambda name=name: page.ask(PAINTED % name) > (250 if name == "field" else 20),
+            LIMIT,
+            f"picture of {name}",
+        )
+        assert page.ask(f"document.getElementById({name!r}).getAttribute('aria-label')")
+    page.until(f"{ITERATION} >= 3", LIMIT)
+    assert page.ask("document.querySelector('#problem').textContent") == "small"
+    for role in ("plant", "controller", "tuner"):
+        assert "there" in card(page, role) and present(page, role) == "true"
+    before = page.ask(ITERATION)
+    episode = page.ask(FIELD)
+
+    nodes["plant"].send_signal(signal.SIGKILL)
+    page.wait_for(lambda: present(page, "plant") == "false", LIMIT, "sign that the plant is gone")
+    assert "gone" in card(page, "plant")
+    loop.node("pde_sim_node", "--params-file", str(SMALL), *SLOW)
+    page.wait_for(lambda: "joined again once" in card(page, "plant"), LIMIT, "new plant")
+    page.until(f"{ITERATION} > {before + 2}", LIMIT)
+    page.until(f"{FIELD} !== {episode!r}", LIMIT)
+    page.until(f"{STATE} === 'running'", LIMIT)
+    assert page.console == []
+    assert all(request.split("://")[1].startswith(url[7:]) for request in page.requested)
+    monitor.send_signal(signal.SIGINT)
+    loop.wait(monitor, 10.0)
+
+
+def test_pause_step_and_resume_on_the_page_move_the_plant_and_stop_ends_the_training(
+    loop, page, tmp_path
+):
+    nodes = start_loop(loop, tmp_path / "run")
+    monitor = loop.pdeloop("monitor", "--port", "0")
+    page.go(address(loop, monitor))
+    page.until(f"{ITERATION} >= 1", LIMIT)
+    page.until("!document.querySelector('#plant-pause').disabled", LIMIT)
+    page.click("#plant-pause")
+    page.until(f"{STATE} === 'plant paused'", LIMIT)
+    page.wait_for(lambda: "paused at step" in card(page, "plant"), LIMIT, "diagnostics")
+    held = at_step(page)
+    page.click("#plant-step")
+    page.wait_for(lambda: at_step(page) not in (None, held), LIMIT, "step")
+    iteration = page.ask(ITERATION)
+    page.click("#plant-resume")
+    page.until(f"{STATE} === 'running'", LIMIT)
+    page.until(f"{ITERATION} > {iteration}", LIMIT)
+    page.click("#tuner-pause")
+    page.until(f"{STATE} === 'training paused'", LIMIT)
+    page.click("#tuner-resume")
+    page.until(f"{STATE} === 'running'", LIMIT)
+    page.click("#tuner-stop")
+    assert page.ask("document.querySelector('#tuner-stop').textContent") == "Really stop?"
+    assert nodes["tuner"].poll() is None
+    page.click("#tuner-stop")
+    page.until(f"{STATE} === 'ended'", LIMIT)
+    nodes["tuner"].wait(LIMIT)
+    page.until("document.querySelector('#tuner-pause').disabled", LIMIT)
+    assert page.console == []
+
+
+def at_step(page: Browser) -> str | None:
+    """Where the plant's diagnostics say that it is paused."""
+    found = re.search(r"paused at (step \d+ of episode \d+)", card(page, "plant"))
+    return found.group(1) if found else None
+
+
+def test_the_monitor_finds_a_training_that_starts_after_it_and_the_page_a_new_monitor(
+    loop, page, tmp_path
+):
+    # As a person uses it: no domain given, so that the training takes one of its own.
+    del loop.environment["ROS_DOMAIN_ID"]
+    loop.environment["TMPDIR"] = str(tmp_path)  # nobody else's trainings are found
+    monitor = loop.pdeloop("monitor", "--port", "0")
+    url = address(loop, monitor)
+    page.go(url)
+    page.until(f"{STATE} === 'looking for a training'", LIMIT)
+    out = tmp_path / "run"
+    run = loop.pdeloop("train", str(SMALL), "--iterations", "100000", "--out", str(out))
+    page.until(f"{STATE} === 'running'", LIMIT)
+    page.until(f"{ITERATION} >= 3", LIMIT)
+    assert "ROS domain" in page.ask("document.querySelector('#place').textContent")
+
+    monitor.send_signal(signal.SIGKILL)
+    page.until(f"{STATE} === 'no connection to the monitor'", LIMIT)
+    before = page.ask(ITERATION)
+    port = url.rstrip("/").rpartition(":")[2]
+    again = loop.pdeloop("monitor", "--port", port)
+    page.until(f"{STATE} === 'running' && {ITERATION} > {before}", LIMIT)
+    assert [text for text in page.console if REFUSED not in text] == []
+
+    run.send_signal(signal.SIGINT)
+    loop.wait(run, LIMIT, code=130)
+    page.until(f"{STATE} === 'ended'", LIMIT)
+    second = tmp_path / "second"
+    loop.pdeloop("train", str(SMALL), "--iterations", "100000", "--out", str(second))
+    page.until("document.querySelector('#place').textContent.includes('second')", LIMIT)
+    page.until(f"{STATE} === 'running' && {ITERATION} >= 1", LIMIT)
+    again.send_signal(signal.SIGTERM)
+    loop.wait(again, 10.0)
+
+
+def test_a_pair_in_a_namespace_and_an_environment_are_chosen_on_the_page(loop, page, tmp_path):
+    given = ("--params-file", str(SMALL))
+    for number in range(2):
+        remap = ("-r", f"__ns:=/pair{number}")
+        clock = ("-p", f"publish_clock:={str(not number).lower()}")
+        loop.node("pde_sim_node", *given, *SLOW, *clock, *remap)
+        loop.node("controller_node", *given, *remap)
+    last = ("-p", "iterations:=100000", "-p", "seeds:=4", "-p", "optimizer:=two_point")
+    loop.node("tuner_node", *given, *last, "-p", "pairs:=[pair0, pair1]")
+    monitor = loop.pdeloop("monitor", "--port", "0", "--namespace", "pair1", "--environment", "1")
+    page.go(address(loop, monitor))
+    page.until(f"{STATE} === 'running'", LIMIT)
+    page.until("document.querySelector('#pair').options.length === 2", LIMIT)
+    assert page.ask("document.querySelector('#pair').value") == "/pair1"
+    page.until("document.querySelector('#environment').value === '1'", LIMIT)
+    page.until("document.querySelector('#environment').options.length >= 4", LIMIT)
+    page.wait_for(lambda: "/pair1/pde_sim_node" in card(page, "plant"), LIMIT, "plant of pair1")
+    choose = (
+        "(() => { const s = document.querySelector('%s'); s.value = '%s';"
+        " s.dispatchEvent(new Event('change')); })()"
+    )
+    page.ask(choose % ("#environment", "3"))
+    said = "document.querySelector('#field').getAttribute('aria-label')"
+    page.until(f"{said}.includes('environment 3')", LIMIT)
+    page.ask(choose % ("#pair", "/pair0"))
+    page.wait_for(lambda: "/pair0/pde_sim_node" in card(page, "plant"), LIMIT, "plant of pair0")
+    page.until(f"{STATE} === 'running'", LIMIT)
+    page.wait_for(lambda: page.ask(PAINTED % "field") > 250, LIMIT, "picture of the field")
+    assert page.console == []
+
+
+def test_a_port_in_use_and_a_folder_without_a_run_are_told_in_one_line(loop, tmp_path):
+    first = loop.pdeloop("monitor", "--port", "0")
+    port = address(loop, first).rstrip("/").rpartition(":")[2]
+    text = loop.wait(loop.pdeloop("monitor", "--port", port), LIMIT, code=1)
+    (line,) = text.strip().splitlines()
+    assert f"port {port}" in line and "--port" in line
+    text = loop.wait(loop.pdeloop("monitor", str(tmp_path / "none")), LIMIT, code=1)
+    (line,) = text.strip().splitlines()
+    assert "no run in" in line
