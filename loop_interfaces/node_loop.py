@@ -27,6 +27,7 @@ from loop_interfaces.endpoints import Bundler, Receiver, Sender, reader_qos, sco
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.health import Health
 from loop_interfaces.introspection import Introspection
+from loop_interfaces.pulse import Pulse
 from loop_interfaces.samples import ACTION_KIND, STATE_KIND
 from loop_interfaces.topics import ACTION, SAMPLES, STATE, Topic
 from loop_interfaces.watching import Watcher
@@ -180,6 +181,16 @@ class NodeLoop:
         tick(now) is called when `deadline()` (monotonic s, or None) has passed; housekeeping(now)
         every HOUSEKEEPING seconds, or BUSY_HOUSEKEEPING.
         """
+        with Pulse() as pulse:
+            return self._handle_events(pulse, tick, deadline, housekeeping)
+
+    def _handle_events(
+        self,
+        pulse: Pulse,
+        tick: Callable[[float], None],
+        deadline: Callable[[], float | None],
+        housekeeping: Callable[[float], None],
+    ) -> str:
         context = self.node.context
         receivers, clock = self._receivers, time.monotonic
         handles, take_from = self._sources()
@@ -189,18 +200,15 @@ class NodeLoop:
         clear, add = wait_set.clear_entities, wait_set.add_subscription
         wait, ready = wait_set.wait, wait_set.get_ready_entities
         next_round = clock()
-        last_round, cpu = next_round, time.process_time()
         poll_until, handled = 0.0, 0
         while self._stop_reason is None:
             now = clock()
             if now >= next_round:
                 if not context.ok():
                     break
-                gap, worked = now - last_round, time.process_time() - cpu
-                if gap > SUSPENDED and worked < gap / 2:
+                if pulse.longest() > SUSPENDED:
                     self.suspended = True
                     return "suspended"
-                last_round, cpu = now, cpu + worked
                 self._executor.spin_once(timeout_sec=0)
                 if self._bundler is not None:
                     self._bundler.look(now)

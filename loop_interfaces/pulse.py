@@ -1,0 +1,55 @@
+"""Tells a process that was suspended (SIGSTOP, a frozen machine) from one that is only busy."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+BEAT = 0.1
+"""Seconds between two beats."""
+IDLE = 0.05
+"""Share of a gap between two beats that a suspended process can have spent working: it worked at
+most BEAT before it was stopped. One that is starved by others still gets more."""
+
+
+class Pulse:
+    """A thread that does nothing but wake up, so that only a suspension keeps it from it.
+
+    The loop itself is no measure: it may compute for seconds. A thread that sleeps is scheduled
+    promptly even on a busy machine, and NumPy and Numba let it in between.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._longest = 0.0
+        self._last, self._cpu = clock(), time.process_time()
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="pulse", daemon=True)
+
+    def __enter__(self) -> Pulse:
+        self._last, self._cpu = self._clock(), time.process_time()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stopped.set()
+        self._thread.join()
+
+    def longest(self) -> float:
+        """The longest suspension in s so far, one that has just ended included."""
+        self._beat()
+        return self._longest
+
+    def _run(self) -> None:
+        while not self._stopped.wait(BEAT):
+            self._beat()
+
+    def _beat(self) -> None:
+        with self._lock:
+            now, cpu = self._clock(), time.process_time()
+            gap, worked = now - self._last, cpu - self._cpu
+            self._last, self._cpu = now, cpu
+            if worked < IDLE * gap:
+                self._longest = max(self._longest, gap)
