@@ -18,6 +18,7 @@ from launch_ros.actions import Node
 from bringup.launch_plan import Argument, Plan
 from bringup.pairs import LoopNode
 from bringup.supervisor import BACK_OFF, RECORDER_GRACE, REFUSED, NodeError
+from loop_interfaces.protocol import STOPPED
 
 _RESPAWN_DELAY = 1.0
 """Seconds before a node that died is started again."""
@@ -73,13 +74,14 @@ def _after(
     if context.is_shutdown:
         return []
     code = event.returncode
-    if node.package == "tuner_node" and code in (0, 130):
-        return [Shutdown(reason="the training is done" if code == 0 else "it was interrupted")]
+    ends = {0: "the training is done", 130: "it was interrupted", STOPPED: "stopped by request"}
+    if node.package == "tuner_node" and code in ends:
+        return [Shutdown(reason=ends[code])]
     if code == REFUSED:
         raise NodeError(f"{node.name} refuses to run; its last words are above")
     if node.package == "recorder_node":
         return [LogInfo(msg=f"{node.name} ended with code {code}; going on without it")]
-    deaths[node.name] += 1
+    deaths[node.name] += node.package != "viewer_node"  # which the training can do without
     if deaths[node.name] > len(BACK_OFF):
         raise NodeError(f"{node.name} ended with code {code} for the {deaths[node.name]}th time")
     return [LogInfo(msg=f"{node.name} ended with code {code}; starting it again")]

@@ -91,6 +91,7 @@ TRAIN_ARGUMENTS = (
     Argument(Spec("record_or_stop", False, "as record, and end if the recording fails")),
     Argument(_KNOWN["bag_storage"]),
     Argument(_KNOWN["bag_per_episode"]),
+    Argument(Spec("view", False, "a viewer_node, for RViz, Foxglove and PlotJuggler")),
 )
 """Arguments of train.launch.py."""
 
@@ -132,7 +133,7 @@ def train_plan(texts: Mapping[str, str]) -> Plan:
         )
     own = {name: given[name] for name in _TRAINING if given[name] is not None}
     own |= _plant_parameters(given)
-    layout = Layout(given["pairs"], given["pin"], recording)
+    layout = Layout(given["pairs"], given["pin"], recording, view=given["view"])
     pair_nodes(layout.pairs, layout.pin)  # refuses before there is a folder
     if given["resume"]:
         if own or given["out"]:

@@ -91,13 +91,14 @@ def pair_nodes(
 class Layout:
     """The nodes of one training: `pairs` pairs, `pin`ned or not, their tuner, perhaps a recorder.
 
-    remaps: of plants and controllers, by package.
+    remaps: of plants and controllers, by package; view: with a viewer of the first pair.
     """
 
     pairs: int = 1
     pin: bool = False
     recording: Recording | None = None
     remaps: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    view: bool = False
 
     def nodes(self, folder: Path, bag: Path | None = None) -> list[LoopNode]:
         """Who is started for the training in `folder`; the recorder, if any, comes first.
@@ -110,6 +111,9 @@ class Layout:
         tuner = [f"out:={quoted(folder.resolve())}", "resume:=true"]
         tuner.append(f"plant:={fingerprint(RunFolder(folder).values())}")
         nodes = pair_nodes(self.pairs, self.pin, self.remaps)
+        if self.view:
+            first = namespaces(self.pairs)[0]
+            nodes.append(LoopNode("viewer_node", "viewer_node", namespace=first))
         recording = self.recording
         if recording is not None:
             own = [] if bag is None else [f"bag:={quoted(bag.resolve())}"]

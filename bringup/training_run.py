@@ -63,7 +63,7 @@ class Transport:
 
     in_process: without ROS; network: let the messages leave this machine; faulty_line: 'LOSS,
     DUPLICATION,DELAY' of a relay between plant and controller; pairs: of plant and controller; pin:
-    give each of their nodes a core.
+    give each of their nodes a core; view: a viewer_node of the first pair beside them.
     """
 
     in_process: bool = False
@@ -72,6 +72,7 @@ class Transport:
     faulty_line: str | None = None
     pairs: int = 1
     pin: bool = False
+    view: bool = False
 
     def __post_init__(self) -> None:
         if self.in_process and (self.recording or self.network or self.faulty_line):
@@ -83,8 +84,10 @@ class Transport:
                 f"--network and {PROFILE}={os.environ[PROFILE]} both say where messages go; leave "
                 "out --network to use that profile, or unset the variable"
             )
-        if self.in_process and (self.pairs > 1 or self.pin):
-            raise ParameterError("--pairs and --pin are about nodes; leave out --in-process")
+        if self.in_process and (self.pairs > 1 or self.pin or self.view):
+            raise ParameterError(
+                "--pairs, --pin and --view are about nodes; leave out --in-process"
+            )
         if self.pairs > 1 and self.faulty_line:
             raise ParameterError("--faulty-line is the line of one pair; leave out --pairs")
         pair_nodes(self.pairs, self.pin)
@@ -94,7 +97,8 @@ class Transport:
     def layout(self) -> Layout:
         """The nodes of the training."""
         remaps = {"pde_sim_node": ["state:=state_sent"], "controller_node": ["action:=action_sent"]}
-        return Layout(self.pairs, self.pin, self.recording, remaps if self.faulty_line else {})
+        remaps = remaps if self.faulty_line else {}
+        return Layout(self.pairs, self.pin, self.recording, remaps, self.view)
 
     def line_arguments(self) -> list[str]:
         """The relay's ROS parameters."""
@@ -200,7 +204,7 @@ def _train_over_topics(folder: Path, display: Display, transport: Transport) -> 
             node.name,
             node_command(node.package, *node.ros_arguments(folder / "parameters.yaml")),
             logs / f"{node.name}.log",
-            optional=node.package == "recorder_node",
+            optional=node.package in ("recorder_node", "viewer_node"),
         )
         for node in transport.layout().nodes(folder)
     }

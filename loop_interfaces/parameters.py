@@ -300,10 +300,22 @@ RECORDER = (
     Spec("record_clock", True, "record /clock, too"),
 )
 
+VIEWER = (
+    Spec("view_rate", 10.0, "views a second", 0.1, 100.0, unit="1/s", live=True),
+    Spec(
+        "view_environment",
+        0,
+        "environment that is shown; of a smaller episode the last one",
+        0,
+        65535,
+        live=True,
+    ),
+)
+
 
 def table() -> tuple[Spec, ...]:
     """Every parameter of the nodes."""
-    return (*PROBLEM, *PLANT, *EXECUTION, *TUNER, *RECORDER)
+    return (*PROBLEM, *PLANT, *EXECUTION, *TUNER, *RECORDER, *VIEWER)
 
 
 def check_names(names: Iterable[str], known: Iterable[str]) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-NODES = ("pde_sim_node", "controller_node", "tuner_node", "recorder_node")
+NODES = ("pde_sim_node", "controller_node", "tuner_node", "recorder_node", "viewer_node")
 WITH_ROS = {
     "node.py",
     "node_loop.py",
@@ -31,6 +31,7 @@ ROS = (
     "diagnostic_msgs",
     "sensor_msgs",
     "visualization_msgs",
+    "geometry_msgs",
     "launch",
     "launch_ros",
 )

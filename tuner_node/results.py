@@ -33,6 +33,7 @@ from loop_interfaces.parameters import (
     EXECUTION,
     PLANT,
     RECORDER,
+    VIEWER,
     ParameterError,
     check,
     read_yaml,
@@ -54,7 +55,7 @@ TRANSIENT = (
         "recorder",
         "plant",
     ),
-    *(spec.name for spec in (*PLANT, *EXECUTION, *RECORDER)),
+    *(spec.name for spec in (*PLANT, *EXECUTION, *RECORDER, *VIEWER)),
 )
 """Parameters that change how a training is carried out, not what comes out of it."""
 

@@ -90,6 +90,11 @@ def add(commands: Commands) -> None:
         action="store_true",
         help="a core for each plant and controller, and polling: less time per step, more power",
     )
+    train.add_argument(
+        "--view",
+        action="store_true",
+        help="a viewer_node beside the others, for RViz, Foxglove and PlotJuggler (docs/views.md)",
+    )
     train.set_defaults(command=_train)
 
 
@@ -111,6 +116,7 @@ def _train(options: argparse.Namespace) -> int:
         options.faulty_line,
         options.pairs,
         options.pin,
+        options.view,
     )
     names = ("iterations", "seed", "seeds", "start", "optimizer", "directions")
     given = {n: getattr(options, n) for n in names if getattr(options, n) is not None}

@@ -1,0 +1,152 @@
+"""The layouts for PlotJuggler, Foxglove and RViz: their form, and that they name what there is."""
+
+from __future__ import annotations
+
+import json
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from typing import Any
+
+import yaml
+
+from bringup.secure import ROLES
+from loop_interfaces.problem import config_folder
+from viewer_node.view import SCALARS
+
+VIEWS = config_folder() / "views"
+FLOAT, MARKER, IMAGE = (
+    "std_msgs/msg/Float64",
+    "visualization_msgs/msg/Marker",
+    "sensor_msgs/msg/Image",
+)
+OTHERS = {
+    "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+    "/rosout": "rcl_interfaces/msg/Log",
+}
+
+
+def plotjuggler() -> ET.Element:
+    return ET.parse(VIEWS / "plotjuggler.xml").getroot()
+
+
+def foxglove() -> dict[str, Any]:
+    layout: dict[str, Any] = json.loads((VIEWS / "foxglove.json").read_text())
+    return layout
+
+
+def rviz() -> dict[str, Any]:
+    config: dict[str, Any] = yaml.safe_load((VIEWS / "pdeloop.rviz").read_text())
+    return config
+
+
+def panels(node: Any) -> Iterator[str]:
+    if isinstance(node, str):
+        yield node
+    else:
+        assert set(node) == {"first", "second", "direction", "splitPercentage"}
+        assert node["direction"] in ("row", "column")
+        yield from panels(node["first"])
+        yield from panels(node["second"])
+
+
+def named_topics() -> dict[str, str]:
+    """Every topic of the layouts, with the type that its panel or display shows."""
+    found = {}
+    for curve in plotjuggler().iter("curve"):
+        topic, _, field = curve.attrib["name"].rpartition("/")
+        assert field == "data"
+        found[topic] = FLOAT
+    for name, config in foxglove()["configById"].items():
+        match name.split("!")[0]:
+            case "Plot":
+                for path in config["paths"]:
+                    topic, _, field = path["value"].partition(".")
+                    assert field == "data"
+                    found[topic] = FLOAT
+            case "Image":
+                found[config["imageMode"]["imageTopic"]] = IMAGE
+            case "3D":
+                found |= dict.fromkeys(config["topics"], MARKER)
+            case "DiagnosticSummary" | "RosOut":
+                found[config["topicToRender"]] = OTHERS[config["topicToRender"]]
+            case "CallService":
+                pass
+            case other:
+                raise AssertionError(f"unknown panel {other}")
+    kinds = {"Marker": MARKER, "Image": IMAGE}
+    for display in rviz()["Visualization Manager"]["Displays"]:
+        package, kind = display["Class"].split("/")
+        assert package == "rviz_default_plugins"
+        if kind in kinds:
+            found[display["Topic"]["Value"]] = kinds[kind]
+        else:
+            assert kind == "Grid"
+    return found
+
+
+def published() -> dict[str, str]:
+    """What viewer_node publishes, by its own table."""
+    own = {f"/view/{name}": FLOAT for name in SCALARS}
+    return own | {"/view/field": MARKER, "/view/target": MARKER, "/view/spacetime": IMAGE} | OTHERS
+
+
+def test_every_topic_of_the_layouts_is_published_with_that_type():
+    named = named_topics()
+    assert len(named) > 10
+    assert named.items() <= published().items()
+
+
+def test_every_number_is_plotted():
+    curves = {curve.attrib["name"] for curve in plotjuggler().iter("curve")}
+    assert curves == {f"/view/{name}/data" for name in SCALARS}
+
+
+def test_the_plotjuggler_layout_has_its_form():
+    root = plotjuggler()
+    assert root.tag == "root"
+    assert [child.tag for child in root if isinstance(child.tag, str)] == [
+        *("tabbed_widget", "use_relative_time_offset", "Plugins", "previouslyLoaded_Datafiles"),
+        *("previouslyLoaded_Streamer", "customMathEquations", "snippets"),
+    ]
+    for splitter in root.iter("DockSplitter"):
+        sizes = [float(size) for size in splitter.attrib["sizes"].split(";")]
+        assert len(sizes) == len(splitter) == int(splitter.attrib["count"])
+        assert abs(sum(sizes) - 1.0) < 1e-3
+        assert splitter.attrib["orientation"] in "-|"
+    for plot in root.iter("plot"):
+        assert plot.attrib["mode"] == "TimeSeries"
+        assert [child.tag for child in plot][:2] == ["range", "limitY"]
+    (plugin,) = root.iter("plugin")
+    assert plugin.attrib["ID"] == "ROS2 Topic Subscriber"
+    assert root.find("previouslyLoaded_Streamer").attrib["name"] == plugin.attrib["ID"]
+    topics = {topic.attrib["name"] for topic in plugin.iter("topic")}
+    assert topics == {f"/view/{name}" for name in SCALARS}
+
+
+def test_the_foxglove_layout_places_every_panel_once_and_calls_services_that_there_are():
+    layout = foxglove()
+    assert set(layout) == {
+        *("configById", "globalVariables", "userNodes", "playbackConfig", "layout"),
+    }
+    placed = list(panels(layout["layout"]))
+    assert sorted(placed) == sorted(layout["configById"])
+    services = {f"/{role.node}/{name}" for role in ROLES for name in role.services}
+    called = {
+        config["serviceName"]
+        for name, config in layout["configById"].items()
+        if name.startswith("CallService!")
+    }
+    assert called
+    assert called <= services
+
+
+def test_the_rviz_config_has_the_frame_of_the_markers_and_no_display_is_off():
+    from viewer_node.node import COLOURS, FRAME_ID
+
+    manager = rviz()["Visualization Manager"]
+    assert manager["Global Options"]["Fixed Frame"] == FRAME_ID
+    markers = [d for d in manager["Displays"] if d["Class"].endswith("/Marker")]
+    assert {name for display in markers for name in display["Namespaces"]} == set(COLOURS)
+    assert all(display["Enabled"] for display in manager["Displays"])
+    (scene,) = [c for n, c in foxglove()["configById"].items() if n.startswith("3D!")]
+    assert scene["followTf"] == FRAME_ID

@@ -1,0 +1,161 @@
+"""What the viewer makes of the loop's messages: numbers, profile, picture."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from loop_interfaces.frames import Frame
+from loop_interfaces.health import Level
+from loop_interfaces.model_rows import ModelRows, pack
+from viewer_node.health import ViewerHealth
+from viewer_node.spacetime import MAX_ROWS, UNSEEN, SpaceTime
+from viewer_node.view import SCALARS, LoopView
+
+RUN, PLANT, N_Z, N_A, N_S = 5, 9, 8, 2, 3
+RNG = np.random.default_rng(4)
+MODEL = ModelRows(
+    U=np.linalg.qr(RNG.normal(size=(N_Z, N_S)))[0],
+    A=RNG.normal(size=(N_S, N_S)),
+    B=RNG.normal(size=(N_S, N_A)),
+    K_a=RNG.normal(size=(N_A, N_S)),
+    K_b=RNG.normal(size=(N_A, N_S)),
+    s_r=RNG.normal(size=N_S),
+)
+TARGET = np.linspace(0.0, 1.0, N_Z)
+
+
+def frame(values, episode: int = 1, step: int = 0, plant: int = PLANT) -> Frame:
+    return Frame(RUN, episode, step, 0.0, np.asarray(values, dtype=float), plant)
+
+
+def view() -> LoopView:
+    made = LoopView(length=4.0, horizon=10, state_weight=2.0, action_weight=0.5)
+    made.target(frame(TARGET, 0))
+    return made
+
+
+def begin(shown: LoopView, policies, episode: int = 1) -> None:
+    rows = [(i, -1.0, 0.0, 0.0) for i in range(len(policies))]
+    shown.model(frame(pack(MODEL)[None], 0, step=1))
+    shown.policy(frame(policies, episode, step=1))
+    shown.start(frame(rows, episode, step=1))
+
+
+def test_a_view_of_nothing_has_nothing_to_show():
+    empty = LoopView(length=1.0, horizon=10, state_weight=1.0, action_weight=1.0)
+    assert empty.numbers() == {}
+    assert empty.profile() is None
+    assert empty.picture(0.0) is None
+
+
+def test_the_numbers_of_a_sample_are_those_of_their_definitions():
+    shown = view()
+    z = RNG.normal(size=(2, N_Z))
+    a = RNG.normal(size=(2, N_A))
+    shown.state(frame(z, step=3), 0.0)
+    shown.action(frame(a, step=3))
+    numbers = shown.numbers()
+    error = z[0] - TARGET
+    assert numbers["step"] == 3.0
+    assert numbers["tracking_error"] == pytest.approx(np.sqrt(np.mean(error**2)))
+    assert numbers["action_norm"] == pytest.approx(np.linalg.norm(a[0]))
+    assert numbers["stage_cost"] == pytest.approx(2.0 * np.sum(error**2) + 0.5 * np.sum(a[0] ** 2))
+    profile = shown.profile()
+    assert profile.x.tolist() == [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5]
+    assert profile.z.tolist() == z[0].tolist()
+    assert profile.target.tolist() == TARGET.tolist()
+    assert set(numbers) <= set(SCALARS)
+
+
+def test_the_chosen_environment_is_shown_and_of_a_smaller_episode_the_last():
+    shown = view()
+    z = RNG.normal(size=(3, N_Z))
+    for environment, row in ((1, 1), (2, 2), (7, 2)):
+        shown.environment = environment
+        shown.state(frame(z), 0.0)
+        assert shown.profile().z.tolist() == z[row].tolist()
+
+
+def test_costs_are_told_apart_by_the_gains_that_caused_them():
+    shown = view()
+    lqt = MODEL.policy
+    adapted = lqt + 0.1
+    begin(shown, [np.zeros_like(lqt), lqt, adapted, adapted, adapted])
+    costs = [(10.0, 100.0, -1), (5.0, 50.0, -1), (4.0, 40.0, -1), (2.0, 20.0, -1), (1e9, 1e10, 3)]
+    shown.cost(frame(costs))
+    numbers = shown.numbers()
+    assert numbers["cost_no_control"] == 10.0
+    assert numbers["cost_lqt"] == 5.0
+    assert numbers["cost"] == 3.0  # the one that diverged is no cost
+    assert numbers["reduction"] == pytest.approx(40.0)
+    shown.environment = 2
+    begin(shown, [np.zeros_like(lqt), lqt, adapted], episode=2)
+    numbers = shown.numbers()
+    assert numbers["gain_norm"] == pytest.approx(np.linalg.norm(adapted))
+    assert numbers["gain_change"] == pytest.approx(0.1 * np.sqrt(lqt.size) / np.linalg.norm(lqt))
+    shown.cost(frame([(9.0, 90.0, -2)] * 3, episode=2))  # void: not a cost
+    assert shown.numbers()["cost"] == 3.0
+
+
+def test_gains_without_their_model_are_never_taken_for_lqt():
+    shown = view()
+    lqt = MODEL.policy
+    shown.policy(frame([lqt], 1, step=2))  # another generation of models than the one that came
+    shown.model(frame(pack(MODEL)[None], 0, step=1))
+    shown.start(frame([(0, -1.0, 0.0, 0.0)], 1, step=2))
+    shown.cost(frame([(5.0, 50.0, -1)]))
+    assert "cost_lqt" not in shown.numbers()
+    assert shown.numbers()["cost"] == 5.0
+
+
+def test_a_finished_episode_is_shown_until_the_next_has_run_for_a_while():
+    shown = view()
+    for k in range(11):
+        shown.state(frame([np.full(N_Z, 1.0)], step=k), 0.0)
+    shown.cost(frame([(1.0, 10.0, -1)], step=10))
+    assert shown.numbers()["final_error"] == pytest.approx(np.sqrt(np.mean((1.0 - TARGET) ** 2)))
+    shown.state(frame([np.full(N_Z, -1.0)], episode=2), 5.0)
+    red, white = shown.picture(5.1), shown.picture(7.0)
+    assert red.shape == (11, N_Z, 3)
+    assert (red == [178, 24, 43]).all()
+    assert (white[0] == [33, 102, 172]).all()
+    assert (white[1:] == UNSEEN).all()
+
+
+@pytest.mark.parametrize("horizon", [1, 399, 400, 5000])
+def test_a_picture_has_a_row_for_every_step_or_shares_them(horizon):
+    picture = SpaceTime(4, horizon)
+    for k in range(horizon + 1):
+        picture.put(k, np.full(4, 1.0 if k % 2 else -1.0))
+    colours = picture.colours()
+    assert len(colours) <= MAX_ROWS
+    per_row = -(-(horizon + 1) // len(colours))
+    assert len(colours) == -(-(horizon + 1) // per_row)
+    assert not (colours == UNSEEN).all(axis=(1, 2)).any()
+
+
+def test_more_steps_than_expected_are_squeezed_in_and_other_widths_are_left_out():
+    picture = SpaceTime(4, 10)
+    picture.put(0, np.full(4, 1.0))
+    picture.put(1500, np.full(4, -1.0))
+    picture.put(3, np.zeros(5))
+    colours = picture.colours()
+    assert len(colours) == MAX_ROWS
+    assert (colours[0] == [178, 24, 43]).all()
+    seen = ~(colours == UNSEEN).all(axis=(1, 2))
+    assert seen.sum() == 2
+    assert (colours[np.flatnonzero(seen)[1]] == [33, 102, 172]).all()
+
+
+def test_a_viewer_that_sees_nothing_any_more_is_stale():
+    shown = view()
+    health = ViewerHealth(shown)
+    assert health.report(0.0, 0).message == "nothing seen yet"
+    shown.state(frame([np.zeros(N_Z)], step=4), 1.0)
+    good = health.report(2.0, 3)
+    assert (good.level, good.message) == (Level.OK, "step 4 of episode 1")
+    assert good.values["subscribers"] == 3
+    assert good.values["samples/s"] == 0.5
+    stale = health.report(8.0, 3)
+    assert (stale.level, stale.message) == (Level.STALE, "no sample for 6 s")

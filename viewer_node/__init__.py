@@ -1,0 +1,1 @@
+"""Shows a running loop to ROS tools: markers, an image and named numbers, throttled."""

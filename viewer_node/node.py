@@ -1,0 +1,165 @@
+"""viewer_node: shows a running loop to RViz, Foxglove and PlotJuggler, as a ROS 2 node.
+
+Subscribes  state, action (or samples), target, episode/start, policy, model, episode/cost
+Publishes   view/field, view/target (visualization_msgs/Marker), view/spacetime (sensor_msgs/Image),
+            view/... (std_msgs/Float64), at view_rate and only what somebody subscribes to
+It takes no part in the loop, and nothing waits for it. What is shown: viewer_node.view, docs/views.md.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import Point
+from numpy.typing import NDArray
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from sensor_msgs.msg import Image
+from std_msgs.msg import ColorRGBA, Float64
+from visualization_msgs.msg import Marker
+
+from loop_interfaces.isolation import keep_on_this_machine
+from loop_interfaces.node_loop import NodeLoop
+from loop_interfaces.node_main import node_main
+from loop_interfaces.parameters import PROBLEM, VIEWER
+from loop_interfaces.ros_parameters import declare, given_parameters, on_change
+from loop_interfaces.topics import ACTION, COST, MODEL, POLICY, START, STATE, TARGET
+from viewer_node.health import ViewerHealth
+from viewer_node.view import SCALARS, LoopView
+
+FRAME_ID = "field"
+"""Frame of the markers and the image: x is the place, y the value of the field; no transform needed."""
+LINE_WIDTH = 0.006
+"""Width of the lines, as a share of the domain's length."""
+COLOURS = {"field": (0.13, 0.40, 0.67), "target": (0.90, 0.45, 0.10)}
+
+VIEWER_PARAMETERS = (
+    *(
+        spec
+        for spec in PROBLEM
+        if spec.name in ("problem", "length", "horizon", "state_weight", "action_weight")
+    ),
+    *VIEWER,
+)
+"""The parameters that concern the viewer."""
+
+
+class ViewerNode:
+    """Moves messages from the topics into the view, and what it shows out of it."""
+
+    def __init__(self, node: Node, loop: NodeLoop) -> None:
+        self._changed: dict[str, Any] = {}
+        values = self._declare(node)
+        self._length = float(values["length"])
+        self._view = LoopView(
+            length=self._length,
+            horizon=values["horizon"],
+            state_weight=values["state_weight"],
+            action_weight=values["action_weight"],
+        )
+        self._health = ViewerHealth(self._view)
+        self._due = loop.now()
+        self._adjust({spec.name: values[spec.name] for spec in VIEWER})
+        self._wire(node, loop)
+        node.get_logger().info(f"{values['problem']}: views at {values['view_rate']:g} Hz")
+
+    def join(self, node: Node, loop: NodeLoop) -> None:
+        self._declare(node)
+        self._wire(node, loop)
+
+    def _declare(self, node: Node) -> dict[str, Any]:
+        return declare(node, VIEWER_PARAMETERS, {**given_parameters(node), **self._changed})
+
+    def _wire(self, node: Node, loop: NodeLoop) -> None:
+        self._node, self._loop = node, loop
+        view = self._view
+        loop.observe(STATE, lambda frame: view.state(frame, loop.now()))
+        loop.observe(ACTION, view.action)
+        for topic, take in (
+            (TARGET, view.target),
+            (MODEL, view.model),
+            (POLICY, view.policy),
+            (START, view.start),
+            (COST, view.cost),
+        ):
+            loop.receive(topic, take)
+        self._markers = {name: node.create_publisher(Marker, f"view/{name}", 1) for name in COLOURS}
+        self._image = node.create_publisher(Image, "view/spacetime", 1)
+        self._scalars = {
+            name: node.create_publisher(Float64, f"view/{name}", 1) for name in SCALARS
+        }
+        loop.diagnose("views", lambda now: self._health.report(now, self._subscribers()))
+        on_change(node, VIEWER, self._adjust)
+
+    def run(self) -> int:
+        self._loop.run(tick=self._show, deadline=lambda: self._due, housekeeping=lambda now: None)
+        return 0
+
+    def _adjust(self, values: dict[str, Any]) -> None:
+        self._changed = values
+        self._period = 1.0 / values["view_rate"]
+        self._view.environment = values["view_environment"]
+
+    def _show(self, now: float) -> None:
+        self._due = max(self._due + self._period, now + self._period / 2)
+        for name, value in self._view.numbers().items():
+            self._scalars[name].publish(Float64(data=value))
+        profile = self._view.profile()
+        if profile is None:
+            return
+        for name, values in (("field", profile.z), ("target", profile.target)):
+            if values is not None and _wanted(self._markers[name]):
+                self._markers[name].publish(self._marker(name, profile.x, values))
+        if _wanted(self._image):
+            picture = self._view.picture(now)
+            if picture is not None:
+                self._image.publish(self._picture(picture))
+
+    def _marker(self, name: str, x: NDArray[np.float64], values: NDArray[np.float64]) -> Marker:
+        marker = Marker(ns=name, id=list(COLOURS).index(name), type=Marker.LINE_STRIP)
+        marker.header.frame_id = FRAME_ID
+        marker.header.stamp = self._node.get_clock().now().to_msg()
+        marker.action = Marker.ADD
+        marker.pose.orientation.w = 1.0
+        marker.scale.x = LINE_WIDTH * self._length
+        red, green, blue = COLOURS[name]
+        marker.color = ColorRGBA(r=red, g=green, b=blue, a=1.0)
+        marker.points = [Point(x=a, y=b) for a, b in zip(x.tolist(), values.tolist(), strict=True)]
+        return marker
+
+    def _picture(self, colours: NDArray[np.uint8]) -> Image:
+        height, width, _ = colours.shape
+        image = Image(height=height, width=width, encoding="rgb8", step=3 * width)
+        image.header.frame_id = FRAME_ID
+        image.header.stamp = self._node.get_clock().now().to_msg()
+        image.data = colours.tobytes()
+        return image
+
+    def _subscribers(self) -> int:
+        publishers = (*self._markers.values(), self._image, *self._scalars.values())
+        return sum(publisher.get_subscription_count() for publisher in publishers)
+
+
+def _wanted(publisher: Publisher) -> bool:
+    return bool(publisher.get_subscription_count())
+
+
+def _stand_back() -> None:
+    """Let the loop's processes go first: what arrives here must not preempt its sender."""
+    with contextlib.suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+
+
+def main(args: list[str] | None = None) -> int:
+    """Console script."""
+    _stand_back()
+    keep_on_this_machine()
+    return node_main("viewer_node", args, ViewerNode)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
