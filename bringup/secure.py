@@ -10,6 +10,7 @@ import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 
 from loop_interfaces import topics
+from viewer_node.view import SCALARS
 
 
 @dataclass(frozen=True)
@@ -20,13 +21,21 @@ class Role:
     publishes: tuple[str, ...]
     subscribes: tuple[str, ...]
     services: tuple[str, ...] = ()
+    of_others: tuple[str, ...] = ()
+    """What it subscribes only where the plant is another one, that publishes no `samples`."""
 
 
 _ARRAYS = tuple(topic.name for topic in topics.ARRAYS)
+_SAMPLED = (topics.STATE.name, topics.ACTION.name)
+VIEWS = tuple(f"view/{name}" for name in ("field", "target", "spacetime", *SCALARS))
+"""What viewer_node publishes for people's tools."""
 ROLES = (
     Role(
         "pde_sim_node",
-        (topics.STATE.name, topics.COST.name, topics.TARGET.name, topics.PAUSED.name, "/clock"),
+        (
+            *(topics.STATE.name, topics.COST.name, topics.TARGET.name, topics.PAUSED.name),
+            *(topics.SAMPLES, "/clock"),
+        ),
         (topics.START.name, topics.ACTION.name),
         ("pause", "resume", "step"),
     ),
@@ -47,14 +56,25 @@ ROLES = (
         (
             *(topics.COST.name, topics.MODEL_IDENTIFIED.name, topics.MODEL_FAILED),
             topics.PAUSED.name,
-            *(topics.STATE.name, topics.ACTION.name, topics.TARGET.name),  # for Gauss-Newton
+            *(topics.SAMPLES, topics.TARGET.name),  # for Gauss-Newton
         ),
         ("pause", "resume", "stop"),
+        _SAMPLED,
     ),
     Role(
         "recorder_node",
         (topics.RECORDER_STATUS,),
-        (*_ARRAYS, topics.MODEL_FAILED, "/clock"),
+        (*(n for n in _ARRAYS if n not in _SAMPLED), topics.SAMPLES, topics.MODEL_FAILED),
+        of_others=(*_SAMPLED, "/clock"),
+    ),
+    Role(
+        "viewer_node",
+        VIEWS,
+        (
+            *(topics.START.name, topics.POLICY.name, topics.MODEL.name, topics.COST.name),
+            *(topics.TARGET.name, topics.SAMPLES),
+        ),
+        of_others=_SAMPLED,
     ),
 )
 """Who may publish and subscribe what; the tests hold it against the running nodes."""
@@ -102,7 +122,7 @@ def _enclave(
         ET.SubElement(services, "service").text = f"~/{service}"
     for attribute, names in (
         ("publish", (*EVERY_NODE_PUBLISHES, *role.publishes)),
-        ("subscribe", role.subscribes),
+        ("subscribe", (*role.subscribes, *role.of_others)),
     ):
         rules = ET.SubElement(profile, "topics", {attribute: "ALLOW"})
         for name in names:

@@ -13,6 +13,10 @@ from typing import Any
 from tests.loop_harness import Processes, until
 
 LIMIT = 60.0
+SERVICES = [
+    *(f"/pde_sim_node/{name}" for name in ("pause", "resume", "step")),
+    *(f"/tuner_node/{name}" for name in ("pause", "resume", "stop")),
+]
 
 
 class Operator:
@@ -30,6 +34,7 @@ class Operator:
             text=True,
         )
         assert self._read() == "ready"
+        self.ask(know=SERVICES)
 
     def _read(self) -> Any:
         assert self._process.stdout is not None

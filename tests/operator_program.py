@@ -1,5 +1,6 @@
 """An operator's ROS tools in a process of their own: JSON commands on stdin, JSON answers on stdout.
 
+{"know": [SERVICE, ...]}            look for these already, so that a call is quick
 {"call": SERVICE}                   a std_srvs/Trigger; [success, message]
 {"set": [NODE, PARAMETER, VALUE]}   [successful, reason]
 {"get": [NODE, PARAMETER]}          the value
@@ -58,6 +59,10 @@ class Operator:
 
     def answer(self, command: dict[str, Any]) -> Any:
         ((what, argument),) = command.items()
+        if what == "know":
+            for name in argument:
+                self.clients[name] = self.node.create_client(Trigger, name)
+            return None
         if what == "call":
             result = self.request(Trigger, argument, Trigger.Request())
             return [result.success, result.message]

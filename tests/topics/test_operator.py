@@ -14,11 +14,15 @@ from tests.topics.test_faults import PARAMETERS, start_pair, start_tuner
 from tests.topics.test_loop import LIMIT, assert_same_training, in_process, iterations_done
 
 pytestmark = pytest.mark.topics
-ITERATIONS = 150
+ITERATIONS = 400
+"""Enough that the training goes on when an operator comes after 20 of them."""
+LONG = 3 * LIMIT
 
 
 def complaints(text: str) -> list[str]:
-    return [line for line in text.splitlines() if "[WARN]" in line or "[ERROR]" in line]
+    """Warnings and errors, but for what a busy machine does to a process."""
+    lines = [line for line in text.splitlines() if "[WARN]" in line or "[ERROR]" in line]
+    return [line for line in lines if "was suspended; joined the network again" not in line]
 
 
 def test_a_paused_and_stepped_plant_gives_the_same_policy_and_nobody_complains(
@@ -53,7 +57,7 @@ def test_a_paused_and_stepped_plant_gives_the_same_policy_and_nobody_complains(
             desk.wait_for_reports("pde_sim_node", 2)
             assert desk.values("pde_sim_node")["step"] == str(step)
         desk.call("/pde_sim_node/resume")
-        loop.wait(running["tuner"], LIMIT)
+        loop.wait(running["tuner"], LONG)
         assert_same_training(out, in_process(iterations=ITERATIONS))
         until(
             lambda: desk.status("controller_node")[2] == "no episode under way",
@@ -79,7 +83,7 @@ def test_a_controller_that_restarts_while_the_plant_is_paused_changes_nothing(
         desk.wait_for_reports("pde_sim_node", 5)
         loop.node("controller_node", *PARAMETERS)
         desk.call("/pde_sim_node/resume")
-        loop.wait(tuner, LIMIT)
+        loop.wait(tuner, LONG)
     assert_same_training(out, in_process(iterations=ITERATIONS))
 
 
@@ -93,6 +97,7 @@ def test_a_paused_tuner_begins_no_episode_and_keeps_the_plant(loop: Processes, t
         until(
             lambda: desk.values("tuner_node").get("episodes under way") == "0", LIMIT, "quiet loop"
         )
+        desk.wait_for_reports("pde_sim_node", 2)
         done = iterations_done(out)
         episodes = desk.values("pde_sim_node")["episodes"]
         desk.wait_for_reports("tuner_node", 5)  # longer than run_hold
@@ -104,7 +109,7 @@ def test_a_paused_tuner_begins_no_episode_and_keeps_the_plant(loop: Processes, t
         assert desk.values("pde_sim_node")["episodes"] == episodes
         assert desk.status("tuner_node")[2].startswith("paused in iteration ")
         assert desk.call("/tuner_node/resume") == "resumed"
-        loop.wait(tuner, LIMIT)
+        loop.wait(tuner, LONG)
     assert_same_training(out, in_process(iterations=ITERATIONS))
     assert '"repeated"' not in (out / "progress.jsonl").read_text()
 
@@ -128,7 +133,7 @@ def test_a_tuner_that_was_asked_to_stop_is_continued_to_the_same_policy(
             lambda: desk.status("pde_sim_node")[2] == "no run; ready for one", LIMIT, "free plant"
         )
     again = start_tuner(loop, out, iterations=ITERATIONS, resume="true")
-    loop.wait(again, LIMIT)
+    loop.wait(again, LONG)
     assert_same_training(out, in_process(iterations=ITERATIONS))
 
 
@@ -143,7 +148,7 @@ def test_the_command_line_ends_with_a_stopped_tuner_and_continues(loop: Processe
     assert f"stopped by request; continue with: pdeloop train --resume {out}" in text
     assert iterations_done(out) < ITERATIONS
     assert not (out / "result.json").exists()
-    loop.wait(loop.pdeloop("train", "--resume", str(out)), LIMIT)
+    loop.wait(loop.pdeloop("train", "--resume", str(out)), LONG)
     assert_same_training(out, in_process(iterations=ITERATIONS))
 
 

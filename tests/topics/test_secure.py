@@ -75,6 +75,8 @@ def test_the_policy_has_the_form_of_sros2_and_an_enclave_for_every_node_of_every
         "/pdeloop/b/controller_node",
         "/pdeloop/tuner_node",
         "/pdeloop/recorder_node",
+        "/pdeloop/a/viewer_node",
+        "/pdeloop/b/viewer_node",
     ]
     plant = next(root.iter("profile"))
     assert plant.attrib == {"ns": "/lab/a", "node": "pde_sim_node"}

@@ -12,7 +12,7 @@ from tests.loop_harness import Processes, until
 from tests.operator_harness import operator
 from tests.small import SMALL
 from tests.test_layouts import named_topics
-from tests.topics.test_faults import PARAMETERS, command_of, start_pair, start_tuner
+from tests.topics.test_faults import PARAMETERS, start_pair, start_tuner
 from tests.topics.test_loop import LIMIT, assert_same_training, in_process, iterations_done
 from viewer_node.view import SCALARS
 
@@ -148,12 +148,9 @@ def test_the_command_line_starts_a_viewer_and_goes_on_when_it_dies(loop: Process
     options = ("--iterations", "100000", "--optimizer", "two_point", "--out", str(out))
     run = loop.pdeloop("train", str(SMALL), *options, "--view", "--pairs", "2")
 
-    def viewers() -> list[int]:
-        return [pid for pid in loop.left_behind() if "viewer_node.node" in command_of(pid)]
-
     with operator(loop) as desk:
         until(lambda: desk.values("pair0/viewer_node").get("samples", "0") != "0", LIMIT, "samples")
-        (pid,) = viewers()
+        (pid,) = loop.pids("viewer_node")
         os.kill(pid, signal.SIGKILL)
         news = "viewer_node was killed by SIGKILL; starting it again"
         until(lambda: news in loop.output(run), LIMIT, "news of it")
