@@ -10,13 +10,13 @@ from dataclasses import asdict, fields
 from typing import Any
 
 from loop_interfaces.frames import MAX_ID
-from pde_sim_node.equations import Equation, load_equation
+from pde_sim_node.equations import Equation, configured_equation
 from pde_sim_node.plant import Plant
 
 
 def build_equation(values: Mapping[str, Any]) -> Equation:
     """The equation named by `equation`, with `length` and `physical.*`. ValueError if none fits."""
-    kind = load_equation(str(values["equation"]))
+    kind = configured_equation(str(values["equation"]))
     known = [item.name for item in fields(kind) if item.name != "length"]
     physical = {
         name.removeprefix("physical."): value

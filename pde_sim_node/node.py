@@ -28,7 +28,7 @@ from loop_interfaces.ros_parameters import declare, given_parameters, on_change
 from loop_interfaces.samples import CLOCK_KIND
 from loop_interfaces.topics import ACTION, COST, PAUSED, START, STATE, TARGET
 from pde_sim_node.build import build_plant, fingerprint
-from pde_sim_node.equations import load_equation
+from pde_sim_node.equations import configured_equation
 from pde_sim_node.health import PlantHealth
 from pde_sim_node.lockstep import MAX_TIME, Lockstep
 
@@ -51,7 +51,7 @@ def declare_parameters(node: Node, changed: Mapping[str, Any] | None = None) -> 
             item.metadata["maximum"],
             unit=item.metadata.get("unit", ""),
         )
-        for item in fields(load_equation(str(values["equation"])))
+        for item in fields(configured_equation(str(values["equation"])))
         if item.name != "length"
     ]
     return {**physical, **values, **declare(node, specs, given)}

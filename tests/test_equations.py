@@ -1,5 +1,6 @@
 """The equations: parameters, fields, operators, and equations from elsewhere."""
 
+import os
 import sys
 from dataclasses import FrozenInstanceError, fields
 from pathlib import Path
@@ -7,7 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from loop_interfaces.problem import load_parameters
+from pde_sim_node.build import build_plant
 from pde_sim_node.equations import (
+    ALLOWED,
     EQUATIONS,
     AllenCahn,
     Burgers,
@@ -20,6 +24,8 @@ from pde_sim_node.equations import (
     KuramotoSivashinsky,
     Schrodinger,
     Wave,
+    allow,
+    configured_equation,
     load_equation,
 )
 
@@ -228,3 +234,59 @@ def test_a_name_that_leads_nowhere_is_refused(heat: Path, name: str, words: str)
     with pytest.raises(ValueError, match=words):
         load_equation(name.format(heat=heat, broken=broken))
     assert not any("broken" in module for module in set(sys.modules) - modules)
+
+
+def test_code_that_only_a_file_names_is_not_run(
+    heat: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = f"{heat}:Heat"
+    heat.write_text("raise SystemExit('run')")
+    for environment in ({}, {ALLOWED: ""}, {ALLOWED: f"other.py:Heat,{heat}:Cold"}):
+        with pytest.raises(ValueError, match="is code, which is not run because a file names it"):
+            configured_equation(name, environment)
+    with pytest.raises(ValueError, match="is code"):
+        configured_equation("antigravity:Heat", {})
+    assert "antigravity" not in sys.modules
+    # The plant of a problem is built with the same care.
+    monkeypatch.delenv(ALLOWED, raising=False)
+    with pytest.raises(ValueError, match="is code"):
+        build_plant({**load_parameters("burgers", {}), "equation": name})
+
+
+def test_code_that_the_user_names_is_run(heat: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert configured_equation("kdv", {}) is KortewegDeVries
+    monkeypatch.chdir(heat.parent)
+    kind = configured_equation(f"{heat}:Heat", {ALLOWED: "x.py:X, heat.py:Heat"})
+    assert kind.name == "heat"
+    assert configured_equation("heat.py:Heat", {ALLOWED: f"{heat}:Heat"}) is kind
+    monkeypatch.setenv(ALLOWED, "x.py:X")
+    assert allow("heat.py:Heat") == f"{heat}:Heat"
+    assert configured_equation(f"{heat}:Heat") is kind
+    assert "x.py:X," in os.environ[ALLOWED]
+
+
+def offer(folder: Path, package: str, entry: str) -> None:
+    """What an installation of a package leaves: its metadata, with an entry point."""
+    about = folder / f"{package}-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(f"[pdeloop.equations]\n{entry}\n")
+
+
+def test_an_installed_package_offers_its_equations_by_name(
+    heat: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(heat.parent))
+    offer(heat.parent, "hot", "warmth = heat:Heat\nkdv = heat:Heat\nbad = heat:Nothing")
+    try:
+        assert configured_equation("warmth", {}).name == "heat"
+        assert configured_equation("kdv", {}) is KortewegDeVries, "no package takes a shipped name"
+        with pytest.raises(ValueError, match=r"'bad': heat:Nothing cannot be loaded"):
+            configured_equation("bad", {})
+        with pytest.raises(ValueError, match=r"give one of burgers, .*, bad, warmth, or"):
+            configured_equation("cold", {})
+        offer(heat.parent, "hotter", "warmth = heat:NUMBER")
+        with pytest.raises(ValueError, match="offered by several installed packages"):
+            configured_equation("warmth", {})
+    finally:
+        sys.modules.pop("heat", None)

@@ -118,3 +118,18 @@ def test_a_real_browser_shows_the_page_without_a_console_message(folder, tmp_pat
     widths = [int(m) for line in messages for m in re.findall(r"picture (\d+)", line)]
     assert len(widths) == len(COMMON) and min(widths) > 600
     assert any("heard" in line for line in messages)
+
+
+def test_a_plant_of_two_fields_shows_both(tmp_path):
+    from bringup.cli import main
+
+    out = str(tmp_path / "run")
+    command = ["train", "wave", "--iterations", "1", "--optimizer", "two_point", "--in-process"]
+    assert main([*command, "--out", out]) == 0
+    assert main(["report", out]) == 0
+    svg = (tmp_path / "run" / "report" / "wave-behaviour.svg").read_text()
+    for words in (">u(x, t)<", ">u_t(x, t)<", ">u(x, T)<", ">u_t(x, T)<"):
+        assert words in svg, words
+    # A map of each field and a profile of each, under every controller, beside two colour bars.
+    maps = re.findall(r'<g id="axes_\d+">', svg)
+    assert len(maps) == 3 * (2 + 1 + 2) + 2

@@ -41,6 +41,12 @@ def add(commands: Commands) -> None:
             help=f"{spec.description} [{spec.default}]",
         )
     train.add_argument(
+        "--equation",
+        metavar="NAME",
+        help="the plant's PDE instead of that of the problem; an own one, 'file.py:Class' or "
+        "'package.module:Class', has to be named here, as a problem's file alone runs no code",
+    )
+    train.add_argument(
         "--out", type=Path, metavar="DIR", help="folder of the results [runs/PROBLEM-TIME]"
     )
     train.add_argument(
@@ -100,6 +106,7 @@ def add(commands: Commands) -> None:
 
 def _train(options: argparse.Namespace) -> int:
     from bringup.training_run import Recording, Transport, run_again, run_new
+    from pde_sim_node.equations import allow
 
     recording = None
     if options.record or options.record_or_stop:
@@ -125,6 +132,7 @@ def _train(options: argparse.Namespace) -> int:
         and given.setdefault("optimizer", "directions") != "directions"
     ):
         raise ParameterError("--directions goes with --optimizer directions")
+    own = {} if options.equation is None else {"equation": allow(options.equation)}
     if options.resume is not None:
         if options.problem or given or options.out:
             raise ParameterError(
@@ -137,4 +145,4 @@ def _train(options: argparse.Namespace) -> int:
             f"no problem given; expected one of {', '.join(shipped_problems())}, a YAML file, "
             "or --resume DIR"
         )
-    return run_new(options.problem, given, options.out, transport)
+    return run_new(options.problem, {**given, **own}, options.out, transport)

@@ -1,6 +1,6 @@
 """The equations the plant can integrate: a file per PDE, all registered by name.
 
-An equation of your own is one class like these; how the plant finds it: `load_equation`.
+An equation of your own is one class like these; how the plant finds it: `configured_equation`.
 """
 
 from .allen_cahn import AllenCahn
@@ -12,12 +12,13 @@ from .fisher import Fisher
 from .ginzburg_landau import GinzburgLandau
 from .korteweg_de_vries import KortewegDeVries
 from .kuramoto_sivashinsky import KuramotoSivashinsky
-from .loading import load_equation
+from .loading import ALLOWED, allow, configured_equation, load_equation
 from .registry import EQUATIONS
 from .schrodinger import Schrodinger
 from .wave import Wave
 
 __all__ = [
+    "ALLOWED",
     "EQUATIONS",
     "AllenCahn",
     "Burgers",
@@ -33,6 +34,8 @@ __all__ = [
     "Schrodinger",
     "Spectrum",
     "Wave",
+    "allow",
+    "configured_equation",
     "draw",
     "load_equation",
     "parameter",

@@ -1,26 +1,77 @@
-"""Which equation a name stands for: one of the project, or one from elsewhere."""
+"""Which equation a name stands for: one of the project, or one from elsewhere.
+
+One from elsewhere is Python code, which is executed to get it. So a name that a problem's file gives
+is not enough: either the code was installed under that name, as an entry point of the group
+``pdeloop.equations``, or the user has allowed it (see `configured_equation`).
+"""
 
 import hashlib
 import importlib
 import importlib.machinery
 import importlib.util
+import os
 import sys
+from collections.abc import Mapping
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import CodeType, ModuleType
+from typing import Any
 
 from .base import Equation
 from .registry import EQUATIONS
 
-__all__ = ["load_equation"]
+__all__ = ["ALLOWED", "GROUP", "allow", "configured_equation", "load_equation"]
+
+GROUP = "pdeloop.equations"
+"""The group of entry points by which an installed package offers equations."""
+ALLOWED = "PDELOOP_EQUATIONS"
+"""The environment variable with the names of code that may be run, separated by commas."""
+
+
+def configured_equation(name: str, environment: Mapping[str, str] = os.environ) -> type[Equation]:
+    """The equation that a problem's parameters name, if it may be run.
+
+    A name with a colon is code, ``package.module:ClassName`` or ``path/to/file.py:ClassName``. It
+    is loaded only if the variable `ALLOWED` names the same.
+
+    Raises
+    ------
+    ValueError
+        The name is code that is not allowed; or see `load_equation`.
+    """
+    allowed = {identity(item.strip()) for item in environment.get(ALLOWED, "").split(",")}
+    if ":" in name and identity(name) not in allowed:
+        raise ValueError(
+            f"the equation {name!r} is code, which is not run because a file names it; if you trust "
+            f"it, name it yourself: 'pdeloop train ... --equation {name}', or for other commands and "
+            f"for nodes {ALLOWED}={name} in the environment"
+        )
+    return load_equation(name)
+
+
+def allow(name: str) -> str:
+    """Allow code for this process and those it starts; returns its name from any folder."""
+    module, name_of_class = identity(name)
+    whole = f"{module}:{name_of_class}" if ":" in name else name
+    before = os.environ.get(ALLOWED)
+    os.environ[ALLOWED] = f"{before},{whole}" if before else whole
+    return whole
+
+
+def identity(name: str) -> tuple[str, str]:
+    """Module or file, and class: equal for equal code."""
+    module, _, name_of_class = name.rpartition(":")
+    return (str(Path(module).resolve()) if module.endswith(".py") else module), name_of_class
 
 
 def load_equation(name: str) -> type[Equation]:
-    """The equation class that ``name`` stands for.
+    """The equation class that ``name`` stands for; code is executed, whoever wrote it.
 
     Parameters
     ----------
     name
-        A key of `EQUATIONS`, ``package.module:ClassName``, or ``path/to/file.py:ClassName``.
+        A key of `EQUATIONS`, the name of an entry point of the group `GROUP`,
+        ``package.module:ClassName``, or ``path/to/file.py:ClassName``.
 
     Raises
     ------
@@ -31,14 +82,40 @@ def load_equation(name: str) -> type[Equation]:
         return EQUATIONS[name]
     source, separator, class_name = name.rpartition(":")
     if not separator:
-        raise ValueError(
-            f"unknown equation {name!r}: give one of {', '.join(EQUATIONS)}, "
-            "or 'package.module:ClassName', or 'path/to/file.py:ClassName'"
-        )
+        return complete(name, name, load_entry_point(name))
     module = load_file(Path(source)) if source.endswith(".py") else load_module(source)
     found = getattr(module, class_name, None)
     if found is None:
         raise ValueError(f"equation {name!r}: there is no {class_name!r} in {source}")
+    return complete(name, class_name, found)
+
+
+def load_entry_point(name: str) -> Any:
+    """What an installed package offers under that name."""
+    offered: dict[str, list[EntryPoint]] = {}
+    for entry in entry_points(group=GROUP):
+        offered.setdefault(entry.name, []).append(entry)
+    found = {entry.value: entry for entry in offered.get(name, [])}
+    if not found:
+        known = ", ".join([*EQUATIONS, *sorted(set(offered) - set(EQUATIONS))])
+        raise ValueError(
+            f"unknown equation {name!r}: give one of {known}, "
+            "or 'package.module:ClassName', or 'path/to/file.py:ClassName'"
+        )
+    if len(found) > 1:
+        raise ValueError(
+            f"equation {name!r} is offered by several installed packages ({', '.join(found)}): "
+            "remove one, or give 'package.module:ClassName'"
+        )
+    (entry,) = found.values()
+    try:
+        return entry.load()
+    except Exception as error:
+        raise ValueError(f"equation {name!r}: {entry.value} cannot be loaded: {error}") from error
+
+
+def complete(name: str, class_name: str, found: Any) -> type[Equation]:
+    """What was found, if it is a whole equation."""
     if not (isinstance(found, type) and issubclass(found, Equation)):
         raise ValueError(f"equation {name!r}: {class_name} must be a subclass of Equation")
     if missing := sorted(found.__abstractmethods__):
