@@ -82,6 +82,13 @@ def add(commands: Commands) -> None:
         help="leave out what the first seed gives from zero and with twice the fields",
     )
     add("--save", type=Path, metavar="DIR", help="write DIR/PROBLEM.json, which reports read")
+    monitor = _add(programs, "monitor", "how much pdeloop monitor with an open page slows the loop")
+    monitor.add_argument("--problem", default="allen-cahn", metavar="PROBLEM", help="[allen-cahn]")
+    monitor.add_argument("--windows", type=int, default=8, metavar="N", help="of each [8]")
+    monitor.add_argument("--seconds", type=float, default=4.0, metavar="S", help="of a window [4]")
+    monitor.add_argument(
+        "--browser", action="store_true", help="with the page drawn by a headless chromium"
+    )
     kernel = _add(programs, "kernel", "time of a step beside other implementations")
     kernel.add_argument(
         "--batches", type=int, nargs="+", default=[1, 2, 12, 64], metavar="M", help="[1 2 12 64]"
