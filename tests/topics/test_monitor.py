@@ -20,7 +20,7 @@ pytestmark = pytest.mark.topics
 SLOW = ("-p", "real_time_factor:=4.0")
 """80 rounds a second: an episode of the small problem takes 0.4 s."""
 STATE = "document.querySelector('#state').textContent"
-ITERATION = "Number(document.querySelectorAll('#figures dd span')[1].textContent) || 0"
+ITERATION = "(Number(document.querySelectorAll('#figures dd span')[1]?.textContent) || 0)"
 FIELD = "document.querySelector('#field-text').textContent"
 """What the page says of the field: the number of the episode, what it is, the step."""
 PAINTED = """

@@ -154,7 +154,7 @@ export class Panel {
   }
 
   figures(status, curve) {
-    const { points, references, total, axis, phase } = curve.told;
+    const { points, references, total, axis, phase, seeds } = curve.told;
     const last = points.length ? points[points.length - 1] : null;
     const cost = last ? last[1] : null;
     const rows = [["phase", phase || "–", ""]];
@@ -166,6 +166,7 @@ export class Panel {
     rows.push(["lowest", text(best), ""]);
     const side = share === null ? "" : share >= 0 ? " % below" : " % above";
     rows.push(["against LQT", share === null ? "–" : Math.abs(share).toFixed(1), side]);
+    rows.push(["seeds", seeds ? String(seeds) : "–", ""]);
     rows.push(["rounds", text(status.rounds < 10 ? status.rounds : Math.round(status.rounds)), " 1/s"]);
     rows.push(["episodes", text(status.episodes), " 1/s"]);
     const list = find("figures");
