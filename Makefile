@@ -23,11 +23,13 @@ test: setup packages
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 # Debian's packages that tests need: a real browser for the report's page, faketime to make a clock
-# jump, iproute2 for hosts made of network namespaces. Where they cannot be had, those tests fail and say so.
+# jump, iproute2 for hosts made of network namespaces, zsh and fish for their
+# completion. Where they cannot be had, those tests fail and say so.
 packages:
 	@missing=(); \
 	command -v chromium >/dev/null || missing+=(chromium); \
 	command -v ip >/dev/null || missing+=(iproute2); \
+	for shell in zsh fish; do command -v $$shell >/dev/null || missing+=($$shell); done; \
 	ls /usr/lib/*/faketime/libfaketime.so.1 >/dev/null 2>&1 || missing+=(faketime); \
 	if [ $${#missing[@]} = 0 ]; then exit 0; fi; \
 	if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \

@@ -1,56 +1,102 @@
-"""The command line `pdeloop`: its commands, and what becomes of their errors."""
+"""The command line `pdeloop`: its commands, and what becomes of their errors.
+
+Exit codes: docs/command-line.md.
+"""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import os
 import sys
+import traceback
 from collections.abc import Sequence
+from importlib import metadata
 
-from bringup.commands import bag, bench, evaluate, monitor, problems, reproduce, secure, train
+from bringup.commands import (
+    bag,
+    bench,
+    completion,
+    evaluate,
+    monitor,
+    problems,
+    reproduce,
+    secure,
+    train,
+)
 
-_EXTRAS = {"rosbags": "record", "mcap": "record", "matplotlib": "report", "aiohttp": "monitor"}
+DONE, FAILED, CRASHED, INTERRUPTED, NOBODY_READS = 0, 1, 70, 130, 141
+"""Exit codes; 2, a command that is not understood, is argparse's."""
+_EXTRAS = {
+    "rosbags": "record",
+    "mcap": "record",
+    "matplotlib": "report",
+    "aiohttp": "monitor",
+    "shtab": "completion",
+}
 """Modules that only some commands need, and the extra that installs them."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Console script. Every error a user can cause is one line on stderr and exit code 1 or 2."""
-    parser = _parser()
-    options = parser.parse_args(arguments)
+    """Console script. Every error a user can cause is one line on stderr."""
+    options = parser().parse_args(arguments)
     try:
         code: int = options.command(options)
+        sys.stdout.flush()  # here, where it can still be said that nobody reads
         return code
     except (ValueError, RuntimeError) as error:
         # RunFolderError, CheckpointError, ParameterError, DomainError, NodeError and the plant's
-        # and controller's refusals; anything else is a bug and shows its traceback.
-        print(f"pdeloop: {error}", file=sys.stderr)
-        return 1
+        # and controller's refusals.
+        return _failed(str(error))
     except ModuleNotFoundError as error:
         extra = _EXTRAS.get((error.name or "").split(".")[0])
         if extra is None:
-            raise
-        print(f"pdeloop: needs {error.name}: pip install 'pdeloop[{extra}]'", file=sys.stderr)
-        return 1
+            return _crashed()
+        return _failed(f"needs {error.name}: pip install 'pdeloop[{extra}]'")
     except KeyboardInterrupt:
         print("pdeloop: interrupted", file=sys.stderr)
-        return 130
+        return INTERRUPTED
     except BrokenPipeError:
-        sys.stderr.close()
-        return 1
+        with contextlib.suppress(OSError, ValueError):  # or the interpreter would try it again
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return NOBODY_READS
     except OSError as error:
         where = f" ({error.filename})" if error.filename else ""
-        print(f"pdeloop: {error.strerror or error}{where}", file=sys.stderr)
-        return 1
+        return _failed(f"{error.strerror or error}{where}")
+    except Exception:
+        return _crashed()
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+def _failed(text: str) -> int:
+    print(f"pdeloop: {text}", file=sys.stderr)
+    return FAILED
+
+
+def _crashed() -> int:
+    """A bug: the only case of a traceback."""
+    traceback.print_exc()
+    return CRASHED
+
+
+def parser() -> argparse.ArgumentParser:
+    """The parser of all commands."""
+    root = argparse.ArgumentParser(
         prog="pdeloop",
         description="Reduce, design and adapt controllers of PDEs over ROS 2 topics.",
+        epilog="example: pdeloop train burgers (every command has an example in its --help)",
     )
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for module in (train, evaluate, bag, monitor, reproduce, bench, secure, problems):
+    root.add_argument("--version", action="version", version=f"pdeloop {_version()}")
+    commands = root.add_subparsers(required=True, metavar="COMMAND")
+    for module in (train, evaluate, bag, monitor, reproduce, bench, secure, problems, completion):
         module.add(commands)
-    return parser
+    return root
+
+
+def _version() -> str:
+    try:
+        return metadata.version("pdeloop")
+    except metadata.PackageNotFoundError:  # run from its sources
+        return "(not installed)"
 
 
 if __name__ == "__main__":

@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import MofNCompleteColumn, Progress
+
+from bringup.progress import bar
 
 _MOST_AT_ONCE = 4_000_000
 """Bytes of progress.jsonl that are read in one go."""
@@ -70,17 +72,9 @@ class Display:
 
     def _phase(self, phase: str) -> None:
         if phase == "adapt" and self._console.is_terminal:
-            self._progress = Progress(
-                TextColumn("adapt   "),
-                BarColumn(),
-                MofNCompleteColumn(),
-                TextColumn("{task.fields[cost]}"),
-                TimeRemainingColumn(),
-                console=self._console,
-                transient=True,
-            )
+            self._progress = bar(self._console, "adapt", MofNCompleteColumn())
             self._progress.start()
-            self._task = self._progress.add_task("", total=self._total, cost="")
+            self._task = self._progress.add_task("", total=self._total, status="")
             return
         self.close()
         if phase != "done":
@@ -92,7 +86,7 @@ class Display:
         before, self._told = self._told, sum(self._rollouts.values()) // 2
         cost = f"cost {row['cost']:.4g}" if "cost" in row else "diverged"
         if self._progress is not None:
-            self._progress.update(self._task, completed=self._told, cost=cost)
+            self._progress.update(self._task, completed=self._told, status=cost)
         elif self._told // self._every > before // self._every or row["diverged"]:
             self.line(f"  seed {row['seed']}, iteration {row['iteration']}: {cost}")
 

@@ -23,6 +23,9 @@ from loop_interfaces.protocol import STOPPED
 _RESPAWN_DELAY = 1.0
 """Seconds before a node that died is started again."""
 
+_ENDED = {0: "is done", 130: "was interrupted", STOPPED: "was stopped on request"}
+"""Exit codes of a tuner that does not want to be started again."""
+
 
 def description(
     arguments: Iterable[Argument], make: Callable[[Mapping[str, str]], Plan]
@@ -74,9 +77,8 @@ def _after(
     if context.is_shutdown:
         return []
     code = event.returncode
-    ends = {0: "the training is done", 130: "it was interrupted", STOPPED: "stopped by request"}
-    if node.package == "tuner_node" and code in ends:
-        return [Shutdown(reason=ends[code])]
+    if node.package == "tuner_node" and code in _ENDED:
+        return [Shutdown(reason=f"the training {_ENDED[code]}")]
     if code == REFUSED:
         raise NodeError(f"{node.name} refuses to run; its last words are above")
     if node.package == "recorder_node":

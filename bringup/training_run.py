@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import itertools
 import json
 import os
@@ -21,6 +22,7 @@ from bringup.display import Display, ProgressFile, summary_text
 from bringup.domain import own_domain
 from bringup.in_process import LocalPair, train
 from bringup.live import announced
+from bringup.output import print_json
 from bringup.pairs import Layout, Recording, pair_nodes, quoted
 from bringup.supervisor import Child, NodeError, Supervisor, node_command
 from loop_interfaces.isolation import NETWORK, PROFILE, loopback_environment
@@ -135,20 +137,28 @@ def reopen(folder: Path) -> dict[str, Any]:
 
 
 def run_new(
-    problem: str, options: Mapping[str, Any], out: Path | None, transport: Transport
+    problem: str,
+    options: Mapping[str, Any],
+    out: Path | None,
+    transport: Transport,
+    as_json: bool = False,
 ) -> int:
-    """Train from the start in a new folder; returns the exit code."""
+    """Train from the start in a new folder; returns the exit code.
+
+    as_json: the result alone on stdout, as JSON; progress goes to stderr.
+    """
     folder, values = begin(problem, options, out)
-    return _run(folder, values, transport)
+    return _run(folder, values, transport, as_json)
 
 
-def run_again(folder: Path, transport: Transport) -> int:
+def run_again(folder: Path, transport: Transport, as_json: bool = False) -> int:
     """Continue the training in `folder`; returns the exit code."""
-    return _run(folder, reopen(folder), transport)
+    return _run(folder, reopen(folder), transport, as_json)
 
 
-def _run(folder: Path, values: dict[str, Any], transport: Transport) -> int:
-    display = Display(values["iterations"], values["seeds"])
+def _run(folder: Path, values: dict[str, Any], transport: Transport, as_json: bool) -> int:
+    stream = sys.stderr if as_json else sys.stdout
+    display = Display(values["iterations"], values["seeds"], stream)
     started = time.monotonic()
     try:
         with interruptible():
@@ -166,6 +176,9 @@ def _run(folder: Path, values: dict[str, Any], transport: Transport) -> int:
     finally:
         display.close()
     summary = json.loads((folder / "result.json").read_text())
+    if as_json:
+        print_json({"folder": str(folder), **summary})
+        return 0
     display.line(summary_text(values["problem"], summary, folder))
     display.line(f"  {time.monotonic() - started:.1f} s with start-up")
     return 0
@@ -197,6 +210,11 @@ def _train_holding(folder: Path, values: dict[str, Any], display: Display) -> No
 
 
 def _train_over_topics(folder: Path, display: Display, transport: Transport) -> None:
+    if importlib.util.find_spec("rclpy") is None:
+        raise NodeError(
+            "needs rclpy: source an installed ROS 2 Jazzy, or pip install 'pdeloop[ros]', or train "
+            f"without ROS: pdeloop train --resume {folder} --in-process"
+        )
     logs = folder / "logs"
     logs.mkdir(exist_ok=True)
     children = {

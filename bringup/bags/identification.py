@@ -35,16 +35,29 @@ class Identified:
     steps: int
     live: bool | None
 
+    def summary(self) -> dict[str, Any]:
+        """The result as data, without the arrays, which `save` writes."""
+        A, B, U = self.model.A, self.model.B, self.model.U
+        return {
+            "reduced_order": len(A),
+            "n_z": U.shape[0],
+            "n_a": B.shape[1],
+            "steps": self.steps,
+            "trajectories": [{"episode": n, "environment": m} for n, m in self.sources],
+            "spectral_radius": float(np.abs(np.linalg.eigvals(A)).max()),
+            "same_as_published": self.live,
+        }
+
     def text(self) -> str:
         """The result for people."""
-        A, B, U = self.model.A, self.model.B, self.model.U
+        known = self.summary()
         used = ", ".join(f"{number}/{env}" for number, env in self.sources[:6])
         more = f" and {len(self.sources) - 6} more" if len(self.sources) > 6 else ""
         lines = [
-            f"reduced model of order {len(A)} from {self.steps} steps of "
+            f"reduced model of order {known['reduced_order']} from {self.steps} steps of "
             f"{len(self.sources)} trajectories (episode/environment {used}{more})",
-            f"  {U.shape[0]} points, {B.shape[1]} actuators, "
-            f"spectral radius {np.abs(np.linalg.eigvals(A)).max():.4f}",
+            f"  {known['n_z']} points, {known['n_a']} actuators, "
+            f"spectral radius {known['spectral_radius']:.4f}",
         ]
         if self.live is not None:
             same = "the same, to the bit, as" if self.live else "not the same as"

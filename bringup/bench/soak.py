@@ -23,8 +23,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.console import Console
 
 from bringup.in_process import LocalPair, train
+from bringup.progress import Share
 from bringup.training_run import resolve
 from tuner_node.build import build_training
 
@@ -63,9 +65,13 @@ def soak(
     iterations: int,
     seed: int,
     tell: Callable[[str], None],
+    tick: Callable[[float, str], None] = lambda share, status: None,
     folder: Path | None = None,
 ) -> SoakReport:
-    """Run trainings of `problem` under faults for `minutes`; the last one is brought to its end."""
+    """Run trainings of `problem` under faults for `minutes`; the last one is brought to its end.
+
+    tell: a line after each training; tick(share, status): often, with the share of the time.
+    """
     report, rng = SoakReport(), np.random.default_rng(seed)
     began = time.monotonic()
     with contextlib.ExitStack() as stack:
@@ -74,7 +80,13 @@ def soak(
         while time.monotonic() - began < 60 * minutes:
             number = report.trainings
             training = _Training(problem, iterations, seed + number, place / f"{number}", report)
-            training.run(rng)
+
+            def now() -> None:
+                share = min(1.0, (time.monotonic() - began) / (60 * minutes))
+                faults = sum(report.faults.values())
+                tick(share, f"training {report.trainings + 1}, {faults} faults")
+
+            training.run(rng, now)
             report.trainings += 1
             same = training.matches()
             report.mismatches += not same
@@ -99,7 +111,7 @@ class _Training:
         self._log = out.with_suffix(".log")
         self._seen: dict[int, tuple[str, float, float]] = {}
 
-    def run(self, rng: np.random.Generator) -> None:
+    def run(self, rng: np.random.Generator, tick: Callable[[], None] = lambda: None) -> None:
         """Start it, disturb it, and start it again until it has its result."""
         report = self._report
         options = [
@@ -123,6 +135,7 @@ class _Training:
             deadline = time.monotonic() + float(rng.uniform(*PAUSE))
             while time.monotonic() < deadline and process.poll() is None:
                 self._watch_memory()
+                tick()
                 time.sleep(0.05)
             if process.poll() is None and not (self._out / "result.json").exists():
                 self._disturb(process, rng)
@@ -239,15 +252,27 @@ def _pairs(rows: list[dict[str, Any]]) -> list[tuple[dict[str, Any], dict[str, A
 
 
 def run(minutes: float, problem: str, iterations: int, seed: int) -> dict[str, Any]:
-    """The soak of the command line, with a line on stderr per training.
+    """The soak of the command line: on stderr a line per training and, on a terminal, a bar.
 
     Raises RuntimeError when a training ended with another policy or other costs.
     """
+    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    progress = Share(console, "soak")
 
     def tell(text: str) -> None:
-        print(text, file=sys.stderr, flush=True)
+        console.print(text, markup=False)
 
-    report = soak(minutes, problem=problem, iterations=iterations, seed=seed, tell=tell)
+    try:
+        report = soak(
+            minutes,
+            problem=problem,
+            iterations=iterations,
+            seed=seed,
+            tell=tell,
+            tick=progress.tell,
+        )
+    finally:
+        progress.close()
     result = as_dict(report)
     if report.mismatches:
         tell(text(result))

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
+from dataclasses import asdict
 from pathlib import Path
 
-from bringup.commands.common import Commands
+from bringup.commands.common import Commands, add_json, command
+from bringup.output import print_json
 from loop_interfaces.parameters import ParameterError
-
-_BAG = "Look into a bag that --record or recorder_node wrote, verify it, recover it, or play it."
 
 
 def add(commands: Commands) -> None:
@@ -19,43 +18,67 @@ def add(commands: Commands) -> None:
 
 
 def _add_bag(commands: Commands) -> None:
-    bag = commands.add_parser(
-        "bag", help="look into a recorded bag, verify it, recover it, play it", description=_BAG
+    bag = command(
+        commands,
+        "bag",
+        None,
+        help="look into a recorded bag, verify it, recover it, play it",
+        description="Look into a bag that --record or recorder_node wrote, verify it, recover "
+        "it, or play it (docs/recording.md).",
+        example="pdeloop bag info runs/burgers-20260101-120000-1",
     )
     actions = bag.add_subparsers(required=True, metavar="ACTION")
-    for name, command, text in (
-        ("info", _bag_info, "topics and episodes of a bag"),
-        ("verify", _bag_verify, "recompute states, actions, costs, models and policies"),
-        ("recover", _bag_recover, "make an ordinary bag of an unfinished one"),
-    ):
-        action = actions.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
-        action.add_argument(
-            "bag",
-            type=Path,
-            metavar="BAG",
-            nargs="+" if name == "verify" else None,
-            help="folder of a bag or of a run" + "; all bags of a run" * (name == "verify"),
-        )
-        action.set_defaults(command=command)
-        if name == "info":
-            action.add_argument("--json", action="store_true", help="print JSON")
-        if name == "verify":
-            action.add_argument(
-                "--parameters", type=Path, metavar="FILE", help="instead of those in the bag"
-            )
-        if name == "recover":
-            action.add_argument("--out", type=Path, metavar="DIR", help="[BAG-recovered]")
+    info = command(
+        actions,
+        "info",
+        _bag_info,
+        help="topics and episodes of a bag",
+        example="pdeloop bag info runs/burgers-20260101-120000-1",
+    )
+    verify = command(
+        actions,
+        "verify",
+        _bag_verify,
+        help="recompute states, actions, costs, models and policies",
+        description="Recompute states, actions, costs, models and policies, and compare them to "
+        "the bit. Exit code 1 if anything differs.",
+        example="pdeloop bag verify runs/burgers-20260101-120000-1",
+    )
+    recover = command(
+        actions,
+        "recover",
+        _bag_recover,
+        help="make an ordinary bag of an unfinished one",
+        example="pdeloop bag recover runs/lab/bag --out runs/lab/whole",
+    )
+    for action in (info, recover):
+        action.add_argument("bag", type=Path, metavar="BAG", help="folder of a bag or of a run")
+    verify.add_argument(
+        "bag",
+        type=Path,
+        metavar="BAG",
+        nargs="+",
+        help="folder of a bag or of a run; all bags of a run",
+    )
+    verify.add_argument(
+        "--parameters", type=Path, metavar="FILE", help="instead of those in the bag"
+    )
+    recover.add_argument("--out", type=Path, metavar="DIR", help="new folder [BAG-recovered]")
+    for action in (info, verify, recover):
+        add_json(action)
     _add_play(actions)
 
 
 def _add_play(actions: Commands) -> None:
-    play = actions.add_parser(
+    play = command(
+        actions,
         "play",
+        _bag_play,
         help="publish a bag's messages over topics",
         description="Publish a bag's messages again: the recorded bytes under the recorded names and "
         "quality of service, in the recorded time. In a ROS domain of its own (pdeloop monitor finds "
         "it), or in ROS_DOMAIN_ID if that is set; never beside a live loop.",
-        epilog="example: pdeloop bag play runs/lab/bag --rate 0.1 --wait",
+        example="pdeloop bag play runs/lab/bag --rate 0.1 --wait",
     )
     play.add_argument("bag", type=Path, metavar="BAG", help="folder of a bag or of a run")
     play.add_argument("--rate", type=float, default=1.0, metavar="R", help="times as fast [1]")
@@ -66,16 +89,17 @@ def _add_play(actions: Commands) -> None:
         action="store_true",
         help="let messages leave this machine (default: loopback interface only)",
     )
-    play.set_defaults(command=_bag_play)
 
 
 def _add_identify(commands: Commands) -> None:
-    identify = commands.add_parser(
+    identify = command(
+        commands,
         "identify",
+        _identify,
         help="reduced model from recorded episodes",
         description="Identify a reduced model by DMDc from the exploratory episodes of a bag (all "
         "episodes if none is), of this plant or a foreign one, and design LQ-tracking gains.",
-        epilog="example: pdeloop identify --bag runs/lab/bag --rank 8 --order 4 --out model.npz",
+        example="pdeloop identify --bag runs/lab/bag --rank 8 --order 4 --out model.npz",
     )
     add = identify.add_argument
     add("--bag", type=Path, metavar="BAG", required=True, help="folder of a bag or of a run")
@@ -86,14 +110,17 @@ def _add_identify(commands: Commands) -> None:
     add("--state-weight", type=float, metavar="Q", help="q of Q = q I [that of the run, or 1]")
     add("--action-weight", type=float, metavar="R", help="r of R = r I [that of the run, or 1]")
     add("--out", type=Path, metavar="FILE", help="write A, B, U, K_a, K_b, s_r to this .npz")
-    identify.set_defaults(command=_identify)
+    add_json(identify)
 
 
 def _bag_info(options: argparse.Namespace) -> int:
     from bringup.bags.tools import describe, info_text
 
     content = describe(options.bag)
-    print(json.dumps(content) if options.json else info_text(content))
+    if options.json:
+        print_json(content)
+    else:
+        print(info_text(content))
     return 0
 
 
@@ -101,7 +128,10 @@ def _bag_verify(options: argparse.Namespace) -> int:
     from bringup.bags.verify import verify
 
     report = verify(*options.bag, parameters=options.parameters)
-    print(report.text())
+    if options.json:
+        print_json(asdict(report))
+    else:
+        print(report.text())
     return 1 if report.count else 0
 
 
@@ -109,7 +139,10 @@ def _bag_recover(options: argparse.Namespace) -> int:
     from bringup.bags.tools import recover
 
     path, messages = recover(options.bag, options.out)
-    print(f"{messages} messages in {path}")
+    if options.json:
+        print_json({"bag": str(path), "messages": messages})
+    else:
+        print(f"{messages} messages in {path}")
     return 0
 
 
@@ -139,8 +172,12 @@ def _identify(options: argparse.Namespace) -> int:
         environment=options.environment,
         weights=(options.state_weight, options.action_weight),
     )
-    print(found.text())
     if options.out is not None:
         save(found, options.out)
+    if options.json:
+        print_json(found.summary() | {"out": options.out and str(options.out)})
+        return 0
+    print(found.text())
+    if options.out is not None:
         print(f"  written to {options.out}")
     return 0

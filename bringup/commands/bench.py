@@ -8,41 +8,72 @@ import json
 from pathlib import Path
 from typing import Any
 
-from bringup.commands.common import Commands
+from bringup.commands.common import Commands, add_json, command
+from bringup.output import print_json
 
 
 def add(commands: Commands) -> None:
     """The command group `bench`."""
-    bench = commands.add_parser(
+    bench = command(
+        commands,
         "bench",
+        None,
         help="measure this machine: kernel, round trip, batch, training, pairs, real time; optimum",
         description="Measure. What is compared runs in turns in one run; figures are medians.",
+        example="pdeloop bench rtt --turns 3",
     )
     programs = bench.add_subparsers(required=True, metavar="PROGRAM")
-    rtt = _add(programs, "rtt", "rounds a second of the loop beside a bare ping-pong")
+    rtt = _add(
+        programs,
+        "rtt",
+        "rounds a second of the loop beside a bare ping-pong",
+        "--turns 3 --seconds 0.3",
+    )
     rtt.add_argument("--turns", type=int, default=9, metavar="N", help="turns of each [9]")
     rtt.add_argument("--seconds", type=float, default=0.4, metavar="S", help="of a turn [0.4]")
     rtt.add_argument("--only", choices=("pinned", "unpinned"), help="one of the two")
-    batch = _add(programs, "batch", "environment-steps a second against the batch")
+    batch = _add(
+        programs, "batch", "environment-steps a second against the batch", "--problem kdv --turns 5"
+    )
     batch.add_argument("--problem", default="allen-cahn", metavar="PROBLEM", help="[allen-cahn]")
     batch.add_argument("--turns", type=int, default=3, metavar="N", help="turns of each [3]")
-    train = _add(programs, "train", "a whole training: topics against in-process")
+    train = _add(
+        programs,
+        "train",
+        "a whole training: topics against in-process",
+        "--problem burgers --turns 2 --out train.json",
+    )
     train.add_argument("--problem", default="burgers", metavar="PROBLEM", help="[burgers]")
     train.add_argument("--turns", type=int, default=3, metavar="N", help="trainings of each [3]")
     train.add_argument("--iterations", type=int, default=40, metavar="N", help="[40]")
     train.add_argument("--pin", action="store_true", help="with --pin as well")
-    real = _add(programs, "realtime", "jitter and missed deadlines at P1's 20 Hz and at 1 kHz")
+    real = _add(
+        programs,
+        "realtime",
+        "jitter and missed deadlines at P1's 20 Hz and at 1 kHz",
+        "--seconds 30 --pin",
+    )
     real.add_argument("--seconds", type=float, default=10.0, metavar="S", help="of each rate [10]")
     real.add_argument("--pin", action="store_true", help="with cores of their own")
     pairs = _add(
-        programs, "pairs", "1, 2, 4 pairs on hosts made of network namespaces (needs root)"
+        programs,
+        "pairs",
+        "1, 2, 4 pairs on hosts made of network namespaces (needs root)",
+        "--pairs 1 2 --loss 0.05",
     )
-    pairs.add_argument("--pairs", type=int, nargs="+", default=[1, 2, 4], metavar="K")
+    pairs.add_argument(
+        "--pairs", type=int, nargs="+", default=[1, 2, 4], metavar="K", help="[1 2 4]"
+    )
     pairs.add_argument("--iterations", type=int, default=20, metavar="N", help="[20]")
     pairs.add_argument("--loss", type=float, default=0.01, help="share of lost messages [0.01]")
     pairs.add_argument("--delay", type=float, default=0.002, help="largest delay in s [0.002]")
     pairs.add_argument("--problem", default="burgers", metavar="PROBLEM", help="[burgers]")
-    soak = _add(programs, "soak", "trainings under random faults, compared bit for bit")
+    soak = _add(
+        programs,
+        "soak",
+        "trainings under random faults, compared bit for bit",
+        "--minutes 5 --seed 1",
+    )
     soak.add_argument("--minutes", type=float, default=20.0, metavar="N", help="[20]")
     soak.add_argument("--problem", default="allen-cahn", metavar="PROBLEM", help="[allen-cahn]")
     soak.add_argument("--iterations", type=int, default=100, metavar="N", help="of each [100]")
@@ -53,6 +84,7 @@ def add(commands: Commands) -> None:
         programs,
         "optimum",
         "what the policy class and any controller at all could reach, by exact gradients",
+        "burgers --seeds 1 --fields 4",
     )
     add = optimum.add_argument
     add("problems", nargs="*", metavar="PROBLEM", help="shipped names or YAML files [all shipped]")
@@ -82,14 +114,21 @@ def add(commands: Commands) -> None:
         help="leave out what the first seed gives from zero and with twice the fields",
     )
     add("--save", type=Path, metavar="DIR", help="write DIR/PROBLEM.json, which reports read")
-    monitor = _add(programs, "monitor", "how much pdeloop monitor with an open page slows the loop")
+    monitor = _add(
+        programs,
+        "monitor",
+        "how much pdeloop monitor with an open page slows the loop",
+        "--windows 8",
+    )
     monitor.add_argument("--problem", default="allen-cahn", metavar="PROBLEM", help="[allen-cahn]")
     monitor.add_argument("--windows", type=int, default=8, metavar="N", help="of each [8]")
     monitor.add_argument("--seconds", type=float, default=4.0, metavar="S", help="of a window [4]")
     monitor.add_argument(
         "--browser", action="store_true", help="with the page drawn by a headless chromium"
     )
-    kernel = _add(programs, "kernel", "time of a step beside other implementations")
+    kernel = _add(
+        programs, "kernel", "time of a step beside other implementations", "--batches 1 12 --json"
+    )
     kernel.add_argument(
         "--batches", type=int, nargs="+", default=[1, 2, 12, 64], metavar="M", help="[1 2 12 64]"
     )
@@ -97,11 +136,11 @@ def add(commands: Commands) -> None:
     kernel.add_argument("--controlgym", metavar="PYTHON", help="interpreter with controlgym 1.0.0")
 
 
-def _add(programs: Commands, name: str, text: str) -> argparse.ArgumentParser:
-    program = programs.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
-    program.add_argument("--json", action="store_true", help="print JSON instead of a table")
+def _add(programs: Commands, name: str, text: str, example: str) -> argparse.ArgumentParser:
+    program = command(programs, name, _bench, help=text, example=f"pdeloop bench {name} {example}")
+    add_json(program, "print JSON instead of a table")
     program.add_argument("--out", type=Path, metavar="FILE", help="write the JSON there, too")
-    program.set_defaults(command=_bench, program=name)
+    program.set_defaults(program=name)
     return program
 
 
@@ -114,7 +153,10 @@ def _bench(options: argparse.Namespace) -> int:
     result, text = _measure(options.program, given)
     if options.out is not None:
         options.out.write_text(json.dumps(result, indent=1) + "\n")
-    print(json.dumps(result) if options.json else text)
+    if options.json:
+        print_json(result)
+    else:
+        print(text)
     return 0
 
 

@@ -1,8 +1,9 @@
-"""What the commands share."""
+"""What the commands share: how they are declared."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from typing import TypeAlias
 
 from loop_interfaces.parameters import TUNER
@@ -11,3 +12,32 @@ Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 """Where a command adds its parser."""
 DEFAULTS = {spec.name: spec for spec in TUNER}
 """The tuner's parameters by name: their defaults, ranges and meanings."""
+
+
+def command(
+    commands: Commands,
+    name: str,
+    run: Callable[[argparse.Namespace], int] | None,
+    *,
+    help: str,
+    description: str = "",
+    example: str,
+) -> argparse.ArgumentParser:
+    """Declare a command, or a group of commands (without `run`); every one shows an example.
+
+    description: `help` as a sentence if not given.
+    """
+    parser = commands.add_parser(
+        name,
+        help=help,
+        description=description or f"{help[0].upper()}{help[1:]}.",
+        epilog=f"example: {example}",
+    )
+    if run is not None:
+        parser.set_defaults(command=run)
+    return parser
+
+
+def add_json(parser: argparse.ArgumentParser, what: str = "print JSON") -> None:
+    """The flag --json: data on stdout, and nothing else there."""
+    parser.add_argument("--json", action="store_true", help=what)

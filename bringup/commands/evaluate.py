@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
-from bringup.commands.common import DEFAULTS, Commands
+from bringup.commands.common import DEFAULTS, Commands, add_json, command
+from bringup.output import print_json
 
 
 def add(commands: Commands) -> None:
     """The command `evaluate`."""
-    evaluate = commands.add_parser(
+    evaluate = command(
+        commands,
         "evaluate",
+        _evaluate,
         help="cost of a run's policies on other fields",
         description="Roll out no control, LQT and the adapted policy of a finished run.",
-        epilog="example: pdeloop evaluate runs/burgers-20260101-120000-1 --fields 60 --seed 7",
+        example="pdeloop evaluate runs/burgers-20260101-120000-1 --fields 60 --seed 7",
     )
     evaluate.add_argument("folder", type=Path, metavar="DIR", help="folder of a finished run")
     evaluate.add_argument(
@@ -29,8 +31,7 @@ def add(commands: Commands) -> None:
         action="store_true",
         help="the mean of the initial distribution instead of sampled fields",
     )
-    evaluate.add_argument("--json", action="store_true", help="print JSON")
-    evaluate.set_defaults(command=_evaluate)
+    add_json(evaluate, "print the costs as JSON: {controller: [[cost a field] a seed]}")
 
 
 def _evaluate(options: argparse.Namespace) -> int:
@@ -42,5 +43,8 @@ def _evaluate(options: argparse.Namespace) -> int:
     costs = evaluate(
         options.folder, fields=options.fields, seed=options.seed, mean_field=options.mean_field
     )
-    print(json.dumps(costs) if options.json else as_text(costs))
+    if options.json:
+        print_json(costs)
+    else:
+        print(as_text(costs))
     return 0

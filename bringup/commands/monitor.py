@@ -7,7 +7,7 @@ import os
 import webbrowser
 from pathlib import Path
 
-from bringup.commands.common import Commands
+from bringup.commands.common import Commands, command
 from loop_interfaces.parameters import ParameterError
 
 PORT = 8420
@@ -15,15 +15,16 @@ PORT = 8420
 
 def add(commands: Commands) -> None:
     """The command `monitor`."""
-    monitor = commands.add_parser(
+    monitor = command(
+        commands,
         "monitor",
+        _monitor,
         help="a page that shows a loop as it runs",
         description="Serve a page on 127.0.0.1 that shows a loop as it runs: the field, the actions, "
         "the profile against the target, the training curve, the nodes, and buttons to pause. "
         "Without DIR and ROS_DOMAIN_ID it shows the newest training (or played bag) on this machine, "
         "and the next one when that has ended. Ctrl-C ends it; the loop never waits for it.",
-        epilog="example: pdeloop monitor runs/burgers-20260101-120000-1 --environment 3",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        example="pdeloop monitor runs/burgers-20260101-120000-1 --environment 3",
     )
     add = monitor.add_argument
     add(
@@ -42,7 +43,6 @@ def add(commands: Commands) -> None:
         action="store_true",
         help="the loop's messages may leave this machine (the page never does)",
     )
-    monitor.set_defaults(command=_monitor)
 
 
 def _monitor(options: argparse.Namespace) -> int:

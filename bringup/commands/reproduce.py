@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bringup.commands.common import DEFAULTS, Commands
+from bringup.commands.common import DEFAULTS, Commands, add_json, command
 
 
 def add(commands: Commands) -> None:
@@ -15,13 +15,15 @@ def add(commands: Commands) -> None:
 
 
 def _add_reproduce(commands: Commands) -> None:
-    reproduce = commands.add_parser(
+    reproduce = command(
+        commands,
         "reproduce",
+        _reproduce,
         help="the paper's experiment: four controllers, several seeds, a table",
         description="For each problem and seed: no control, LQT, LQT-PO and pure PO, with the cost "
         "of every iteration's policy on the evaluation fields. Ctrl-C interrupts; --out DIR of an "
         "interrupted reproduction continues it.",
-        epilog="example: pdeloop reproduce burgers kdv --seeds 6 --out runs/paper",
+        example="pdeloop reproduce burgers kdv --seeds 6 --out runs/paper",
     )
     add = reproduce.add_argument
     add("problems", nargs="*", metavar="PROBLEM", help="shipped names or YAML files [the paper's]")
@@ -37,21 +39,22 @@ def _add_reproduce(commands: Commands) -> None:
     )
     add("--processes", type=int, metavar="N", help="jobs at the same time [one a core]")
     add("--out", type=Path, metavar="DIR", help="folder of the results [runs/reproduce-TIME]")
-    reproduce.set_defaults(command=_reproduce)
+    add_json(reproduce, "print the table as JSON; progress goes to stderr")
 
 
 def _add_report(commands: Commands) -> None:
-    report = commands.add_parser(
+    report = command(
+        commands,
         "report",
+        _report,
         help="figures and an HTML page of a run or a reproduction",
         description="Figures for a paper (PNG and SVG) and one HTML page that needs no network.",
-        epilog="example: pdeloop report runs/paper",
+        example="pdeloop report runs/paper",
     )
     report.add_argument(
         "folder", type=Path, metavar="DIR", help="folder of a finished run or reproduction"
     )
     report.add_argument("--out", type=Path, metavar="DIR", help="[DIR/report]")
-    report.set_defaults(command=_report)
 
 
 def _reproduce(options: argparse.Namespace) -> int:
@@ -61,7 +64,7 @@ def _reproduce(options: argparse.Namespace) -> int:
     given = {n: getattr(options, n) for n in names if getattr(options, n) is not None}
     for name, value in given.items():
         DEFAULTS[name].check(value)
-    return reproduce(options.problems, given, options.out, options.processes)
+    return reproduce(options.problems, given, options.out, options.processes, options.json)
 
 
 def _report(options: argparse.Namespace) -> int:

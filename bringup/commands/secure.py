@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import argparse
 
-from bringup.commands.common import Commands
+from bringup.commands.common import Commands, command
 
 
 def add(commands: Commands) -> None:
     """The command `secure`."""
-    secure = commands.add_parser(
+    secure = command(
+        commands,
         "secure",
+        _secure,
         help="print an access policy for SROS2",
         description="Print a policy for `ros2 security generate_artifacts -p` in which each node "
         "has its own topics and nothing else (docs/security.md).",
-        epilog="example: pdeloop secure --namespace /lab > policy.xml",
+        example="pdeloop secure --namespace /lab > policy.xml",
     )
     secure.add_argument("--namespace", default="/", metavar="NS", help="namespace of the loop [/]")
     secure.add_argument(
         "--pairs", nargs="+", default=[""], metavar="NS", help="namespaces of its pairs below it"
     )
-    secure.set_defaults(command=_secure)
 
 
 def _secure(options: argparse.Namespace) -> int:

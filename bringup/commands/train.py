@@ -5,21 +5,22 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bringup.commands.common import DEFAULTS, Commands
+from bringup.commands.common import DEFAULTS, Commands, add_json, command
 from loop_interfaces.parameters import ParameterError
 from loop_interfaces.problem import shipped_problems
 
 
 def add(commands: Commands) -> None:
     """The command `train`."""
-    train = commands.add_parser(
+    train = command(
+        commands,
         "train",
+        _train,
         help="identify, design, adapt and evaluate",
         description="Train a controller: identify a reduced model, design LQ-tracking gains, adapt "
         "them by policy gradient, evaluate. The plant, the controller and the tuner run as ROS 2 "
         "nodes in processes of their own.",
-        epilog="example: pdeloop train burgers --iterations 40 --seed 0",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        example="pdeloop train burgers --iterations 40 --seed 0",
     )
     train.add_argument(
         "problem",
@@ -101,7 +102,7 @@ def add(commands: Commands) -> None:
         action="store_true",
         help="a viewer_node beside the others, for RViz, Foxglove and PlotJuggler (docs/views.md)",
     )
-    train.set_defaults(command=_train)
+    add_json(train, "print the result as JSON at the end; progress goes to stderr")
 
 
 def _train(options: argparse.Namespace) -> int:
@@ -139,10 +140,10 @@ def _train(options: argparse.Namespace) -> int:
                 "--resume continues a run with its own parameters; "
                 "give it alone (or with --in-process)"
             )
-        return run_again(options.resume, transport)
+        return run_again(options.resume, transport, options.json)
     if options.problem is None:
         raise ParameterError(
             f"no problem given; expected one of {', '.join(shipped_problems())}, a YAML file, "
             "or --resume DIR"
         )
-    return run_new(options.problem, {**given, **own}, options.out, transport)
+    return run_new(options.problem, {**given, **own}, options.out, transport, options.json)

@@ -22,8 +22,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
+from bringup.output import print_json
+from bringup.progress import Share
 from bringup.reproduce.folder import STARTS, Job, run, work
 from bringup.training_run import Interruption, interruptible
 from pde_sim_node.plant import DIVERGED_COST
@@ -121,27 +122,40 @@ def asked(folder: Path) -> dict[str, Any]:
 
 
 def reproduce(
-    problems: Sequence[str], options: Mapping[str, Any], out: Path | None, processes: int | None
+    problems: Sequence[str],
+    options: Mapping[str, Any],
+    out: Path | None,
+    processes: int | None,
+    as_json: bool = False,
 ) -> int:
-    """Run what is not done yet; returns the exit code."""
+    """Run what is not done yet; returns the exit code.
+
+    as_json: the table alone on stdout, as JSON; progress goes to stderr.
+    """
     folder = out or Path("runs") / f"reproduce-{timestamp()}"
     jobs = _jobs(folder, problems, options)
-    console = Console(highlight=False, soft_wrap=True)
+    console = Console(stderr=as_json, highlight=False, soft_wrap=True)
+    progress = Share(console, "reproduce")
     started = time.monotonic()
     pool = _Pool(jobs, processes or _cores())
     try:
         with interruptible():
-            pool.run(_progress(console))
+            pool.run(progress.tell)
     except Interruption as signal_name:
+        progress.close()
         console.print(
             f"stopped by {signal_name}; continue with: pdeloop reproduce --out {folder}",
             markup=False,
         )
         return 130
     finally:
+        progress.close()
         pool.stop()
     rows = [results.row() for results in load(folder)]
     (folder / "table.json").write_text(json.dumps({"rows": rows, "versions": versions()}, indent=1))
+    if as_json:
+        print_json({"folder": str(folder), "rows": rows})
+        return 0
     console.print(table(rows), markup=False)
     console.print(
         f"{time.monotonic() - started:.0f} s; results in {folder} (figures: pdeloop report {folder})",
@@ -237,14 +251,15 @@ class _Pool:
     processes: int
     _alive: dict[int, BaseProcess] = field(default_factory=dict)
 
-    def run(self, tell: Callable[[float], None]) -> None:
-        """Run all jobs; tell(share) is called with the share of the work that is done."""
+    def run(self, tell: Callable[[float, str], None]) -> None:
+        """Run all jobs; tell(share, status) is called with the share of the work that is done."""
         context = multiprocessing.get_context("spawn")
         news: Any = context.Queue()
         weights = [work(job.values()) for job in self.jobs]
         shares = [1.0 if job.done else 0.0 for job in self.jobs]
         order = sorted(range(len(self.jobs)), key=lambda i: -weights[i])
         waiting = [i for i in order if not self.jobs[i].done]
+        status = ""
         while waiting or self._alive:
             while waiting and len(self._alive) < self.processes:
                 number = waiting.pop(0)
@@ -253,8 +268,8 @@ class _Pool:
                 )
                 process.start()
                 self._alive[number] = process
-            self._listen(news, shares)
-            tell(float(np.dot(weights, shares) / sum(weights)))
+            status = self._listen(news, shares) or status
+            tell(float(np.dot(weights, shares) / sum(weights)), status)
             for number, ended in list(self._alive.items()):
                 if ended.exitcode is not None:
                     del self._alive[number]
@@ -275,16 +290,19 @@ class _Pool:
                 process.kill()
                 process.join()
 
-    def _listen(self, news: Any, shares: list[float]) -> None:
+    def _listen(self, news: Any, shares: list[float]) -> str:
+        """Take what the processes say; returns the newest words."""
+        words = ""
         try:
-            number, word = news.get(timeout=0.1)
+            number, share, words = news.get(timeout=0.1)
             while True:
-                if isinstance(word, str):
-                    raise RunFolderError(f"{self.jobs[number].folder}: {word}")
-                shares[number] = word
-                number, word = news.get_nowait()
+                if share is None:
+                    raise RunFolderError(f"{self.jobs[number].folder}: {words}")
+                shares[number] = share
+                number, share, newer = news.get_nowait()
+                words = newer or words
         except queue.Empty:
-            return
+            return words
 
 
 def _work(number: int, job: Job, news: Any) -> None:
@@ -292,49 +310,9 @@ def _work(number: int, job: Job, news: Any) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     try:
-        run(job, lambda share: news.put((number, share)))
+        run(job, lambda share, words: news.put((number, share, words)))
     except (ValueError, RuntimeError, OSError) as error:
-        news.put((number, str(error)))
+        news.put((number, None, str(error)))
         news.close()
         news.join_thread()
         raise SystemExit(1) from error
-
-
-def _progress(console: Console) -> Callable[[float], None]:
-    """Shows the share that is done: a bar with the time left on a terminal, lines elsewhere."""
-    if not console.is_terminal:
-        return _Lines(console).tell
-    bar = Progress(
-        TextColumn("reproduce"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-    )
-    task = bar.add_task("", total=1.0)
-
-    def tell(share: float) -> None:
-        if not bar.live.is_started:
-            bar.start()
-        bar.update(task, completed=share)
-        if share >= 1.0:
-            bar.stop()
-
-    return tell
-
-
-class _Lines:
-    """Progress as lines, one every tenth."""
-
-    def __init__(self, console: Console) -> None:
-        self._console, self._began, self._told = console, time.monotonic(), 0
-        self._first: float | None = None
-
-    def tell(self, share: float) -> None:
-        self._first = share if self._first is None else self._first
-        tenth = int(10 * share)
-        if tenth > self._told and share > self._first:
-            self._told = tenth
-            left = (time.monotonic() - self._began) * (1 - share) / (share - self._first)
-            self._console.print(f"{100 * share:.0f} % done, {left:.0f} s left", markup=False)

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from bringup.in_process import LocalPair
 from bringup.training_run import resolve
 from loop_interfaces.topics import CostColumn
+from pde_sim_node.plant import DIVERGED_COST
 from tuner_node import checkpoint
 from tuner_node.build import build_training
 from tuner_node.results import RunFolder, RunFolderError
@@ -34,6 +35,7 @@ SAVE_PERIOD = 2.0
 """Seconds between two savings: what an interruption may lose."""
 STARTS = ("lqt", "zero")
 """LQT-PO and pure PO."""
+TITLES = {"lqt": "LQT-PO", "zero": "pure PO"}
 
 
 @dataclass(frozen=True)
@@ -64,8 +66,11 @@ def work(values: Mapping[str, Any]) -> float:
     return float(rollouts * values["horizon"] * inner * values["n_z"])
 
 
-def run(job: Job, tell: Callable[[float], None]) -> None:
-    """Carry the job out, or on; tell(share) is called now and then with the share that is done."""
+def run(job: Job, tell: Callable[[float, str], None]) -> None:
+    """Carry the job out, or on.
+
+    tell(share, status) is called now and then with the share that is done and the cost so far.
+    """
     values = job.values()
     folder = RunFolder(job.folder)
     if (job.folder / "parameters.yaml").exists():
@@ -74,12 +79,12 @@ def run(job: Job, tell: Callable[[float], None]) -> None:
         folder.create(values)
     state = _Curve(values, job.folder / "progress")
     while state.advance():
-        tell(state.share)
+        tell(state.share, f"{values['problem']} {TITLES[job.start]} {state.cost}".strip())
     folder.finish(state.training, {"seconds": state.seconds, "transport": "in-process"})
     state.save_result(job.folder / "curve.npz")
     for path in job.folder.glob("progress*"):
         path.unlink()
-    tell(1.0)
+    tell(1.0, "")
 
 
 class _Curve:
@@ -100,6 +105,16 @@ class _Curve:
     @property
     def share(self) -> float:
         return len(self._costs) / float(self._values["iterations"] + 1)
+
+    @property
+    def cost(self) -> str:
+        """The mean cost of the newest policy on the evaluation fields, in words."""
+        if not self._costs:
+            return ""
+        newest = self._costs[-1]
+        if (newest >= DIVERGED_COST).any():
+            return "diverged"
+        return f"cost {newest.mean():.4g}"
 
     def advance(self) -> bool:
         """One batch of the training; False when it is over."""

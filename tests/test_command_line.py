@@ -1,0 +1,374 @@
+"""The command line as a tool: help, JSON, colours, exit codes, completion in real shells."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import fcntl
+import importlib.util
+import io
+import json
+import os
+import pty
+import re
+import select
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import termios
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from bringup import cli
+from bringup.cli import main
+from bringup.commands import problems
+from bringup.display import Display
+from bringup.output import print_json
+from bringup.progress import Share, duration
+from loop_interfaces.parameters import read_yaml
+from tests.loop_harness import ROOT
+from tests.small import SMALL
+
+PDELOOP = [sys.executable, "-m", "bringup.cli"]
+CONTROL = re.compile(r"\x1b\[[0-9;?]*[a-zA-Z]")
+COLOUR = re.compile(r"\x1b\[(?:\d+;)*(?:3[0-8]|4[0-8]|9[0-7]|10[0-7])(?:;\d+)*m")
+LIMIT = 240.0
+"""Seconds for a command, on a busy machine that has to compile the kernels first."""
+
+
+def commands(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """Every command and subcommand below `parser`."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for below in action.choices.values():
+                yield below
+                yield from commands(below)
+
+
+ALL = {command.prog: command for command in commands(cli.parser())}
+
+
+def run(*words: str, environment: Mapping[str, str] | None = None, cwd: Path | None = None):
+    """The command in a process of its own, with its output in pipes."""
+    return subprocess.run(
+        [*PDELOOP, *words],
+        env={**os.environ, "PYTHONPATH": str(ROOT), **(environment or {})},
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        timeout=LIMIT,
+    )
+
+
+def test_there_are_commands() -> None:
+    assert {"pdeloop train", "pdeloop bag verify", "pdeloop bench soak"} <= set(ALL)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_every_command_shows_an_example_that_its_parser_takes(name: str, capsys) -> None:
+    command = ALL[name]
+    with pytest.raises(SystemExit) as left:
+        main([*name.split()[1:], "--help"])
+    assert left.value.code == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert (command.epilog or "").startswith("example: ")
+    example = (command.epilog or "").removeprefix("example: ")
+    assert " ".join(example.split()) in said
+    inside = re.search(r"\$\((.*?)\)", example)
+    words = shlex.split(inside.group(1) if inside else example.partition(" > ")[0])
+    assert " ".join(words).startswith(name)
+    cli.parser().parse_args(words[1:])
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_every_argument_says_what_it_is(name: str) -> None:
+    for action in ALL[name]._actions:
+        if not isinstance(action, argparse._SubParsersAction):
+            assert action.help, f"{name} {action.dest}"
+
+
+def test_a_version_is_told(capsys) -> None:
+    with pytest.raises(SystemExit) as left:
+        main(["--version"])
+    assert left.value.code == 0
+    assert re.fullmatch(r"pdeloop \d+\.\d+\.\d+\n", capsys.readouterr().out)
+
+
+def test_data_is_one_line_of_strict_json(capsys) -> None:
+    print_json({"a": [1.5, float("nan"), (float("inf"), None)], 3: "ü"})
+    out = capsys.readouterr().out
+    assert out.count("\n") == 1
+    assert json.loads(out) == {"a": [1.5, None, [None, None]], "3": "ü"}
+
+
+def test_problems_are_data_too(capsys) -> None:
+    assert main(["problems", "--json"]) == 0
+    found = {one["name"]: one for one in json.loads(capsys.readouterr().out)}
+    assert Path(found["burgers"]["file"]).is_file()
+    values = read_yaml(Path(found["kdv"]["file"]))
+    assert all(found["kdv"][name] == values[name] for name in ("n_z", "n_a", "horizon"))
+
+
+def test_a_trainings_result_is_all_of_its_output(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    done = run(
+        *("train", str(SMALL), "--in-process", "--iterations", "2", "--json", "--out", str(out))
+    )
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert result["folder"] == str(out)
+    assert result["mean_cost"] == json.loads((out / "result.json").read_text())["mean_cost"]
+    assert "evaluate" in done.stderr
+
+
+def test_a_reproductions_table_is_all_of_its_output(tmp_path: Path) -> None:
+    out = tmp_path / "paper"
+    words = ("reproduce", str(SMALL), "--seeds", "1", "--iterations", "2", "--out", str(out))
+    done = run(*words, "--json")
+    assert done.returncode == 0, done.stderr
+    table = json.loads(done.stdout)
+    assert table["folder"] == str(out)
+    (row,) = table["rows"]
+    assert row["problem"] == "small"
+    assert (
+        row["lqt"]["mean"] == json.loads((out / "table.json").read_text())["rows"][0]["lqt"]["mean"]
+    )
+    assert "\x1b" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (["problems"], 0, ""),
+        (["train", "stokes"], 1, "unknown problem 'stokes'"),
+        (["bag", "info", "nowhere"], 1, "nowhere"),
+        (["train", "burgers", "--iterations", "many"], 2, "invalid int value: 'many'"),
+        (["tarin"], 2, "invalid choice: 'tarin'"),
+        ([], 2, "required: COMMAND"),
+    ],
+)
+def test_exit_codes(words: list[str], code: int, said: str) -> None:
+    done = run(*words)
+    assert done.returncode == code
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_bug_is_a_traceback_and_a_code_of_its_own(monkeypatch, capsys) -> None:
+    def broken() -> dict[str, Path]:
+        raise KeyError("a bug")
+
+    monkeypatch.setattr(problems, "shipped_problems", broken)
+    assert main(["problems"]) == 70
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_a_missing_extra_is_named(monkeypatch, capsys) -> None:
+    monkeypatch.setitem(sys.modules, "shtab", None)
+    assert main(["completion", "bash"]) == 1
+    assert capsys.readouterr().err == "pdeloop: needs shtab: pip install 'pdeloop[completion]'\n"
+
+
+def test_a_machine_without_ros_is_told_what_to_do(monkeypatch, capsys, tmp_path: Path) -> None:
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda n: None if n == "rclpy" else find(n))
+    out = str(tmp_path / "run")
+    assert main(["train", str(SMALL), "--iterations", "2", "--out", out]) == 1
+    assert "pdeloop[ros]" in capsys.readouterr().err
+    assert main(["train", "--resume", out, "--in-process"]) == 0
+
+
+def test_a_reader_that_leaves_is_no_error_to_talk_about() -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = subprocess.run(
+        [*PDELOOP, "problems"], stdout=writing, stderr=subprocess.PIPE, text=True, timeout=LIMIT
+    )
+    os.close(writing)
+    assert done.returncode == 141
+    assert done.stderr == ""
+
+
+class Terminal:
+    """A process on a pseudo-terminal: what is typed and what is shown."""
+
+    def __init__(self, *command: str, cwd: Path, environment: Mapping[str, str]) -> None:
+        self.master, slave = pty.openpty()
+        self.process = subprocess.Popen(
+            command,
+            stdin=slave,
+            stdout=slave,
+            stderr=slave,
+            cwd=cwd,
+            env={**os.environ, "TERM": "xterm-256color", "COLUMNS": "100", **environment},
+            start_new_session=True,
+            preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),  # of which it is in charge
+        )
+        os.close(slave)
+        self.shown = ""
+
+    def read(self, seconds: float) -> bool:
+        """Take what comes within `seconds`; False at the end."""
+        if not select.select([self.master], [], [], seconds)[0]:
+            return True
+        try:
+            new = os.read(self.master, 65536)
+        except OSError:
+            return False
+        self.shown += new.decode(errors="replace")
+        return bool(new)
+
+    def until(self, text: str) -> str:
+        """What is shown when `text` is (escape sequences left out)."""
+        deadline = time.monotonic() + LIMIT
+        while text not in self.plain:
+            assert time.monotonic() < deadline, f"no {text!r} in {self.plain!r}"
+            if not self.read(0.1):
+                assert text in self.plain, f"no {text!r} in {self.plain!r}"
+        return self.plain
+
+    @property
+    def plain(self) -> str:
+        return CONTROL.sub("", self.shown)
+
+    def type(self, text: str) -> None:
+        """Type `text`, forgetting what was shown before."""
+        self.shown = ""
+        os.write(self.master, text.encode())
+
+    def wait(self) -> int:
+        """Read to the end; the exit code."""
+        deadline = time.monotonic() + LIMIT
+        while self.read(0.1) and time.monotonic() < deadline:
+            pass
+        return self.process.wait(5.0)
+
+
+@contextlib.contextmanager
+def terminal(*command: str, cwd: Path, **environment: str) -> Iterator[Terminal]:
+    started = Terminal(*command, cwd=cwd, environment=environment)
+    try:
+        yield started
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(started.process.pid, signal.SIGKILL)
+        started.process.wait(10.0)
+        os.close(started.master)
+
+
+@pytest.mark.parametrize("colour", [True, False])
+def test_a_terminal_shows_a_bar_with_cost_and_time_left(tmp_path: Path, colour: bool) -> None:
+    words = ("train", str(SMALL), "--in-process", "--iterations", "400", "--out", "run")
+    environment = {"PYTHONPATH": str(ROOT)} | ({} if colour else {"NO_COLOR": "1"})
+    with terminal(*PDELOOP, *words, cwd=tmp_path, **environment) as shown:
+        assert shown.wait() == 0, shown.plain
+    assert re.search(r"adapt [━╺╸]+ +\d+/400 cost [\d.]+ +\d:\d\d:\d\d", shown.plain), shown.plain
+    assert bool(COLOUR.search(shown.shown)) == colour
+    assert "results in run" in shown.plain
+
+
+def test_a_pipe_gets_plain_lines(tmp_path: Path) -> None:
+    done = run(
+        *("train", str(SMALL), "--in-process", "--iterations", "16", "--out", "run"),
+        environment={"TERM": "xterm-256color"},
+        cwd=tmp_path,
+    )
+    assert done.stdout.count("iteration ") == 8
+    assert "\x1b" not in done.stdout
+    assert "\r" not in done.stdout
+
+
+def test_an_interrupted_training_says_how_to_go_on(tmp_path: Path) -> None:
+    words = ("train", str(SMALL), "--in-process", "--iterations", "100000", "--out", "run")
+    with terminal(*PDELOOP, *words, cwd=tmp_path, PYTHONPATH=str(ROOT)) as shown:
+        shown.until("cost ")
+        os.killpg(shown.process.pid, signal.SIGINT)
+        assert shown.wait() == 130
+    assert "continue with: pdeloop train --resume run --in-process" in shown.plain
+
+
+def test_shares_become_lines_with_the_time_left() -> None:
+    file = io.StringIO()
+    share = Share(Console(file=file, width=80), "soak")
+    for tenth in range(0, 101, 2):
+        share.tell(tenth / 100, f"{tenth} faults")
+    lines = file.getvalue().splitlines()
+    assert len(lines) == 10
+    assert re.fullmatch(r"soak 50 %, 50 faults, \d+ s left", lines[4])
+
+
+def test_shares_on_a_terminal_are_a_bar_that_leaves_nothing() -> None:
+    file = io.StringIO()
+    share = Share(Console(file=file, width=80, force_terminal=True), "soak")
+    share.tell(0.0)
+    share.tell(0.5, "3 faults")
+    share.close()
+    text = CONTROL.sub("", file.getvalue())
+    assert re.search(r"soak [━╺]+ +50 % 3 faults", text)
+    assert file.getvalue().rstrip().endswith("\x1b[2K")
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"), [(0.4, "0 s"), (99, "99 s"), (600, "10 min"), (7200, "2.0 h")]
+)
+def test_durations_are_in_words(seconds: float, words: str) -> None:
+    assert duration(seconds) == words
+
+
+def test_a_row_of_a_training_is_a_line_where_there_is_no_terminal() -> None:
+    file = io.StringIO()
+    display = Display(8, 1, file)
+    display.row(
+        {
+            "event": "iteration",
+            "seed": 0,
+            "iteration": 1,
+            "rollouts": 2,
+            "cost": 1.25,
+            "diverged": 0,
+        }
+    )
+    assert file.getvalue() == "  seed 0, iteration 1: cost 1.25\n"
+
+
+SHELLS = {
+    "bash": (["bash", "--norc", "--noprofile", "-i"], 'eval "$({} completion bash)"'),
+    "zsh": (
+        ["zsh", "-f", "-i"],
+        'autoload -Uz compinit; compinit -u -D; eval "$({} completion zsh)"',
+    ),
+    "fish": (["fish", "--no-config", "-i"], "{} completion fish | source"),
+}
+
+
+@pytest.mark.parametrize("shell", SHELLS)
+def test_a_real_shell_completes(shell: str, tmp_path: Path) -> None:
+    command, load = SHELLS[shell]
+    assert shutil.which(command[0]), f"{command[0]} is not installed (make packages)"
+    (tmp_path / "zzz-own.yaml").write_text("")
+    (tmp_path / "zzz-other.txt").write_text("")
+    (tmp_path / "runs").mkdir()
+    program = shlex.join(PDELOOP)
+    home = {"HOME": str(tmp_path), "PYTHONPATH": str(ROOT), "PS1": "$ "}
+    with terminal(*command, cwd=tmp_path, **home) as shown:
+        shown.type(load.format(program) + "; echo load''ed\n")
+        shown.until("loaded")
+        for typed, completed in (
+            ("pdeloop tra", "pdeloop train "),
+            ("pdeloop train bur", "pdeloop train burgers "),
+            # fish only sorts YAML files before others; bash and zsh leave the others out.
+            ("pdeloop train zzz" + "-ow" * (shell == "fish"), "pdeloop train zzz-own.yaml "),
+            ("pdeloop bag ver", "pdeloop bag verify "),
+            ("pdeloop bench so", "pdeloop bench soak "),
+            ("pdeloop train --optimizer gauss", "--optimizer gauss_newton "),
+            ("pdeloop evaluate ru", "pdeloop evaluate runs/"),
+        ):
+            shown.type(typed + "\t")
+            shown.until(completed)
+            shown.type("\x15")  # an empty line again
