@@ -317,6 +317,8 @@ class TunerNode:
         )
         if row.get("event") == "repeated":
             self._log.warning(text)
+        elif row.get("event") == "iteration":  # hundreds a second of a small problem
+            self._log.info(text, throttle_duration_sec=1.0)
         else:
             self._log.info(text)
 
