@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from bringup.in_process import LocalPair
-from loop_interfaces.parameters import check, table
+from loop_interfaces.parameters import check, noisy, table
 from loop_interfaces.topics import CostColumn
 from pde_sim_node.plant import DIVERGED_COST
+from tuner_node.noise import evaluation_noise
 from tuner_node.results import RunFolder, RunFolderError
 from tuner_node.seeds import Purpose, derive
 from tuner_node.training import CONTROLLERS, Batch
@@ -37,11 +38,13 @@ def evaluate(folder: Path, *, fields: int, seed: int, mean_field: bool) -> dict[
     field_seeds = (
         [-1] if mean_field else [derive(seed, Purpose.EVALUATION_FIELD, i) for i in range(fields)]
     )
+    # A noise of its own for every field, the same for all controllers.
+    noise = evaluation_noise(seed, len(field_seeds)) if noisy(values) else []
     rows, gains = [], []
     for m in range(len(policies)):
         for policy in (np.zeros_like(warm[m]), warm[m], policies[m]):
-            for field_seed in field_seeds:
-                rows.append((field_seed, -1, 0, m))
+            for i, field_seed in enumerate(field_seeds):
+                rows.append((field_seed, -1, 0, m, *noise[i : i + 1]))
                 gains.append(policy)
     pair = LocalPair(values)
     pair.use_models(models)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from controller_node.identification import DesignSettings, design
 from controller_node.policy import ProjectedLaw, excitation
 from loop_interfaces import model_rows
-from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn
+from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn, noise_seeds
 from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.plant import Plant
 from tuner_node.observer import cut
@@ -37,13 +37,14 @@ class LocalPair:
             reduced_order=values["reduced_order"],
             state_weight=values["state_weight"],
             action_weight=values["action_weight"],
+            action_limit=values["action_limit"],
         )
         self._law: ProjectedLaw | None = None
 
     def use_models(self, models: Array) -> None:
         """Take the reduced models (S, rows, n_s) that policies refer to."""
         bases = [model_rows.unpack(rows, self._settings.n_a).U for rows in models]
-        self._law = ProjectedLaw(bases, self.plant.target)
+        self._law = ProjectedLaw(bases, self.plant.target, self._settings.action_limit)
 
     def run(self, batch: Batch, max_batch: int = 1024) -> BatchResult:
         """Roll the batch out. ValueError if exploration gives no model."""
@@ -68,7 +69,9 @@ class LocalPair:
 
     def _episode(self, batch: Batch) -> BatchResult:
         plant, settings = self.plant, self._settings
-        states = plant.reset(batch.rows[:, StartColumn.SEED].astype(np.int64))
+        states = plant.reset(
+            batch.rows[:, StartColumn.SEED].astype(np.int64), noise_seeds(batch.rows)
+        )
         columns = batch.rows[:, [StartColumn.EXCITATION, StartColumn.VARIANCE]]
         excitations = [(int(seed), float(variance)) for seed, variance in columns]
         watched = batch.exploratory or batch.trajectories
@@ -78,7 +81,12 @@ class LocalPair:
             self._law.set(batch.policies, batch.rows[:, StartColumn.MODEL].astype(np.int64))
         for k in range(plant.horizon):
             if batch.exploratory:
-                actions = np.stack([excitation(s, k, settings.n_a, v) for s, v in excitations])
+                actions = np.stack(
+                    [
+                        excitation(s, k, settings.n_a, v, settings.action_limit)
+                        for s, v in excitations
+                    ]
+                )
             else:
                 assert self._law is not None
                 actions = self._law.actions(states)

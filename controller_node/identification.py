@@ -14,13 +14,17 @@ from loop_interfaces.model_rows import ModelRows
 
 @dataclass(frozen=True)
 class DesignSettings:
-    """Actuators, p and n_s of the DMDc, and the weights of the stage cost."""
+    """Actuators, p and n_s of the DMDc, the weights of the stage cost, and where actions saturate.
+
+    The gains are designed without the limit (action_limit, 0: none); only the actions keep it.
+    """
 
     n_a: int
     dmdc_rank: int
     reduced_order: int
     state_weight: float
     action_weight: float
+    action_limit: float = 0.0
 
 
 def design(

@@ -50,6 +50,7 @@ CONTROLLER_PARAMETERS = (
             "reduced_order",
             "state_weight",
             "action_weight",
+            "action_limit",
         )
     ),
     *EXECUTION,

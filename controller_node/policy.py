@@ -2,6 +2,8 @@
 
     a = K_a U^T z + K_b U^T z_r,        policy = [K_a K_b], shape (n_a, 2 n_s)
 
+saturated at +- action_limit if there is one.
+
 An environment's action does not depend on how many environments are in the batch, nor on its place
 in it, to the last bit: every sum runs over its terms one after the other (no BLAS, no
 reassociation), and what is vectorised is the independent sums beside each other.
@@ -65,12 +67,17 @@ class ProjectedLaw:
         The bases U that environments can use; all of one shape.
     target : (n_z,) array
         The target field z_r.
+    action_limit : float
+        Largest magnitude of an action; 0 for none.
 
     Call `set` before the first `actions`. Anything malformed raises a ValueError and leaves the law
     as it was.
     """
 
-    def __init__(self, models: Sequence[ArrayLike], target: ArrayLike) -> None:
+    def __init__(
+        self, models: Sequence[ArrayLike], target: ArrayLike, action_limit: float = 0.0
+    ) -> None:
+        self._action_limit = action_limit
         bases = [np.asarray(basis, dtype=np.float64) for basis in models]
         shapes = {basis.shape for basis in bases}
         if len(shapes) != 1 or bases[0].ndim != 2 or 0 in bases[0].shape:
@@ -185,10 +192,12 @@ class ProjectedLaw:
         control(
             self._feedback, self._constant, self._bases, self._model_index, z, self._reduced, out
         )
+        if self._action_limit:
+            np.clip(out, -self._action_limit, self._action_limit, out=out)
         return out
 
 
-def excitation(seed: int, step: int, n_a: int, variance: float) -> Array:
+def excitation(seed: int, step: int, n_a: int, variance: float, action_limit: float = 0.0) -> Array:
     """The exploratory action of one step, drawn from N(0, variance I).
 
     A pure function of (seed, step), so that a step that is answered twice gets the same action
@@ -202,6 +211,8 @@ def excitation(seed: int, step: int, n_a: int, variance: float) -> Array:
         Number of actuators.
     variance : float
         Variance of every entry, not its standard deviation.
+    action_limit : float
+        Magnitude at which an entry saturates; 0 for none.
     """
     if seed < 0 or step < 0 or n_a < 1:
         raise ValueError(
@@ -211,4 +222,5 @@ def excitation(seed: int, step: int, n_a: int, variance: float) -> Array:
     if not (np.isfinite(variance) and variance >= 0.0):
         raise ValueError(f"variance must be finite and not negative, but it is {variance}.")
     draw: Array = np.random.default_rng([seed, step]).standard_normal(n_a)
-    return math.sqrt(variance) * draw
+    action: Array = math.sqrt(variance) * draw
+    return np.clip(action, -action_limit, action_limit) if action_limit else action

@@ -25,6 +25,7 @@ from loop_interfaces.topics import (
     COMPLETED,
     MAX_GAIN,
     MODEL_IDENTIFIED,
+    START_COLUMNS,
     VOID,
     CostColumn,
     StartColumn,
@@ -107,8 +108,10 @@ class Responder:
     def start(self, frame: Frame) -> Sequence[Send | ModelFailure]:
         """Learn of an episode: who explores, which model each environment uses."""
         rows = frame.values
-        if rows.shape[1] != len(StartColumn):
-            raise FrameError(f"expected rows of {len(StartColumn)} numbers, got {rows.shape[1]}")
+        if rows.shape[1] not in (START_COLUMNS, len(StartColumn)):
+            raise FrameError(
+                f"expected rows of {START_COLUMNS} numbers, or one more, got {rows.shape[1]}"
+            )
         if not len(rows):
             self._runs.pop(frame.run, None)
             return []
@@ -223,7 +226,7 @@ class Responder:
             return np.stack([self._explore(*how, frame.step) for how in _excitations(start)])
         law, episode = run.laws.get(frame.plant, (None, -1))
         if law is None or episode != frame.episode:
-            law = self._prepare(run, start, law, target)
+            law = self._prepare(run, start, law, target, self._settings.action_limit)
             if law is None:
                 return None
             run.laws[frame.plant] = (law, frame.episode)
@@ -231,7 +234,11 @@ class Responder:
 
     @staticmethod
     def _prepare(
-        run: _Run, start: Frame, law: ProjectedLaw | None, target: np.ndarray
+        run: _Run,
+        start: Frame,
+        law: ProjectedLaw | None,
+        target: np.ndarray,
+        action_limit: float,
     ) -> ProjectedLaw | None:
         """The law set for the run's episode; None while something has not arrived yet."""
         policy = run.policy
@@ -240,7 +247,7 @@ class Responder:
         if not run.models or run.generation != start.step:
             return None
         if law is None:
-            law = ProjectedLaw([model.U for model in run.models], target)
+            law = ProjectedLaw([model.U for model in run.models], target, action_limit)
         index = start.values[:, StartColumn.MODEL].astype(np.int64)
         if len(policy.values) != len(index):
             raise FrameError(
@@ -250,7 +257,8 @@ class Responder:
         return law
 
     def _explore(self, seed: int, variance: float, step: int) -> np.ndarray:
-        return excitation(seed, step, self._settings.n_a, variance)
+        settings = self._settings
+        return excitation(seed, step, settings.n_a, variance, settings.action_limit)
 
     def _identify(self, run: _Run, start: Frame, cost: Frame) -> Send | ModelFailure:
         def failure(retry: bool, reason: str) -> ModelFailure:

@@ -106,6 +106,32 @@ def _plain(number: float) -> str:
 
 MAX_SEED = 2**53 - 1
 
+INSTRUMENTS = (
+    Spec(
+        "measurement_noise",
+        0.0,
+        "standard deviation of the noise on every number of the published state; 0: none",
+        0.0,
+        1e6,
+    ),
+    Spec(
+        "process_noise",
+        0.0,
+        "intensity sigma of a white noise in space and time that forces the field: "
+        "N(0, sigma^2 sample_time / dx) per step and grid point; 0: none",
+        0.0,
+        1e6,
+    ),
+    Spec(
+        "action_limit",
+        0.0,
+        "largest magnitude of an action, which saturates there; 0: no limit",
+        0.0,
+        1e9,
+    ),
+)
+"""What stands between the field and its controller, beyond the paper's setting; see docs/beyond.md."""
+
 PROBLEM = (
     Spec("problem", "burgers", "name of the problem, used in messages and result folders"),
     Spec(
@@ -157,6 +183,7 @@ PROBLEM = (
     Spec(
         "smoothing_radius", 0.1, "r, size of the two-point perturbation", positive=True, maximum=1e6
     ),
+    *INSTRUMENTS,
 )
 """What a problem's YAML file may set, besides `physical.*` (the equation's own parameters)."""
 
@@ -316,6 +343,11 @@ VIEWER = (
 def table() -> tuple[Spec, ...]:
     """Every parameter of the nodes."""
     return (*PROBLEM, *PLANT, *EXECUTION, *TUNER, *RECORDER, *VIEWER)
+
+
+def noisy(values: Mapping[str, Any]) -> bool:
+    """Whether the plant of these parameters has noise, so that a rollout has a seed of it."""
+    return bool(values["measurement_noise"] or values["process_noise"])
 
 
 def check_names(names: Iterable[str], known: Iterable[str]) -> None:

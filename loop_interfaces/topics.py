@@ -9,6 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum
 
+import numpy as np
+from numpy.typing import NDArray
+
 
 @dataclass(frozen=True)
 class Topic:
@@ -34,6 +37,17 @@ class StartColumn(IntEnum):
     """Variance of each exploratory action; 0 where the policy acts."""
     MODEL = 3
     """Index of the reduced model the environment's policy belongs to."""
+    NOISE = 4
+    """Seed of the environment's noise; only where the plant has noise."""
+
+
+START_COLUMNS = 4
+"""Columns of every `episode/start`; with noise there is one more."""
+
+
+def noise_seeds(rows: NDArray[np.float64]) -> NDArray[np.int64] | None:
+    """The column NOISE of the rows of a start, or None where there is none."""
+    return rows[:, StartColumn.NOISE].astype(np.int64) if rows.shape[1] > START_COLUMNS else None
 
 
 class CostColumn(IntEnum):

@@ -10,7 +10,9 @@ from dataclasses import asdict, fields
 from typing import Any
 
 from loop_interfaces.frames import MAX_ID
+from loop_interfaces.parameters import INSTRUMENTS
 from pde_sim_node.equations import Equation, configured_equation
+from pde_sim_node.instruments import InstrumentedPlant, Instruments
 from pde_sim_node.plant import Plant
 
 
@@ -38,6 +40,8 @@ def fingerprint(values: Mapping[str, Any]) -> int:
     """
     equation = build_equation(values)
     content = {spec: values[spec] for spec in _PLANT_VALUES} | asdict(equation)
+    # Only those in use: a plant without them is the same plant as before they were known.
+    content |= {spec.name: values[spec.name] for spec in INSTRUMENTS if values[spec.name]}
     digest = hashlib.sha256(json.dumps([content, sources(equation)], sort_keys=True).encode())
     return 1 + int.from_bytes(digest.digest()[:8], "big") % (MAX_ID - 1)
 
@@ -66,15 +70,10 @@ _PLANT_VALUES = (
 
 def build_plant(values: Mapping[str, Any]) -> Plant:
     """The plant of a problem. ValueError, one sentence, if the parameters do not fit together."""
-    return Plant(
-        build_equation(values),
-        n_z=values["n_z"],
-        n_a=values["n_a"],
-        width=values["actuator_width"],
-        sample_time=values["sample_time"],
-        integration_time=values["integration_time"],
-        horizon=values["horizon"],
-        state_weight=values["state_weight"],
-        action_weight=values["action_weight"],
-        divergence_bound=values["divergence_bound"],
-    )
+    equation = build_equation(values)
+    grid = {name: values[name] for name in _PLANT_VALUES if name != "actuator_width"}
+    grid["width"] = values["actuator_width"]
+    instruments = Instruments(**{spec.name: values[spec.name] for spec in INSTRUMENTS})
+    if instruments.ideal:
+        return Plant(equation, **grid)
+    return InstrumentedPlant(equation, instruments=instruments, **grid)

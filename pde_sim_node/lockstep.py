@@ -16,7 +16,18 @@ import numpy as np
 
 from loop_interfaces.frames import MAX_VALUES, Frame, FrameError
 from loop_interfaces.protocol import Send, Tally
-from loop_interfaces.topics import COMPLETED, COST, PAUSED, STATE, TARGET, VOID, StartColumn, Topic
+from loop_interfaces.topics import (
+    COMPLETED,
+    COST,
+    PAUSED,
+    START_COLUMNS,
+    STATE,
+    TARGET,
+    VOID,
+    StartColumn,
+    Topic,
+    noise_seeds,
+)
 from pde_sim_node.pace import Pace
 from pde_sim_node.plant import Plant
 
@@ -69,7 +80,7 @@ class Lockstep:
         self.episodes_total = 0
         self.last_cost: np.ndarray | None = None
         """The rows of the last `episode/cost`."""
-        self._rows = np.empty((0, len(StartColumn)))
+        self._rows = np.empty((0, START_COLUMNS))
         self._active = False
         self._reply: Send | None = None
         self._repeats = 0
@@ -214,7 +225,7 @@ class Lockstep:
                 )
             self.tally["starts repeated"] += 1
             return [self._reply] if self._reply and not self._held else []
-        states = self._plant.reset(rows[:, StartColumn.SEED].astype(np.int64))
+        states = self._plant.reset(rows[:, StartColumn.SEED].astype(np.int64), noise_seeds(rows))
         self.episode, self._rows, self._active = frame.episode, rows.copy(), True
         self.time = max(self.time, frame.time) + self._sample_time
         self._stepping = False
@@ -322,14 +333,17 @@ class Lockstep:
 
     def _check_rows(self, frame: Frame) -> np.ndarray:
         rows = frame.values
-        if rows.shape[1] != len(StartColumn):
+        if rows.shape[1] not in (START_COLUMNS, len(StartColumn)):
             raise FrameError(
-                f"expected rows of {len(StartColumn)} numbers "
-                f"(seed, excitation, variance, model), got {rows.shape[1]}"
+                f"expected rows of {START_COLUMNS} numbers (seed, excitation, variance, model), "
+                f"or one more (noise), got {rows.shape[1]}"
             )
         if rows.shape[0] * max(self._plant.n_z, self._plant.n_a) > MAX_VALUES:
             raise FrameError(f"{rows.shape[0]} environments are more than one message can hold")
         seeds = rows[:, StartColumn.SEED]
         if len(rows) and (seeds.min() < -1 or (seeds != np.floor(seeds)).any()):
             raise FrameError("expected seeds that are whole numbers of at least -1")
+        noise = rows[:, START_COLUMNS:]
+        if noise.size and (noise.min() < 0 or (noise != np.floor(noise)).any()):
+            raise FrameError("expected noise seeds that are whole numbers of at least 0")
         return rows

@@ -138,7 +138,9 @@ class Plant:
         self._total = np.zeros(batch)
         self._diverged_step = np.full(batch, -1, dtype=np.int64)
 
-    def reset(self, seeds: ArrayLike) -> NDArray[np.float64]:
+    def reset(
+        self, seeds: ArrayLike, noise: NDArray[np.int64] | None = None
+    ) -> NDArray[np.float64]:
         """Begin an episode.
 
         Parameters
@@ -146,6 +148,8 @@ class Plant:
         seeds : (M,) int
             One seed for each environment: 0 or more draws the initial field from its distribution,
             equal seeds giving equal fields; -1 is the mean field.
+        noise : (M,) int, optional
+            Seeds of the noise of each environment. This plant has none; see InstrumentedPlant.
 
         Returns
         -------

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.parameters import noisy
 from tuner_node.optimizers import NEED_TRAJECTORIES, OPTIMIZERS, Context, Optimizer
 from tuner_node.training import UNKNOWN_PLANT, Training, TrainingSettings
 
@@ -52,5 +53,7 @@ def build_training(values: Mapping[str, Any]) -> Training:
         state_weight=values["state_weight"],
         action_weight=values["action_weight"],
         trajectories=values["optimizer"] in NEED_TRAJECTORIES,
+        noise=noisy(values),
+        action_limit=values["action_limit"],
     )
     return Training(settings, make_optimizer, plant=values["plant"] or UNKNOWN_PLANT)

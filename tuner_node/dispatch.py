@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import ModelFailure, Send, Tally
-from loop_interfaces.topics import MODEL, POLICY, START, VOID, CostColumn, StartColumn
+from loop_interfaces.topics import MODEL, POLICY, START, START_COLUMNS, VOID, CostColumn
 from tuner_node.training import UNKNOWN_PLANT, Batch, BatchResult
 from tuner_node.work import Chunk, Pair
 
@@ -116,7 +116,7 @@ class Dispatcher:
 
     def release(self) -> list[Order]:
         """Tell every pair that the run is over."""
-        frame = Frame(self.run, 0, 0, self.sim_time, np.empty((0, len(StartColumn))))
+        frame = Frame(self.run, 0, 0, self.sim_time, np.empty((0, START_COLUMNS)))
         return [(pair, Send(START, frame)) for pair in range(len(self.pairs))]
 
     def presence(self, pair: int, missing: Sequence[str], now: float) -> list[Order]:

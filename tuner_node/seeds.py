@@ -19,6 +19,10 @@ class Purpose(IntEnum):
     EXCITATION = 2
     EVALUATION_FIELD = 3
     CHECK_FIELD = 4
+    EXPLORATORY_NOISE = 5
+    CHECK_NOISE = 6
+    ADAPT_NOISE = 7
+    EVALUATION_NOISE = 8
 
 
 def derive(seed: int, purpose: Purpose, index: int = 0) -> int:

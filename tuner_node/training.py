@@ -13,14 +13,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces import model_rows
-from loop_interfaces.topics import COMPLETED, MAX_GAIN, CostColumn, StartColumn
+from loop_interfaces.topics import COMPLETED, MAX_GAIN, START_COLUMNS, CostColumn, StartColumn
+from tuner_node.noise import PURPOSES, evaluation_noise, rollout_noise
 from tuner_node.optimizers import Context, Optimizer, Rollout, RolloutResult, Trajectory
 from tuner_node.seeds import Purpose, derive
 
@@ -37,7 +38,7 @@ CONTROLLERS = ("none", "lqt", "adapted")
 class Batch:
     """Rollouts wanted together; any split into episodes gives the same results.
 
-    rows (R, 4): the columns of `episode/start`; policies (R, n_a, 2 n_s), or
+    rows (R, 4), with noise (R, 5): the columns of `episode/start`; policies (R, n_a, 2 n_s), or
     None for an exploratory batch, whose result is a model a row instead of a cost.
     """
 
@@ -81,6 +82,9 @@ class TrainingSettings:
     state_weight: float
     action_weight: float
     trajectories: bool
+    noise: bool = False
+    """Whether rollouts get seeds of the plant's noise."""
+    action_limit: float = 0.0
 
 
 OptimizerFactory = Callable[[Array, int, Context | None], Optimizer]
@@ -130,15 +134,19 @@ class Training:
                 ]
                 for m in self.pending
             ]
-            return Batch(np.array(rows, dtype=np.float64), None, self.settings.trajectories)
-        if self.phase == "check":
-            return _batch(self._check_rollouts())
-        if self.phase == "adapt":
+            batch = Batch(np.array(rows, dtype=np.float64), None, self.settings.trajectories)
+        elif self.phase == "check":
+            batch = _batch(self._check_rollouts())
+        elif self.phase == "adapt":
             wanted = [(m, rollout) for m, asked in enumerate(self._asked()) for rollout in asked]
-            return _batch(wanted, self.settings.trajectories)
-        if self.phase == "evaluate":
-            return _batch(self._evaluation_rollouts())
-        return None
+            batch = _batch(wanted, self.settings.trajectories)
+        elif self.phase == "evaluate":
+            batch = _batch(self._evaluation_rollouts())
+        else:
+            return None
+        if not self.settings.noise:
+            return batch
+        return replace(batch, rows=np.column_stack([batch.rows, self._noise(batch.rows)]))
 
     def finish(self, result: BatchResult) -> list[dict[str, Any]]:
         """Take the results of the batch that `next_batch` gave, in its order."""
@@ -234,6 +242,17 @@ class Training:
     def _seeds(self) -> list[int]:
         return [self.settings.seed + s for s in range(self.settings.seeds)]
 
+    def _noise(self, rows: Array) -> list[int]:
+        """The seed of the noise of every row of a batch."""
+        settings, counts = self.settings, self.attempts
+        if self.phase == "evaluate":
+            fields = evaluation_noise(settings.evaluation_seed, settings.evaluation_fields)
+            return fields * (settings.seeds * len(CONTROLLERS))
+        if self.phase == "adapt":
+            counts = [optimizer.iteration for optimizer in self.optimizers]
+        owners = rows[:, StartColumn.MODEL].astype(int).tolist()
+        return rollout_noise(PURPOSES[self.phase], self._seeds(), owners, counts)
+
     def _identified(self, models: Array) -> list[dict[str, Any]]:
         if self.models is None:
             if len(models) != self.settings.seeds:
@@ -318,6 +337,7 @@ class Training:
             action_weight=self.settings.action_weight,
             horizon=len(exploration.actions),
             exploration=exploration,
+            action_limit=self.settings.action_limit,
         )
 
     def _asked(self) -> list[list[Rollout]]:
@@ -384,7 +404,7 @@ class Training:
 
 
 def _batch(wanted: Sequence[tuple[int, Rollout]], trajectories: bool = False) -> Batch:
-    rows = np.empty((len(wanted), len(StartColumn)))
+    rows = np.empty((len(wanted), START_COLUMNS))
     for row, (model, rollout) in zip(rows, wanted, strict=True):
         row[:] = (rollout.field_seed, -1, 0.0, model)
     policies = np.stack([rollout.policy for _, rollout in wanted])

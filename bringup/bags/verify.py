@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +22,10 @@ from controller_node.identification import DesignSettings, design
 from controller_node.policy import ProjectedLaw, excitation
 from loop_interfaces import model_rows
 from loop_interfaces.parameters import check, read_yaml, table
-from loop_interfaces.topics import COMPLETED, VOID, CostColumn, StartColumn
+from loop_interfaces.topics import COMPLETED, VOID, CostColumn, StartColumn, noise_seeds
 from pde_sim_node.build import build_plant, fingerprint
-from pde_sim_node.plant import DIVERGED_COST
+from pde_sim_node.instruments import InstrumentedPlant
+from pde_sim_node.plant import DIVERGED_COST, Plant
 from tuner_node.build import build_training
 from tuner_node.observer import cut
 from tuner_node.optimizers import NEED_TRAJECTORIES, Trajectory
@@ -133,7 +134,7 @@ class _Run:
         self._values = {**check(table(), {}), **values}
         self._plant = build_plant(self._values)
         self._fingerprint = fingerprint(self._values)
-        names = ("n_a", "dmdc_rank", "reduced_order", "state_weight", "action_weight")
+        names = [item.name for item in fields(DesignSettings)]
         self._settings = DesignSettings(**{name: self._values[name] for name in names})
 
     def episode(self, episode: RecordedEpisode) -> None:
@@ -242,16 +243,42 @@ class _Run:
         assert episode.start is not None and episode.cost is not None
         report, plant = self._report, self._plant
         states, actions = episode.trajectory()
-        steps, count = actions.shape[:2]
         rows = episode.start.values
         if states.shape[1:] != (len(rows), plant.n_z) or actions.shape[2] != plant.n_a:
             report.differs(f"{where}: states and actions do not have the plant's shape")
             return
-        initial = plant.reset(rows[:, StartColumn.SEED].astype(np.int64)).copy()
+        initial = plant.reset(rows[:, StartColumn.SEED].astype(np.int64), noise_seeds(rows)).copy()
         report.compare("initial fields", f"z_0 of {where}", states[0], initial)
         self._actions(episode, where, states, actions)
 
         ended = episode.cost.values[:, CostColumn.ENDED]
+        if isinstance(plant, InstrumentedPlant):
+            self._run_again(plant, where, states, actions, episode.cost.values)
+        else:
+            self._steps_again(plant, where, states, actions, episode.cost.values)
+        if episode.exploratory and episode.model is not None and (ended == COMPLETED).all():
+            self._models(episode, where, states, actions)
+
+    def _run_again(
+        self, plant: InstrumentedPlant, where: str, states: Array, actions: Array, costs: Array
+    ) -> None:
+        """The whole episode from its seeds: what is recorded is not the field, but measurements."""
+        for k, held in enumerate(actions):
+            where_k = f"z_{k + 1} of {where}"
+            if not self._report.compare("steps", where_k, states[k + 1], plant.step(held)):
+                return
+        again = plant.episode_costs()
+        ended = np.where(again.diverged_step >= 0, again.diverged_step, COMPLETED)
+        table_again = np.column_stack([again.mean, again.total, ended.astype(np.float64)])
+        self._report.compare("costs", f"cost of {where}", costs, table_again)
+
+    def _steps_again(
+        self, plant: Plant, where: str, states: Array, actions: Array, recorded: Array
+    ) -> None:
+        """Every step from the recorded state before it."""
+        report = self._report
+        steps, count = actions.shape[:2]
+        ended = recorded[:, CostColumn.ENDED]
         alive = np.arange(steps)[:, None] < np.where(ended == COMPLETED, steps, ended + 1)
         flat = (steps * count, -1)
         again, stage = plant.evaluate(states[:-1].reshape(flat), actions.reshape(flat))
@@ -267,9 +294,7 @@ class _Run:
         diverged = ended != COMPLETED
         total[diverged], mean[diverged] = DIVERGED_COST * plant.horizon, DIVERGED_COST
         table_again = np.column_stack([mean, total, ended])
-        report.compare("costs", f"cost of {where}", episode.cost.values, table_again)
-        if episode.exploratory and episode.model is not None and not diverged.any():
-            self._models(episode, where, states, actions)
+        report.compare("costs", f"cost of {where}", recorded, table_again)
 
     def _actions(self, episode: RecordedEpisode, where: str, states: Array, actions: Array) -> None:
         assert episode.start is not None
@@ -279,14 +304,16 @@ class _Run:
             if episode.policy is None or episode.bases is None:
                 return
             models = [model_rows.unpack(own, n_a) for own in episode.bases.values]
-            law = ProjectedLaw([model.U for model in models], self._plant.target)
+            limit = self._settings.action_limit
+            law = ProjectedLaw([model.U for model in models], self._plant.target, limit)
             law.set(episode.policy.values, rows[:, StartColumn.MODEL].astype(np.int64))
         columns = rows[:, [StartColumn.EXCITATION, StartColumn.VARIANCE]]
         for k, recorded in enumerate(actions):
             if law is not None:
                 again = law.actions(states[k])
             else:
-                again = np.stack([excitation(int(s), k, n_a, float(v)) for s, v in columns])
+                limit = self._settings.action_limit
+                again = np.stack([excitation(int(s), k, n_a, float(v), limit) for s, v in columns])
             if not report.compare("actions", f"a_{k} of {where}", recorded, again):
                 return
 

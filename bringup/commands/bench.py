@@ -126,6 +126,12 @@ def add(commands: Commands) -> None:
     monitor.add_argument(
         "--browser", action="store_true", help="with the page drawn by a headless chromium"
     )
+    beyond = _add(programs, "beyond", "trainings with noise, action limits and few sensors", "--problems burgers --parts limit")
+    beyond.add_argument("--problems", nargs="+", metavar="PROBLEM", help="[all three]")
+    beyond.add_argument(
+        "--parts", nargs="+", metavar="PART", help="[ideal measurement process limit]"
+    )
+    beyond.add_argument("--seeds", type=int, default=3, metavar="N", help="[3]")
     kernel = _add(
         programs, "kernel", "time of a step beside other implementations", "--batches 1 12 --json"
     )

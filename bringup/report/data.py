@@ -178,21 +178,26 @@ def _problem(
         models=trained.models,
         adapted=final,
         shown=shown,
-        behaviours=_behaviours(plant, trained.models[shown], policies),
+        behaviours=_behaviours(
+            plant, trained.models[shown], policies, trained.values["action_limit"]
+        ),
         x=plant.x,
         target=plant.target,
         components=plant.equation.components,
     )
 
 
-def _behaviours(plant: Plant, model: ModelRows, policies: Mapping[str, Array]) -> list[Behaviour]:
-    law = ProjectedLaw([model.U], plant.target)
+def _behaviours(
+    plant: Plant, model: ModelRows, policies: Mapping[str, Array], action_limit: float
+) -> list[Behaviour]:
+    law = ProjectedLaw([model.U], plant.target, action_limit)
     law.set(np.stack(list(policies.values())))
-    states = [plant.reset(np.full(len(policies), MEAN_FIELD)).copy()]
-    actions = []
+    published = plant.reset(np.full(len(policies), MEAN_FIELD))
+    states, actions = [plant.states.copy()], []  # the fields, whatever is measured of them
     for _ in range(plant.horizon):
-        actions.append(law.actions(states[-1]).copy())
-        states.append(plant.step(actions[-1]).copy())
+        actions.append(law.actions(published).copy())
+        published = plant.step(actions[-1])
+        states.append(plant.states.copy())
     costs = plant.episode_costs()
     t = plant.sample_time * np.arange(plant.horizon + 1, dtype=np.float64)
     field, action = np.stack(states), np.stack(actions)

@@ -91,6 +91,8 @@ class Context:
         T, the steps of an episode.
     exploration : Trajectory
         The exploratory trajectory that the reduced model was identified from.
+    action_limit : float
+        Magnitude at which actions saturate; 0 for none.
     """
 
     U: Array
@@ -99,6 +101,7 @@ class Context:
     action_weight: float
     horizon: int
     exploration: Trajectory
+    action_limit: float = 0.0
 
 
 class Optimizer(Protocol):

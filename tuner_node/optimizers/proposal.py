@@ -97,6 +97,7 @@ class Proposer:
         self._U, self._target, self._modes = U, target, modes
         self._q, self._r = context.state_weight, context.action_weight
         self._horizon = context.horizon
+        self._action_limit = context.action_limit
         self._exploration = Record(-1, np.zeros_like(policy), np.inf, states, actions)
         # U^T z_r, as a plain sum like the controller's.
         self._s_r: Array = np.sum(U * target[:, None], axis=0)
@@ -209,8 +210,11 @@ class Proposer:
     def _path(self, record: Record, V: Array) -> Path:
         length = len(record.actions)
         x = record.states[:length] @ V
+        free = None
+        if self._action_limit:
+            free = (np.abs(record.actions) < self._action_limit).astype(np.float64)
         return Path(
-            x, record.actions, np.column_stack([x[:, : self.n_s], np.full(length, self._one)])
+            x, record.actions, np.column_stack([x[:, : self.n_s], np.full(length, self._one)]), free
         )
 
     def _pairs(

@@ -59,6 +59,9 @@ def mismatches(
     measured = np.stack([pair.second.x for pair in pairs]) - x
     forcing = np.stack([pair.second.features @ pair.change.T for pair in pairs])
     size = np.maximum(np.sum(measured**2, axis=(1, 2)), 1e-300)
+    free = None
+    if pairs[0].first.free is not None:
+        free = np.stack([pair.first.free for pair in pairs if pair.first.free is not None])
     gammas = np.exp(-np.array(KAPPAS) / horizon)
     for i, model in enumerate(models):
         # A model that is unstable along the trajectory overflows: it counts as the worst.
@@ -70,6 +73,7 @@ def mismatches(
                 initial=measured[:, 0],
                 forcing=forcing,
                 gammas=gammas,
+                free=free,
             )
             error = np.sum((predicted - measured) ** 2, axis=(2, 3)) / size
         error = np.where(np.isfinite(error), np.minimum(error, _WORST), _WORST)

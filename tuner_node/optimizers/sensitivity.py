@@ -6,9 +6,9 @@ matrix B of a fitted model, X_k = dx_k/dtheta and G_k = da_k/dtheta follow
 
     G_k = K X_k[:n_s] + I (x) [s_k; 1]^T,        X_{k+1} = gamma (A_k X_k + B G_k),        X_0 = 0.
 
-gamma <= 1 forgets: it keeps the sensitivities of a model that is unstable where the plant is not
-from growing. The cost itself needs no model. With the measured x_k and a_k its gradient and
-Gauss-Newton curvature are
+A saturated action does not move with theta: its row of G_k is zero. gamma <= 1 forgets: it keeps
+the sensitivities of a model that is unstable where the plant is not from growing. The cost itself
+needs no model. With the measured x_k and a_k its gradient and Gauss-Newton curvature are
 
     g = (2 / T) sum_k (q X_k^T (x_k - V^T z_r) + r G_k^T a_k),     H = (2 / T) sum_k (q X_k^T X_k +
     r G_k^T G_k).
@@ -50,11 +50,14 @@ class Path:
     a : (T, n_a) array
     features : (T, n_s + 1) array
         [s_k; 1], or [s_k; 0] where the law has no constant part.
+    free : (T, n_a) array, optional
+        1 where the action moves with the gains, 0 where it was saturated; None: it never was.
     """
 
     x: Array
     a: Array
     features: Array
+    free: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +107,8 @@ def expand(
     for k in range(steps):
         G = K @ X[:n_s]
         G.reshape(n_a, n_a, n_f)[diagonal, diagonal] += path.features[k]
+        if path.free is not None:
+            G *= path.free[k][:, None]
         stacked[k, :r] = X
         stacked[k, r:] = G
         X = gamma * (jacobians[k] @ X + B @ G)
@@ -120,7 +125,14 @@ def expand(
 
 
 def predict_difference(
-    jacobians: Array, B: Array, K: Array, *, initial: Array, forcing: Array, gammas: Array
+    jacobians: Array,
+    B: Array,
+    K: Array,
+    *,
+    initial: Array,
+    forcing: Array,
+    gammas: Array,
+    free: Array | None = None,
 ) -> Array:
     """How far a second trajectory runs from a measured one, to first order.
 
@@ -138,6 +150,8 @@ def predict_difference(
         f_k = (theta_2 - theta_1) [s_k; 1] along the second trajectory.
     gammas : (C,) array
         Values of gamma.
+    free : (P, T, n_a) array, optional
+        Of the measured trajectories, see `Path`.
 
     Returns
     -------
@@ -147,8 +161,12 @@ def predict_difference(
     pairs, steps, r, _ = jacobians.shape
     n_s = K.shape[1]
     closed = jacobians.copy()
-    closed[..., :n_s] += B @ K
-    drive = forcing @ B.T
+    if free is None:
+        closed[..., :n_s] += B @ K
+        drive = forcing @ B.T
+    else:
+        closed[..., :n_s] += (B * free[..., None, :]) @ K
+        drive = (forcing * free) @ B.T
     difference = np.empty((gammas.size, pairs, steps, r))
     delta = np.broadcast_to(initial, (gammas.size, pairs, r)).copy()
     for k in range(steps):
