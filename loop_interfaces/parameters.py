@@ -129,6 +129,20 @@ INSTRUMENTS = (
         0.0,
         1e9,
     ),
+    Spec(
+        "sensors",
+        0,
+        "point sensors n_y, equally spaced, instead of the whole state; 0: the whole state",
+        0,
+        65536,
+    ),
+    Spec(
+        "sensor_delays",
+        4,
+        "last measurements d of each sensor that the published state holds, if there are sensors",
+        1,
+        1024,
+    ),
 )
 """What stands between the field and its controller, beyond the paper's setting; see docs/beyond.md."""
 

@@ -40,8 +40,9 @@ def fingerprint(values: Mapping[str, Any]) -> int:
     """
     equation = build_equation(values)
     content = {spec: values[spec] for spec in _PLANT_VALUES} | asdict(equation)
-    # Only those in use: a plant without them is the same plant as before they were known.
-    content |= {spec.name: values[spec.name] for spec in INSTRUMENTS if values[spec.name]}
+    instruments = Instruments(**{spec.name: values[spec.name] for spec in INSTRUMENTS})
+    if not instruments.ideal:  # else it is the same plant as before they were known
+        content |= asdict(instruments)
     digest = hashlib.sha256(json.dumps([content, sources(equation)], sort_keys=True).encode())
     return 1 + int.from_bytes(digest.digest()[:8], "big") % (MAX_ID - 1)
 

@@ -1,10 +1,20 @@
-"""What stands between a field and its controller: noise, and actuators that saturate.
+"""What stands between a field and its controller: noise, actuators that saturate, few sensors.
 
-    y_k = z_k + v_k,                        v_k ~ N(0, measurement_noise^2 I)
+    y_k = C z_k + v_k,                      v_k ~ N(0, measurement_noise^2 I)
     z_{k+1} = f(z_k, sat(a_k)) + w_k,       w_k ~ N(0, process_noise^2 dt / dx I)
 
-with sat(a)_i = min(max(a_i, -action_limit), action_limit). The plant publishes y_k; its stage cost
-is that of the true z_k and of sat(a_k), which a real plant could only estimate.
+with sat(a)_i = min(max(a_i, -action_limit), action_limit). C picks the grid points of the n_y
+sensors, or all. The stage cost is that of the true z_k and of sat(a_k), which a real plant could
+only estimate.
+
+With sensors the plant publishes the last d measurements, scaled,
+
+    o_k = sqrt(n_z / (n_y d)) [y_k, y_{k-1}, ..., y_{k-d+1}]        (y_0 in place of y_{-1}, ...),
+
+and as its target that of them, o_r. By this delay embedding the dynamics can be read off a state
+that is measured (Takens; for linear systems d is to reach the observability index), and who answers
+needs no memory. The scale makes q |o_k - o_r|^2, summed over an episode, the part of the stage cost
+that the sensors see: every measurement is in d of the o_k, and stands for n_z / n_y grid points.
 
 w_k is space-time white noise on the grid: du = F(u) dt + sigma dW(x, t) has increments of
 covariance sigma^2 dt delta(x - x'), and on cells of width dx = L / n_z the delta is 1 / dx. So the
@@ -18,6 +28,9 @@ another batch or by another process, has the same noise, to the bit.
 References
 ----------
 Lord, Powell, Shardlow, "An Introduction to Computational Stochastic PDEs", Cambridge 2014, chapter 10.
+Takens, "Detecting strange attractors in turbulence", LNM 898, 1981. Arbabi, Mezic, "Ergodic theory,
+dynamic mode decomposition, and computation of spectral properties of the Koopman operator", SIAM J.
+Appl. Dyn. Syst. 16(4), 2017 (Hankel DMD).
 Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011 (Philox).
 """
 
@@ -46,7 +59,7 @@ class Noise(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Instruments:
-    """Standard deviation of the measurement, intensity of the forcing, and limit of the actions.
+    """Noise of the measurement, forcing of the field, limit of the actions, sensors and delays.
 
     See loop_interfaces.parameters.INSTRUMENTS; 0 is none of it.
     """
@@ -54,11 +67,13 @@ class Instruments:
     measurement_noise: float = 0.0
     process_noise: float = 0.0
     action_limit: float = 0.0
+    sensors: int = 0
+    sensor_delays: int = 4
 
     @property
     def ideal(self) -> bool:
         """Whether there is nothing between the field and the controller."""
-        return self == Instruments()
+        return self == Instruments(sensor_delays=self.sensor_delays)
 
 
 def standard_normal(
@@ -79,9 +94,9 @@ def standard_normal(
 class InstrumentedPlant(Plant):
     """A plant behind its instruments.
 
-    As `Plant`, but `reset` and `step` return what is measured, and actions saturate. `states` are
-    the true fields. An environment is forced only after a step that did not diverge, and it has
-    diverged, too, if the forcing takes it beyond the bound.
+    As `Plant`, but `reset` and `step` return what is measured, `target` is the target of that, and
+    actions saturate. `states` are the true fields. An environment is forced only after a step that
+    did not diverge, and it has diverged, too, if the forcing takes it beyond the bound.
 
     Parameters
     ----------
@@ -91,15 +106,30 @@ class InstrumentedPlant(Plant):
         What stands between the field and the controller.
     grid
         The other parameters of `Plant`.
+
+    Raises
+    ------
+    ValueError
+        More sensors than grid points, or what `Plant` raises.
     """
 
     def __init__(self, equation: Equation, *, instruments: Instruments, **grid: Any) -> None:
         self.instruments = instruments
-        self._measured = np.zeros((0, 0))
-        self._seeds: list[tuple[int, int]] = []
         super().__init__(equation, **grid)
-        dx = equation.length / self.n_z
-        self._forcing = instruments.process_noise * math.sqrt(self.sample_time / dx)
+        self.positions = sensor_positions(self.n_z, instruments.sensors)
+        n_y = self.positions.size
+        self._delays = instruments.sensor_delays if instruments.sensors else 1
+        self._scale = math.sqrt(self.n_z / (n_y * self._delays))
+        self._forcing = instruments.process_noise * math.sqrt(
+            self.sample_time * self.n_z / equation.length
+        )
+        self.target = self._scale * np.tile(self.target[self.positions], self._delays)
+        self._seeds: list[tuple[int, int]] = []
+        self._published = np.zeros((0, self.state_size))
+
+    @property
+    def state_size(self) -> int:
+        return self._delays * self.positions.size
 
     def reset(
         self, seeds: ArrayLike, noise: NDArray[np.int64] | None = None
@@ -109,7 +139,8 @@ class InstrumentedPlant(Plant):
         if noise is None:
             noise = np.zeros(self.batch, dtype=np.int64)
         self._seeds = [(int(n), int(s)) for n, s in zip(noise, np.asarray(seeds), strict=True)]
-        return self._measure()
+        self._published = np.tile(self._measure(), (1, self._delays))
+        return self._published
 
     def step(self, actions: NDArray[np.float64]) -> NDArray[np.float64]:
         """Hold the saturated actions for one sampling time; returns what is measured then."""
@@ -117,7 +148,11 @@ class InstrumentedPlant(Plant):
         super().step(np.clip(actions, -limit, limit) if limit else actions)
         if self._forcing:
             self._force()
-        return self._measure()
+        newest = self._measure()
+        if self._delays > 1:
+            newest = np.hstack([newest, self._published[:, : -self.positions.size]])
+        self._published = newest
+        return newest
 
     def _force(self) -> None:
         step = self.step_index
@@ -132,14 +167,21 @@ class InstrumentedPlant(Plant):
                 self._diverged_step[m] = step - 1
 
     def _measure(self) -> NDArray[np.float64]:
+        """The scaled readings of the sensors now, (M, n_y)."""
+        y = self.states[:, self.positions]
         sigma = self.instruments.measurement_noise
-        if not sigma:
-            return self.states
-        if self._measured.shape != self.states.shape:
-            self._measured = np.empty_like(self.states)
-        for m, (noise_seed, field_seed) in enumerate(self._seeds):
-            draw = standard_normal(
-                noise_seed, field_seed, self.step_index, Noise.MEASUREMENT, self.n_z
-            )
-            self._measured[m] = self.states[m] + sigma * draw
-        return self._measured
+        if sigma:
+            for m, (noise_seed, field_seed) in enumerate(self._seeds):
+                y[m] += sigma * standard_normal(
+                    noise_seed, field_seed, self.step_index, Noise.MEASUREMENT, len(y[m])
+                )
+        y *= self._scale
+        return y
+
+
+def sensor_positions(n_z: int, sensors: int) -> NDArray[np.int64]:
+    """Grid indices of equally spaced sensors, int((j + 0.5) n_z / sensors); all if there are 0."""
+    if sensors > n_z:
+        raise ValueError(f"sensors must be at most n_z = {n_z}, got {sensors}")
+    count = sensors or n_z
+    return (2 * np.arange(count) + 1) * n_z // (2 * count)

@@ -338,7 +338,7 @@ class Lockstep:
                 f"expected rows of {START_COLUMNS} numbers (seed, excitation, variance, model), "
                 f"or one more (noise), got {rows.shape[1]}"
             )
-        if rows.shape[0] * max(self._plant.n_z, self._plant.n_a) > MAX_VALUES:
+        if rows.shape[0] * max(self._plant.state_size, self._plant.n_a) > MAX_VALUES:
             raise FrameError(f"{rows.shape[0]} environments are more than one message can hold")
         seeds = rows[:, StartColumn.SEED]
         if len(rows) and (seeds.min() < -1 or (seeds != np.floor(seeds)).any()):

@@ -131,6 +131,11 @@ class Plant:
         self.compiled_in_seconds = self._integrator.compiled_in_seconds
         self._allocate(0)
 
+    @property
+    def state_size(self) -> int:
+        """Numbers of a published state."""
+        return self.n_z
+
     def _allocate(self, batch: int) -> None:
         self.batch, self.step_index = batch, 0
         self.states = np.zeros((batch, self.n_z))

@@ -24,16 +24,17 @@ def planted(seed: int = 0, bend: float = 0.1) -> LocalModel:
     )
 
 
-def roll(model: LocalModel, theta: np.ndarray, x: np.ndarray) -> Path:
-    """Closed loop a = K s + b of the model, with theta = [K b]."""
+def roll(model: LocalModel, theta: np.ndarray, x: np.ndarray, limit: float = np.inf) -> Path:
+    """Closed loop a = K s + b of the model, with theta = [K b], saturated at +- limit."""
     states, actions = [], []
     for _ in range(STEPS):
-        a = theta @ np.append(x[:N_S], 1.0)
+        a = np.clip(theta @ np.append(x[:N_S], 1.0), -limit, limit)
         states.append(x)
         actions.append(a)
         x = model.step(x, a)
-    s = np.array(states)
-    return Path(s, np.array(actions), np.column_stack([s[:, :N_S], np.ones(STEPS)]))
+    s, applied = np.array(states), np.array(actions)
+    free = None if limit == np.inf else (np.abs(applied) < limit).astype(float)
+    return Path(s, applied, np.column_stack([s[:, :N_S], np.ones(STEPS)]), free)
 
 
 THETA = 0.1 * np.random.default_rng(9).standard_normal((N_A, N_S + 1))
@@ -98,8 +99,10 @@ def test_basis_is_orthonormal_begins_with_the_given_modes_and_spans_the_data() -
     assert np.array_equal(extended_basis(U, [states @ U @ U.T], 9)[:, :3], U)
 
 
-def mean_cost(model: LocalModel, theta: np.ndarray, q: float, r: float) -> float:
-    path = roll(model, theta, START)
+def mean_cost(
+    model: LocalModel, theta: np.ndarray, q: float, r: float, limit: float = np.inf
+) -> float:
+    path = roll(model, theta, START, limit)
     return float(q * np.sum((path.x - TARGET) ** 2) + r * np.sum(path.a**2)) / STEPS
 
 
@@ -121,6 +124,51 @@ def test_gradient_is_that_of_the_closed_loop() -> None:
         up, down = mean_cost(model, THETA + e, q, r), mean_cost(model, THETA - e, q, r)
         assert expansion.gradient[i] == pytest.approx((up - down) / (2 * h), rel=1e-6, abs=1e-8)
     assert np.linalg.eigvalsh(expansion.curvature).min() > -1e-12
+
+
+def test_gradient_knows_of_saturation() -> None:
+    model, q, r, h, limit = planted(), 1.5, 0.3, 1e-7, 0.06
+    path = roll(model, THETA, START, limit)
+    assert path.free is not None
+    assert 0.1 < path.free.mean() < 0.9  # some of the actions are at the limit, and some are not
+    expansion = expand(
+        path,
+        model.jacobians(path.x),
+        model.B,
+        THETA[:, :N_S],
+        target=TARGET,
+        state_weight=q,
+        action_weight=r,
+        gamma=1.0,
+    )
+    for i in range(THETA.size):
+        e = h * np.eye(THETA.size)[i].reshape(THETA.shape)
+        up, down = (mean_cost(model, THETA + sign * e, q, r, limit) for sign in (1, -1))
+        assert expansion.gradient[i] == pytest.approx((up - down) / (2 * h), rel=1e-5, abs=1e-8)
+
+
+def test_differences_are_predicted_to_first_order_under_saturation() -> None:
+    model, limit = planted(), 0.06
+    first = roll(model, THETA, START, limit)
+    rng = np.random.default_rng(3)
+    change, shift = rng.standard_normal(THETA.shape), rng.standard_normal(R)
+    assert first.free is not None
+    errors = []
+    for h in (1e-5, 1e-6):
+        second = roll(model, THETA + h * change, START + h * shift, limit)
+        assert second.free is not None
+        assert np.array_equal(first.free, second.free)
+        predicted = predict_difference(
+            model.jacobians(first.x)[None],
+            model.B,
+            THETA[:, :N_S],
+            initial=h * shift[None],
+            forcing=(second.features @ (h * change).T)[None],
+            gammas=np.ones(1),
+            free=first.free[None],
+        )
+        errors.append(np.abs(predicted[0, 0] - (second.x - first.x)).max())
+    assert errors[1] < 0.02 * errors[0]  # of second order
 
 
 def test_curvature_is_exact_where_the_trajectory_is_linear_in_theta() -> None:

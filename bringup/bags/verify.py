@@ -244,7 +244,7 @@ class _Run:
         report, plant = self._report, self._plant
         states, actions = episode.trajectory()
         rows = episode.start.values
-        if states.shape[1:] != (len(rows), plant.n_z) or actions.shape[2] != plant.n_a:
+        if states.shape[1:] != (len(rows), plant.state_size) or actions.shape[2] != plant.n_a:
             report.differs(f"{where}: states and actions do not have the plant's shape")
             return
         initial = plant.reset(rows[:, StartColumn.SEED].astype(np.int64), noise_seeds(rows)).copy()

@@ -6,6 +6,8 @@ Every line of the tables is a training of `--seeds` seeds side by side in this p
 
 from __future__ import annotations
 
+import json
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -24,6 +26,11 @@ LEVELS: dict[str, list[dict[str, Any]]] = {
     "measurement": [{"measurement_noise": level} for level in (0.01, 0.03, 0.1)],
     "process": [{"process_noise": level} for level in (0.003, 0.01, 0.03)],
     "limit": [{"action_limit": level} for level in (2.0, 1.0, 0.5)],
+    "sensors": [
+        {"sensors": sensors, "sensor_delays": delays}
+        for sensors in (32, 16, 8)
+        for delays in (1, 2, 4)
+    ],
 }
 """What is tried, by part."""
 
@@ -39,6 +46,7 @@ def run(
                 for optimizer in OPTIMIZERS:
                     row = measure(problem, options, optimizer, seeds)
                     rows.append({"part": part, **row})
+                    print(json.dumps(row), file=sys.stderr, flush=True)
     return rows
 
 

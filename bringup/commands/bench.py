@@ -129,7 +129,7 @@ def add(commands: Commands) -> None:
     beyond = _add(programs, "beyond", "trainings with noise, action limits and few sensors", "--problems burgers --parts limit")
     beyond.add_argument("--problems", nargs="+", metavar="PROBLEM", help="[all three]")
     beyond.add_argument(
-        "--parts", nargs="+", metavar="PART", help="[ideal measurement process limit]"
+        "--parts", nargs="+", metavar="PART", help="[ideal measurement process limit sensors]"
     )
     beyond.add_argument("--seeds", type=int, default=3, metavar="N", help="[3]")
     kernel = _add(
