@@ -76,8 +76,10 @@ class Plant:
     ----------
     x : (n_x,)
         Grid points; n_x = n_z / components.
-    target : (n_z,)
+    field_target : (n_z,)
         Field z_r to be tracked.
+    target : (state_size,)
+        Target of what `reset` and `step` return: the same, unless instruments are between.
     supports : (n_x, n_a)
         Phi_j(x_i), entries 0 or 1, on the component ``equation.actuated``.
     compiled_in_seconds : float
@@ -116,12 +118,13 @@ class Plant:
         n_x = grid_points(equation, self.n_z)
         self.supports = indicator_supports(n_x, n_a, positive("width", width))
         self.x = equation.length * np.arange(n_x) / n_x
-        self.target = self._checked("target", equation.target(self.x))
+        self.field_target = self._checked("target", equation.target(self.x))
+        self.target = self.field_target
         advance = Propagator if isinstance(equation, LinearEquation) else Integrator
         self._integrator: Integrator | Propagator = advance(
             equation,
             supports=self.supports,
-            target=self.target,
+            target=self.field_target,
             integration_time=self.integration_time,
             steps=internal_steps(self.sample_time, self.integration_time),
             state_weight=self.state_weight,

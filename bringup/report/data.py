@@ -182,7 +182,7 @@ def _problem(
             plant, trained.models[shown], policies, trained.values["action_limit"]
         ),
         x=plant.x,
-        target=plant.target,
+        target=plant.field_target,
         components=plant.equation.components,
     )
 
