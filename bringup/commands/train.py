@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from bringup.commands.common import DEFAULTS, Commands, add_json, command
-from loop_interfaces.parameters import ParameterError
+from loop_interfaces.parameters import INSTRUMENTS, ParameterError
 from loop_interfaces.problem import shipped_problems
 
 
@@ -97,6 +97,13 @@ def add(commands: Commands) -> None:
         action="store_true",
         help="a core for each plant and controller, and polling: less time per step, more power",
     )
+    for spec in INSTRUMENTS:
+        train.add_argument(
+            f"--{spec.name.replace('_', '-')}",
+            type=spec.type,
+            metavar="N" if spec.type is int else "X",
+            help=f"{spec.description} [{spec.default}]",
+        )
     train.add_argument(
         "--view",
         action="store_true",
@@ -126,7 +133,8 @@ def _train(options: argparse.Namespace) -> int:
         options.pin,
         options.view,
     )
-    names = ("iterations", "seed", "seeds", "start", "optimizer", "directions")
+    names = ["iterations", "seed", "seeds", "start", "optimizer", "directions"]
+    names += [spec.name for spec in INSTRUMENTS]
     given = {n: getattr(options, n) for n in names if getattr(options, n) is not None}
     if (
         options.directions is not None
