@@ -118,11 +118,34 @@ def test_a_state_of_another_batch_or_before_the_first_one_is_left_out():
     assert not episode.whole
 
 
-@pytest.mark.parametrize(("n", "most"), [(4, 256), (256, 256), (257, 256), (65536, 256), (1, 5)])
-def test_rows_are_evenly_spaced_from_the_first_point_to_the_last(n, most):
-    rows = rows_of(n, most)
-    assert len(rows) == min(n, most) and rows[0] == 0 and rows[-1] == n - 1
-    assert n == 1 or np.ptp(np.diff(rows)) <= 1
+@pytest.mark.parametrize("components", [1, 2])
+@pytest.mark.parametrize("n", [4, ROWS, ROWS + 1, 65536, 1])
+def test_rows_are_evenly_spaced_from_the_first_point_of_each_component_to_the_last(n, components):
+    rows = rows_of(n * components, components).reshape(components, -1)
+    for component, own in enumerate(rows - n * np.arange(components)[:, None]):
+        assert len(own) == min(n, ROWS) and own[0] == 0 and own[-1] == n - 1, component
+        assert n == 1 or (np.ptp(np.diff(own)) <= 1 and np.diff(own).min() >= 1)
+
+
+def test_one_component_of_the_state_is_shown_at_a_time():
+    view, cursor = View(), Cursor()
+    view.components(["u", "u_t"])
+    view.target(frame([0.0, 0.0, 7.0, 8.0]), 0.0)
+    for k in range(3):
+        view.state(frame([[k, k, 90, 99]], step=k), 0.0)
+    view.refresh(10.0)
+    for component, values, aim, span in (
+        (0, [0, 0, 1, 1, 2, 2, 2, 2], [0, 0], [0, 2]),
+        (1, [90, 99] * 4, [7, 8], [7, 99]),
+    ):
+        view.choose(component=component)
+        view.refresh(20.0 + component)
+        parts = {h["part"]: (h, n) for h, n in map(unpacked, view.updates(cursor))}
+        assert parts["status"][0]["component"] == component
+        np.testing.assert_array_equal(parts["target"][1], aim)
+        header, numbers = parts["episode"]
+        np.testing.assert_array_equal(numbers, values)
+        assert header["rows"] == 2 and header["range"] == pytest.approx(span, abs=0.1)
 
 
 # When to read.
@@ -369,7 +392,7 @@ def test_another_environment_and_another_loop_are_told_from_the_beginning():
     parts = {h["part"]: (h, n) for h, n in map(unpacked, view.updates(cursor))}
     np.testing.assert_array_equal(parts["target"][1], [1, 2, 3, 4])
     assert parts["episode"][0]["environment"] == 0
-    view.choose(1)
+    view.choose(environment=1)
     ((header, numbers),) = map(unpacked, view.updates(cursor))
     assert header["new"] and header["environment"] == 1 and numbers[0] == 100
     view.watch({"domain": 3, "namespace": "/"}, run=None, from_topics=True)
@@ -548,6 +571,8 @@ def test_a_page_of_ours_reaches_the_nodes_and_nothing_but_what_they_offer():
             ({"environment": 3}, 200),
             ({"environment": -1}, 400),
             ({"environment": True}, 400),
+            ({"component": 1}, 200),
+            ({"component": "u"}, 400),
         ):
             assert asyncio.run(ask(server, "POST", watch, json=body, **allowed))[0] == status, body
         assert commands.get(timeout=10) == Watch("/lab") and commands.empty()

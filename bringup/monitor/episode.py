@@ -1,7 +1,8 @@
 """The samples of one episode in a fixed room, however long it is. Pure.
 
 Columns are steps of the episode; when they run out, every second one is dropped and a column stands
-for twice as many steps. Rows are grid points, or every n-th of them on a fine grid.
+for twice as many steps. Rows are grid points, or every n-th of them on a fine grid, for one component
+of the state after the other.
 """
 
 from __future__ import annotations
@@ -32,9 +33,11 @@ def key_of(frame: Frame) -> Key:
     return frame.run, frame.episode, frame.plant
 
 
-def rows_of(n: int, most: int = ROWS) -> NDArray[np.intp]:
-    """Indices of at most `most` of n grid points, evenly spaced."""
-    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(np.intp))
+def rows_of(n_z: int, components: int = 1) -> NDArray[np.intp]:
+    """Indices into a state of at most ROWS grid points of each component, evenly spaced."""
+    n_x = n_z // components
+    points = np.linspace(0, n_x - 1, min(n_x, ROWS)).round().astype(np.intp)
+    return (n_x * np.arange(components)[:, None] + points).ravel()
 
 
 def _empty(*shape: int) -> Array:
@@ -56,6 +59,7 @@ class Episode:
     batch: int
     environments: list[int]
     fields: Array
+    components: int = 1
     actions: Array = field(default_factory=lambda: _empty(0, COLUMNS, 0))
     stride: int = 1
     last: int = 0
@@ -66,10 +70,14 @@ class Episode:
     samples: int = 0
 
     @staticmethod
-    def begin(frame: Frame, chosen: int) -> Episode:
-        """An episode of which the state in `frame` is the first sample."""
+    def begin(frame: Frame, chosen: int, components: int = 1) -> Episode:
+        """An episode of which the state in `frame` is the first sample.
+
+        chosen: the environment to keep if not all can be kept; components: of the state.
+        """
         batch, n_z = frame.values.shape
-        rows = min(n_z, ROWS)
+        components = components if components > 0 and n_z % components == 0 else 1
+        rows = len(rows_of(n_z, components))
         fits = batch * COLUMNS * (rows + LINES) * 4 <= ROOM
         kept = list(range(batch)) if fits else [min(chosen, batch - 1)]
         return Episode(
@@ -79,6 +87,7 @@ class Episode:
             batch=batch,
             environments=kept,
             fields=_empty(len(kept), COLUMNS, rows),
+            components=components,
         )
 
     @property
@@ -105,7 +114,7 @@ class Episode:
         values = frame.values[self.environments]
         if frame.step > self.first:
             self.sample_time = (frame.time - self.time) / (frame.step - self.first)
-        self.fields[:, column] = values[:, rows_of(values.shape[1])]
+        self.fields[:, column] = values[:, rows_of(values.shape[1], self.components)]
         if frame.step >= self.last:
             self.last, self.latest = frame.step, values.astype(np.float32)
         self.samples += 1
@@ -126,6 +135,12 @@ class Episode:
         """Where `environment` is kept; the first one if it is not."""
         known = environment in self.environments
         return self.environments.index(environment) if known else 0
+
+    def part(self, component: int) -> slice:
+        """The rows of one component; of the last one if there are not so many."""
+        size = self.fields.shape[2] // self.components
+        component = min(component, self.components - 1)
+        return slice(component * size, (component + 1) * size)
 
     def _column(self, step: int) -> int:
         while (step - self.first) // self.stride >= COLUMNS:

@@ -27,9 +27,9 @@ class Cursor:
 
     status: int = -1
     curve: tuple[int, int] = (-1, -1)
-    target: tuple[int, int] = (-1, -1)
+    target: tuple[int, int, int] = (-1, -1, -1)
     begun: tuple[int, int] = (-1, -1)
-    environment: int = -1
+    chosen: tuple[int, int] = (-1, -1)
     stride: int = 0
     column: int = 0
     shown: tuple[int, int, bool] = (-1, -1, False)
@@ -42,12 +42,13 @@ def pack(header: Mapping[str, Any], values: NDArray[np.float32]) -> bytes:
     return _LENGTH.pack(len(text)) + text + values.astype("<f4").tobytes()
 
 
-def target(watched: Watched, shown: Episode) -> bytes:
+def target(watched: Watched, shown: Episode, component: int) -> bytes:
     """The target of the plant whose episode is shown; no numbers if it is not known."""
     values = watched.targets.get(shown.key[2])
     if values is None:
         return pack({"part": "target"}, np.empty(0, np.float32))
-    return pack({"part": "target"}, values[rows_of(len(values))].astype(np.float32))
+    rows = rows_of(len(values), shown.components)[shown.part(component)]
+    return pack({"part": "target"}, values[rows].astype(np.float32))
 
 
 def sample(
@@ -56,24 +57,24 @@ def sample(
     cursor: Cursor,
     *,
     generation: int,
-    environment: int,
+    chosen: tuple[int, int],
     colours: tuple[float, float],
 ) -> bytes | None:
     """The columns of the shown episode that are new since `cursor`, or None.
 
     Its numbers: field (columns, rows), actions (columns, actions), the newest state (rows).
-    generation: of what is watched.
+    generation: of what is watched; chosen: environment and component.
     """
     now = (shown.samples, shown.last, shown.ended)
     begun = (generation, watched.begun)
-    same = (cursor.begun, cursor.environment, cursor.stride) == (begun, environment, shown.stride)
+    same = (cursor.begun, cursor.chosen, cursor.stride) == (begun, chosen, shown.stride)
     if same and cursor.shown == now:
         return None
-    row = shown.row(environment)
+    row, part = shown.row(chosen[0]), shown.part(chosen[1])
     first = cursor.column if same else 0
-    cursor.begun, cursor.environment, cursor.stride = begun, environment, shown.stride
+    cursor.begun, cursor.chosen, cursor.stride = begun, chosen, shown.stride
     cursor.column, cursor.shown = shown.settled, now
-    fields = shown.fields[row, first : shown.columns]
+    fields = shown.fields[row, first : shown.columns, part]
     actions = shown.actions[row, first : shown.columns] if shown.actions.size else fields[:, :0]
     header = {
         "part": "episode",
@@ -93,5 +94,5 @@ def sample(
         "sample_time": shown.sample_time or watched.parameters.get("sample_time", 0.0),
         "range": colours,
     }
-    latest = shown.latest[row][rows_of(shown.latest.shape[1])]
+    latest = shown.latest[row][rows_of(shown.latest.shape[1], shown.components)[part]]
     return pack(header, np.concatenate([fields.ravel(), actions.ravel(), latest]))

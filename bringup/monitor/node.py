@@ -36,6 +36,7 @@ from loop_interfaces.node_loop import NodeLoop
 from loop_interfaces.node_main import ConfigurationError, ros_node
 from loop_interfaces.ros_parameters import RemoteParameters
 from loop_interfaces.topics import COST, PAUSED, POLICY, START, TARGET, Topic
+from pde_sim_node.equations import EQUATIONS
 
 DRAIN = 0.03
 """Seconds between two looks at what has come in."""
@@ -229,6 +230,8 @@ class MonitorNode:
     def _learn(self, values: dict[str, Any]) -> None:
         """Take a node's parameters; the tuner's may say where its run's folder is."""
         self._view.parameters(values)
+        if values.get("equation") in EQUATIONS:
+            self._view.components(EQUATIONS[values["equation"]].components)
         out = values.get("out")
         self._out = Path(out) if isinstance(out, str) and out else self._out
 

@@ -3,7 +3,7 @@
 GET   /, /NAME     the page and its files, all of them from this package
 GET   /ws          a WebSocket with what is new (monitor.view), at most FRAMES times a second
 POST  /api/call    {"node", "verb"}: call a service of a node; {"success", "message"}
-POST  /api/watch   {"namespace"} or {"environment"}: what is shown
+POST  /api/watch   {"namespace"}, {"environment"} or {"component"}: what is shown
 
 Any page of the web that is open in a browser can send requests to 127.0.0.1. So a request must name
 this server as its host (a foreign name that was made to resolve to 127.0.0.1 does not), one from a
@@ -185,15 +185,18 @@ class Server:
 
     async def _on_watch(self, request: web.Request) -> web.Response:
         asked = await _body(request)
-        environment, namespace = asked.get("environment"), asked.get("namespace")
-        if isinstance(environment, int) and not isinstance(environment, bool):
-            if not 0 <= environment < 2**24:
-                raise web.HTTPBadRequest(text="expected the index of an environment")
-            self._view.choose(environment)
+        namespace = asked.get("namespace")
+        chosen = {n: asked[n] for n in ("environment", "component") if n in asked}
+        if chosen:
+            if any(type(i) is not int or not 0 <= i < 2**24 for i in chosen.values()):
+                raise web.HTTPBadRequest(text="expected the index of an environment or component")
+            self._view.choose(**chosen)
         elif isinstance(namespace, str) and namespace in self._view.known_namespaces():
             self._commands.put(Watch(namespace))
         else:
-            raise web.HTTPBadRequest(text="expected an environment or a known namespace")
+            raise web.HTTPBadRequest(
+                text="expected an environment, a component or a known namespace"
+            )
         return web.json_response({"success": True})
 
 

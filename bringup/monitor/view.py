@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from bringup.monitor.curve import Curve
@@ -37,7 +37,7 @@ class View:
         self._watched = Watched()
         self._generation = 0
         self._place: dict[str, Any] = {"domain": None, "folder": None, "namespace": None}
-        self._environment = environment
+        self._environment, self._component = environment, 0
         self._status = b"{}"
         self._status_version = -1
         self._colours = (0.0, 1.0)
@@ -117,6 +117,11 @@ class View:
             self._watched.parameters |= {k: values[k] for k in _PARAMETERS if k in values}
             self._tell_total()
 
+    def components(self, names: Sequence[str]) -> None:
+        """Take the names of the components that make up a state, one after the other."""
+        with self._lock:
+            self._watched.components = list(names) or ["u"]
+
     def follow(self, folder: str) -> None:
         """The curve comes from the lines of the run in `folder` from now on (`progress`)."""
         with self._lock:
@@ -150,10 +155,11 @@ class View:
 
     # From and to the page.
 
-    def choose(self, environment: int) -> None:
-        """Show another environment."""
+    def choose(self, *, environment: int | None = None, component: int | None = None) -> None:
+        """Show another environment, or another component of the state."""
         with self._lock:
-            self._environment = environment
+            self._environment = self._environment if environment is None else environment
+            self._component = self._component if component is None else component
             self._coloured = float("-inf")
 
     def offers(self, node: str, verb: object) -> bool:
@@ -169,7 +175,7 @@ class View:
     def refresh(self, now: float) -> None:
         """Put the status together again; call it now and then."""
         with self._lock:
-            watched = self._watched
+            watched, chosen = self._watched, (self._environment, self._component)
             watched.join(now)
             searching = self._place["domain"] is None
             status = {
@@ -180,6 +186,8 @@ class View:
                 "parameters": watched.parameters,
                 "environment": self._environment,
                 "environments": 0 if watched.shown is None else watched.shown.batch,
+                "component": min(self._component, len(watched.components) - 1),
+                "components": watched.components,
                 "rounds": round(watched.rounds.per_second(now), 2),
                 "episodes": round(watched.episodes.per_second(now), 2),
                 "nodes": watched.health.told(now),
@@ -191,12 +199,13 @@ class View:
                 self._status_version += 1
             if now - self._coloured > FRESH:
                 self._coloured = now
-                self._colours = watched.colours(self._environment, self._colours)
+                self._colours = watched.colours(*chosen, self._colours)
 
     def updates(self, cursor: Cursor) -> list[bytes]:
         """The messages with what is new since `cursor`, which moves on."""
         with self._lock:
             watched, generation, found = self._watched, self._generation, []
+            chosen = self._environment, self._component
             if cursor.status != self._status_version:
                 cursor.status = self._status_version
                 found.append(self._status)
@@ -206,16 +215,16 @@ class View:
                 found.append(json.dumps({"part": "curve", **watched.curve.told()}).encode())
             if watched.shown is None:
                 return found
-            aims = (watched.begun, len(watched.targets))
+            aims = (watched.begun, len(watched.targets), self._component)
             if cursor.target != aims or cursor.begun[0] != generation:
                 cursor.target = aims
-                found.append(target(watched, watched.shown))
+                found.append(target(watched, watched.shown, self._component))
             message = sample(
                 watched,
                 watched.shown,
                 cursor,
                 generation=generation,
-                environment=self._environment,
+                chosen=chosen,
                 colours=self._colours,
             )
             return [*found, message] if message else found

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bringup.monitor.curve import Curve
-from bringup.monitor.episode import Episode, Key, key_of
+from bringup.monitor.episode import Episode, Key, key_of, rows_of
 from bringup.monitor.health import Health, Rate
 from loop_interfaces.frames import Frame
 from loop_interfaces.topics import VOID, CostColumn, StartColumn
@@ -44,6 +44,7 @@ class Watched:
         self.begun = 0
         self.targets: dict[int, NDArray[np.float64]] = {}
         self.parameters: dict[str, Any] = {}
+        self.components = ["u"]
         self.controls: list[dict[str, Any]] = []
         self.run = 0
         self.kinds: dict[tuple[int, int], str] = {}
@@ -72,7 +73,10 @@ class Watched:
                 episode.state(frame)
                 break
         else:  # a new episode, or the same one again from its beginning: the plant was restarted
-            self._pending, self._pending_since = Episode.begin(frame, chosen), now
+            self._pending, self._pending_since = (
+                Episode.begin(frame, chosen, len(self.components)),
+                now,
+            )
             self._pending.state(frame)
         self.join(now)
         self._count(key, frame.step, now)
@@ -176,18 +180,22 @@ class Watched:
             return "waiting"
         return "running" if now - self._heard < SILENT else "silent"
 
-    def colours(self, environment: int, before: tuple[float, float]) -> tuple[float, float]:
+    def colours(
+        self, environment: int, component: int, before: tuple[float, float]
+    ) -> tuple[float, float]:
         """The range of u that the colours span; `before` if it is hardly another one."""
         if self.shown is None:
             return before
-        seen = self.shown.fields[self.shown.row(environment), : self.shown.columns]
+        shown, part = self.shown, self.shown.part(component)
+        seen = shown.fields[shown.row(environment), : shown.columns, part]
         seen = seen[np.isfinite(seen)]
         if not seen.size:
             return before
         some = seen[:: max(1, seen.size // 20_000)]
         low, high = (float(v) for v in np.percentile(some, EXTREMES))
-        target = self.targets.get(self.shown.key[2])
+        target = self.targets.get(shown.key[2])
         if target is not None:
+            target = target[rows_of(len(target), shown.components)][part]
             low, high = min(low, float(target.min())), max(high, float(target.max()))
         if high - low < 1e-9:
             low, high = low - 0.5, high + 0.5

@@ -80,7 +80,7 @@ export function profilePlot(episode, facts) {
     const label = facts.length ? "x (m)" : "grid point";
     if (!header) {
       plot.y = [-1, 1];
-      plot.frame(label, "u");
+      plot.frame(label, facts.name);
       plot.message("no state has come yet");
       plot.say("Profile: nothing yet");
       return;
@@ -88,7 +88,7 @@ export function profilePlot(episode, facts) {
     const initial = header.begin === 0 ? episode.fields.subarray(0, header.rows) : [];
     const [low, high] = extent(latest, target, initial, header.range);
     plot.y = [low - 0.08 * (high - low), high + 0.28 * (high - low)]; // with room for the legend
-    plot.frame(label, "u");
+    plot.frame(label, facts.name);
     plot.clip(() => {
       if (initial.length) plot.line(grid(initial.length), initial, colour("none"), { dash: DOTTED, width: 1.3 });
       if (target.length) plot.line(grid(target.length), target, colour("text"), { dash: DASHED, width: 1.3 });
@@ -97,7 +97,7 @@ export function profilePlot(episode, facts) {
     const entries = [];
     if (initial.length) entries.push(["initial", colour("none"), DOTTED]);
     if (target.length) entries.push(["target", colour("text"), DASHED]);
-    plot.legend([...entries, ["u(x, t)", colour("adapted")]]);
+    plot.legend([...entries, [`${facts.name}(x, t)`, colour("adapted")]]);
     let error = 0;
     for (let i = 0; i < target.length; i++) error += (latest[i] - target[i]) ** 2;
     const distance = target.length ? Math.sqrt(error / target.length) : null;
@@ -111,7 +111,7 @@ export function profilePlot(episode, facts) {
     const at = (values) => values[Math.min(values.length - 1, Math.floor((x / plot.x[1]) * values.length))];
     if (!latest.length) return "";
     const aim = target.length ? `, target ${text(at(target))}` : "";
-    return `x ${text(x)}: u = ${text(at(latest))}${aim}`;
+    return `x ${text(x)}: ${facts.name} = ${text(at(latest))}${aim}`;
   }
 
   const plot = new Plot("profile", draw, describe);

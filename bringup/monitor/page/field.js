@@ -157,9 +157,9 @@ export function fieldPlot(episode, facts) {
     bar(plot);
     const number = header.episode % 2 ** 32; // the rest counts the restarts of the tuner
     const kind = header.kind ? ` (${header.kind})` : "";
-    plot.caption = `episode ${number}${kind}, step ${header.last}`;
+    plot.caption = `${facts.name}(x, t), episode ${number}${kind}, step ${header.last}`;
     plot.say(
-      `Field u(x, t) of episode ${number}, environment ${header.environment}, up to step ` +
+      `Field ${facts.name}(x, t) of episode ${number}, environment ${header.environment}, up to step ` +
         `${header.last}, values from ${text(header.range[0])} to ${text(header.range[1])}`,
     );
   }
@@ -170,7 +170,7 @@ export function fieldPlot(episode, facts) {
     const column = Math.floor((t / (dt || 1) - begin) / stride);
     const row = Math.min(rows - 1, Math.floor((x / (facts.length || rows)) * rows));
     if (column < 0 || column >= episode.columns || row < 0) return "";
-    return `t ${text(t)}, x ${text(x)}: u = ${text(episode.value(column, row))}`;
+    return `t ${text(t)}, x ${text(x)}: ${facts.name} = ${text(episode.value(column, row))}`;
   }
 
   const plot = new Plot("field", draw, describe);

@@ -8,7 +8,7 @@ import { Panel } from "./panel.js";
 const EMPTY = { axis: "iteration", phase: "", total: 0, band: "seeds", references: {}, points: [] };
 
 const episode = new Episode();
-const facts = { length: 0, horizon: 0, n_a: 0 }; // of the loop, as far as its nodes told
+const facts = { length: 0, horizon: 0, n_a: 0, name: "u" }; // of the loop, as far as its nodes told
 const curve = { told: EMPTY };
 let status = null;
 
@@ -28,8 +28,9 @@ const take = {
     const moved = status && status.place.begun !== message.place.begun;
     status = message;
     const { length = 0, horizon = 0, n_a = 0 } = message.parameters;
-    const changed = facts.length !== length || facts.horizon !== horizon;
-    Object.assign(facts, { length, horizon, n_a });
+    const changed = facts.length !== length || facts.horizon !== horizon || facts.name !== message.components[message.component];
+    const name = message.components[message.component];
+    Object.assign(facts, { length, horizon, n_a, name });
     panel.status(message, curve);
     if (moved) Object.assign(episode, new Episode());
     if (changed || moved) redraw(ofEpisode);

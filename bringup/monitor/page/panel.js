@@ -21,7 +21,18 @@ const TITLES = {
   step: "one step, then pause again",
   stop: "end after this iteration",
 };
-const NAMES = { burgers: "Burgers", "allen-cahn": "Allen-Cahn", kdv: "Korteweg-de Vries" };
+const NAMES = {
+  burgers: "Burgers",
+  "allen-cahn": "Allen-Cahn",
+  kdv: "Korteweg-de Vries",
+  "kuramoto-sivashinsky": "Kuramoto-Sivashinsky",
+  fisher: "Fisher-KPP",
+  "cahn-hilliard": "Cahn-Hilliard",
+  "ginzburg-landau": "Ginzburg-Landau",
+  "convection-diffusion-reaction": "Convection-diffusion-reaction",
+  wave: "Wave equation",
+  schrodinger: "Schrödinger",
+};
 const PAUSED = { plant: "plant", tuner: "training" };
 const LEVELS = ["good", "warn", "bad", "warn"];
 const SURE = 3000; // ms in which a second click confirms
@@ -46,6 +57,7 @@ export class Panel {
     this.cards = {};
     for (const [role, name, verbs] of BUTTONS) this.group(role, name, verbs);
     this.choice("environment", (value) => ({ environment: Number(value) }));
+    this.choice("component", (value) => ({ component: this.components.indexOf(value) }));
     this.choice("pair", (value) => ({ namespace: value }));
   }
 
@@ -132,6 +144,9 @@ export class Panel {
       button.title = offer ? `${TITLES[verb]} (${offer.node}/${verb})` : `no ${role} offers the service ~/${verb}`;
     }
     this.options("environment", status.environments, status.environment);
+    this.components = status.components;
+    this.list("component", status.components, status.components[status.component]);
+    find("component-label").hidden = status.components.length < 2;
     const pairs = place.namespaces ?? [];
     find("pair-label").hidden = pairs.length < 2;
     this.list("pair", pairs, place.namespace);
