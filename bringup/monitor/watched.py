@@ -18,7 +18,7 @@ from loop_interfaces.topics import VOID, CostColumn, StartColumn
 
 JOIN = 0.5
 """Seconds after which an episode is shown of which the beginning was missed."""
-SILENT = 2.0
+SILENT = 5.0
 """Seconds without a message after which a loop is not going."""
 EXTREMES = (0.3, 99.7)
 """Percentiles of the field that the colours span, as in the report."""
