@@ -55,7 +55,7 @@ class Share:
             self._told = int(10 * share)
             taken = time.monotonic() - self._began
             left = duration(taken * (1 - share) / (share - self._first))
-            words = [f"{self._title} {100 * share:.0f} %", status, f"{left} left"]
+            words = [f"{self._title}: {100 * share:.0f} % done", status, f"{left} left"]
             self._console.print(", ".join(word for word in words if word), markup=False)
 
     def close(self) -> None:

@@ -300,7 +300,7 @@ def test_shares_become_lines_with_the_time_left() -> None:
         share.tell(tenth / 100, f"{tenth} faults")
     lines = file.getvalue().splitlines()
     assert len(lines) == 10
-    assert re.fullmatch(r"soak 50 %, 50 faults, \d+ s left", lines[4])
+    assert re.fullmatch(r"soak: 50 % done, 50 faults, \d+ s left", lines[4])
 
 
 def test_shares_on_a_terminal_are_a_bar_that_leaves_nothing() -> None:

@@ -58,6 +58,14 @@ def test_every_package_is_in_the_list_that_is_installed() -> None:
     assert packages == set(PROJECT["tool"]["setuptools"]["packages"])
 
 
+def test_colcon_installs_every_file_of_the_packages(workspace: Workspace) -> None:
+    (library,) = workspace.prefix.glob("lib/python*/site-packages")
+    for top in {name.split(".")[0] for name in PROJECT["tool"]["setuptools"]["packages"]}:
+        for path in (ROOT / top).rglob("*"):
+            if path.is_file() and "__pycache__" not in path.parts:
+                assert (library / path.relative_to(ROOT)).is_file(), path
+
+
 def test_colcon_installs_what_ros2_looks_for(workspace: Workspace) -> None:
     share = workspace.prefix / "share"
     assert (share / "ament_index/resource_index/packages/pdeloop").is_file()
