@@ -264,6 +264,12 @@ TUNER = (
         choices=("lqt", "zero"),
     ),
     Spec(
+        "model",
+        "",
+        "file of 'pdeloop identify --out': the reduced model and warm start of every seed instead of "
+        "an identification; empty: identify",
+    ),
+    Spec(
         "identification_attempts",
         10,
         "exploratory episodes a seed may use until its LQT law beats no control on four "

@@ -80,6 +80,7 @@ def test_the_shipped_problems_have_controlgyms_sizes(
     assert (values["sample_time"], values["horizon"], values["n_z"]) == (sample_time, horizon, n_z)
     assert (values["n_a"], values["actuator_width"]) == (8, 0.1)
     # controlgym's linear plants take an action as an impulse, which is sample_time times a held one.
-    weight = sample_time**2 if name in LINEAR else 1.0
+    impulses = ("convection-diffusion-reaction", "schrodinger")
+    weight = sample_time**2 if name in impulses else 1.0
     assert (values["state_weight"], values["action_weight"]) == (1.0, pytest.approx(weight))
     assert not [key for key in values if key.startswith("physical.")], "the equation's defaults"

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bringup.in_process import LocalPair
+from bringup.in_process import LocalPair, train
+from loop_interfaces.model_rows import unpack
 from loop_interfaces.topics import COMPLETED, StartColumn
 from tests.small import parameters, same_bits, train_here
 from tuner_node import checkpoint
@@ -139,3 +140,70 @@ def test_damaged_checkpoints_are_passed_over_or_refused(tmp_path):
     checkpoint.previous(path).unlink()
     with pytest.raises(checkpoint.CheckpointError, match="no usable checkpoint"):
         checkpoint.load(path)
+
+
+def rows_file(path, model, name="model"):
+    with path.open("wb") as file:
+        np.savez(file, **{name: model})
+    return str(path)
+
+
+@pytest.mark.parametrize("optimizer", ["two_point", "gauss_newton"])
+def test_a_given_model_is_the_warm_start_of_every_seed(tmp_path, optimizer):
+    found = train_here(parameters(seed=3, iterations=2, optimizer="two_point")).models
+    given = {"model": rows_file(tmp_path / "model.npz", found)}
+    values = parameters(seed=7, seeds=2, iterations=6, optimizer=optimizer, **given)
+    training = build_training(values)
+    first = training.next_batch()
+    assert first.exploratory == (optimizer == "gauss_newton"), (
+        "only an optimiser may want to explore"
+    )
+    training = train_here(values)
+    assert training.phase == "done"
+    assert same_bits(training.models, np.repeat(found, 2, axis=0))
+    n_a = values["n_a"]
+    assert same_bits(training.warm_starts()[1], unpack(found[0], n_a).policy)
+    costs = training.evaluation.mean(axis=2)
+    assert costs[0, 1] == costs[1, 1], "the same law on the same fields"
+    assert not same_bits(training.policies()[0], training.policies()[1])
+
+
+def test_a_given_model_survives_a_restart(tmp_path):
+    found = train_here(parameters(seed=3, iterations=2, optimizer="two_point")).models
+    given = {"model": rows_file(tmp_path / "model.npz", found)}
+    values = parameters(seed=7, iterations=6, optimizer="two_point", **given)
+    whole = train_here(values)
+    half = build_training(values)
+    pair = LocalPair(values)
+    pair.use_models(half.models)
+    for _ in range(3):
+        half.finish(pair.run(half.next_batch()))
+    again = build_training(values)
+    again.restore(half.state())
+    train(again, LocalPair(values), lambda row: None)
+    assert same_bits(again.policies(), whole.policies())
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (None, "holds no reduced model; expected a file of 'pdeloop identify --out'"),
+        ({"name": "other"}, "holds no reduced model"),
+        ({"model": np.full((1, 40, 4), np.nan)}, "must be one array of finite rows"),
+        ({"model": np.zeros((2, 40, 4))}, "must be one array of finite rows"),
+        ({"model": np.zeros((1, 9, 4))}, "leaves"),
+    ],
+)
+def test_a_file_that_is_no_model_is_refused(tmp_path, content, words):
+    path = tmp_path / "model.npz"
+    if content is not None:
+        rows_file(path, content.get("model", np.zeros((1, 40, 4))), content.get("name", "model"))
+    with pytest.raises(ValueError, match=words):
+        build_training(parameters(model=str(path)))
+
+
+def test_a_model_of_another_plant_is_refused(tmp_path):
+    path = rows_file(tmp_path / "model.npz", np.ones((1, 500, 4)))
+    for optimizer in ("two_point", "gauss_newton"):
+        with pytest.raises(ValueError, match=r"state"):
+            train_here(parameters(model=path, optimizer=optimizer))

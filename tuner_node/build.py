@@ -2,15 +2,40 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.model_rows import unpack
 from loop_interfaces.parameters import noisy
 from tuner_node.optimizers import NEED_TRAJECTORIES, OPTIMIZERS, Context, Optimizer
 from tuner_node.training import UNKNOWN_PLANT, Training, TrainingSettings
+
+MAX_MODEL_BYTES = 1 << 30
+
+
+def read_model(path: Path, n_a: int) -> NDArray[np.float64]:
+    """The rows of the model that `pdeloop identify --out` wrote. ValueError if there is none."""
+    try:
+        if path.stat().st_size > MAX_MODEL_BYTES:
+            raise ValueError(f"{path} is larger than {MAX_MODEL_BYTES} bytes; not a reduced model")
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            rows = np.array(arrays["model"], dtype=np.float64)
+    except (OSError, KeyError, EOFError, zipfile.BadZipFile, TypeError, AttributeError) as error:
+        raise ValueError(
+            f"{path} holds no reduced model; expected a file of 'pdeloop identify --out' ({error})"
+        ) from error
+    if rows.ndim != 3 or len(rows) != 1 or not np.isfinite(rows).all():
+        raise ValueError(
+            f"the model in {path} must be one array of finite rows, got shape {rows.shape}"
+        )
+    model: NDArray[np.float64] = rows[0]
+    unpack(model, n_a)
+    return model
 
 
 def build_training(values: Mapping[str, Any]) -> Training:
@@ -55,5 +80,6 @@ def build_training(values: Mapping[str, Any]) -> Training:
         trajectories=values["optimizer"] in NEED_TRAJECTORIES,
         noise=noisy(values),
         action_limit=values["action_limit"],
+        model=read_model(Path(values["model"]), values["n_a"]) if values["model"] else None,
     )
     return Training(settings, make_optimizer, plant=values["plant"] or UNKNOWN_PLANT)

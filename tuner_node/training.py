@@ -85,6 +85,8 @@ class TrainingSettings:
     noise: bool = False
     """Whether rollouts get seeds of the plant's noise."""
     action_limit: float = 0.0
+    model: Array | None = None
+    """Rows of a reduced model to start from instead of identifying one."""
 
 
 OptimizerFactory = Callable[[Array, int, Context | None], Optimizer]
@@ -120,6 +122,9 @@ class Training:
         self.pending = list(range(self.settings.seeds))
         self.attempts = [0] * self.settings.seeds
         self.explorations = [None] * self.settings.seeds
+        if self.settings.model is not None and not self.settings.trajectories:
+            self.models = np.repeat(self.settings.model[np.newaxis], self.settings.seeds, axis=0)
+            self._start_adapting()
 
     def next_batch(self) -> Batch | None:
         """The rollouts wanted now; the same at every call until `finish`. None: all is done."""
@@ -162,6 +167,8 @@ class Training:
                 for m, trajectory in zip(self.pending, result.trajectories, strict=True):
                     self.explorations[m] = trajectory
                 self.target = result.target
+            if self.settings.model is not None:  # explored for the optimiser's sake
+                return self._given(result.models)
             return self._identified(result.models)
         if self.phase == "check":
             return self._checked(result)
@@ -275,6 +282,20 @@ class Training:
         if self.settings.identification_attempts == 1:
             self._start_adapting()
         return rows
+
+    def _given(self, identified: Array) -> list[dict[str, Any]]:
+        """The given model instead of the identified ones, if it is one of this plant's size."""
+        assert self.settings.model is not None
+        size = len(identified[0]) - identified.shape[2]
+        own = len(self.settings.model) - self.settings.model.shape[1]
+        if own != size:
+            raise ValueError(
+                f"the given model is of a state of {own - 3 * self.settings.n_a - 1} numbers, the "
+                f"plant's has {size - 3 * self.settings.n_a - 1}; identify one of this plant"
+            )
+        self.models = np.repeat(self.settings.model[np.newaxis], self.settings.seeds, axis=0)
+        self._start_adapting()
+        return []
 
     def _check_rollouts(self) -> list[tuple[int, Rollout]]:
         warm = self.warm_starts()

@@ -126,7 +126,12 @@ def add(commands: Commands) -> None:
     monitor.add_argument(
         "--browser", action="store_true", help="with the page drawn by a headless chromium"
     )
-    beyond = _add(programs, "beyond", "trainings with noise, action limits and few sensors", "--problems burgers --parts limit")
+    beyond = _add(
+        programs,
+        "beyond",
+        "trainings with noise, action limits and few sensors",
+        "--problems burgers --parts limit",
+    )
     beyond.add_argument("--problems", nargs="+", metavar="PROBLEM", help="[all three]")
     beyond.add_argument(
         "--parts", nargs="+", metavar="PART", help="[ideal measurement process limit sensors]"

@@ -48,6 +48,12 @@ def add(commands: Commands) -> None:
         "'package.module:Class', has to be named here, as a problem's file alone runs no code",
     )
     train.add_argument(
+        "--model",
+        type=Path,
+        metavar="FILE",
+        help="start from this model of `pdeloop identify --out` instead of identifying one",
+    )
+    train.add_argument(
         "--out", type=Path, metavar="DIR", help="folder of the results [runs/PROBLEM-TIME]"
     )
     train.add_argument(
@@ -142,6 +148,8 @@ def _train(options: argparse.Namespace) -> int:
     ):
         raise ParameterError("--directions goes with --optimizer directions")
     own = {} if options.equation is None else {"equation": allow(options.equation)}
+    if options.model is not None:
+        given["model"] = str(options.model.resolve())
     if options.resume is not None:
         if options.problem or given or options.out:
             raise ParameterError(
