@@ -23,7 +23,7 @@ class Display:
 
     def __init__(self, iterations: int, seeds: int, stream: TextIO | None = None) -> None:
         self._console = Console(file=stream or sys.stdout, highlight=False, soft_wrap=True)
-        self._total = iterations * seeds
+        self._total = 2 * iterations * seeds  # rollouts: an iteration is another thing everywhere
         self._every = max(1, self._total // 8)
         self._told = 0
         self._rollouts: dict[int, int] = {}
@@ -81,14 +81,13 @@ class Display:
             self.line(phase)
 
     def _iteration(self, row: Mapping[str, Any]) -> None:
-        # Optimisers differ in what an iteration is; two rollouts are one of the paper's.
         self._rollouts[row["seed"]] = row["rollouts"]
-        before, self._told = self._told, sum(self._rollouts.values()) // 2
+        before, self._told = self._told, sum(self._rollouts.values())
         cost = f"cost {row['cost']:.4g}" if "cost" in row else "diverged"
         if self._progress is not None:
             self._progress.update(self._task, completed=self._told, status=cost)
         elif self._told // self._every > before // self._every or row["diverged"]:
-            self.line(f"  seed {row['seed']}, iteration {row['iteration']}: {cost}")
+            self.line(f"  seed {row['seed']}, {row['rollouts']} rollouts: {cost}")
 
 
 class ProgressFile:
@@ -138,9 +137,11 @@ def summary_text(problem: str, summary: Mapping[str, Any], folder: Path) -> str:
             return f"diverged in {diverged[name]} of {rollouts} rollouts"
         return f"{costs[name]:.4g}" + (f"{change})" if comparable and name == "adapted" else "")
 
+    budget = max((row["rollouts"] for row in summary["history"]), default=0)
+    each = " a seed" if seeds > 1 else ""
     comparable = not diverged["lqt"] and not diverged["adapted"]
     lines = [
-        f"{problem}, {who}: {summary['iterations']} iterations in {summary['seconds']:.1f} s",
+        f"{problem}, {who}: {budget} rollouts{each} in {summary['seconds']:.1f} s",
         f"  mean stage cost without control  {cost('none')}",
         f"  mean stage cost with LQT         {cost('lqt')}",
         f"  mean stage cost after adaptation {cost('adapted')}",

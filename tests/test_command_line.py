@@ -268,7 +268,7 @@ def test_a_terminal_shows_a_bar_with_cost_and_time_left(tmp_path: Path, colour: 
     environment = {"PYTHONPATH": str(ROOT)} | ({} if colour else {"NO_COLOR": "1"})
     with terminal(*PDELOOP, *words, cwd=tmp_path, **environment) as shown:
         assert shown.wait() == 0, shown.plain
-    assert re.search(r"adapt [━╺╸]+ +\d+/400 cost [\d.]+ +\d:\d\d:\d\d", shown.plain), shown.plain
+    assert re.search(r"adapt [━╺╸]+ +\d+/800 cost [\d.]+ +\d:\d\d:\d\d", shown.plain), shown.plain
     assert bool(COLOUR.search(shown.shown)) == colour
     assert "results in run" in shown.plain
 
@@ -279,7 +279,7 @@ def test_a_pipe_gets_plain_lines(tmp_path: Path) -> None:
         environment={"TERM": "xterm-256color"},
         cwd=tmp_path,
     )
-    assert done.stdout.count("iteration ") == 8
+    assert done.stdout.count(" rollouts: cost ") == 8
     assert "\x1b" not in done.stdout
     assert "\r" not in done.stdout
 
@@ -334,7 +334,7 @@ def test_a_row_of_a_training_is_a_line_where_there_is_no_terminal() -> None:
             "diverged": 0,
         }
     )
-    assert file.getvalue() == "  seed 0, iteration 1: cost 1.25\n"
+    assert file.getvalue() == "  seed 0, 2 rollouts: cost 1.25\n"
 
 
 SHELLS = {
