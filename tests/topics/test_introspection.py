@@ -176,7 +176,8 @@ SIM_TIME = ("-p", "use_sim_time:=true")
 
 
 def test_nodes_on_simulated_time_train_the_same_policy(loop: Processes, tmp_path):
-    plant = loop.node("pde_sim_node", *PARAMETERS, *SIM_TIME)
+    # 75 ms an episode: so long that there are several reports of it.
+    plant = loop.node("pde_sim_node", *PARAMETERS, *SIM_TIME, "-p", "real_time_factor:=20.0")
     controller = loop.node("controller_node", *PARAMETERS, *SIM_TIME)
     recorder = loop.node("recorder_node", *SIM_TIME, "-p", f"bag:={tmp_path / 'bag'}")
     clock = loop.start("-c", CLOCK, name="clock")
@@ -187,10 +188,9 @@ def test_nodes_on_simulated_time_train_the_same_policy(loop: Processes, tmp_path
         loop.wait(tuner, LIMIT)
         assert_same_training(out, in_process(iterations=60))
         stamps = [float(x) for x in loop.wait(clock, LIMIT).split()[1:]]
-        assert len(stamps) >= 3
+        assert len(set(stamps)) >= 3
         # Stamps of /diagnostics are simulated time of the loop: seconds since it began, and growing.
         assert stamps == sorted(stamps)
-        assert stamps[-1] > stamps[0]
         simulated = float(desk.values("pde_sim_node")["simulated time"])
         assert 0 < stamps[-1] <= simulated
     for process in (plant, controller, recorder):
@@ -214,7 +214,7 @@ def take(message):
 node.create_subscription(DiagnosticArray, "/diagnostics", take, 10)
 print("ready", flush=True)
 end = time.monotonic() + 50.0
-while len(stamps) < 3 and time.monotonic() < end:
+while len(set(stamps)) < 3 and time.monotonic() < end:
     rclpy.spin_once(node, timeout_sec=0.2)
 print(*stamps)
 rclpy.shutdown()

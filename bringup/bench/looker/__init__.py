@@ -1,0 +1,1 @@
+"""Reads everything that a viewer publishes, as the tools of people do."""
