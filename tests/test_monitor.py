@@ -345,6 +345,19 @@ def test_who_holds_the_loop_is_told_by_the_plant_by_diagnostics_or_by_the_answer
     assert watched.doing(9.0) == "ended"
 
 
+def test_a_loop_that_is_gone_without_a_word_has_ended_too():
+    watched = Watched()
+    assert watched.doing(0.0) == "empty"
+    watched.health.look({"plant": [Endpoint("/p", b"p")]})
+    watched.state(state(0), 0.0, 0)
+    assert watched.doing(0.1) == "running"
+    watched.health.look({})
+    assert watched.doing(0.2) == "ended"
+    watched.health.look({"plant": [Endpoint("/p", b"q")]})
+    watched.state(state(1), 0.3, 0)
+    assert watched.doing(0.3) == "running"
+
+
 # The messages to a page.
 
 

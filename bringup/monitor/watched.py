@@ -170,9 +170,11 @@ class Watched:
 
     def doing(self, now: float) -> str:
         """What goes on, in one word."""
-        if self._ended:
+        # The last word of a tuner that was interrupted may be lost: then everybody is gone.
+        nobody = not any(peer.present for peer in self.health.peers.values())
+        if self._ended or (nobody and self._heard is not None):
             return "ended"
-        if not any(peer.present for peer in self.health.peers.values()):
+        if nobody:
             return "empty"
         if self.held():
             return "paused"

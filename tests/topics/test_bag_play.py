@@ -14,8 +14,7 @@ from bringup.bags.reader import Bag, Message
 from tests.browser import browser
 from tests.loop_harness import Processes, processes, until
 from tests.small import SMALL
-from tests.topics.test_loop import LIMIT
-from tests.topics.test_monitor import FIELD, ITERATION, PAINTED, STATE, address, card
+from tests.topics.test_monitor import FIELD, ITERATION, LIMIT, PAINTED, STATE, address, card
 
 pytestmark = pytest.mark.topics
 
@@ -38,6 +37,12 @@ def by_topic(messages: list[Message]) -> dict[str, list[bytes]]:
     return found
 
 
+def lasting(bag: Path, seconds: float) -> float:
+    """The rate at which the bag is played within so many seconds."""
+    times = [message.when for message in Bag(bag).messages()]
+    return (times[-1] - times[0]) / 1e9 / seconds
+
+
 def slowness(original: Bag, bag: Bag) -> float:
     """How much longer the states took in `bag`."""
     times = [
@@ -48,9 +53,7 @@ def slowness(original: Bag, bag: Bag) -> float:
 
 
 def test_what_is_played_can_be_recorded_again_to_the_byte(loop: Processes, tmp_path, bag):
-    original = Bag(bag)
-    seconds = (lambda m: (m[-1].when - m[0].when) / 1e9)(list(original.messages()))
-    rate = seconds / 8.0  # so slowly that a busy machine loses nothing
+    original, rate = Bag(bag), lasting(bag, 8.0)  # so slowly that a busy machine loses nothing
     player = loop.pdeloop("bag", "play", str(bag), "--wait", "--rate", str(rate))
     until(lambda: "waiting for somebody" in loop.output(player), LIMIT, "player")
     recorder = loop.node("recorder_node", "-p", f"bag:={tmp_path / 'again'}")
@@ -90,7 +93,8 @@ def test_a_bag_is_not_played_beside_a_live_loop_nor_further_when_one_appears(loo
 def test_the_monitor_shows_a_bag_that_is_played(loop: Processes, tmp_path, bag):
     del loop.environment["ROS_DOMAIN_ID"]
     loop.environment["TMPDIR"] = str(tmp_path)
-    player = loop.pdeloop("bag", "play", str(bag), "--loop", "--rate", "0.05", "--wait")
+    rate = str(lasting(bag, 20.0))
+    player = loop.pdeloop("bag", "play", str(bag), "--loop", "--rate", rate, "--wait")
     monitor = loop.pdeloop("monitor", "--port", "0")
     with browser(tmp_path) as page:
         page.go(address(loop, monitor))
