@@ -44,7 +44,7 @@ class Curve:
     with, by controller; total: iterations asked for, 0 if unknown; version grows with each change.
     """
 
-    axis: str = "episode of the policy"
+    axis: str = "episode"
     phase: str = ""
     total: int = 0
     seeds: set[int] = field(default_factory=set)
