@@ -5,6 +5,7 @@ Without ROS; bringup.launch_actions makes actions of it, and launch/*.launch.py 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,10 +14,11 @@ from typing import Any
 from bringup.pairs import MAX_PAIRS, Layout, LoopNode, Recording, pair_nodes, quoted
 from bringup.training_run import begin, reopen, unused
 from loop_interfaces.isolation import NETWORK
-from loop_interfaces.parameters import PLANT, RECORDER, TUNER, ParameterError, Spec
+from loop_interfaces.parameters import INSTRUMENTS, PLANT, RECORDER, TUNER, ParameterError, Spec
 from loop_interfaces.problem import find_problem, load_parameters, shipped_problems
+from pde_sim_node.equations import ALLOWED, allow
 
-_KNOWN = {spec.name: spec for spec in (*PLANT, *TUNER, *RECORDER)}
+_KNOWN = {spec.name: spec for spec in (*INSTRUMENTS, *PLANT, *TUNER, *RECORDER)}
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,7 @@ class Argument:
         return self.spec.check(value)
 
 
+_PLANT = ("real_time_factor", *(spec.name for spec in INSTRUMENTS))
 LOOP_ARGUMENTS = (
     Argument(
         Spec(
@@ -68,7 +71,15 @@ LOOP_ARGUMENTS = (
     Argument(Spec("namespace", "", "namespace of all nodes; empty: none")),
     Argument(Spec("pairs", 1, "plants with a controller each", 1, MAX_PAIRS)),
     Argument(Spec("pin", False, "a core for each plant and controller, and polling")),
-    Argument(_KNOWN["real_time_factor"], given_by_problem=True),
+    Argument(
+        Spec(
+            "equation",
+            "",
+            "the plant's PDE; an own one, file.py:Class or package.module:Class, has to be named "
+            "here, as a problem's file alone runs no code; empty: the problem's",
+        )
+    ),
+    *(Argument(_KNOWN[name], given_by_problem=True) for name in _PLANT),
     Argument(Spec("network", False, "let messages leave this machine; false: loopback only")),
     Argument(
         Spec(
@@ -85,6 +96,7 @@ _TRAINING = ("iterations", "seed", "seeds", "start", "optimizer", "directions")
 TRAIN_ARGUMENTS = (
     *LOOP_ARGUMENTS,
     *(Argument(_KNOWN[name], given_by_problem=True) for name in _TRAINING),
+    Argument(Spec("model", "", "start from this model of pdeloop identify; empty: identify one")),
     Argument(Spec("out", "", "new folder of the results; empty: runs/PROBLEM-TIME")),
     Argument(Spec("resume", "", "folder of an interrupted run to continue; empty: a new run")),
     Argument(Spec("record", False, "record all topics to a rosbag2 bag in the folder")),
@@ -133,11 +145,14 @@ def train_plan(texts: Mapping[str, str]) -> Plan:
         )
     own = {name: given[name] for name in _TRAINING if given[name] is not None}
     own |= _plant_parameters(given)
+    if given["model"]:
+        own["model"] = str(Path(given["model"]).resolve())
     layout = Layout(given["pairs"], given["pin"], recording, view=given["view"])
     pair_nodes(layout.pairs, layout.pin)  # refuses before there is a folder
     if given["resume"]:
-        if own or given["out"]:
-            names = ", ".join([*own, *(["out"] if given["out"] else [])])
+        changes = [name for name in own if name != "equation"] + ["out"] * bool(given["out"])
+        if changes:
+            names = ", ".join(changes)
             raise ParameterError(
                 f"resume:={given['resume']} continues a run with its own parameters; "
                 f"leave out {names}"
@@ -155,12 +170,14 @@ def _plan(
     nodes: list[LoopNode], file: Path, given: Mapping[str, Any], folder: Path | None = None
 ) -> Plan:
     environment = {NETWORK: "1"} if given["network"] else {}
+    if given["equation"]:
+        environment[ALLOWED] = os.environ[ALLOWED]  # as `allow` has left it
     return Plan(nodes, file, given["namespace"], given["log_level"], environment, folder)
 
 
 def _plant_parameters(given: Mapping[str, Any]) -> dict[str, Any]:
-    factor = given["real_time_factor"]
-    return {} if factor is None else {"real_time_factor": factor}
+    own = {name: given[name] for name in _PLANT if given[name] is not None}
+    return own | ({"equation": allow(given["equation"])} if given["equation"] else {})
 
 
 def _values(arguments: Iterable[Argument], texts: Mapping[str, str]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import ast
 import importlib.util
 import re
@@ -11,10 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from bringup import launch_plan
+from bringup import cli, launch_plan
 from bringup.launch_plan import LOOP_ARGUMENTS, TRAIN_ARGUMENTS, loop_plan, train_plan
 from bringup.pairs import LoopNode
 from loop_interfaces.parameters import ParameterError, read_yaml, table
+from pde_sim_node.equations import ALLOWED
 from tests.colcon_workspace import ROOT, Workspace, build
 from tests.small import SMALL
 from tuner_node.results import RunFolderError
@@ -166,16 +168,44 @@ def test_a_bad_argument_is_refused_before_anything_is_made(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_loop_without_a_tuner_takes_an_equation_from_a_file(tmp_path: Path) -> None:
-    (tmp_path / "own.py").write_text(
-        "from pde_sim_node.equations import Burgers\n\n\nclass Own(Burgers):\n    name = 'own'\n"
-    )
+@pytest.fixture
+def own_equation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A problem whose equation is code beside it, which nobody has allowed yet."""
+    monkeypatch.setenv(ALLOWED, "")
+    code = "from pde_sim_node.equations import Burgers\n\n\nclass Own(Burgers):\n    name = 'own'\n"
+    (tmp_path / "own.py").write_text(code)
     text = SMALL.read_text().replace("equation: burgers", "equation: own.py:Own")
     (tmp_path / "own.yaml").write_text(text)
-    plan = loop_plan({"problem": str(tmp_path / "own.yaml"), "namespace": "lab"})
+    return tmp_path / "own.yaml"
+
+
+def test_code_that_only_a_problems_file_names_is_not_run(own_equation: Path) -> None:
+    out = str(own_equation.parent / "run")
+    with pytest.raises(ValueError, match="is code, which is not run because a file names it"):
+        train_plan({"problem": str(own_equation), "out": out})
+    plan = train_plan(
+        {"problem": str(own_equation), "out": out, "equation": f"{own_equation.parent}/own.py:Own"}
+    )
+    assert plan.environment == {ALLOWED: f",{own_equation.parent}/own.py:Own".lstrip(",")}
+
+
+def test_a_loop_without_a_tuner_finds_an_equation_beside_its_file(own_equation: Path) -> None:
+    plan = loop_plan({"problem": str(own_equation), "namespace": "lab", "process_noise": "0.1"})
     assert plan.namespace == "lab"
+    assert plan.environment == {}
     for node in plan.nodes:
-        assert f"equation:='{tmp_path / 'own.py'}:Own'" in node.parameters
+        assert f"equation:='{own_equation.parent / 'own.py'}:Own'" in node.parameters
+        assert "process_noise:=0.1" in node.parameters
+
+
+def test_what_train_takes_is_a_launch_argument_too() -> None:
+    subcommands = next(
+        a for a in cli.parser()._actions if isinstance(a, argparse._SubParsersAction)
+    )
+    actions = subcommands.choices["train"]._actions
+    known = {argument.spec.name for argument in TRAIN_ARGUMENTS}
+    not_for_launch = {"help", "in_process", "faulty_line", "json"}
+    assert {action.dest for action in actions} - not_for_launch <= known
 
 
 def test_every_launch_argument_is_described() -> None:
