@@ -2,7 +2,8 @@
 
     a = K_a U^T z + K_b U^T z_r,        policy = [K_a K_b], shape (n_a, 2 n_s)
 
-saturated at +- action_limit if there is one.
+saturated at +- action_limit if there is one. A policy [K_a K_b Q] with n_s (n_s + 1) / 2 columns more
+adds sum_{i <= j} Q_ij e_i e_j with e = U^T (z - z_r); see `loop_interfaces.policy_columns`.
 
 An environment's action does not depend on how many environments are in the batch, nor on its place
 in it, to the last bit: every sum runs over its terms one after the other (no BLAS, no
@@ -18,6 +19,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from loop_interfaces.policy_columns import quadratic_columns
+
 __all__ = ["ProjectedLaw", "control", "excitation"]
 
 Array = NDArray[np.float64]
@@ -28,16 +31,20 @@ IndexArray = NDArray[np.int64]
 def control(
     feedback: Array,
     constant: Array,
+    quadratic: Array,
     bases: Array,
+    centres: Array,
     model_index: IndexArray,
     states: Array,
     reduced: Array,
     actions: Array,
 ) -> None:
-    """Write a[m] = constant[m] + feedback[m]^T U[model_index[m]]^T z[m] into `actions`.
+    """Write a[m] = constant[m] + feedback[m]^T s[m] + quadratic[m]^T (e[m] x e[m]) into `actions`.
 
-    feedback : (M, n_s, n_a), K_a transposed; constant : (M, n_a), K_b s_r; bases : (models, n_z,
-    n_s);
+    s[m] = U[model_index[m]]^T z[m] and e[m] = s[m] - centres[model_index[m]]; x: the products i <= j.
+    feedback : (M, n_s, n_a), K_a transposed; constant : (M, n_a), K_b s_r; quadratic : (M, n_s (n_s
+    + 1) / 2, n_a), Q transposed, or (M, 0, n_a); bases : (models, n_z, n_s); centres : (models,
+    n_s), s_r;
     model_index : (M,); states : (M, n_z); reduced : (n_s,), workspace; actions : (M, n_a), written.
     """
     n_z, n_s = bases.shape[1], bases.shape[2]
@@ -56,6 +63,16 @@ def control(
             value = reduced[j]
             for k in range(n_a):
                 actions[m, k] += feedback[m, j, k] * value
+        if quadratic.shape[1] > 0:
+            for j in range(n_s):
+                reduced[j] -= centres[model_index[m], j]
+            pair = 0
+            for i in range(n_s):
+                for j in range(i, n_s):
+                    value = reduced[i] * reduced[j]
+                    for k in range(n_a):
+                        actions[m, k] += quadratic[m, pair, k] * value
+                    pair += 1
 
 
 class ProjectedLaw:
@@ -104,7 +121,9 @@ class ProjectedLaw:
         control(
             np.ascontiguousarray(np.broadcast_to(np.eye(self._n_s), (count, self._n_s, self._n_s))),
             np.zeros((count, self._n_s)),
+            np.zeros((count, 0, self._n_s)),
             self._bases,
+            np.zeros((count, self._n_s)),
             np.arange(count, dtype=np.int64),
             np.ascontiguousarray(np.broadcast_to(z_r, (count, self._n_z))),
             self._reduced,
@@ -112,6 +131,7 @@ class ProjectedLaw:
         )
         self._feedback: Array | None = None
         self._constant: Array = np.empty((0, 0))
+        self._quadratic: Array = np.empty((0, 0, 0))
         self._model_index = np.empty(0, dtype=np.int64)
 
     @property
@@ -124,16 +144,18 @@ class ProjectedLaw:
 
         Parameters
         ----------
-        policies : (M, n_a, 2 n_s) array
-            [K_a K_b] of every environment.
+        policies : (M, n_a, 2 n_s) or (M, n_a, 2 n_s + n_s (n_s + 1) / 2) array
+            [K_a K_b] or [K_a K_b Q] of every environment.
         model_index : (M,) array of int, optional
             Which of the models an environment projects with; the first one if not given.
         """
         gains = np.asarray(policies, dtype=np.float64)
-        if gains.ndim != 3 or 0 in gains.shape or gains.shape[2] != 2 * self._n_s:
+        affine = 2 * self._n_s
+        known = (affine, affine + quadratic_columns(self._n_s))
+        if gains.ndim != 3 or 0 in gains.shape or gains.shape[2] not in known:
             raise ValueError(
-                f"policies must have shape (environments, actuators, {2 * self._n_s}) for "
-                f"{self._n_s} modes, but the shape is {gains.shape}."
+                f"policies must have shape (environments, actuators, {known[0]}), or {known[1]} with "
+                f"quadratic terms, for {self._n_s} modes, but the shape is {gains.shape}."
             )
         if not np.isfinite(gains).all():
             raise ValueError("policies must be finite, but there is NaN or infinity in them.")
@@ -155,6 +177,7 @@ class ProjectedLaw:
             constant += gains[:, :, self._n_s + j] * self._reduced_targets[index, j, None]
         self._feedback = np.ascontiguousarray(gains[:, :, : self._n_s].transpose(0, 2, 1))
         self._constant = constant
+        self._quadratic = np.ascontiguousarray(gains[:, :, affine:].transpose(0, 2, 1))
         self._model_index = index.astype(np.int64)
 
     def actions(self, states: ArrayLike, out: Array | None = None) -> Array:
@@ -190,7 +213,15 @@ class ProjectedLaw:
                 f"of shape {out.shape}."
             )
         control(
-            self._feedback, self._constant, self._bases, self._model_index, z, self._reduced, out
+            self._feedback,
+            self._constant,
+            self._quadratic,
+            self._bases,
+            self._reduced_targets,
+            self._model_index,
+            z,
+            self._reduced,
+            out,
         )
         if self._action_limit:
             np.clip(out, -self._action_limit, self._action_limit, out=out)

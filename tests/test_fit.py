@@ -34,7 +34,8 @@ def roll(model: LocalModel, theta: np.ndarray, x: np.ndarray, limit: float = np.
         x = model.step(x, a)
     s, applied = np.array(states), np.array(actions)
     free = None if limit == np.inf else (np.abs(applied) < limit).astype(float)
-    return Path(s, applied, np.column_stack([s[:, :N_S], np.ones(STEPS)]), free)
+    features = np.column_stack([s[:, :N_S], np.ones(STEPS)])
+    return Path(s, applied, features, theta[:, :N_S], free)
 
 
 THETA = 0.1 * np.random.default_rng(9).standard_normal((N_A, N_S + 1))
@@ -113,7 +114,6 @@ def test_gradient_is_that_of_the_closed_loop() -> None:
         path,
         model.jacobians(path.x),
         model.B,
-        THETA[:, :N_S],
         target=TARGET,
         state_weight=q,
         action_weight=r,
@@ -180,7 +180,6 @@ def test_curvature_is_exact_where_the_trajectory_is_linear_in_theta() -> None:
         path,
         model.jacobians(path.x),
         model.B,
-        theta[:, :N_S],
         target=TARGET,
         state_weight=1.0,
         action_weight=0.5,
@@ -198,7 +197,7 @@ def test_forgetting_shortens_the_memory_of_the_sensitivities() -> None:
     model = planted()
     path = roll(model, THETA, START)
     settings = {"target": TARGET, "state_weight": 1.0, "action_weight": 0.1}
-    arguments = (path, model.jacobians(path.x), model.B, THETA[:, :N_S])
+    arguments = (path, model.jacobians(path.x), model.B)
     none = expand(*arguments, **settings, gamma=1e-12)
     # With no memory only the direct effect on the actions is left.
     direct = 2 * 0.1 / STEPS * (path.a.T @ path.features).ravel()
@@ -230,11 +229,11 @@ def test_the_true_model_has_the_smallest_mismatch() -> None:
     true, wrong = planted(), planted(7)
     change = 1e-5 * np.ones_like(THETA)
     pair = Pair(roll(true, THETA, START), roll(true, THETA + change, START), change)
-    errors = mismatches([wrong, true], THETA[:, :N_S], [pair], STEPS)
+    errors = mismatches([wrong, true], [pair], STEPS)
     assert errors.shape == (2, len(KAPPAS))
     assert errors[1, 0] < 1e-4 < errors[0, 0]
     assert errors.max() <= 2.0
-    assert not mismatches([wrong, true], THETA[:, :N_S], [], STEPS).any()
+    assert not mismatches([wrong, true], [], STEPS).any()
 
 
 def test_an_exploding_model_is_the_worst_not_an_error() -> None:
@@ -242,11 +241,10 @@ def test_an_exploding_model_is_the_worst_not_an_error() -> None:
     exploding = LocalModel(true.centre, true.constant, 1e200 * np.eye(R), true.B, true.quadratic)
     change = 1e-3 * np.ones_like(THETA)
     pair = Pair(roll(true, THETA, START), roll(true, THETA + change, START), change)
-    assert mismatches([exploding], THETA[:, :N_S], [pair], STEPS)[0, 0] == 2.0
+    assert mismatches([exploding], [pair], STEPS)[0, 0] == 2.0
     step, fall = damped_step(
         [exploding],
         [pair.first],
-        THETA[:, :N_S],
         target=TARGET,
         state_weight=1.0,
         action_weight=1.0,
@@ -275,7 +273,6 @@ def test_the_step_shrinks_with_the_damping_and_predicts_its_fall() -> None:
         step, fall = damped_step(
             [model],
             [path],
-            THETA[:, :N_S],
             target=TARGET,
             state_weight=1.0,
             action_weight=0.1,

@@ -286,7 +286,7 @@ def test_a_target_outside_of_the_basis_leaves_the_constant_part_alone() -> None:
         ({"fields": 0}, "fields must be positive"),
         ({"iterations": 0}, "iterations must be positive"),
         ({"modes": 3}, "at least n_s = 4"),
-        ({"policy": np.zeros((2, 6))}, "basis U with 3 columns"),
+        ({"policy": np.zeros((2, 6))}, "must have 8 or 18 columns"),
         ({"policy": np.zeros((3, 8))}, "exploratory trajectory must have"),
     ],
 )

@@ -207,3 +207,30 @@ def test_a_model_of_another_plant_is_refused(tmp_path):
     for optimizer in ("two_point", "gauss_newton"):
         with pytest.raises(ValueError, match=r"state"):
             train_here(parameters(model=path, optimizer=optimizer))
+
+
+def test_a_quadratic_law_continues_from_a_checkpoint_in_the_middle_to_the_same_bits(tmp_path):
+    values = parameters(iterations=8, optimizer="gauss_newton", policy_features="quadratic")
+    undisturbed = train_here(values)
+    first, pair = build_training(values), LocalPair(values)
+    for _ in range(9):
+        result = pair.run(first.next_batch())
+        first.finish(result)
+        if result.models is not None:
+            pair.use_models(first.models)
+    assert first.phase == "adapt"
+    checkpoint.save(tmp_path / "checkpoint", first.state())
+    arrays, _ = checkpoint.load(tmp_path / "checkpoint")
+    second = build_training(values)
+    second.restore(arrays)
+    train(second, LocalPair(values), lambda row: None)
+    assert same_bits(second.policies(), undisturbed.policies())
+    assert same_bits(second.evaluation, undisturbed.evaluation)
+    n_s = second.models.shape[2]
+    assert second.policies()[:, :, 2 * n_s :].any()
+
+
+def test_only_gauss_newton_adapts_a_quadratic_law():
+    values = parameters(optimizer="two_point", policy_features="quadratic")
+    with pytest.raises(ValueError, match=r"policy_features.*expected 'affine'"):
+        build_training(values)

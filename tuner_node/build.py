@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from loop_interfaces.model_rows import unpack
 from loop_interfaces.parameters import noisy
-from tuner_node.optimizers import NEED_TRAJECTORIES, OPTIMIZERS, Context, Optimizer
+from tuner_node.optimizers import NEED_TRAJECTORIES, OPTIMIZERS, Context, GaussNewton, Optimizer
 from tuner_node.training import UNKNOWN_PLANT, Training, TrainingSettings
 
 MAX_MODEL_BYTES = 1 << 30
@@ -52,6 +52,12 @@ def build_training(values: Mapping[str, Any]) -> Training:
                 "many as there are iterations and entries of the policy"
             )
         options["directions"] = values["directions"]
+    features = values["policy_features"]
+    if features != "affine" and values["optimizer"] != GaussNewton.name:
+        raise ValueError(
+            f"parameter 'policy_features' is '{features}'; expected 'affine' with the optimizer "
+            f"'{values['optimizer']}': only '{GaussNewton.name}' adapts another law"
+        )
 
     def make_optimizer(
         policy: NDArray[np.float64], seed: int, context: Context | None
@@ -81,5 +87,6 @@ def build_training(values: Mapping[str, Any]) -> Training:
         noise=noisy(values),
         action_limit=values["action_limit"],
         model=read_model(Path(values["model"]), values["n_a"]) if values["model"] else None,
+        policy_features=features,
     )
     return Training(settings, make_optimizer, plant=values["plant"] or UNKNOWN_PLANT)

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces import model_rows
+from loop_interfaces.policy_columns import with_features
 from loop_interfaces.topics import COMPLETED, MAX_GAIN, START_COLUMNS, CostColumn, StartColumn
 from tuner_node.noise import PURPOSES, evaluation_noise, rollout_noise
 from tuner_node.optimizers import Context, Optimizer, Rollout, RolloutResult, Trajectory
@@ -38,7 +39,7 @@ CONTROLLERS = ("none", "lqt", "adapted")
 class Batch:
     """Rollouts wanted together; any split into episodes gives the same results.
 
-    rows (R, 4), with noise (R, 5): the columns of `episode/start`; policies (R, n_a, 2 n_s), or
+    rows (R, 4), with noise (R, 5): the columns of `episode/start`; policies (R, n_a, columns), or
     None for an exploratory batch, whose result is a model a row instead of a cost.
     """
 
@@ -87,6 +88,7 @@ class TrainingSettings:
     action_limit: float = 0.0
     model: Array | None = None
     """Rows of a reduced model to start from instead of identifying one."""
+    policy_features: str = "affine"
 
 
 OptimizerFactory = Callable[[Array, int, Context | None], Optimizer]
@@ -177,13 +179,14 @@ class Training:
         return self._evaluated(result)
 
     def policies(self) -> Array:
-        """The adapted policies, (S, n_a, 2 n_s)."""
+        """The adapted policies, of the shape of the warm starts."""
         return np.stack([optimizer.best_policy for optimizer in self.optimizers])
 
     def warm_starts(self) -> Array:
-        """The LQT policies of the models, (S, n_a, 2 n_s)."""
+        """The LQT policies of the models, (S, n_a, columns): 2 n_s, more if the law has more terms."""
         assert self.models is not None
-        return np.stack([model_rows.unpack(rows, self.settings.n_a).policy for rows in self.models])
+        lqt = np.stack([model_rows.unpack(rows, self.settings.n_a).policy for rows in self.models])
+        return with_features(lqt, self.settings.policy_features)
 
     @property
     def generation(self) -> int:

@@ -29,6 +29,7 @@ from bringup.reproduce.experiment import PAPER
 from controller_node.dmdc import identify
 from controller_node.lqt import track
 from controller_node.policy import ProjectedLaw, excitation
+from loop_interfaces.policy_columns import POLICY_FEATURES, with_features
 from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import Plant
@@ -53,6 +54,8 @@ class Job:
     evaluation_fields: int
     fresh_fields: int
     attempts: int | None
+    features: str
+    marks: tuple[int, ...]
     options: dict[str, Any]
 
 
@@ -151,6 +154,7 @@ def run(job: Job) -> dict[str, Any]:
     parameters = load_parameters(job.problem, options)
     plant = build_plant(parameters)
     policy, context = warm_start(plant, parameters, job.seed)
+    policy = with_features(policy, job.features)
     optimizer = OPTIMIZERS[job.optimizer](
         policy,
         seed=job.seed,
@@ -171,7 +175,7 @@ def run(job: Job) -> dict[str, Any]:
 
     budget = 2 * job.iterations
     costs = {"0": evaluate(policy)}
-    marks = [mark for mark in (budget // 4, budget // 2) if mark > 0]
+    marks = [mark for mark in job.marks or (budget // 4, budget // 2) if 0 < mark < budget]
     used = diverged = 0
     history = []
     seconds = 0.0
@@ -265,6 +269,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--attempts", type=int, help="identifications until one beats no control (as in a training)"
     )
+    parser.add_argument(
+        "--features", choices=POLICY_FEATURES, default="affine", help="the law (default affine)"
+    )
+    parser.add_argument(
+        "--marks",
+        type=int,
+        nargs="+",
+        default=[],
+        metavar="N",
+        help="rollouts after which to evaluate (default: a quarter and half of the budget)",
+    )
     parser.add_argument("--jobs", type=int, default=1, help="processes (default 1)")
     parser.add_argument("--output", type=Path, help="write all numbers to this JSON file")
     options = parser.parse_args(arguments)
@@ -282,6 +297,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             options.evaluation_fields,
             options.fresh_fields,
             options.attempts,
+            options.features,
+            tuple(options.marks),
             settings,
         )
         for problem in options.problem or list(PAPER)

@@ -54,6 +54,11 @@ def add(commands: Commands) -> None:
         help="start from this model of `pdeloop identify --out` instead of identifying one",
     )
     train.add_argument(
+        "--policy-features",
+        choices=DEFAULTS["policy_features"].choices,
+        help=f"{DEFAULTS['policy_features'].description} [affine]",
+    )
+    train.add_argument(
         "--out", type=Path, metavar="DIR", help="folder of the results [runs/PROBLEM-TIME]"
     )
     train.add_argument(
@@ -139,7 +144,7 @@ def _train(options: argparse.Namespace) -> int:
         options.pin,
         options.view,
     )
-    names = ["iterations", "seed", "seeds", "start", "optimizer", "directions"]
+    names = ["iterations", "seed", "seeds", "start", "optimizer", "directions", "policy_features"]
     names += [spec.name for spec in INSTRUMENTS]
     given = {n: getattr(options, n) for n in names if getattr(options, n) is not None}
     if (

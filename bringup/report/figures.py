@@ -221,7 +221,7 @@ def gains(problem: ProblemData) -> Figure:
     figure = Figure(figsize=(6.4, 0.5 + len(names) * max(1.1, 0.11 * n_a + 0.5)))
     grid = figure.subplots(len(names), 2, sharex=True, sharey=True, squeeze=False)
     for part, (symbol, columns) in enumerate(
-        (("$K_a$", slice(0, n_s)), ("$K_b$", slice(n_s, None)))
+        (("$K_a$", slice(0, n_s)), ("$K_b$", slice(n_s, 2 * n_s)))
     ):
         largest = max(float(np.abs(problem.policies[n][:, columns]).max()) for n in names) or 1.0
         for row, name in enumerate(names):

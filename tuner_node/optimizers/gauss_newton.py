@@ -39,6 +39,7 @@ from tuner_node.optimizers.base import (
     require_results,
     require_state,
 )
+from tuner_node.optimizers.features import known_columns
 from tuner_node.optimizers.proposal import Proposer
 from tuner_node.optimizers.trajectories import Record, Records
 
@@ -59,8 +60,8 @@ class GaussNewton:
 
     Parameters
     ----------
-    policy0 : (n_a, 2 n_s) array
-        Where to start; the warm start.
+    policy0 : (n_a, 2 n_s) or (n_a, 2 n_s + n_s (n_s + 1) / 2) array
+        Where to start, [K_a K_b] or [K_a K_b Q]; the warm start.
     seed : int
         Determines the initial fields.
     iterations : int
@@ -92,8 +93,9 @@ class GaussNewton:
         smoothing_radius: float | None = None,
     ) -> None:
         require_positive(iterations=iterations, fields=fields)
-        self._policy = checked_policy(policy0)
-        n_s = self._policy.shape[1] // 2
+        n_s = context.U.shape[1]
+        self._columns = known_columns(n_s)
+        self._policy = checked_policy(policy0, self._columns)
         self._proposer = Proposer(
             context, self._policy, max(_MODES, n_s) if modes is None else modes
         )
@@ -186,7 +188,9 @@ class GaussNewton:
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
         """Continue from a checkpoint with the same seed and number of fields."""
         require_state(state, self.state(), ("seed", "field_count"))
-        self._policy, self._candidate = map(checked_policy, (state["policy"], state["candidate"]))
+        self._policy, self._candidate = (
+            checked_policy(state[name], self._columns) for name in ("policy", "candidate")
+        )
         for name in _STAMPS:
             setattr(self, f"_{name}", state[name].astype(np.int64))
         for name in _NUMBERS:

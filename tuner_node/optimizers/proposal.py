@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tuner_node.optimizers.base import Array, Context, Row
+from tuner_node.optimizers.features import Features, known_columns
 from tuner_node.optimizers.fit import LocalModel, extended_basis, fit
 from tuner_node.optimizers.selection import KAPPAS, LOCAL, RIDGES, Pair, choices, mismatches
 from tuner_node.optimizers.sensitivity import Path, damped_step
@@ -33,7 +34,7 @@ class Proposal:
 
     Attributes
     ----------
-    policy : (n_a, 2 n_s) array
+    policy : (n_a, columns) array
     fall : float
         The fall of the mean stage cost that the quadratic model predicts.
     models : int
@@ -66,7 +67,7 @@ class Proposer:
     Parameters
     ----------
     context : Context
-    policy : (n_a, 2 n_s) array
+    policy : (n_a, columns) array
         Any policy of the training, for its shape.
     modes : int
         Coordinates of the fitted models.
@@ -76,10 +77,9 @@ class Proposer:
         U = np.array(context.U, dtype=np.float64)
         target = np.array(context.target, dtype=np.float64)
         n_a, columns = policy.shape
-        if U.ndim != 2 or U.shape[1] * 2 != columns:
+        if U.ndim != 2 or columns not in known_columns(U.shape[1]):
             raise ValueError(
-                f"a policy of shape {policy.shape} needs a basis U with {columns // 2} columns, "
-                f"but its shape is {U.shape}."
+                f"a policy of shape {policy.shape} does not fit a basis U of shape {U.shape}."
             )
         if target.shape != U.shape[:1]:
             raise ValueError(
@@ -104,18 +104,21 @@ class Proposer:
         self._s_r_square = float(np.sum(self._s_r * self._s_r))
         # A target outside of U leaves the law without a constant part.
         self._one = 1.0 if self._s_r_square > 1e-20 * float(np.sum(target * target)) else 0.0
+        self._features = Features(self._s_r, self._one, quadratic=columns > 2 * self.n_s)
 
     def theta(self, policy: Array) -> Array:
-        """[K_a b] of a policy, (n_a, n_s + 1)."""
-        b = policy[:, self.n_s :] @ self._s_r
-        return np.column_stack([policy[:, : self.n_s], b])
+        """[K_a b] or [K_a b Q] of a policy, (n_a, n_f)."""
+        b = policy[:, self.n_s : 2 * self.n_s] @ self._s_r
+        return np.column_stack([policy[:, : self.n_s], b, policy[:, 2 * self.n_s :]])
 
     def moved(self, policy: Array, step: Array) -> Array:
         """The policy after a step of theta; K_b moves least among those with the wanted b."""
         moved = policy.copy()
         moved[:, : self.n_s] += step[:, : self.n_s]
         if self._one:
-            moved[:, self.n_s :] += np.outer(step[:, self.n_s], self._s_r / self._s_r_square)
+            constant = np.outer(step[:, self.n_s], self._s_r / self._s_r_square)
+            moved[:, self.n_s : 2 * self.n_s] += constant
+        moved[:, 2 * self.n_s :] += step[:, self.n_s + 1 :]
         return moved
 
     def propose(
@@ -146,9 +149,8 @@ class Proposer:
         V = extended_basis(self._U, [record.states for record in data], self._modes)
         models = self._fit(data, V, incumbents)
         policy = incumbents[0].policy
-        K = np.ascontiguousarray(policy[:, : self.n_s])
         pairs = self._pairs(V, incumbents, others)
-        errors = mismatches(models, K, pairs, self._horizon)
+        errors = mismatches(models, pairs, self._horizon)
         paths = [self._path(record, V) for record in incumbents if len(record.actions)]
         least = _LEAST_FALL * self._level(incumbents)
         proposal = None
@@ -157,7 +159,6 @@ class Proposer:
             step, fall = damped_step(
                 ensemble,
                 paths,
-                K,
                 target=V.T @ self._target,
                 state_weight=self._q,
                 action_weight=self._r,
@@ -213,8 +214,13 @@ class Proposer:
         free = None
         if self._action_limit:
             free = (np.abs(record.actions) < self._action_limit).astype(np.float64)
+        s = x[:, : self.n_s]
         return Path(
-            x, record.actions, np.column_stack([x[:, : self.n_s], np.full(length, self._one)]), free
+            x,
+            record.actions,
+            self._features(s),
+            self._features.feedback(self.theta(record.policy), s),
+            free,
         )
 
     def _pairs(

@@ -5,10 +5,10 @@ the neighbours. So a model is judged by what it will be used for: given the meas
 the initial fields, or the known difference of two policies, predict the difference of two measured
 trajectories,
 
-    delta_{k+1} = gamma ((A_k + B [K 0]) delta_k + B (theta_2 - theta_1) [s_k; 1]),
+    delta_{k+1} = gamma ((A_k + B [K 0]) delta_k + B (theta_2 - theta_1) phi(s_k)),
 
-and compare: E = mean over pairs of min(2, sum_k |error_k|^2 / sum_k |delta_k|^2). No prediction at
-all has E = 1.
+with the law's features phi(s) = [s; 1, ...], and compare:
+E = mean over pairs of min(2, sum_k |error_k|^2 / sum_k |delta_k|^2). No prediction at all has E = 1.
 """
 
 from __future__ import annotations
@@ -41,22 +41,23 @@ _WORST = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two measured trajectories, and by how much theta differs, (n_a, n_s + 1)."""
+    """Two measured trajectories, and by how much theta differs, (n_a, n_f)."""
 
     first: Path
     second: Path
     change: Array
 
 
-def mismatches(
-    models: Sequence[LocalModel], K: Array, pairs: Sequence[Pair], horizon: int
-) -> Array:
+def mismatches(models: Sequence[LocalModel], pairs: Sequence[Pair], horizon: int) -> Array:
     """E of every model and kappa, (models, kappas); zeros without pairs."""
     errors = np.zeros((len(models), len(KAPPAS)))
     if not pairs:
         return errors
     x = np.stack([pair.first.x for pair in pairs])
     measured = np.stack([pair.second.x for pair in pairs]) - x
+    K = pairs[0].first.K
+    if K.ndim == 3:
+        K = np.stack([pair.first.K for pair in pairs])
     forcing = np.stack([pair.second.features @ pair.change.T for pair in pairs])
     size = np.maximum(np.sum(measured**2, axis=(1, 2)), 1e-300)
     free = None
