@@ -105,6 +105,7 @@ def planted() -> LocalModel:
         linear=0.3 * rng.standard_normal((R, R)) - 0.3 * np.eye(R),
         B=rng.standard_normal((R, N_A)),
         quadratic=0.5 * (H + H.transpose(0, 2, 1)),
+        cubic=np.zeros((R, 0, 0, 0)),
     )
 
 

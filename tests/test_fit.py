@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import permutations
+
 import numpy as np
 import pytest
 
@@ -21,6 +24,7 @@ def planted(seed: int = 0, bend: float = 0.1) -> LocalModel:
         linear=0.3 * rng.standard_normal((R, R)) - 0.3 * np.eye(R),
         B=rng.standard_normal((R, N_A)),
         quadratic=0.5 * (H + H.transpose(0, 2, 1)),
+        cubic=np.zeros((R, 0, 0, 0)),
     )
 
 
@@ -55,6 +59,22 @@ def test_fit_recovers_a_planted_quadratic_system() -> None:
     np.testing.assert_allclose(fitted.quadratic, model.quadratic, atol=2e-4)
 
 
+def test_fit_recovers_a_planted_cubic_system_in_the_leading_modes() -> None:
+    rng = np.random.default_rng(1)
+    C = 0.05 * rng.standard_normal((R, 2, 2, 2))
+    model = replace(planted(), cubic=sum(C.transpose(0, *o) for o in permutations((1, 2, 3))) / 6)
+    x, a = rng.standard_normal((3000, R)), rng.standard_normal((3000, N_A))
+    change = model.step(x, a) - x
+    without, fitted = fit(x, a, change, np.ones(3000), [1e-8], leading=2)
+    assert without.cubic.size == 0
+    assert np.abs(without.step(x, a) - model.step(x, a)).max() > 0.1
+    np.testing.assert_allclose(fitted.step(x, a), model.step(x, a), atol=2e-3)
+    np.testing.assert_allclose(fitted.cubic, model.cubic, atol=2e-4)
+    np.testing.assert_allclose(fitted.jacobians(x), model.jacobians(x), atol=2e-3)
+    alone = fit(x, a, change, np.ones(3000), [1e-8])[0]
+    np.testing.assert_allclose(without.quadratic, alone.quadratic, atol=1e-10)
+
+
 def test_an_infinite_ridge_fits_an_affine_system() -> None:
     model = planted(bend=0.0)
     rng = np.random.default_rng(2)
@@ -76,8 +96,11 @@ def test_weights_choose_between_two_systems() -> None:
     np.testing.assert_allclose(fitted.B, first.B, atol=1e-3)
 
 
-def test_jacobians_are_the_derivative_of_the_step() -> None:
-    model, a = planted(), np.zeros(N_A)
+@pytest.mark.parametrize("leading", [0, 1, 3])
+def test_jacobians_are_the_derivative_of_the_step(leading: int) -> None:
+    C = np.random.default_rng(8).standard_normal((R, leading, leading, leading))
+    symmetric = sum(C.transpose(0, *order) for order in permutations((1, 2, 3))) / 6
+    model, a = replace(planted(), cubic=symmetric), np.zeros(N_A)
     jacobian = model.jacobians(START)
     h = 1e-6
     for j in range(R):
@@ -238,7 +261,7 @@ def test_the_true_model_has_the_smallest_mismatch() -> None:
 
 def test_an_exploding_model_is_the_worst_not_an_error() -> None:
     true = planted()
-    exploding = LocalModel(true.centre, true.constant, 1e200 * np.eye(R), true.B, true.quadratic)
+    exploding = replace(true, linear=1e200 * np.eye(R))
     change = 1e-3 * np.ones_like(THETA)
     pair = Pair(roll(true, THETA, START), roll(true, THETA + change, START), change)
     assert mismatches([exploding], [pair], STEPS)[0, 0] == 2.0

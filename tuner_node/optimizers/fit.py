@@ -1,13 +1,14 @@
 """A local model of the plant, fitted to measured trajectories: affine plus quadratic in a few
-modes.
+modes, plus cubic in fewer.
 
 On coordinates x = V^T z, with V = [U, further modes] orthonormal, centred and scaled by their
 spread,
 
-    x_{k+1} - x_k  ~  c + A x_k + B a_k + H(x_k, x_k)
+    x_{k+1} - x_k  ~  c + A x_k + B a_k + H(x_k, x_k) + C(x_k, x_k, x_k)
 
-is fitted by weighted ridge regression. The ridge on the quadratic part decides how much of it the
-data must prove; infinity leaves it out. One Gram matrix serves all ridges.
+is fitted by weighted ridge regression. The ridge on the quadratic and cubic part decides how much of
+it the data must prove; infinity leaves it out. C acts on the leading modes only: a reaction term like
+u - u^3 has its cubes where the field is large. One Gram matrix serves all models.
 
 References
 ----------
@@ -20,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations_with_replacement, permutations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +30,7 @@ from scipy import linalg
 __all__ = ["LocalModel", "extended_basis", "fit"]
 
 Array = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
 
 # Ridges on the scaled variables, per unit weight: enough to bound directions that the data does not
 # move.
@@ -37,7 +40,7 @@ _ACTION_RIDGE = 1e-8
 
 @dataclass(frozen=True, eq=False)
 class LocalModel:
-    """x_{k+1} = x_k + c + A (x_k - m) + B a_k + H(x_k - m, x_k - m).
+    """x_{k+1} = x_k + c + A e + B a_k + H(e, e) + C(e, e, e) with e = x_k - m.
 
     Attributes
     ----------
@@ -50,6 +53,8 @@ class LocalModel:
     B : (r, n_a) array
     quadratic : (r, r, r) array
         H, symmetric in its last two indices.
+    cubic : (r, l, l, l) array
+        C, symmetric in its last three indices, on the first l coordinates of e; l may be 0.
     """
 
     centre: Array
@@ -57,21 +62,30 @@ class LocalModel:
     linear: Array
     B: Array
     quadratic: Array
+    cubic: Array
 
     def step(self, x: Array, a: Array) -> Array:
         """x_{k+1} of the states x (..., r) and the actions a (..., n_a)."""
         e = x - self.centre
         bend = np.einsum("ijl,...j,...l->...i", self.quadratic, e, e)
+        lead = e[..., : self.cubic.shape[1]]
+        bend = bend + np.einsum("ijlm,...j,...l,...m->...i", self.cubic, lead, lead, lead)
         after: Array = x + self.constant + e @ self.linear.T + a @ self.B.T + bend
         return after
 
     def jacobians(self, x: Array) -> Array:
         """The derivatives of `step` by x, (..., r, r), at the states x (..., r)."""
-        r = self.centre.size
-        bend = (x - self.centre) @ self.quadratic.reshape(r * r, r).T
+        r, leading = self.cubic.shape[:2]
+        e = x - self.centre
+        bend = e @ self.quadratic.reshape(r * r, r).T
         jacobians: Array = bend.reshape(*x.shape[:-1], r, r)
         jacobians *= 2.0
         jacobians += np.eye(r) + self.linear
+        if leading:
+            lead = e[..., :leading]
+            products = (lead[..., :, None] * lead[..., None, :]).reshape(*x.shape[:-1], leading**2)
+            bend = products @ self.cubic.reshape(r * leading, leading**2).T
+            jacobians[..., :leading] += 3.0 * bend.reshape(*x.shape[:-1], r, leading)
         return jacobians
 
 
@@ -100,9 +114,15 @@ def extended_basis(U: Array, states: Sequence[Array], modes: int) -> Array:
 
 
 def fit(
-    x: Array, a: Array, change: Array, weights: Array, ridges: Sequence[float]
+    x: Array,
+    a: Array,
+    change: Array,
+    weights: Array,
+    ridges: Sequence[float],
+    *,
+    leading: int = 0,
 ) -> list[LocalModel]:
-    """Fit one model per ridge.
+    """Fit one model per ridge, and with `leading` above 0 one with a cubic part per ridge after them.
 
     Parameters
     ----------
@@ -111,7 +131,9 @@ def fit(
     weights : (N,) array
         Not negative.
     ridges : sequence of float
-        Ridge of the quadratic part per unit weight; `numpy.inf` for an affine model.
+        Ridge of the quadratic and cubic part per unit weight; `numpy.inf` for an affine model.
+    leading : int
+        l, coordinates that the cubic part acts on, at most r.
     """
     r, n_a = x.shape[1], a.shape[1]
     share = weights / weights.sum()
@@ -119,42 +141,62 @@ def fit(
     spread = _spread(share, x - centre)
     action_spread = _spread(share, a)
     e = (x - centre) / spread
-    rows, columns = np.triu_indices(r)
-    features = np.empty((len(x), 1 + r + n_a + rows.size))
+    pairs, triples = _products(r, 2), _products(leading, 3)
+    affine = 1 + r + n_a
+    bent = affine + len(pairs)
+    features = np.empty((len(x), bent + len(triples)))
     features[:, 0] = 1.0
     features[:, 1 : 1 + r] = e
-    features[:, 1 + r : 1 + r + n_a] = a / action_spread
-    np.multiply(e[:, rows], e[:, columns], out=features[:, 1 + r + n_a :])
+    features[:, 1 + r : affine] = a / action_spread
+    np.multiply(e[:, pairs[:, 0]], e[:, pairs[:, 1]], out=features[:, affine:bent])
+    for column, (i, j, m) in enumerate(triples, bent):
+        features[:, column] = e[:, i] * e[:, j] * e[:, m]
     features *= np.sqrt(share)[:, None]
     gram = features.T @ features
     moment = features.T @ (change * np.sqrt(share)[:, None])
 
     models = []
-    affine = 1 + r + n_a
-    for ridge in ridges:
-        size = affine if np.isinf(ridge) else len(gram)
-        penalty = np.full(size, ridge)
-        penalty[0] = 0.0
-        penalty[1 : 1 + r] = _LINEAR_RIDGE
-        penalty[1 + r : affine] = _ACTION_RIDGE
-        matrix = gram[:size, :size].copy()
-        matrix[np.diag_indices(size)] += penalty
-        solution = linalg.cho_solve(linalg.cho_factor(matrix), moment[:size]).T
-        quadratic = np.zeros((r, r, r))
-        if size > affine:
-            half = 0.5 * solution[:, affine:] / spread**2
-            quadratic[:, rows, columns] += half
-            quadratic[:, columns, rows] += half
-        models.append(
-            LocalModel(
-                centre=centre,
-                constant=solution[:, 0],
-                linear=solution[:, 1 : 1 + r] / spread,
-                B=solution[:, 1 + r : affine] / action_spread,
-                quadratic=quadratic,
+    for most in (bent, len(gram)) if len(triples) else (bent,):
+        for ridge in ridges:
+            size = affine if np.isinf(ridge) else most
+            penalty = np.full(size, ridge)
+            penalty[0] = 0.0
+            penalty[1 : 1 + r] = _LINEAR_RIDGE
+            penalty[1 + r : affine] = _ACTION_RIDGE
+            matrix = gram[:size, :size].copy()
+            matrix[np.diag_indices(size)] += penalty
+            solution = linalg.cho_solve(linalg.cho_factor(matrix), moment[:size]).T
+            models.append(
+                LocalModel(
+                    centre=centre,
+                    constant=solution[:, 0],
+                    linear=solution[:, 1 : 1 + r] / spread,
+                    B=solution[:, 1 + r : affine] / action_spread,
+                    quadratic=_symmetric(solution[:, affine:bent] / spread**2, pairs, r),
+                    cubic=_symmetric(
+                        solution[:, bent:] / spread**3, triples, leading if size > bent else 0
+                    ),
+                )
             )
-        )
     return models
+
+
+def _products(count: int, degree: int) -> IndexArray:
+    """The products of `degree` of `count` coordinates, each once: indices, (products, degree)."""
+    chosen = list(combinations_with_replacement(range(count), degree))
+    return np.array(chosen, dtype=np.int64).reshape(-1, degree)
+
+
+def _symmetric(coefficients: Array, products: IndexArray, size: int) -> Array:
+    """The form with these coefficients of its products, symmetric in the indices after the first."""
+    degree = products.shape[1]
+    form = np.zeros((len(coefficients), *(size,) * degree))
+    if coefficients.shape[1] and size:
+        orders = list(permutations(range(degree)))
+        part = coefficients / len(orders)
+        for order in orders:
+            form[(slice(None), *products[:, order].T)] += part
+    return form
 
 
 def _spread(share: Array, values: Array) -> float:

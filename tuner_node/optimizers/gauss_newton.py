@@ -73,6 +73,8 @@ class GaussNewton:
         step.
     modes : int, optional
         Coordinates of the fitted model, at least n_s; 32 by default, or n_s where that is more.
+    cubic_modes : int
+        How many of them, at most, its cubic part acts on; 0 leaves it out.
     learning_rate, smoothing_radius : float, optional
         Not used; every optimiser takes them.
     """
@@ -89,6 +91,7 @@ class GaussNewton:
         context: Context,
         fields: int = 3,
         modes: int | None = None,
+        cubic_modes: int = 0,
         learning_rate: float | None = None,
         smoothing_radius: float | None = None,
     ) -> None:
@@ -96,9 +99,8 @@ class GaussNewton:
         n_s = context.U.shape[1]
         self._columns = known_columns(n_s)
         self._policy = checked_policy(policy0, self._columns)
-        self._proposer = Proposer(
-            context, self._policy, max(_MODES, n_s) if modes is None else modes
-        )
+        modes = max(_MODES, n_s) if modes is None else modes
+        self._proposer = Proposer(context, self._policy, modes, min(cubic_modes, modes))
         self._seed = seed
         self._budget = 2 * iterations
         self._fields = np.arange(fields, dtype=np.int64)

@@ -71,9 +71,11 @@ class Proposer:
         Any policy of the training, for its shape.
     modes : int
         Coordinates of the fitted models.
+    cubic_modes : int
+        How many of them the cubic part acts on.
     """
 
-    def __init__(self, context: Context, policy: Array, modes: int) -> None:
+    def __init__(self, context: Context, policy: Array, modes: int, cubic_modes: int = 0) -> None:
         U = np.array(context.U, dtype=np.float64)
         target = np.array(context.target, dtype=np.float64)
         n_a, columns = policy.shape
@@ -94,7 +96,10 @@ class Proposer:
         if modes < U.shape[1]:
             raise ValueError(f"modes must be at least n_s = {U.shape[1]}, but it is {modes}.")
         self.n_z, self.n_s, self.n_a = U.shape[0], U.shape[1], n_a
+        if not 0 <= cubic_modes <= modes:
+            raise ValueError(f"cubic_modes must be 0 .. modes = {modes}, but it is {cubic_modes}.")
         self._U, self._target, self._modes = U, target, modes
+        self._cubic_modes = cubic_modes
         self._q, self._r = context.state_weight, context.action_weight
         self._horizon = context.horizon
         self._action_limit = context.action_limit
@@ -197,6 +202,7 @@ class Proposer:
             np.concatenate(change),
             np.concatenate(weights),
             RIDGES,
+            leading=min(self._cubic_modes, V.shape[1]),
         )
 
     def _level(self, incumbents: Sequence[Record]) -> float:
