@@ -1,16 +1,15 @@
 """Compare optimisers in one process: DMDc and LQT warm start, one optimiser, held-out fields.
 
-    python -m bringup.bench.optimizers --optimizer gauss_newton --problem kdv --seeds 6
+    pdeloop bench optimizers --optimizer gauss_newton --problem kdv --seeds 6
 
 For every seed: an exploratory episode, the reduced model and its tracking gains, 2 * iterations
 rollouts of the optimiser, and then the cost of its policy on held-out initial fields that no
-optimiser has seen. Prints a table and writes all numbers as JSON. No topics, no nodes: what is
-measured is the optimiser.
+optimiser has seen. Prints a table; `--out` writes all numbers as JSON. No topics, no nodes: what is
+measured is the optimiser and the law that it adapts.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
@@ -19,7 +18,6 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,7 +27,7 @@ from bringup.reproduce.experiment import PAPER
 from controller_node.dmdc import identify
 from controller_node.lqt import track
 from controller_node.policy import ProjectedLaw, excitation
-from loop_interfaces.policy_columns import POLICY_FEATURES, with_features
+from loop_interfaces.policy_columns import with_features
 from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import Plant
@@ -148,7 +146,7 @@ def design(
     return track(model, **weights).policy, context
 
 
-def run(job: Job) -> dict[str, Any]:
+def train(job: Job) -> dict[str, Any]:
     """One training with its evaluations, as JSON-able numbers."""
     options = {} if job.attempts is None else {"identification_attempts": job.attempts}
     parameters = load_parameters(job.problem, options)
@@ -209,7 +207,11 @@ def run(job: Job) -> dict[str, Any]:
 
 
 def table(results: Sequence[dict[str, Any]]) -> str:
-    """Mean over the seeds (worst seed) of the mean stage cost, after the rollouts of a column."""
+    """Mean over the seeds (worst seed) of the mean stage cost, after the rollouts of a column.
+
+    `worst field`: the largest cost on one held-out field relative to that seed's mean over them, of
+    the final policies; `diverged`: rollouts of the training; `fresh`: of the final policies.
+    """
     lines: list[str] = []
     for problem in dict.fromkeys(result["problem"] for result in results):
         chosen = [result for result in results if result["problem"] == problem]
@@ -219,106 +221,82 @@ def table(results: Sequence[dict[str, Any]]) -> str:
             lines.append(
                 f"{'problem':<12}"
                 + "".join(f"{mark + ' rollouts':>20}" for mark in marks)
-                + f"{'mean of ratios':>16}{'diverged':>10}{'fresh':>12}"
+                + f"{'mean of ratios':>16}{'worst field':>13}{'diverged':>10}{'fresh':>12}"
             )
         ratio = float(np.mean(costs[:, -1] / costs[:, 0]) - 1.0)
+        worst = max(
+            float(np.max(r["costs"][marks[-1]]) / np.mean(r["costs"][marks[-1]])) for r in chosen
+        )
         diverged = sum(result["diverged_rollouts"] for result in chosen)
         fresh = sum(result["fresh_diverged"] for result in chosen)
         count = sum(len(result["fresh_costs"]) for result in chosen)
         cells = [
-            f"{mean:.4g} ({worst:.4g})"
-            for mean, worst in zip(costs.mean(axis=0), costs.max(axis=0), strict=True)
+            f"{mean:.4g} ({largest:.4g})"
+            for mean, largest in zip(costs.mean(axis=0), costs.max(axis=0), strict=True)
         ]
         lines.append(
             f"{problem:<12}"
             + "".join(f"{cell:>20}" for cell in cells)
-            + f"{100 * ratio:>15.1f}%{diverged:>10}{f'{fresh}/{count}':>12}"
+            + f"{100 * ratio:>15.1f}%{worst:>13.2f}{diverged:>10}{f'{fresh}/{count}':>12}"
         )
     return "\n".join(lines)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--optimizer", choices=sorted(OPTIMIZERS), default="gauss_newton")
-    parser.add_argument(
-        "--problem",
-        action="append",
-        help="a shipped problem or a YAML file; all shipped ones if absent",
-    )
-    parser.add_argument("--seeds", type=int, default=6, help="number of seeds (default 6)")
-    parser.add_argument("--first-seed", type=int, default=0, help="the first seed (default 0)")
-    parser.add_argument("--iterations", type=int, default=40, help="half the rollouts (default 40)")
-    parser.add_argument(
-        "--evaluation-seed", type=int, default=2024, help="draws the held-out fields"
-    )
-    parser.add_argument("--evaluation-fields", type=int, default=10, help="held-out fields")
-    parser.add_argument(
-        "--fresh-fields",
-        type=int,
-        default=0,
-        help="further fields on which the final policy must not diverge",
-    )
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="a parameter of the optimiser, as JSON",
-    )
-    parser.add_argument(
-        "--attempts", type=int, help="identifications until one beats no control (as in a training)"
-    )
-    parser.add_argument(
-        "--features", choices=POLICY_FEATURES, default="affine", help="the law (default affine)"
-    )
-    parser.add_argument(
-        "--marks",
-        type=int,
-        nargs="+",
-        default=[],
-        metavar="N",
-        help="rollouts after which to evaluate (default: a quarter and half of the budget)",
-    )
-    parser.add_argument("--jobs", type=int, default=1, help="processes (default 1)")
-    parser.add_argument("--output", type=Path, help="write all numbers to this JSON file")
-    options = parser.parse_args(arguments)
-    settings = {}
-    for item in options.set:
-        name, _, value = item.partition("=")
-        settings[name] = json.loads(value)
-    jobs = [
+def text(result: dict[str, Any]) -> str:
+    """The table of a `run`."""
+    return table(result["results"])
+
+
+def run(
+    *,
+    optimizer: str = "gauss_newton",
+    problem: Sequence[str] = (),
+    seeds: int = 6,
+    first_seed: int = 0,
+    iterations: int = 40,
+    evaluation_seed: int = 2024,
+    evaluation_fields: int = 10,
+    fresh_fields: int = 0,
+    settings: Sequence[str] = (),
+    attempts: int | None = None,
+    features: str = "affine",
+    marks: Sequence[int] = (),
+    jobs: int = 1,
+) -> dict[str, Any]:
+    """Train and evaluate every seed of every problem; the command line explains the parameters.
+
+    ValueError if a setting is not NAME=JSON.
+    """
+    given = dict(locals())
+    options = {}
+    for item in settings:
+        name, equals, value = item.partition("=")
+        if not equals:
+            raise ValueError(f"--set is {item!r}; expected NAME=VALUE like fields=4")
+        options[name] = json.loads(value)
+    wanted = [
         Job(
-            problem,
-            options.optimizer,
+            each,
+            optimizer,
             seed,
-            options.iterations,
-            options.evaluation_seed,
-            options.evaluation_fields,
-            options.fresh_fields,
-            options.attempts,
-            options.features,
-            tuple(options.marks),
-            settings,
+            iterations,
+            evaluation_seed,
+            evaluation_fields,
+            fresh_fields,
+            attempts,
+            features,
+            tuple(marks),
+            options,
         )
-        for problem in options.problem or list(PAPER)
-        for seed in range(options.first_seed, options.first_seed + options.seeds)
+        for each in problem or PAPER
+        for seed in range(first_seed, first_seed + seeds)
     ]
     results = []
-    with ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool:
-        for result in pool.map(run, jobs):
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        for result in pool.map(train, wanted):
             costs = {mark: round(float(np.mean(c)), 4) for mark, c in result["costs"].items()}
             print(
                 f"{result['problem']} seed {result['seed']}: {costs}", file=sys.stderr, flush=True
             )
             results.append(result)
-    print(table(results))
-    if options.output:
-        options.output.write_text(
-            json.dumps({"settings": vars(options), "results": results}, default=str)
-        )
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return {"settings": given, "results": results}

@@ -8,7 +8,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from bringup.commands.common import Commands, add_json, command
+from bringup.commands.common import DEFAULTS, Commands, add_json, command
 from bringup.output import print_json
 
 
@@ -80,6 +80,7 @@ def add(commands: Commands) -> None:
     soak.add_argument(
         "--seed", type=int, default=0, metavar="S", help="of faults and trainings [0]"
     )
+    _add_optimizers(programs)
     optimum = _add(
         programs,
         "optimum",
@@ -145,6 +146,60 @@ def add(commands: Commands) -> None:
     )
     kernel.add_argument("--jax", metavar="PYTHON", help="interpreter that can import JAX")
     kernel.add_argument("--controlgym", metavar="PYTHON", help="interpreter with controlgym 1.0.0")
+
+
+def _add_optimizers(programs: Commands) -> None:
+    """The comparison of optimisers and laws; its defaults are those of the program."""
+    add = _add(
+        programs,
+        "optimizers",
+        "what an optimiser and a law reach in so many rollouts",
+        "--problem allen-cahn --features quadratic --seeds 2",
+    ).add_argument
+    add("--optimizer", choices=DEFAULTS["optimizer"].choices, help="[gauss_newton]")
+    add(
+        "--problem",
+        action="append",
+        metavar="PROBLEM",
+        help="a shipped problem or a YAML file, may be repeated [those of the paper]",
+    )
+    add(
+        "--features",
+        choices=DEFAULTS["policy_features"].choices,
+        help="the law that is adapted [affine]",
+    )
+    add("--seeds", type=int, metavar="N", help="number of seeds [6]")
+    add("--first-seed", type=int, metavar="S", help="the first seed [0]")
+    add("--iterations", type=int, metavar="N", help="half the rollouts [40]")
+    add("--evaluation-seed", type=int, metavar="S", help="draws the held-out fields [2024]")
+    add("--evaluation-fields", type=int, metavar="N", help="held-out fields [10]")
+    add(
+        "--fresh-fields",
+        type=int,
+        metavar="N",
+        help="further fields on which the final policy must not diverge [0]",
+    )
+    add(
+        "--marks",
+        type=int,
+        nargs="+",
+        metavar="N",
+        help="rollouts after which to evaluate [a quarter and half of the budget]",
+    )
+    add(
+        "--set",
+        action="append",
+        metavar="NAME=VALUE",
+        dest="settings",
+        help="a parameter of the optimiser, as JSON",
+    )
+    add(
+        "--attempts",
+        type=int,
+        metavar="N",
+        help="identifications until one beats no control [as in a training]",
+    )
+    add("--jobs", type=int, metavar="N", help="processes [1]")
 
 
 def _add(programs: Commands, name: str, text: str, example: str) -> argparse.ArgumentParser:

@@ -1,0 +1,55 @@
+"""`pdeloop bench optimizers`: the same training as everywhere else, and its table."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from bringup.bench.optimizers import Job, run, table, train
+from tests.small import SMALL, parameters, train_here
+
+
+@pytest.mark.parametrize("features", ["affine", "quadratic"])
+def test_it_is_the_training_of_the_loop(features):
+    job = Job(
+        problem=str(SMALL),
+        optimizer="gauss_newton",
+        seed=3,
+        iterations=6,
+        evaluation_seed=2024,
+        evaluation_fields=2,
+        fresh_fields=1,
+        attempts=None,
+        features=features,
+        marks=(4,),
+        options={},
+    )
+    measured = train(job)
+    options = {"seed": 3, "iterations": 6, "optimizer": "gauss_newton"}
+    training = train_here(parameters(**options, policy_features=features))
+    rows = [
+        {name: value for name, value in row.items() if name not in ("event", "seed")}
+        for row in training.history
+    ]
+    assert measured["history"] == rows
+    assert list(measured["costs"]) == ["0", "4", "12"]
+    assert np.mean(measured["costs"]["12"]) < np.mean(measured["costs"]["0"])
+    assert json.loads(json.dumps(measured)) == measured
+
+
+def test_the_table_has_means_worst_seeds_and_worst_fields():
+    common = {"problem": "p", "diverged_rollouts": 1, "fresh_diverged": 0, "fresh_costs": [1.0]}
+    results = [
+        {**common, "costs": {"0": [4.0, 4.0], "80": [1.0, 3.0]}},
+        {**common, "costs": {"0": [8.0, 8.0], "80": [2.0, 2.0]}},
+    ]
+    head, row = table(results).splitlines()
+    assert head.split()[:5] == ["problem", "0", "rollouts", "80", "rollouts"]
+    assert row.split() == ["p", "6", "(8)", "2", "(2)", "-62.5%", "1.50", "2", "0/2"]
+
+
+def test_a_setting_that_is_none_is_refused_in_one_sentence():
+    with pytest.raises(ValueError, match="--set is 'fields'; expected NAME=VALUE"):
+        run(problem=[str(SMALL)], settings=["fields"])
