@@ -91,7 +91,7 @@ class GaussNewton:
         context: Context,
         fields: int = 3,
         modes: int | None = None,
-        cubic_modes: int = 0,
+        cubic_modes: int = 12,
         learning_rate: float | None = None,
         smoothing_radius: float | None = None,
     ) -> None:
