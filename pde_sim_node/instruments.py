@@ -9,17 +9,18 @@ only estimate.
 
 With sensors the plant publishes the last d measurements, scaled,
 
-    o_k = sqrt(n_z / (n_y d)) [y_k, y_{k-1}, ..., y_{k-d+1}]        (y_0 in place of y_{-1}, ...),
+    o_k = sqrt(n_x / (n_y d)) [y_k, y_{k-1}, ..., y_{k-d+1}]        (y_0 in place of y_{-1}, ...),
 
 and as its target that of them, o_r. By this delay embedding the dynamics can be read off a state
 that is measured (Takens; for linear systems d is to reach the observability index), and who answers
 needs no memory. The scale makes q |o_k - o_r|^2, summed over an episode, the part of the stage cost
-that the sensors see: every measurement is in d of the o_k, and stands for n_z / n_y grid points.
+that the sensors see: every measurement is in d of the o_k, and stands for n_x / n_y grid points.
 
 w_k is space-time white noise on the grid: du = F(u) dt + sigma dW(x, t) has increments of
-covariance sigma^2 dt delta(x - x'), and on cells of width dx = L / n_z the delta is 1 / dx. So the
-statistics of a mode of the field depend neither on the sampling time dt nor on n_z. The flow and
-the increment are applied one after the other (Lie splitting), once a sample.
+covariance sigma^2 dt delta(x - x'), and on cells of width dx = L / n_x the delta is 1 / dx. So the
+statistics of a mode of the field depend neither on the sampling time dt nor on n_x. The flow and
+the increment are applied one after the other (Lie splitting), once a sample. A
+field of several components is forced in the one that is actuated, and measured in all.
 
 All noise is a pure function of (noise seed, field seed, step): a counter-based generator (Philox) is
 keyed with the two seeds and its counter set from the step. So an episode that is repeated, in
@@ -116,13 +117,17 @@ class InstrumentedPlant(Plant):
     def __init__(self, equation: Equation, *, instruments: Instruments, **grid: Any) -> None:
         self.instruments = instruments
         super().__init__(equation, **grid)
-        self.positions = sensor_positions(self.n_z, instruments.sensors)
-        n_y = self.positions.size
+        n_x = self.x.size
+        points = sensor_positions(n_x, instruments.sensors)
+        # A sensor measures every component at its point.
+        first = n_x * np.arange(len(equation.components))
+        self.positions = (first[:, None] + points).ravel()
         self._delays = instruments.sensor_delays if instruments.sensors else 1
-        self._scale = math.sqrt(self.n_z / (n_y * self._delays))
+        self._scale = math.sqrt(n_x / (points.size * self._delays))
         self._forcing = instruments.process_noise * math.sqrt(
-            self.sample_time * self.n_z / equation.length
+            self.sample_time * n_x / equation.length
         )
+        self._forced = slice(equation.actuated * n_x, (equation.actuated + 1) * n_x)
         self.target = self._scale * np.tile(self.target[self.positions], self._delays)
         self._seeds: list[tuple[int, int]] = []
         self._published = np.zeros((0, self.state_size))
@@ -159,10 +164,10 @@ class InstrumentedPlant(Plant):
         for m, (noise_seed, field_seed) in enumerate(self._seeds):
             if self._diverged_step[m] >= 0:
                 continue
-            draw = standard_normal(noise_seed, field_seed, step, Noise.PROCESS, self.n_z)
-            forced = self.states[m] + self._forcing * draw
+            draw = standard_normal(noise_seed, field_seed, step, Noise.PROCESS, self.x.size)
+            forced = self.states[m, self._forced] + self._forcing * draw
             if np.abs(forced).max() <= self.divergence_bound:
-                self.states[m] = forced
+                self.states[m, self._forced] = forced
             else:
                 self._diverged_step[m] = step - 1
 
@@ -179,9 +184,9 @@ class InstrumentedPlant(Plant):
         return y
 
 
-def sensor_positions(n_z: int, sensors: int) -> NDArray[np.int64]:
-    """Grid indices of equally spaced sensors, int((j + 0.5) n_z / sensors); all if there are 0."""
-    if sensors > n_z:
-        raise ValueError(f"sensors must be at most n_z = {n_z}, got {sensors}")
-    count = sensors or n_z
-    return (2 * np.arange(count) + 1) * n_z // (2 * count)
+def sensor_positions(n_x: int, sensors: int) -> NDArray[np.int64]:
+    """Grid indices of equally spaced sensors, int((j + 0.5) n_x / sensors); all if there are 0."""
+    if sensors > n_x:
+        raise ValueError(f"sensors must be at most the {n_x} grid points, got {sensors}")
+    count = sensors or n_x
+    return (2 * np.arange(count) + 1) * n_x // (2 * count)

@@ -251,7 +251,7 @@ def test_sensors_are_equally_spaced_and_as_many_as_wanted() -> None:
             assert len(set(positions.tolist())) == n_y
             assert positions[0] >= 0 and positions[-1] < n_z
             assert n_y == 1 or gaps.max() - gaps.min() <= 1
-    with pytest.raises(ValueError, match="at most n_z = 32"):
+    with pytest.raises(ValueError, match="at most the 32 grid points"):
         instrumented(sensors=33)
 
 

@@ -29,7 +29,12 @@ LEVELS: dict[str, list[dict[str, Any]]] = {
     "sensors": [
         {"sensors": sensors, "sensor_delays": delays}
         for sensors in (32, 16, 8)
-        for delays in (1, 2, 4)
+        for delays in (1, 4)
+    ],
+    "both": [
+        {"measurement_noise": level, "sensors": 64, "sensor_delays": delays}
+        for level in (0.03, 0.1)
+        for delays in (1, 4)
     ],
 }
 """What is tried, by part."""

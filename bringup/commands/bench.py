@@ -135,7 +135,7 @@ def add(commands: Commands) -> None:
     )
     beyond.add_argument("--problems", nargs="+", metavar="PROBLEM", help="[all three]")
     beyond.add_argument(
-        "--parts", nargs="+", metavar="PART", help="[ideal measurement process limit sensors]"
+        "--parts", nargs="+", metavar="PART", help="[ideal measurement process limit sensors both]"
     )
     beyond.add_argument("--seeds", type=int, default=3, metavar="N", help="[3]")
     kernel = _add(
