@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 import importlib.util
+import json
+import os
 import re
 import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from bringup.cli import main
+from loop_interfaces.model_rows import unpack
 from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
-from tests.loop_harness import ROOT, Processes
+from pde_sim_node.equations import ALLOWED
+from tests.loop_harness import ROOT, Processes, until
+from tests.topics.test_foreign import INTERFACES, code_block, documented_command
 from tests.topics.test_loop import LIMIT
 from tuner_node.seeds import Purpose, derive
 
@@ -29,9 +41,11 @@ def commands(mark: str) -> list[list[str]]:
     return [shlex.split(line) for line in block.replace("\\\n", " ").splitlines()]
 
 
-def ros_arguments(mark: str, start: str) -> list[str]:
-    (words,) = [line for line in commands(mark) if line[: len(start.split())] == start.split()]
-    return words[words.index("--ros-args") + 1 :]
+def ros_arguments(mark: str, start: str, which: int = 0) -> list[str]:
+    """The ROS arguments of the line of that block that begins with `start`."""
+    found = [line for line in commands(mark) if line[: len(start.split())] == start.split()]
+    given = found[which][found[which].index("--ros-args") + 1 :]
+    return [str(ROOT / word) if word.startswith("config/") else word for word in given]
 
 
 def example(name: str) -> Any:
@@ -46,17 +60,11 @@ def test_a_controller_of_ones_own_is_tuned(loop: Processes, tmp_path: Path) -> N
     source = (EXAMPLES / "saturated_controller.py").read_text()
     assert not re.search(r"import (loop_interfaces|pde_sim_node|controller_node|bringup)", source)
     mark = "examples/saturated_controller.py"
-    problem = str(ROOT / "config" / "problems" / "burgers.yaml")
-
-    def arguments(start: str) -> list[str]:
-        given = ros_arguments(mark, start)
-        return [problem if word == "config/problems/burgers.yaml" else word for word in given]
-
-    loop.node("pde_sim_node", *arguments("pde_sim_node"))
-    controller = arguments("python examples/saturated_controller.py")
+    loop.node("pde_sim_node", *ros_arguments(mark, "pde_sim_node"))
+    controller = ros_arguments(mark, "python examples/saturated_controller.py")
     loop.start(str(EXAMPLES / "saturated_controller.py"), "--ros-args", *controller)
     out = tmp_path / "run"
-    tuner = loop.node("tuner_node", *arguments("tuner_node"), "-p", f"out:={out}")
+    tuner = loop.node("tuner_node", *ros_arguments(mark, "tuner_node"), "-p", f"out:={out}")
     text = loop.wait(tuner, 3 * LIMIT)
 
     with np.load(out / "policy.npz") as arrays:
@@ -84,3 +92,103 @@ def test_a_controller_of_ones_own_is_tuned(loop: Processes, tmp_path: Path) -> N
     np.testing.assert_allclose([float(word) for word in found.groups()], expected, rtol=1e-5)
     assert expected[2] < expected[1] < expected[0]
     assert found.group() in PAGE
+
+
+def test_a_pde_of_ones_own_trains_from_its_file(
+    tmp_path: Path, capsys: Any, monkeypatch: Any
+) -> None:
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setenv(ALLOWED, "")  # which the command line sets
+    (command,) = [line for line in commands("--seed 0") if line[0] == "pdeloop"]
+    without = [word for word in command[1:] if "Hohenberg" not in word and word != "--equation"]
+    here = ["--in-process", "--out", str(tmp_path / "run")]
+    assert main([*without, *here]) == 1
+    assert "unknown equation 'swift-hohenberg'" in capsys.readouterr().err
+    assert main([*command[1:], *here]) == 0
+    (line,) = re.findall(r"seed 0: cost .*LQT, .* adapted", capsys.readouterr().out)
+    assert line in PAGE
+    # The run's folder names the file, which alone is not enough.
+    monkeypatch.setenv(ALLOWED, "")
+    assert main(["evaluate", str(tmp_path / "run")]) == 1
+    assert "is code, which is not run because a file names it" in capsys.readouterr().err
+    (allowed,) = [line[1] for line in commands("export PDELOOP_EQ") if line[0] == "export"]
+    monkeypatch.setenv(*allowed.split("="))
+    assert main(["evaluate", str(tmp_path / "run")]) == 0
+
+
+def test_a_pde_of_ones_own_is_offered_by_its_package(tmp_path: Path, monkeypatch: Any) -> None:
+    """What `pip install` makes of the example's pyproject.toml, and a process that has it."""
+    project = tomllib.loads((EXAMPLES / "swift_hohenberg" / "pyproject.toml").read_text())
+    entries = project["project"]["entry-points"]
+    (name, value) = next(iter(entries["pdeloop.equations"].items()))
+    assert f'[project.entry-points."pdeloop.equations"]\n{name} = "{value}"' in PAGE
+    (module,) = project["tool"]["setuptools"]["py-modules"]
+    shutil.copy(EXAMPLES / "swift_hohenberg" / f"{module}.py", tmp_path)
+    about = tmp_path / "pdeloop_swift_hohenberg-0.1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: pdeloop-swift-hohenberg\n")
+    (about / "entry_points.txt").write_text(f"[pdeloop.equations]\n{name} = {value}\n")
+    problem = EXAMPLES / "swift_hohenberg" / "swift-hohenberg.yaml"
+    options = ["--in-process", "--iterations", "1", "--optimizer", "two_point"]
+    options += ["--out", str(tmp_path / "run")]
+    done = subprocess.run(
+        [sys.executable, "-m", "bringup.cli", "train", str(problem), *options],
+        env={**os.environ, "PYTHONPATH": f"{ROOT}:{tmp_path}"},
+        capture_output=True,
+        text=True,
+        timeout=LIMIT,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "swift-hohenberg, seed 0: 1 iteration" in done.stdout
+
+
+def test_a_model_from_a_bag_of_a_foreign_plant_starts_a_training(
+    loop: Processes, tmp_path: Path
+) -> None:
+    (tmp_path / "linear_plant.py").write_text(code_block(INTERFACES, "python", "class LinearPlant"))
+    mark = "pdeloop identify --bag lab"
+    loop.start(str(tmp_path / "linear_plant.py"), name="linear_plant")
+    loop.node("controller_node", *documented_command("controller_node"))
+    recorder = loop.node("recorder_node", *ros_arguments(mark, "recorder_node"))
+    out = f"out:={tmp_path / 'first'}"
+    tuner = loop.node("tuner_node", *ros_arguments(mark, "tuner_node"), "-p", out)
+    loop.wait(tuner, 2 * LIMIT)
+    recorder.send_signal(signal.SIGINT)
+    recorder.wait(LIMIT)
+    (identify,) = [line for line in commands(mark) if line[:2] == ["pdeloop", "identify"]]
+    loop.wait(loop.pdeloop(*identify[1:]), LIMIT)
+
+    with np.load(tmp_path / "model.npz") as arrays, np.load(tmp_path / "first/policy.npz") as run:
+        rows, live = arrays["model"], run["model"]
+    assert np.array_equal(rows, live), "one exploratory episode: the controller's own model"
+    second = tmp_path / "second"
+    tuner = loop.node(
+        "tuner_node", *ros_arguments(mark, "tuner_node", which=1), "-p", f"out:={second}"
+    )
+    text = loop.wait(tuner, 2 * LIMIT)
+    assert "identify" not in [row.get("name") for row in events(second)]
+    with np.load(second / "policy.npz") as arrays:
+        assert np.array_equal(arrays["model"], rows)
+        assert np.array_equal(arrays["lqt"][0], unpack(rows[0], n_a=2).policy)
+    assert "done: cost 0.600719 without control, 0.240657 with LQT" in text
+
+
+def events(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (folder / "progress.jsonl").read_text().splitlines()]
+
+
+def test_the_rehearsal_in_real_time(loop: Processes, tmp_path: Path) -> None:
+    mark = "real_time_factor:=1.0"
+    plant = loop.node("pde_sim_node", *ros_arguments(mark, "pde_sim_node"))
+    loop.node("controller_node", *ros_arguments(mark, "controller_node"))
+    tuner = loop.node(
+        "tuner_node", *ros_arguments(mark, "tuner_node"), "-p", f"out:={tmp_path / 'run'}"
+    )
+    began = time.monotonic()
+    loop.wait(tuner, 2 * LIMIT)
+    # 8 episodes: exploration, 2 iterations of 2 rollouts, 3 controllers on 1 field; one at a time.
+    assert time.monotonic() - began > 8 * 20 * 0.05
+    until(lambda: "real time:" in loop.output(plant), LIMIT, "summary of the plant")
+    said = "real time: 168 states every 50 ms"
+    assert said in loop.output(plant), loop.output(plant)
+    assert said in PAGE
