@@ -151,7 +151,8 @@ PROBLEM = (
     Spec(
         "equation",
         "burgers",
-        "PDE of the plant: a known name, 'package.module:Class' or 'path/to/file.py:Class'",
+        "PDE of the plant: a shipped or installed name; or code that the user has to allow, "
+        "'package.module:Class' or 'path/to/file.py:Class'",
     ),
     Spec("length", 1.0, "length L of the periodic domain", positive=True, unit="m"),
     Spec(

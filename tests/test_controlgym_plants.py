@@ -84,3 +84,25 @@ def test_the_shipped_problems_have_controlgyms_sizes(
     weight = sample_time**2 if name in impulses else 1.0
     assert (values["state_weight"], values["action_weight"]) == (1.0, pytest.approx(weight))
     assert not [key for key in values if key.startswith("physical.")], "the equation's defaults"
+
+
+@pytest.mark.parametrize("name", ["kuramoto-sivashinsky", "ginzburg-landau"])
+def test_eight_equal_actuators_cannot_reach_some_growing_waves(name: str) -> None:
+    """Symmetric supports at (j + 1/2) L/8 push cos and sin of 4, 8 and 12 waves alike, or one not.
+
+    So no law with controlgym's actuators stabilises u = 0; twenty narrower ones reach every wave.
+    """
+
+    def unreached(**changes: Any) -> list[int]:
+        plant = build_plant({**load_parameters(name, {}), **changes})
+        found = []
+        for waves in range(1, 41):
+            k = 2 * np.pi * waves / plant.equation.length
+            (growth,) = plant.equation.linear_operator(np.array([k]))
+            pair = np.stack([np.cos(k * plant.x), np.sin(k * plant.x)]) @ plant.supports
+            if growth > 0 and np.linalg.svd(pair, compute_uv=False)[-1] < 1e-9:
+                found.append(waves)
+        return found
+
+    assert unreached() == [4, 8, 12]
+    assert unreached(n_a=20, actuator_width=0.05) == []

@@ -136,7 +136,7 @@ def test_a_pde_of_ones_own_is_offered_by_its_package(tmp_path: Path, monkeypatch
         env={**os.environ, "PYTHONPATH": f"{ROOT}:{tmp_path}"},
         capture_output=True,
         text=True,
-        timeout=LIMIT,
+        timeout=5 * LIMIT,
     )
     assert done.returncode == 0, done.stderr
     assert "swift-hohenberg, seed 0: 1 iteration" in done.stdout
@@ -189,6 +189,6 @@ def test_the_rehearsal_in_real_time(loop: Processes, tmp_path: Path) -> None:
     # 8 episodes: exploration, 2 iterations of 2 rollouts, 3 controllers on 1 field; one at a time.
     assert time.monotonic() - began > 8 * 20 * 0.05
     until(lambda: "real time:" in loop.output(plant), LIMIT, "summary of the plant")
-    said = "real time: 168 states every 50 ms"
+    said = "real time: 160 states every 50 ms"
     assert said in loop.output(plant), loop.output(plant)
     assert said in PAGE
