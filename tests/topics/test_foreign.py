@@ -9,17 +9,14 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from bringup.cli import main
 from loop_interfaces.model_rows import unpack
 from loop_interfaces.parameters import table
-from pde_sim_node.equations import ALLOWED
 from tests.loop_harness import ROOT, Processes
 from tests.topics.test_loop import LIMIT
 from tuner_node.seeds import Purpose, derive
 
 pytestmark = pytest.mark.topics
 INTERFACES = (ROOT / "docs" / "interfaces.md").read_text()
-README = (ROOT / "README.md").read_text()
 
 
 def code_block(page: str, language: str, mark: str) -> str:
@@ -92,19 +89,6 @@ def test_a_linear_plant_written_from_the_interface_page_is_identified_and_tuned(
     assert np.allclose([float(number) for number in found.groups()], expected, rtol=1e-5)
     assert not np.array_equal(lqt, adapted)
     assert found.group() in INTERFACES
-
-
-def test_the_readmes_own_pde_trains(tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv(ALLOWED, "")  # which the command line sets
-    (tmp_path / "fisher.py").write_text(code_block(README, "python", "class FisherKpp"))
-    (tmp_path / "fisher.yaml").write_text(code_block(README, "yaml", "fisher.py:FisherKpp"))
-    out = tmp_path / "run"
-    command = ["train", str(tmp_path / "fisher.yaml"), "--in-process", "--out", str(out)]
-    assert main(command) == 1
-    assert "is code, which is not run because a file names it" in capsys.readouterr().err
-    assert main([*command, "--equation", f"{tmp_path}/fisher.py:FisherKpp"]) == 0
-    (line,) = re.findall(r"seed 0: cost .*LQT, .* adapted", capsys.readouterr().out)
-    assert line in README
 
 
 def test_every_parameter_is_on_the_interface_page():
