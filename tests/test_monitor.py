@@ -18,7 +18,7 @@ from bringup.live import Live, announced, running
 from bringup.monitor.attention import Attention
 from bringup.monitor.commands import Call, Commands, Watch
 from bringup.monitor.curve import MOST, Curve
-from bringup.monitor.episode import COLUMNS, ROWS, Episode, rows_of
+from bringup.monitor.episode import COLUMNS, COMPONENTS, ROWS, Episode, rows_of
 from bringup.monitor.finder import Finder
 from bringup.monitor.health import Endpoint, Health, Rate
 from bringup.monitor.messages import Cursor
@@ -125,6 +125,15 @@ def test_rows_are_evenly_spaced_from_the_first_point_of_each_component_to_the_la
     for component, own in enumerate(rows - n * np.arange(components)[:, None]):
         assert len(own) == min(n, ROWS) and own[0] == 0 and own[-1] == n - 1, component
         assert n == 1 or (np.ptp(np.diff(own)) <= 1 and np.diff(own).min() >= 1)
+
+
+def test_of_very_many_delayed_measurements_the_first_are_kept():
+    measured = Frame(5, 1, 0, 0.0, np.arange(3.0 * 1000)[None], PLANT)
+    episode = Episode.begin(measured, 0, 1000)
+    episode.state(measured)
+    assert episode.fields.shape == (1, COLUMNS, 3 * COMPONENTS)
+    np.testing.assert_array_equal(episode.fields[0, 0, episode.part(1)], [3, 4, 5])
+    assert episode.part(999) == episode.part(COMPONENTS - 1)
 
 
 def test_one_component_of_the_state_is_shown_at_a_time():

@@ -19,6 +19,8 @@ COLUMNS = 512
 ROWS = 256
 LINES = 32
 """Actions that are kept: more lines than that nobody can tell apart."""
+COMPONENTS = 8
+"""Components of the state that are kept: of delayed measurements there may be very many."""
 LATE = 64
 """Columns by which actions may come later than states."""
 ROOM = 32 * 2**20
@@ -34,10 +36,12 @@ def key_of(frame: Frame) -> Key:
 
 
 def rows_of(n_z: int, components: int = 1) -> NDArray[np.intp]:
-    """Indices into a state of at most ROWS grid points of each component, evenly spaced."""
+    """Indices into a state of at most ROWS grid points of each of the first COMPONENTS components,
+    evenly spaced.
+    """
     n_x = n_z // components
     points = np.linspace(0, n_x - 1, min(n_x, ROWS)).round().astype(np.intp)
-    return (n_x * np.arange(components)[:, None] + points).ravel()
+    return (n_x * np.arange(min(components, COMPONENTS))[:, None] + points).ravel()
 
 
 def _empty(*shape: int) -> Array:
@@ -138,8 +142,9 @@ class Episode:
 
     def part(self, component: int) -> slice:
         """The rows of one component; of the last one if there are not so many."""
-        size = self.fields.shape[2] // self.components
-        component = min(component, self.components - 1)
+        kept = min(self.components, COMPONENTS)
+        size = self.fields.shape[2] // kept
+        component = min(component, kept - 1)
         return slice(component * size, (component + 1) * size)
 
     def _column(self, step: int) -> int:

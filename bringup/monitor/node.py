@@ -230,7 +230,10 @@ class MonitorNode:
     def _learn(self, values: dict[str, Any]) -> None:
         """Take a node's parameters; the tuner's may say where its run's folder is."""
         self._view.parameters(values)
-        if values.get("equation") in EQUATIONS:
+        if values.get("sensors"):
+            count = int(values.get("sensor_delays") or 1)
+            self._view.components(["y", *(f"y {k} ago" for k in range(1, count))])
+        elif values.get("equation") in EQUATIONS:
             self._view.components(EQUATIONS[values["equation"]].components)
         out = values.get("out")
         self._out = Path(out) if isinstance(out, str) and out else self._out

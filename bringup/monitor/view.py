@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from bringup.monitor.curve import Curve
+from bringup.monitor.episode import COMPONENTS
 from bringup.monitor.health import Endpoint
 from bringup.monitor.messages import Cursor, sample, target
 from bringup.monitor.watched import Watched
@@ -176,6 +177,7 @@ class View:
         """Put the status together again; call it now and then."""
         with self._lock:
             watched, chosen = self._watched, (self._environment, self._component)
+            names = watched.components[:COMPONENTS]
             watched.join(now)
             searching = self._place["domain"] is None
             status = {
@@ -186,8 +188,8 @@ class View:
                 "parameters": watched.parameters,
                 "environment": self._environment,
                 "environments": 0 if watched.shown is None else watched.shown.batch,
-                "component": min(self._component, len(watched.components) - 1),
-                "components": watched.components,
+                "component": min(self._component, len(names) - 1),
+                "components": names,
                 "rounds": round(watched.rounds.per_second(now), 2),
                 "episodes": round(watched.episodes.per_second(now), 2),
                 "nodes": watched.health.told(now),
