@@ -9,8 +9,8 @@ was computed for: all parameters of the problem must agree, and the plant must s
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from loop_interfaces.parameters import PROBLEM
 from loop_interfaces.problem import config_folder
-from pde_sim_node.build import build_plant
-from pde_sim_node.plant import MEAN_FIELD
+from pde_sim_node.build import build_equation, build_plant
+from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD
 from tuner_node.results import RunFolderError
 
 __all__ = ["FORMAT", "Reference", "bound_parameters", "find", "no_control_cost"]
@@ -32,6 +32,8 @@ IGNORED = ("problem", "learning_rate", "learning_rate_from_zero", "smoothing_rad
 """Parameters of a problem that neither the plant nor the basis U depends on."""
 AGREEMENT = 1e-6
 """Relative, of two plants' costs without control: another compiler rounds differently."""
+SAME_LAW = 1e-3
+"""Relative, of the costs of two LQT laws of one seed: rounding moves a model a little."""
 
 
 @dataclass(frozen=True)
@@ -45,23 +47,41 @@ class Reference:
     optimum: Mapping[int, Array]
     open_loop: Array
 
-    def share(self, seed: int, lqt: float, cost: float) -> float:
-        """(J_LQT - J)/(J_LQT - J_opt) of mean costs over the fields; NaN for an unknown seed.
+    def share(self, seeds: Sequence[int], lqt: Array, cost: Array) -> float | None:
+        """The share of the possible gain, of the means over seeds and fields.
 
-        NaN also where the LQT cost is not the reference's, which is then another law.
+        Parameters
+        ----------
+        seeds
+            Training seeds; those without a reference, and those whose LQT law is another one than
+            the reference's, are left out.
+        lqt, cost : (seeds, fields)
+            Mean stage costs of the LQT law and of the policy, on the reference's fields.
+
+        Returns
+        -------
+        None if no seed is left or a rollout of the others diverged.
         """
-        if seed not in self.optimum:
-            return float("nan")
-        if abs(lqt / float(self.lqt[seed].mean()) - 1) > 1e-3:
-            return float("nan")
-        best = float(self.optimum[seed].mean())
-        return (lqt - cost) / (lqt - best)
+        known = [
+            s
+            for s, seed in enumerate(seeds)
+            if seed in self.optimum
+            and np.allclose(lqt[s].mean(), self.lqt[seed].mean(), rtol=SAME_LAW, atol=0)
+        ]
+        if not known:
+            return None
+        best = float(np.mean([self.optimum[seeds[s]].mean() for s in known]))
+        start, end = float(lqt[known].mean()), float(cost[known].mean())
+        if not (end < DIVERGED_COST / self.open_loop.size and start > best):
+            return None
+        return (start - end) / (start - best)
 
 
 def bound_parameters(values: Mapping[str, Any]) -> dict[str, Any]:
     """The parameters that a reference holds for."""
     bound = {spec.name: values.get(spec.name, spec.default) for spec in PROBLEM}
-    bound |= {name: value for name, value in values.items() if name.startswith("physical.")}
+    equation = asdict(build_equation(values))
+    bound |= {f"physical.{name}": number for name, number in equation.items() if name != "length"}
     # A file of an equation may stand elsewhere.
     bound["equation"] = str(values["equation"]).rpartition("/")[2]
     bound["identification_attempts"] = values["identification_attempts"]
@@ -115,12 +135,15 @@ def find(
                     optimum=_costs(draw["optimum"], count),
                     open_loop=np.array(draw["open_loop"], dtype=np.float64),
                 )
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except _UNREADABLE as error:
         raise RunFolderError(
             f"{path} cannot be used ({error}); write it anew: pdeloop bench optimum --save "
             f"{path.parent}"
         ) from error
     return None
+
+
+_UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError)
 
 
 def _costs(rows: Mapping[str, Any], count: int) -> dict[int, Array]:

@@ -83,7 +83,7 @@ def test_axes_are_labelled_with_units_and_controllers_named(folder):
 
 
 def test_a_controller_has_the_same_colour_in_every_figure(folder):
-    from bringup.report.figures import COLOURS
+    from bringup.report.style import COLOURS
 
     for name in ("costs", "small-behaviour", "small-spectrum"):
         svg = (folder / "report" / f"{name}.svg").read_text().lower()

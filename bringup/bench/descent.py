@@ -28,7 +28,7 @@ class Descent:
 
     x: the argument; cost; iterations; evaluations: of cost and gradient; gradient_norm: |dJ/dx|/J
     at the end; last_fall: of the last WINDOW iterations, relative to the cost; converged: whether
-    that is below the tolerance (else the iterations were used up).
+    that, or (|x| |dJ/dx|/J)^2, is below the tolerance (else the iterations were used up).
     """
 
     x: Array
@@ -95,13 +95,16 @@ def descend(
         options={**options, "ftol": 0.0, "gtol": 0.0},
     )
     _, gradient = bounded(end.x)
+    norm = float(np.linalg.norm(gradient) / end.fun)
+    # A descent that comes to the bottom fast ends before its window is full of small falls. What is
+    # left to fall is of second order in the gradient.
+    flat = (norm * float(np.linalg.norm(end.x))) ** 2 < tolerance
     return Descent(
         x=end.x.reshape(x.shape),
         cost=float(end.fun),
         iterations=len(costs) - 1,
         evaluations=int(end.nfev) + 2,
-        gradient_norm=float(np.linalg.norm(gradient) / end.fun),
+        gradient_norm=norm,
         last_fall=float(fall()),
-        # A line search that finds nothing lower any more ends a descent before its window is full.
-        converged=bool(fall() < tolerance or len(costs) <= min(WINDOW, iterations)),
+        converged=bool(len(costs) > WINDOW and fall() < tolerance) or flat,
     )

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from bringup.bench.descent import Descent, descend
+from bringup.bench.descent import WINDOW, Descent, descend
 from bringup.bench.gradients import Gradients, features
 from bringup.bench.optimizers import warm_start
 from bringup.reference import FORMAT, bound_parameters, no_control_cost
@@ -82,7 +82,8 @@ def optimise_law(job: LawJob) -> dict[str, Any]:
     """The optimum of the class for the basis of one seed, and its costs on evaluation fields.
 
     L-BFGS runs in coordinates phi, theta = phi F^{-1/2}, in which the features [s; 1] of the first
-    rollouts have unit covariance.
+    rollouts have unit covariance: on a quarter of the fields first, which brings it near for a
+    quarter of the time, and then on all.
     """
     with threadpool_limits(limits=1):
         values = load_parameters(job.problem, {})
@@ -101,11 +102,16 @@ def optimise_law(job: LawJob) -> dict[str, Any]:
         root = np.linalg.cholesky(moments)
         inverse = np.linalg.inv(root)
 
-        def scaled(phi: Array) -> tuple[float, Array]:
-            cost, gradient = gradients.of_law(U, phi @ inverse, fields)
+        def scaled(phi: Array, chosen: Sequence[int]) -> tuple[float, Array]:
+            cost, gradient = gradients.of_law(U, phi @ inverse, chosen)
             return cost, gradient @ inverse.T
 
-        found = descend(scaled, theta @ root, tolerance=job.tolerance, iterations=job.iterations)
+        few = fields[: -(-len(fields) // 4)]
+        start, how = theta @ root, {"iterations": job.iterations}
+        x = descend(lambda phi: scaled(phi, few), start, tolerance=10 * job.tolerance, **how).x
+        if not np.isfinite(scaled(x, fields)[0]):
+            x = start  # good on few fields and diverging on another
+        found = descend(lambda phi: scaled(phi, fields), x, tolerance=job.tolerance, **how)
         best = found.x @ inverse
         measured = {
             seed: {
@@ -150,7 +156,7 @@ def run(
     fields: int = 16,
     evaluation_seed: Sequence[int] = (0,),
     evaluation_fields: int = 10,
-    tolerance: float = 1e-4,
+    tolerance: float = 2e-4,
     iterations: int = 1000,
     jobs: int | None = None,
     checks: bool = True,
@@ -338,12 +344,12 @@ def text(results: Sequence[Mapping[str, Any]]) -> str:
             )
     for result in results:
         ends = [*result["laws"].values(), *result["inputs"]]
-        late = max(end["last_fall"] for end in ends)
+        late = max((e["last_fall"] for e in ends if e["iterations"] > WINDOW), default=0.0)
         open_ended = sum(not end["converged"] for end in ends)
         lines.append(
             f"{result['problem']}: laws of {len(result['laws'])} seeds on "
             f"{result['settings']['fields']} fields, {max(e['iterations'] for e in ends)} "
-            f"iterations at most, the last 20 lowered no cost by more than {100 * late:.2g} %"
+            f"iterations at most, the last {WINDOW} lowered no cost by more than {100 * late:.2g} %"
             + (f"; {open_ended} did not converge" if open_ended else "")
         )
         if checks := result["checks"]:

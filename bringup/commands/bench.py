@@ -104,7 +104,7 @@ def add(commands: Commands) -> None:
         "--tolerance",
         type=float,
         metavar="SHARE",
-        help="converged when 20 iterations lower the cost by less [1e-4]",
+        help="converged when 20 iterations lower the cost by less [2e-4]",
     )
     add("--iterations", type=int, metavar="N", help="of L-BFGS, at most [1000]")
     add("--jobs", type=int, metavar="N", help="processes [one a core]")

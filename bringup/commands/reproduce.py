@@ -55,6 +55,12 @@ def _add_report(commands: Commands) -> None:
         "folder", type=Path, metavar="DIR", help="folder of a finished run or reproduction"
     )
     report.add_argument("--out", type=Path, metavar="DIR", help="[DIR/report]")
+    report.add_argument(
+        "--limits",
+        type=Path,
+        metavar="DIR",
+        help="what `pdeloop bench optimum --save DIR` wrote [that of the shipped problems]",
+    )
 
 
 def _reproduce(options: argparse.Namespace) -> int:
@@ -70,6 +76,6 @@ def _reproduce(options: argparse.Namespace) -> int:
 def _report(options: argparse.Namespace) -> int:
     from bringup.report.page import report
 
-    page = report(options.folder, options.out)
+    page = report(options.folder, options.out, options.limits)
     print(f"report in {page}")
     return 0

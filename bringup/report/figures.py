@@ -1,9 +1,4 @@
-"""The figures of a report: one function each, data in, a matplotlib figure out.
-
-The same colour (and line style) is the same controller everywhere. Colours are Okabe and Ito's,
-fields are drawn with cividis, gains with straight lines in CIELAB from white to blue and to brown:
-perceptually uniform, and readable with any colour vision.
-"""
+"""The figures of a report about one problem: one function each, data in, a matplotlib figure out."""
 
 from __future__ import annotations
 
@@ -12,146 +7,16 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from bringup.report.data import Behaviour, ProblemData
-from pde_sim_node.plant import DIVERGED_COST
+from bringup.report.style import COLOURS, FIELD_MAP, GAIN_MAP, TITLES
 
 Array = NDArray[np.float64]
 Eigenvalues = NDArray[Any]
-COLOURS = {"none": "#8C8C8C", "lqt": "#0072B2", "lqt_po": "#D55E00", "pure_po": "#009E73"}
-STYLES = {"none": ":", "lqt": "--", "lqt_po": "-", "pure_po": "-."}
-TITLES = {"none": "no control", "lqt": "LQT", "lqt_po": "LQT-PO", "pure_po": "pure PO"}
-PROBLEMS = {
-    "burgers": "Burgers",
-    "allen-cahn": "Allen-Cahn",
-    "kdv": "Korteweg-de Vries",
-    "kuramoto-sivashinsky": "Kuramoto-Sivashinsky",
-    "fisher": "Fisher-KPP",
-    "cahn-hilliard": "Cahn-Hilliard",
-    "ginzburg-landau": "Ginzburg-Landau",
-    "convection-diffusion-reaction": "convection-diffusion-reaction",
-    "wave": "wave equation",
-    "schrodinger": "Schrödinger",
-}
-FIELD_MAP = "cividis"
-STYLE: dict[Any, Any] = {
-    "font.family": "DejaVu Sans",
-    "font.size": 9,
-    "axes.titlesize": 9,
-    "axes.labelsize": 9,
-    "legend.fontsize": 8,
-    "xtick.labelsize": 8,
-    "ytick.labelsize": 8,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.linewidth": 0.7,
-    "lines.linewidth": 1.5,
-    "legend.frameon": False,
-    "svg.fonttype": "none",
-    "svg.hashsalt": "pdeloop",
-    "savefig.dpi": 200,
-    "figure.constrained_layout.use": True,
-}
-
-
-def _srgb(lab: Array) -> Array:
-    """CIELAB (D65) to sRGB, shape (..., 3)."""
-    f = (lab[..., 0] + 16) / 116
-    xyz = np.stack([f + lab[..., 1] / 500, f, f - lab[..., 2] / 200], axis=-1)
-    xyz = np.where(xyz > 6 / 29, xyz**3, 3 * (6 / 29) ** 2 * (xyz - 4 / 29))
-    xyz = xyz * np.array([0.95047, 1.0, 1.08883])
-    matrix = np.array(
-        [[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]]
-    )
-    linear = np.clip(xyz @ matrix.T, 0.0, 1.0)
-    gamma = 1.055 * linear ** (1 / 2.4) - 0.055
-    srgb: Array = np.where(linear <= 0.0031308, 12.92 * linear, gamma)
-    return srgb
-
-
-def _diverging() -> ListedColormap:
-    """Blue, white, brown, with equal steps in CIELAB."""
-    blue, white, brown = (np.array(lab) for lab in ((32, 8, -44), (97, 0, 0), (32, 28, 42)))
-    share = np.linspace(0.0, 1.0, 128)[:, None]
-    return ListedColormap(
-        np.vstack([_srgb(blue + share * (white - blue)), _srgb(white + share * (brown - white))])
-    )
-
-
-GAIN_MAP = _diverging()
-
-
-def title_of(problem: ProblemData) -> str:
-    """The problem's name as a reader writes it."""
-    return PROBLEMS.get(problem.name, problem.name)
-
-
-def training_curves(problems: Sequence[ProblemData]) -> Figure:
-    """Cost while learning, relative to LQT: mean and standard deviation over the seeds."""
-    figure, axes = _panels(len(problems), height=2.6)
-    for ax, problem in zip(axes, problems, strict=True):
-        ax.axhline(1.0, color=COLOURS["lqt"], linestyle=STYLES["lqt"], label=TITLES["lqt"])
-        low, top = 1.0, 1.0
-        for curve in problem.curves:
-            relative = curve.relative
-            known = np.isfinite(relative).any(axis=1)
-            mean, std = np.full(len(relative), np.nan), np.full(len(relative), np.nan)
-            mean[known] = np.nanmean(relative[known], axis=1)
-            std[known] = np.nanstd(relative[known], axis=1)
-            colour = COLOURS[curve.controller]
-            below = np.maximum(mean - std, mean / 10)  # the axis is logarithmic
-            ax.fill_between(
-                curve.iterations, below, mean + std, color=colour, alpha=0.2, linewidth=0
-            )
-            ax.plot(
-                curve.iterations,
-                mean,
-                color=colour,
-                linestyle=STYLES[curve.controller],
-                label=TITLES[curve.controller],
-            )
-            top = max(top, float(np.nanmax(mean + std, initial=1.0)))
-            low = min(low, float(np.nanmin(below, initial=1.0)))
-        ax.set_yscale("log")
-        ax.set_ylim(0.93 * min(low, 0.8), 1.08 * max(top, 1.25))
-        ax.yaxis.set_major_locator(LogLocator(10, subs=_ticks(top / low)))
-        ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        ax.yaxis.set_minor_locator(NullLocator())
-        ax.set_xlabel("iteration")
-        ax.set_title(title_of(problem))
-    axes[0].set_ylabel(problems[0].curve_label)
-    _legend_above(figure, axes)
-    return figure
-
-
-def bars(problems: Sequence[ProblemData]) -> Figure:
-    """Mean stage cost of each controller over seeds and fields, with the standard deviation."""
-    figure, axes = _panels(len(problems), height=2.8)
-    for ax, problem in zip(axes, problems, strict=True):
-        names = list(problem.costs)
-        high = 0.0
-        for i, name in enumerate(names):
-            costs = problem.costs[name]
-            good = costs[costs < DIVERGED_COST]
-            if not good.size:
-                ax.text(i, 0, "diverged", ha="center", va="bottom", rotation=90)
-                continue
-            mean, std = float(good.mean()), float(good.std())
-            ax.bar(i, mean, color=COLOURS[name], width=0.72)
-            ax.errorbar(i, mean, std, color="black", linewidth=0.9, capsize=3)
-            ax.text(i, mean + std, f"{mean:.3g}", ha="center", va="bottom", fontsize=8)
-            high = max(high, mean + std)
-        ax.set_ylim(0, 1.12 * high)
-        ax.set_xticks(range(len(names)), [TITLES[name].replace(" ", "\n", 1) for name in names])
-        ax.tick_params(axis="x", length=0)
-        ax.set_title(title_of(problem))
-    axes[0].set_ylabel("mean stage cost")
-    return figure
 
 
 def behaviour(problem: ProblemData) -> Figure:
@@ -277,7 +142,7 @@ def spectrum(problem: ProblemData) -> Figure:
         whole.set_title(f"{TITLES[name]}: {symbols.get(name, symbols['lqt'])}\nradius {radius:.4f}")
         detail.set_title("around 1")
         detail.set_xlabel("real part")
-        detail.tick_params(axis="x", rotation=30)
+        detail.xaxis.set_major_locator(MaxNLocator(4))
     for ax in grid[:, 0]:
         ax.set_ylabel("imaginary part")
     return figure
@@ -302,31 +167,6 @@ def _eigenvalues(ax: Axes, found: Sequence[Eigenvalues], name: str, shown: int) 
             zorder=3 if s == shown else 2,
         )
     ax.set_aspect("equal")
-
-
-def _panels(count: int, height: float) -> tuple[Figure, list[Axes]]:
-    figure = Figure(figsize=(max(2.35 * count + 0.5, 3.6), height))
-    return figure, list(figure.subplots(1, count, squeeze=False)[0])
-
-
-def _ticks(ratio: float) -> tuple[float, ...]:
-    """Where a logarithmic axis over this ratio has its ticks, within a decade."""
-    if ratio > 30:
-        return (1.0, 3.0)
-    if ratio > 6:
-        return (1.0, 2.0, 5.0)
-    return (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
-
-
-def _legend_above(figure: Figure, axes: Sequence[Axes]) -> None:
-    entries = {
-        label: handle
-        for ax in axes
-        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
-    }
-    figure.legend(
-        list(entries.values()), list(entries), loc="outside upper center", ncols=len(entries)
-    )
 
 
 def _field(

@@ -20,13 +20,16 @@ from tuner_node.results import RunFolderError
 PAGE = "index.html"
 
 
-def report(folder: Path, out: Path | None) -> Path:
-    """Write the report of the run or reproduction in `folder`; returns the page's path."""
+def report(folder: Path, out: Path | None, limits: Path | None = None) -> Path:
+    """Write the report of the run or reproduction in `folder`; returns the page's path.
+
+    limits: see `gather`.
+    """
     import matplotlib
 
-    from bringup.report.figures import STYLE
+    from bringup.report.style import STYLE
 
-    data = gather(folder)
+    data = gather(folder, limits)
     target = out or folder / "report"
     inlined: list[tuple[str, str, bytes]] = []
     try:
@@ -47,26 +50,42 @@ def report(folder: Path, out: Path | None) -> Path:
 
 def _figures(data: ReportData) -> Iterator[tuple[str, str, Any]]:
     """Name, caption and figure, one after the other."""
-    from bringup.report import figures
+    from bringup.report import figures, learning
+    from bringup.report.style import title_of
 
-    learning = [problem for problem in data.problems if problem.curves]
-    if learning:
-        seeds = max(problem.seeds for problem in learning)
+    learned = [problem for problem in data.problems if problem.curves]
+    known = any(problem.share("lqt") is not None for problem in data.problems)
+    limits = (
+        " Best of class: the law with these reduced states that exact gradients find; open-loop "
+        "limit: the optimal inputs of each field."
+    ) * known
+    if learned:
+        seeds = max(problem.seeds for problem in learned)
         over = f"Line and band: mean and standard deviation over {seeds} seeds. " * (seeds > 1)
         yield (
             "training-curves",
-            f"Cost while learning, divided by the cost of LQT. {over}Lower is better.",
-            figures.training_curves(learning),
+            "Cost against the rollouts used to learn, divided by the cost of LQT. "
+            f"{over}Lower is better.",
+            learning.training_curves(learned),
         )
     yield (
         "costs",
         "Mean stage cost of each controller after the last iteration, over the sampled initial "
-        "fields and the seeds, with the standard deviation.",
-        figures.bars(data.problems),
+        f"fields and the seeds, with the standard deviation.{limits}",
+        learning.bars(data.problems),
     )
     for problem in data.problems:
-        name, prefix = figures.title_of(problem), problem.name
+        name, prefix = title_of(problem), problem.name
         seed = int(problem.values["seed"]) + problem.shown
+        if problem.steps is not None:
+            accepted = int(problem.steps.accepted.sum())
+            yield (
+                f"{prefix}-steps",
+                f"{name} (seed {seed}): {len(problem.steps.accepted)} steps were tried and "
+                f"{accepted} accepted; the damping, which a rejection raises; and the relative "
+                "error of the best fitted model in predicting how measured trajectories differ.",
+                learning.steps(problem, problem.steps),
+            )
         yield (
             f"{prefix}-behaviour",
             f"{name}, from the mean initial field (seed {seed}): the field in space and time, the "
@@ -117,7 +136,7 @@ def _page(data: ReportData, pictures: list[tuple[str, str, bytes]]) -> str:
 
 
 def _results(data: ReportData) -> str:
-    from bringup.report.figures import PROBLEMS, TITLES
+    from bringup.report.style import PROBLEMS, TITLES
 
     if data.rows:
         names: tuple[str, ...] = ("none", "lqt", "lqt_po", "pure_po")
@@ -150,6 +169,41 @@ def _results(data: ReportData) -> str:
         "<h2>Mean stage cost</h2>"
         + _table(head, rows)
         + "<p>Mean and standard deviation over seeds and sampled initial fields.</p>"
+        + _gain(data)
+    )
+
+
+def _gain(data: ReportData) -> str:
+    """The share of the possible gain, of the problems whose limits are known."""
+    from bringup.report.style import TITLES, title_of
+
+    rows = []
+    for problem in data.problems:
+        if problem.reference is None or problem.share("lqt") is None:
+            continue
+        first = int(problem.values["seed"])
+        known = problem.reference.optimum
+        best = [known[s].mean() for s in range(first, first + problem.seeds) if s in known]
+        for name in problem.adapted:
+            share = problem.share(name)
+            rows.append(
+                (
+                    title_of(problem),
+                    TITLES[name],
+                    "diverged" if share is None else f"{100 * share:.1f} %",
+                    f"{sum(best) / len(best):.4g}",
+                    f"{problem.reference.open_loop.mean():.4g}",
+                )
+            )
+    if not rows:
+        return ""
+    return (
+        "<h2>Share of the possible gain</h2>"
+        + _table(("problem", "", "share", TITLES["optimum"], TITLES["open_loop"]), rows)
+        + "<p>(J<sub>LQT</sub> - J)/(J<sub>LQT</sub> - J<sub>opt</sub>) with J<sub>opt</sub> the "
+        "least cost of the policy class a = K<sub>a</sub> Uᵀz + b, found with exact gradients of "
+        "the plant (pdeloop bench optimum). The open-loop limit, the optimal inputs of each field "
+        "when it is known beforehand, is for any controller.</p>"
     )
 
 

@@ -234,6 +234,8 @@ class GaussNewton:
         else:
             return False
         row["accepted"] = self._accepted
+        if np.isfinite(trial) and np.isfinite(incumbent):
+            row["relative_cost"] = trial / incumbent
         self._trials[:] = _NONE
         self._proposed = False
         return True
