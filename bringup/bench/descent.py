@@ -26,9 +26,9 @@ WINDOW = 20
 class Descent:
     """Where a descent ended, and how far it had come.
 
-    x: the argument; cost; iterations; evaluations: of cost and gradient; gradient_norm: |dJ/dx|/J
-    at the end; last_fall: of the last WINDOW iterations, relative to the cost; converged: whether
-    that, or (|x| |dJ/dx|/J)^2, is below the tolerance (else the iterations were used up).
+    x: the argument; cost; iterations; evaluations: of cost and gradient; gradient_norm: |x|
+    |dJ/dx|/J at the end; last_fall: of the last WINDOW iterations, relative to the cost; converged: whether
+    that, or the square of the gradient norm, is below the tolerance (else the iterations were used up).
     """
 
     x: Array
@@ -95,10 +95,10 @@ def descend(
         options={**options, "ftol": 0.0, "gtol": 0.0},
     )
     _, gradient = bounded(end.x)
-    norm = float(np.linalg.norm(gradient) / end.fun)
+    norm = float(np.linalg.norm(end.x) * np.linalg.norm(gradient) / end.fun)
     # A descent that comes to the bottom fast ends before its window is full of small falls. What is
     # left to fall is of second order in the gradient.
-    flat = (norm * float(np.linalg.norm(end.x))) ** 2 < tolerance
+    flat = norm**2 < tolerance
     return Descent(
         x=end.x.reshape(x.shape),
         cost=float(end.fun),

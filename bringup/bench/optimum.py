@@ -18,7 +18,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
@@ -45,6 +45,10 @@ TRAINING_SEED = 7000
 """Draws the fields that a law is optimised on: no evaluation uses it."""
 RIDGE = 1e-2
 """Of the scaling of a law's gains, relative to the mean square of the features."""
+
+
+FLOOR = 1e-4
+"""Of the eigenvalues of the Hessian in the scaling, relative to the largest."""
 
 
 @dataclass(frozen=True)
@@ -81,9 +85,9 @@ def evaluation_seeds(seed: int, fields: int) -> list[int]:
 def optimise_law(job: LawJob) -> dict[str, Any]:
     """The optimum of the class for the basis of one seed, and its costs on evaluation fields.
 
-    L-BFGS runs in coordinates phi, theta = phi F^{-1/2}, in which the features [s; 1] of the first
-    rollouts have unit covariance: on a quarter of the fields first, which brings it near for a
-    quarter of the time, and then on all.
+    L-BFGS runs on a quarter of the fields first, in coordinates in which the features [s; 1] have
+    unit covariance, and then on all, in coordinates in which the Hessian found there is the unit
+    matrix (differences of exact gradients): what is left is well conditioned and takes few steps.
     """
     with threadpool_limits(limits=1):
         values = load_parameters(job.problem, {})
@@ -99,20 +103,30 @@ def optimise_law(job: LawJob) -> dict[str, Any]:
         rows = features(U, target, path.states).reshape(-1, n_s + 1)
         moments = rows.T @ rows / len(rows)
         moments += RIDGE * np.trace(moments) / (n_s + 1) * np.eye(n_s + 1)
-        root = np.linalg.cholesky(moments)
-        inverse = np.linalg.inv(root)
+        scale: Array = np.kron(np.eye(plant.n_a), np.linalg.inv(np.linalg.cholesky(moments)).T)
 
-        def scaled(phi: Array, chosen: Sequence[int]) -> tuple[float, Array]:
-            cost, gradient = gradients.of_law(U, phi @ inverse, chosen)
-            return cost, gradient @ inverse.T
+        def cost(chosen: Sequence[int], scale: Array) -> Callable[[Array], tuple[float, Array]]:
+            """J and its gradient at theta = scale x."""
 
-        few = fields[: -(-len(fields) // 4)]
-        start, how = theta @ root, {"iterations": job.iterations}
-        x = descend(lambda phi: scaled(phi, few), start, tolerance=10 * job.tolerance, **how).x
-        if not np.isfinite(scaled(x, fields)[0]):
-            x = start  # good on few fields and diverging on another
-        found = descend(lambda phi: scaled(phi, fields), x, tolerance=job.tolerance, **how)
-        best = found.x @ inverse
+            def function(x: Array) -> tuple[float, Array]:
+                value, gradient = gradients.of_law(U, (scale @ x).reshape(theta.shape), chosen)
+                return value, scale.T @ gradient.ravel()
+
+            return function
+
+        few = cost(fields[: -(-len(fields) // 4)], scale)
+        how = {"iterations": job.iterations}
+        near = descend(
+            few, np.linalg.solve(scale, theta.ravel()), tolerance=10 * job.tolerance, **how
+        )
+        start = scale @ near.x
+        if not np.isfinite(cost(fields, scale)(near.x)[0]):
+            start = theta.ravel()  # good on few fields and diverging on another
+        scale = scale @ inverse_root(hessian(few, near.x))
+        found = descend(
+            cost(fields, scale), np.linalg.solve(scale, start), tolerance=job.tolerance, **how
+        )
+        best = (scale @ found.x).reshape(theta.shape)
         measured = {
             seed: {
                 name: gradients.law(
@@ -123,6 +137,22 @@ def optimise_law(job: LawJob) -> dict[str, Any]:
             for seed in job.evaluations
         }
     return {"U": U, "theta": best, "costs": measured, **_summary(found)}
+
+
+def hessian(function: Callable[[Array], tuple[float, Array]], x: Array) -> Array:
+    """The symmetric part of the differences of exact gradients, (p, p)."""
+    step = 1e-4 * max(float(np.linalg.norm(x)), 1e-3)
+    rows = [function(x + e)[1] - function(x - e)[1] for e in step * np.eye(x.size)]
+    differences = np.stack(rows) / (2 * step)
+    return 0.5 * (differences + differences.T)
+
+
+def inverse_root(matrix: Array) -> Array:
+    """|H|^{-1/2} for a scaling: of the magnitudes of the eigenvalues, none below FLOOR the largest."""
+    values, vectors = np.linalg.eigh(matrix)
+    magnitudes = np.maximum(np.abs(values), FLOOR * np.abs(values).max())
+    root: Array = vectors / np.sqrt(magnitudes / magnitudes.max())
+    return root
 
 
 def optimise_inputs(job: InputJob) -> dict[str, Any]:
