@@ -27,8 +27,9 @@ class Descent:
     """Where a descent ended, and how far it had come.
 
     x: the argument; cost; iterations; evaluations: of cost and gradient; gradient_norm: |x|
-    |dJ/dx|/J at the end; last_fall: of the last WINDOW iterations, relative to the cost; converged: whether
-    that, or the square of the gradient norm, is below the tolerance (else the iterations were used up).
+    |dJ/dx|/J at the end; last_fall: of the last WINDOW iterations, relative to the cost; converged:
+    whether that, or the gradient norm's square, is below the tolerance (else the iterations were
+    used up).
     """
 
     x: Array

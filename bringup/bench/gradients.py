@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pde_sim_node.adjoint import Adjoint
+from pde_sim_node.instruments import InstrumentedPlant
 from pde_sim_node.plant import Plant
 
 __all__ = ["Gradients", "features"]
@@ -58,9 +59,19 @@ class Gradients:
     ----------
     plant
         Used for the rollouts, which end its episode.
+
+    Raises
+    ------
+    ValueError
+        The plant has noise, limits or sensors, or an equation without an adjoint.
     """
 
     def __init__(self, plant: Plant) -> None:
+        if isinstance(plant, InstrumentedPlant):
+            raise ValueError(
+                "exact gradients are of a plant without noise, limits and sensors: leave "
+                "measurement_noise, process_noise, action_limit and sensors at 0"
+            )
         self.plant = plant
         self._adjoint = Adjoint(plant)
 

@@ -4,7 +4,8 @@
 
 For every seed: an exploratory episode, the reduced model and its tracking gains, 2 * iterations
 rollouts of the optimiser, and then the cost of its policy on held-out initial fields that no
-optimiser has seen. Prints a table; `--out` writes all numbers as JSON. No topics, no nodes: what is
+optimiser has seen, and the share of the possible gain where the limit is known (`pdeloop bench
+optimum`). Prints a table; `--out` writes all numbers as JSON. No topics, no nodes: what is
 measured is the optimiser and the law that it adapts.
 """
 
@@ -13,7 +14,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -23,6 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bringup.reference import Reference, find
 from bringup.reproduce.experiment import PAPER
 from controller_node.dmdc import identify
 from controller_node.lqt import track
@@ -206,13 +208,17 @@ def train(job: Job) -> dict[str, Any]:
     }
 
 
-def table(results: Sequence[dict[str, Any]]) -> str:
+def table(
+    results: Sequence[dict[str, Any]], references: Mapping[str, Reference | None] | None = None
+) -> str:
     """Mean over the seeds (worst seed) of the mean stage cost, after the rollouts of a column.
 
     `worst field`: the largest cost on one held-out field relative to that seed's mean over them, of
     the final policies; `diverged`: rollouts of the training; `fresh`: of the final policies.
+    references: by problem, for the share of the possible gain; `-` where there is none.
     """
     lines: list[str] = []
+    references = dict(references or {})
     for problem in dict.fromkeys(result["problem"] for result in results):
         chosen = [result for result in results if result["problem"] == problem]
         marks = sorted(chosen[0]["costs"], key=int)
@@ -221,7 +227,7 @@ def table(results: Sequence[dict[str, Any]]) -> str:
             lines.append(
                 f"{'problem':<12}"
                 + "".join(f"{mark + ' rollouts':>20}" for mark in marks)
-                + f"{'mean of ratios':>16}{'worst field':>13}{'diverged':>10}{'fresh':>12}"
+                + f"{'mean of ratios':>16}{'share':>9}{'worst field':>13}{'diverged':>10}{'fresh':>12}"
             )
         ratio = float(np.mean(costs[:, -1] / costs[:, 0]) - 1.0)
         worst = max(
@@ -234,17 +240,33 @@ def table(results: Sequence[dict[str, Any]]) -> str:
             f"{mean:.4g} ({largest:.4g})"
             for mean, largest in zip(costs.mean(axis=0), costs.max(axis=0), strict=True)
         ]
+        share = None
+        if (reference := references.get(problem)) is not None:
+            seeds = [int(result["seed"]) for result in chosen]
+            first, last = (np.array([r["costs"][m] for r in chosen]) for m in (marks[0], marks[-1]))
+            share = reference.share(seeds, first, last)
+        gain = "-" if share is None else f"{100 * share:.1f}%"
         lines.append(
             f"{problem:<12}"
             + "".join(f"{cell:>20}" for cell in cells)
-            + f"{100 * ratio:>15.1f}%{worst:>13.2f}{diverged:>10}{f'{fresh}/{count}':>12}"
+            + f"{100 * ratio:>15.1f}%{gain:>9}{worst:>13.2f}{diverged:>10}{f'{fresh}/{count}':>12}"
         )
     return "\n".join(lines)
 
 
 def text(result: dict[str, Any]) -> str:
     """The table of a `run`."""
-    return table(result["results"])
+    results, settings = result["results"], result["settings"]
+    problems = {row["problem"]: reference_of(row["problem"], settings) for row in results}
+    return table(results, problems)
+
+
+def reference_of(problem: str, settings: Mapping[str, Any]) -> Reference | None:
+    """The limits for an evaluation, where `pdeloop bench optimum` has computed them."""
+    names = {"attempts": "identification_attempts"}
+    names |= {name: name for name in ("evaluation_seed", "evaluation_fields")}
+    given = {new: settings[name] for name, new in names.items() if settings[name] is not None}
+    return find(load_parameters(problem, given))
 
 
 def run(

@@ -103,7 +103,9 @@ def optimise_law(job: LawJob) -> dict[str, Any]:
         rows = features(U, target, path.states).reshape(-1, n_s + 1)
         moments = rows.T @ rows / len(rows)
         moments += RIDGE * np.trace(moments) / (n_s + 1) * np.eye(n_s + 1)
-        scale: Array = np.kron(np.eye(plant.n_a), np.linalg.inv(np.linalg.cholesky(moments)).T)
+        scale: Array = np.kron(
+            np.eye(plant.n_a), np.linalg.inv(np.linalg.cholesky(moments)).T
+        ).astype(np.float64)
 
         def cost(chosen: Sequence[int], scale: Array) -> Callable[[Array], tuple[float, Array]]:
             """J and its gradient at theta = scale x."""
@@ -116,16 +118,14 @@ def optimise_law(job: LawJob) -> dict[str, Any]:
 
         few = cost(fields[: -(-len(fields) // 4)], scale)
         how = {"iterations": job.iterations}
-        near = descend(
-            few, np.linalg.solve(scale, theta.ravel()), tolerance=10 * job.tolerance, **how
-        )
+        first: Array = np.linalg.solve(scale, theta.ravel()).astype(np.float64)
+        near = descend(few, first, tolerance=10 * job.tolerance, **how)
         start = scale @ near.x
         if not np.isfinite(cost(fields, scale)(near.x)[0]):
             start = theta.ravel()  # good on few fields and diverging on another
         scale = scale @ inverse_root(hessian(few, near.x))
-        found = descend(
-            cost(fields, scale), np.linalg.solve(scale, start), tolerance=job.tolerance, **how
-        )
+        first = np.linalg.solve(scale, start).astype(np.float64)
+        found = descend(cost(fields, scale), first, tolerance=job.tolerance, **how)
         best = (scale @ found.x).reshape(theta.shape)
         measured = {
             seed: {

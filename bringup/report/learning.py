@@ -127,7 +127,8 @@ def _candidates(ax: Axes, shown: Steps) -> None:
     edge = 1.5
     colour, rejected = COLOURS["lqt_po"], ~shown.accepted
     inside = rejected & (shown.relative < edge)
-    outside = rejected & ~inside
+    # Without any number the run was recorded before it was kept: nothing to draw.
+    outside = rejected & ~inside & np.isfinite(shown.relative).any()
     ax.axhline(1.0, color="0.6", linestyle=":", linewidth=1)
     ax.plot(
         shown.decided,
