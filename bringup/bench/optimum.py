@@ -33,7 +33,8 @@ from bringup.bench.descent import WINDOW, Descent, descend
 from bringup.bench.gradients import Gradients, features
 from bringup.bench.optimizers import warm_start
 from bringup.reference import FORMAT, bound_parameters, no_control_cost
-from loop_interfaces.problem import load_parameters, shipped_problems
+from bringup.reproduce.experiment import PAPER
+from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from tuner_node.results import RunFolderError, versions
 from tuner_node.seeds import Purpose, derive
@@ -197,7 +198,7 @@ def run(
     Parameters
     ----------
     problems
-        Shipped names or YAML files; none: all that are shipped.
+        Shipped names or YAML files; none: the paper's.
     seeds, first_seed
         Trainings whose basis U is used.
     fields
@@ -238,7 +239,7 @@ def run(
     # Processes, as L-BFGS and the loop over the steps hold the interpreter's lock.
     cores = jobs or len(os.sched_getaffinity(0))
     with ProcessPoolExecutor(cores, mp_context=get_context("spawn")) as pool:
-        for problem in problems or tuple(shipped_problems()):
+        for problem in problems or tuple(PAPER):
             values = load_parameters(problem, {})
             laws: dict[Any, LawJob] = {
                 seed: law(problem, seed, fields) for seed in range(first_seed, first_seed + seeds)

@@ -88,7 +88,7 @@ def add(commands: Commands) -> None:
         "burgers --seeds 1 --fields 4",
     )
     add = optimum.add_argument
-    add("problems", nargs="*", metavar="PROBLEM", help="shipped names or YAML files [all shipped]")
+    add("problems", nargs="*", metavar="PROBLEM", help="shipped names or YAML files [the paper's]")
     add("--seeds", type=int, metavar="N", help="trainings whose basis U is used [6]")
     add("--first-seed", type=int, metavar="S", help="the first of them [0]")
     add("--fields", type=int, metavar="M", help="initial fields a law is optimised on [16]")
