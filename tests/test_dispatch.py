@@ -237,9 +237,18 @@ def test_a_paused_pair_gets_no_new_episode_and_loses_none():
 def test_a_plant_that_left_in_a_pause_is_not_paused_when_it_is_back():
     served = dispatcher()
     served.paused(0, said(1.0), 1.0)
-    assert served.assign(batch(1), 1.5) == []
     served.presence(0, ("plant",), 2.0)
-    assert len(starts(served.presence(0, (), 3.0))) == 1
+    served.presence(0, (), 3.0)
+    assert served.paused_pairs(3.0) == []
+
+
+def test_the_only_pair_gets_its_next_episode_in_a_pause_too_so_that_it_can_be_stepped_through():
+    served = dispatcher()
+    served.paused(0, said(1.0), 1.0)
+    ((_, first),) = starts(served.assign(batch(1), 1.5))
+    served.cost(0, costs_of(first), 2.0)
+    served.result()
+    assert len(starts(served.assign(batch(1), 2.5))) == 1
 
 
 @pytest.mark.parametrize("values", [[], [0.5], [1.0, 1.0]])

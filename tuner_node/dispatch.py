@@ -175,7 +175,10 @@ class Dispatcher:
         return self._hand_out(now)
 
     def paused(self, pair: int, frame: Frame, now: float) -> list[Order]:
-        """Learn whether a pair's plant is paused: it is not silent then, and gets no new episode."""
+        """Learn whether a pair's plant is paused: it is not silent then.
+
+        It gets a new episode only if no other pair can take it, so that it can be stepped through.
+        """
         if frame.values.shape != (1,) or frame.values[0] not in (0.0, 1.0):
             raise FrameError(f"expected one number, 0 or 1, got {frame.values.tolist()}")
         if self.plant in (UNKNOWN_PLANT, frame.plant):
@@ -346,8 +349,9 @@ class Dispatcher:
         orders: list[Order] = []
         if self.held:
             return orders
+        others = any(now >= pair.paused_until for pair in self._present())
         for number, pair in enumerate(self.pairs):
-            if pair.chunk is not None or pair.missing or now < pair.paused_until:
+            if pair.chunk is not None or pair.missing or (others and now < pair.paused_until):
                 continue
             if not self._waiting:
                 self._take_from_the_absent()

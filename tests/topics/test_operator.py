@@ -33,7 +33,7 @@ def test_a_paused_and_stepped_plant_gives_the_same_policy_and_nobody_complains(
     out = tmp_path / "run"
     with operator(loop) as desk:
         running["tuner"] = start_tuner(loop, out, iterations=ITERATIONS, episode_timeout=2.0)
-        until(lambda: iterations_done(out) >= 20, LIMIT, "iteration 20")
+        until(lambda: iterations_done(out) >= 20, LONG, "iteration 20")
         desk.call("/pde_sim_node/pause")
         until(lambda: desk.values("pde_sim_node").get("paused") == "yes", LIMIT, "paused plant")
         done = iterations_done(out)
@@ -76,7 +76,7 @@ def test_a_controller_that_restarts_while_the_plant_is_paused_changes_nothing(
     out = tmp_path / "run"
     with operator(loop) as desk:
         tuner = start_tuner(loop, out, iterations=ITERATIONS)
-        until(lambda: iterations_done(out) >= 20, LIMIT, "iteration 20")
+        until(lambda: iterations_done(out) >= 20, LONG, "iteration 20")
         desk.call("/pde_sim_node/pause")
         running["controller"].send_signal(signal.SIGKILL)
         running["controller"].wait()
@@ -92,7 +92,7 @@ def test_a_paused_tuner_begins_no_episode_and_keeps_the_plant(loop: Processes, t
     out = tmp_path / "run"
     with operator(loop) as desk:
         tuner = start_tuner(loop, out, iterations=ITERATIONS)
-        until(lambda: iterations_done(out) >= 20, LIMIT, "iteration 20")
+        until(lambda: iterations_done(out) >= 20, LONG, "iteration 20")
         desk.call("/tuner_node/pause")
         until(
             lambda: desk.values("tuner_node").get("episodes under way") == "0", LIMIT, "quiet loop"
@@ -122,7 +122,7 @@ def test_a_tuner_that_was_asked_to_stop_is_continued_to_the_same_policy(
     out = tmp_path / "run"
     with operator(loop) as desk:
         tuner = start_tuner(loop, out, iterations=ITERATIONS)
-        until(lambda: iterations_done(out) >= 20, LIMIT, "iteration 20")
+        until(lambda: iterations_done(out) >= 20, LONG, "iteration 20")
         if paused:
             desk.call("/tuner_node/pause")
         desk.call("/tuner_node/stop")
@@ -142,7 +142,7 @@ def test_the_command_line_ends_with_a_stopped_tuner_and_continues(loop: Processe
     options = ("--iterations", str(ITERATIONS), "--optimizer", "two_point", "--out", str(out))
     with operator(loop) as desk:
         run = loop.pdeloop("train", str(SMALL), *options)
-        until(lambda: iterations_done(out) >= 20, LIMIT, "iteration 20")
+        until(lambda: iterations_done(out) >= 20, LONG, "iteration 20")
         desk.call("/tuner_node/stop")
         text = loop.wait(run, 15.0, code=130)
     assert f"stopped by request; continue with: pdeloop train --resume {out}" in text
