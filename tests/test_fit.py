@@ -158,7 +158,6 @@ def test_gradient_knows_of_saturation() -> None:
         path,
         model.jacobians(path.x),
         model.B,
-        THETA[:, :N_S],
         target=TARGET,
         state_weight=q,
         action_weight=r,
