@@ -47,7 +47,7 @@ def test_the_table_has_means_worst_seeds_and_worst_fields():
     ]
     head, row = table(results).splitlines()
     assert head.split()[:5] == ["problem", "0", "rollouts", "80", "rollouts"]
-    assert row.split() == ["p", "6", "(8)", "2", "(2)", "-62.5%", "1.50", "2", "0/2"]
+    assert row.split() == ["p", "6", "(8)", "2", "(2)", "-62.5%", "-", "1.50", "2", "0/2"]
 
 
 def test_a_setting_that_is_none_is_refused_in_one_sentence():
