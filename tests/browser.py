@@ -16,6 +16,8 @@ from typing import Any
 
 import aiohttp
 
+from bringup.supervisor import die_with_parent
+
 COMMAND = [
     "chromium",
     "--headless",
@@ -166,6 +168,7 @@ def browser(folder: Path) -> Iterator[Browser]:
             stdout=log,
             stderr=log,
             start_new_session=True,
+            preexec_fn=die_with_parent,
         )
     port_file = profile / "DevToolsActivePort"
     try:
