@@ -302,3 +302,28 @@ def test_a_reduced_model_larger_than_the_default_number_of_modes_is_adapted() ->
     assert training.policies().shape == (1, 8, 80)
     _, lqt, adapted = training.evaluation.mean(axis=2)[0]
     assert adapted < lqt
+
+
+def test_small_steps_are_judged_on_more_fields_and_survive_a_checkpoint() -> None:
+    plant = Plant()
+    optimizer = make(plant, iterations=20, most_fields=6)
+    counts, asked_on = [], set()
+    middle = None
+    while not optimizer.done:
+        asked = optimizer.ask()
+        asked_on |= {rollout.field_seed for rollout in asked}
+        optimizer.tell(measure(plant, asked))
+        counts.append(optimizer.state()["fields"].size)
+        if middle is None and counts[-1] == 4:
+            middle = optimizer.state()
+    # Large steps first, on M fields; then, near the optimum, on more, at most twice as many.
+    assert counts[0] == 3
+    assert counts == sorted(counts)
+    assert 3 < counts[-1] <= 6
+    assert len(asked_on) >= counts[-1]
+    assert middle is not None
+    again = make(plant, iterations=20, most_fields=6)
+    again.restore(middle)
+    while not again.done:
+        again.tell(measure(plant, again.ask()))
+    assert np.array_equal(again.best_policy, optimizer.best_policy)

@@ -49,6 +49,9 @@ _DAMPING = (1e-4, 1.0, 100.0)  # smallest, first, largest after a rejection
 _ABORT = 1.05
 _MODES = 32
 _MEMORY = 40
+# An accepted step that gains less than this share of the cost is small: what is left to gain is less
+# than how much fields differ, so more of them have to judge.
+_SMALL = 0.02
 _NONE = -1
 # Attributes that a checkpoint holds besides the policies and the records.
 _STAMPS = ("fields", "incumbents", "trials", "others")
@@ -71,6 +74,9 @@ class GaussNewton:
     fields : int
         M, initial fields that judge a policy: more fit the distribution better, at M rollouts a
         step.
+    most_fields : int, optional
+        Up to how many they grow, one after each accepted step that gains less than 2 % of the cost;
+        they stay M without it.
     modes : int, optional
         Coordinates of the fitted model, at least n_s; 32 by default, or n_s where that is more.
     cubic_modes : int
@@ -90,6 +96,7 @@ class GaussNewton:
         iterations: int,
         context: Context,
         fields: int = 3,
+        most_fields: int | None = None,
         modes: int | None = None,
         cubic_modes: int = 12,
         learning_rate: float | None = None,
@@ -103,6 +110,7 @@ class GaussNewton:
         self._proposer = Proposer(context, self._policy, modes, min(cubic_modes, modes))
         self._seed = seed
         self._budget = 2 * iterations
+        self._field_count, self._most_fields = fields, max(fields, most_fields or 0)
         self._fields = np.arange(fields, dtype=np.int64)
         # Stamps of the records of the incumbent, the candidate, and what the incumbent is compared
         # to.
@@ -183,7 +191,7 @@ class GaussNewton:
             **{name: getattr(self, f"_{name}").copy() for name in _STAMPS},
             **{name: np.array(getattr(self, f"_{name}")) for name in _NUMBERS},
             "seed": np.array(self._seed),
-            "field_count": np.array(self._fields.size),
+            "field_count": np.array(self._field_count),
             **self._records.state(self._proposer.n_z, n_a, gains),
         }
 
@@ -227,10 +235,7 @@ class GaussNewton:
             self._policy = self._candidate.copy()
             self._others, self._incumbents = self._incumbents, self._trials.copy()
             self._accepted = True
-            if self._budget - self._records.count > len(self._fields):
-                oldest = int(np.argmin(self._fields))
-                self._fields[oldest] = self._fields.max() + 1
-                self._others[oldest] = self._incumbents[oldest] = _NONE
+            self._renew_fields(fall < _SMALL * incumbent)
         else:
             return False
         row["accepted"] = self._accepted
@@ -239,6 +244,20 @@ class GaussNewton:
         self._trials[:] = _NONE
         self._proposed = False
         return True
+
+    def _renew_fields(self, small: bool) -> None:
+        """A fresh field in place of the oldest, or besides it after a small step."""
+        grow = small and len(self._fields) < self._most_fields
+        if self._budget - self._records.count <= len(self._fields) + grow:
+            return
+        if grow:
+            self._fields = np.append(self._fields, self._fields.max() + 1)
+            for name in ("incumbents", "trials", "others"):
+                setattr(self, f"_{name}", np.append(getattr(self, f"_{name}"), _NONE))
+        else:
+            oldest = int(np.argmin(self._fields))
+            self._fields[oldest] = self._fields.max() + 1
+            self._others[oldest] = self._incumbents[oldest] = _NONE
 
     def _propose(self, row: Row) -> None:
         if self._budget - self._records.count < len(self._fields):
