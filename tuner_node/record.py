@@ -15,6 +15,8 @@ from tuner_node.training import Training
 
 CHECKPOINT_PERIOD = 1.0
 """Seconds between checkpoints at the least. What a crash loses is computed again, identically."""
+CHECKPOINT_SHARE = 0.05
+"""Share of the time that writing them may take: with many trajectories one has 100 MB and more."""
 
 
 class Recorder:
@@ -36,7 +38,7 @@ class Recorder:
         self._folder = RunFolder(path)
         self._training = training
         self._warn = warn
-        self._saved_at = float("-inf")
+        self._save_at = float("-inf")
         self._began = time.monotonic()
         self._changed = False
         self.identity: RunIdentity
@@ -56,9 +58,9 @@ class Recorder:
 
     def keep(self, *, now: float, force: bool = False) -> None:
         """Write a checkpoint if something changed and the last one is old enough."""
-        if not self._changed or (not force and now - self._saved_at < CHECKPOINT_PERIOD):
+        if not self._changed or (not force and now < self._save_at):
             return
-        self._saved_at = now
+        began = time.monotonic()
         try:
             arrays = self._training.state() | {"run": np.array(self.identity.run)}
             checkpoint.save(self._folder.checkpoint, arrays)
@@ -68,6 +70,8 @@ class Recorder:
                 f"cannot write the checkpoint to {self._folder.path}: {error.strerror}; "
                 "the training goes on, the previous checkpoint stays"
             )
+        took = time.monotonic() - began
+        self._save_at = now + max(CHECKPOINT_PERIOD, took / CHECKPOINT_SHARE)
 
     def finish(self, extra: Mapping[str, Any]) -> dict[str, Any]:
         """Write the results of the finished training. Raises OSError if they cannot be written."""
