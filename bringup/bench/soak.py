@@ -169,6 +169,7 @@ class _Training:
                 stderr=subprocess.STDOUT,
                 env={**os.environ, MARK: str(self._out)},
                 start_new_session=True,
+                preexec_fn=_hear_interruptions,
             )
 
     def _disturb(self, supervisor: subprocess.Popen[bytes], rng: np.random.Generator) -> None:
@@ -245,6 +246,11 @@ class _Training:
 
 MARK = "PDELOOP_SOAK"
 """Environment variable by which the processes of one training are found."""
+
+
+def _hear_interruptions() -> None:
+    """For `preexec_fn`: a shell starts what runs in its background deaf to SIGINT."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def _pairs(rows: list[dict[str, Any]]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
