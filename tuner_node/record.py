@@ -15,7 +15,7 @@ from tuner_node.training import Training
 
 CHECKPOINT_PERIOD = 1.0
 """Seconds between checkpoints at the least. What a crash loses is computed again, identically."""
-CHECKPOINT_SHARE = 0.05
+CHECKPOINT_SHARE = 0.2
 """Share of the time that writing them may take: with many trajectories one has 100 MB and more."""
 
 
