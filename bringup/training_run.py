@@ -10,7 +10,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -161,11 +161,11 @@ def _run(folder: Path, values: dict[str, Any], transport: Transport, as_json: bo
     display = Display(values["iterations"], values["seeds"], stream)
     started = time.monotonic()
     try:
-        with interruptible():
+        with interruptible() as check:
             if transport.in_process:
-                _train_here(folder, values, display)
+                _train_here(folder, values, display, check)
             else:
-                _train_over_topics(folder, display, transport)
+                _train_over_topics(folder, display, transport, check)
     except Interruption as signal_name:
         display.close()
         display.line(
@@ -184,12 +184,16 @@ def _run(folder: Path, values: dict[str, Any], transport: Transport, as_json: bo
     return 0
 
 
-def _train_here(folder: Path, values: dict[str, Any], display: Display) -> None:
+def _train_here(
+    folder: Path, values: dict[str, Any], display: Display, check: Callable[[], None]
+) -> None:
     with RunFolder(folder).held():
-        _train_holding(folder, values, display)
+        _train_holding(folder, values, display, check)
 
 
-def _train_holding(folder: Path, values: dict[str, Any], display: Display) -> None:
+def _train_holding(
+    folder: Path, values: dict[str, Any], display: Display, check: Callable[[], None]
+) -> None:
     training = build_training(values)
     recorder = Recorder(folder, values, training, resume=True, warn=display.line)
 
@@ -197,6 +201,7 @@ def _train_holding(folder: Path, values: dict[str, Any], display: Display) -> No
         recorder.note(row)
         recorder.keep(now=time.monotonic())
         display.row(row)
+        check()
 
     # Nothing is saved on the way out of an interruption: it may come in the middle of an update.
     train(training, LocalPair(values), report, max_batch=values["max_batch"])
@@ -209,7 +214,9 @@ def _train_holding(folder: Path, values: dict[str, Any], display: Display) -> No
         ) from error
 
 
-def _train_over_topics(folder: Path, display: Display, transport: Transport) -> None:
+def _train_over_topics(
+    folder: Path, display: Display, transport: Transport, check: Callable[[], None]
+) -> None:
     if importlib.util.find_spec("rclpy") is None:
         raise NodeError(
             "needs rclpy: source an installed ROS 2 Jazzy, or pip install 'pdeloop[ros]', or train "
@@ -249,6 +256,7 @@ def _train_over_topics(folder: Path, display: Display, transport: Transport) -> 
         try:
             done = False
             while not done:
+                check()
                 done = supervisor.poll()
                 for row in progress.rows():
                     display.row(row)
@@ -290,17 +298,26 @@ def unused(path: Path) -> Path:
 
 
 @contextmanager
-def interruptible() -> Iterator[None]:
-    """SIGINT and SIGTERM raise Interruption within the block, once."""
+def interruptible() -> Iterator[Callable[[], None]]:
+    """SIGINT and SIGTERM raise Interruption within the block, once.
+
+    Yields a function to be called now and then, which raises it, too: an exception that comes in the
+    middle of a finalizer or a callback of some library is lost.
+    """
+    caught: list[str] = []
 
     def interrupt(number: int, frame: FrameType | None) -> None:
-        for other in known:
-            signal.signal(other, signal.SIG_IGN)  # the way out is not interrupted again
-        raise Interruption(signal.Signals(number).name)
+        if not caught:  # the way out is not interrupted again
+            caught.append(signal.Signals(number).name)
+            raise Interruption(caught[0])
+
+    def check() -> None:
+        if caught:
+            raise Interruption(caught[0])
 
     known = {n: signal.signal(n, interrupt) for n in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield
+        yield check
     finally:
         for number, handler in known.items():
             signal.signal(number, handler)

@@ -190,8 +190,7 @@ class _Training:
                 self._report.faults[f"{'SIGKILL' if kind == 'kill' else 'SIGSTOP'} {name}"] += 1
         elif kind == "supervisor":
             number = signal.SIGKILL if rng.random() < 0.5 else signal.SIGINT
-            supervisor.send_signal(number)
-            supervisor.wait(30.0)
+            _end(supervisor, number)
             self._report.faults[f"{number.name} supervisor"] += 1
         elif kind == "checkpoint":
             path = self._out / "checkpoint"
@@ -248,6 +247,16 @@ class _Training:
 
 MARK = "PDELOOP_SOAK"
 """Environment variable by which the processes of one training are found."""
+
+
+def _end(process: subprocess.Popen[bytes], number: signal.Signals) -> None:
+    """Signal a process until it ends: one that comes while Python starts may be lost in an import."""
+    for _ in range(6):
+        process.send_signal(number)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(15.0)
+            return
+    raise RuntimeError(f"the supervisor did not end by {number.name}")
 
 
 def _hear_interruptions() -> None:
