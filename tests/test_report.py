@@ -16,7 +16,7 @@ from matplotlib.image import imread
 from tests.loop_harness import processes
 from tests.small import SMALL
 
-LIMIT = 120.0
+LIMIT = 300.0
 COMMON = ("training-curves", "costs", "small-behaviour", "small-gains", "small-spectrum")
 BROWSER = [
     "chromium",
