@@ -72,7 +72,7 @@ def measure(
 
         try:
             nodes = [start("pde_sim_node"), start("controller_node")]
-            start("tuner_node", f"out:={run}", "iterations:=100000", *tuner)
+            start("tuner_node", f"out:={run}", "iterations:=100000", "optimizer:=two_point", *tuner)
             progress = run / "progress.jsonl"
 
             def observe(beside: int) -> None:
