@@ -25,7 +25,7 @@ class Pulse:
         self._lock = threading.Lock()
         self._longest = 0.0
         self._last, self._cpu = clock(), time.process_time()
-        self._stopped = threading.Event()
+        self._stopped = False
         self._thread = threading.Thread(target=self._run, name="pulse", daemon=True)
 
     def __enter__(self) -> Pulse:
@@ -34,8 +34,7 @@ class Pulse:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._stopped.set()
-        self._thread.join()
+        self._stopped = True  # the thread ends with its next beat; it holds nothing
 
     def longest(self) -> float:
         """The longest suspension in s so far, one that has just ended included."""
@@ -43,7 +42,9 @@ class Pulse:
         return self._longest
 
     def _run(self) -> None:
-        while not self._stopped.wait(BEAT):
+        # Not Event.wait: it waits for a point of the wall clock on some systems, which may jump.
+        while not self._stopped:
+            time.sleep(BEAT)
             self._beat()
 
     def _beat(self) -> None:
