@@ -92,7 +92,15 @@ LOOP_ARGUMENTS = (
 )
 """Arguments of loop.launch.py."""
 
-_TRAINING = ("iterations", "seed", "seeds", "start", "optimizer", "directions")
+_TRAINING = (
+    "iterations",
+    "seed",
+    "seeds",
+    "start",
+    "optimizer",
+    "directions",
+    "policy_features",
+)
 TRAIN_ARGUMENTS = (
     *LOOP_ARGUMENTS,
     *(Argument(_KNOWN[name], given_by_problem=True) for name in _TRAINING),

@@ -35,8 +35,8 @@ def view() -> LoopView:
     return made
 
 
-def begin(shown: LoopView, policies, episode: int = 1) -> None:
-    rows = [(i, -1.0, 0.0, 0.0) for i in range(len(policies))]
+def begin(shown: LoopView, policies, episode: int = 1, noise: tuple[float, ...] = ()) -> None:
+    rows = [(i, -1.0, 0.0, 0.0, *noise) for i in range(len(policies))]
     shown.model(frame(pack(MODEL)[None], 0, step=1))
     shown.policy(frame(policies, episode, step=1))
     shown.start(frame(rows, episode, step=1))
@@ -77,11 +77,12 @@ def test_the_chosen_environment_is_shown_and_of_a_smaller_episode_the_last():
         assert shown.profile().z.tolist() == z[row].tolist()
 
 
-def test_costs_are_told_apart_by_the_gains_that_caused_them():
+@pytest.mark.parametrize("noise", [(), (3.0,)])  # the column of a plant with noise, or none
+def test_costs_are_told_apart_by_the_gains_that_caused_them(noise):
     shown = view()
     lqt = MODEL.policy
     adapted = lqt + 0.1
-    begin(shown, [np.zeros_like(lqt), lqt, adapted, adapted, adapted])
+    begin(shown, [np.zeros_like(lqt), lqt, adapted, adapted, adapted], noise=noise)
     costs = [(10.0, 100.0, -1), (5.0, 50.0, -1), (4.0, 40.0, -1), (2.0, 20.0, -1), (1e9, 1e10, 3)]
     shown.cost(frame(costs))
     numbers = shown.numbers()

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from loop_interfaces import model_rows
 from loop_interfaces.frames import Frame
-from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn
+from loop_interfaces.topics import COMPLETED, START_COLUMNS, CostColumn, StartColumn
 from viewer_node.spacetime import SpaceTime
 
 Array = NDArray[np.float64]
@@ -99,7 +99,7 @@ class LoopView:
 
     def start(self, frame: Frame) -> None:
         """Learn of an episode."""
-        if frame.values.shape[1] == len(StartColumn):
+        if frame.values.shape[1] in (START_COLUMNS, len(StartColumn)):
             self._start = frame
             self._join()
 
