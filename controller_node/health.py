@@ -22,6 +22,8 @@ class ControllerHealth:
         self._waiting_since: float | None = None
         self.plant_paused = False
         """What the plant said on `episode/paused`."""
+        self.plants: int | None = None
+        """How many publish `state`; None: not known."""
 
     def waiting(self, now: float) -> list[str]:
         """What a state has waited for, for longer than WAITING; to be called in every round."""
@@ -67,10 +69,12 @@ class ControllerHealth:
         if responder.failure:
             return Level.ERROR, f"no reduced model: {responder.failure}"
         where = f"step {responder.step} of episode {responder.episode}"
-        if not responder.under_way:
+        gone = self.plants == 0 and responder.answered > 0
+        if not responder.under_way and not gone:
             return Level.OK, "no episode under way"
         if self.plant_paused:
             return Level.OK, f"the plant is paused at {where}"
         if now - self._heard > SILENT:
-            return Level.STALE, f"no state for {now - self._heard:.0f} s, after {where}"
+            reason = ", and no plant any more" if gone else ""
+            return Level.STALE, f"no state for {now - self._heard:.0f} s, after {where}{reason}"
         return Level.OK, where

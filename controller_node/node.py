@@ -19,6 +19,7 @@ from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
 from loop_interfaces.endpoints import writer_qos
 from loop_interfaces.frames import Frame
+from loop_interfaces.health import Health
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.node_loop import NodeLoop
 from loop_interfaces.node_main import node_main
@@ -92,7 +93,11 @@ class ControllerNode:
             loop.receive(topic, self._performer(handlers[topic]))
 
         loop.listen(PAUSED, self._on_paused)
-        loop.diagnose("responder", self._health.report)
+        loop.diagnose("responder", self._report)
+
+    def _report(self, now: float) -> Health:
+        self._health.plants = self._node.count_publishers(self._node.resolve_topic_name(STATE.name))
+        return self._health.report(now)
 
     def _on_paused(self, frame: Frame) -> None:
         self._health.plant_paused = bool(frame.values.any())

@@ -145,7 +145,16 @@ def test_a_controller_waits_answers_grows_stale_and_is_at_rest():
     controller.state(Frame(RUN, 2, 0, 0.0, np.ones((1, 8)), 9))
     assert health.report(21.0).level is Level.OK
     controller.cost(Frame(RUN, 2, 5, 0.0, np.array([[0.5, 5.0, 3.0]]), 9))
-    failed = health.report(22.0)
+    controller.failure, kept = "", controller.failure
+    health.plants = 1
+    assert health.report(22.0).message == "no episode under way"
+    health.plants = 0
+    assert health.report(23.0).level is Level.OK
+    gone = health.report(28.0)
+    assert gone.level is Level.STALE
+    assert gone.message == "no state for 7 s, after step 0 of episode 2, and no plant any more"
+    controller.failure = kept
+    failed = health.report(28.0)
     assert failed.level is Level.ERROR
     assert "diverged under exploration" in failed.message
     assert failed.values["identifications failed"] == 2

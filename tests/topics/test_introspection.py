@@ -72,8 +72,15 @@ def test_every_node_reports_once_a_second_what_an_operator_asks(loop: Processes,
         assert "is the controller running?" in desk.status("pde_sim_node")[2]
         until(lambda: desk.status("tuner_node")[1] == 1, LIMIT, "warning of the tuner")
         assert desk.status("tuner_node")[2] == "waiting for controller"
+        before = desk.status("controller_node")[0]
         running["controller"] = loop.node("controller_node", *PARAMETERS)
         until(lambda: desk.status("tuner_node")[1] == 0, LIMIT, "tuner in order again")
+
+        def answers_again() -> bool:
+            count, _, _, values = desk.status("controller_node")
+            return count > before and int(values["answers"]) > 0
+
+        until(answers_again, LIMIT, "answers of the new controller")
         running["plant"].send_signal(signal.SIGKILL)
         until(lambda: desk.status("controller_node")[1] == 3, LIMIT, "stale controller")
         assert "no state for" in desk.status("controller_node")[2]
