@@ -11,19 +11,6 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
-from importlib import metadata
-
-from bringup.commands import (
-    bag,
-    bench,
-    completion,
-    evaluate,
-    monitor,
-    problems,
-    reproduce,
-    secure,
-    train,
-)
 
 DONE, FAILED, CRASHED, INTERRUPTED, NOBODY_READS = 0, 1, 70, 130, 141
 """Exit codes; 2, a command that is not understood, is argparse's."""
@@ -39,8 +26,8 @@ _EXTRAS = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Console script. Every error a user can cause is one line on stderr."""
-    options = parser().parse_args(arguments)
     try:
+        options = parser().parse_args(arguments)
         code: int = options.command(options)
         sys.stdout.flush()  # here, where it can still be said that nobody reads
         return code
@@ -80,6 +67,19 @@ def _crashed() -> int:
 
 def parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
+    # Imported here, where `main` catches Ctrl-C: it takes most of a short command's time.
+    from bringup.commands import (
+        bag,
+        bench,
+        completion,
+        evaluate,
+        monitor,
+        problems,
+        reproduce,
+        secure,
+        train,
+    )
+
     root = argparse.ArgumentParser(
         prog="pdeloop",
         description="Reduce, design and adapt controllers of PDEs over ROS 2 topics.",
@@ -93,6 +93,8 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _version() -> str:
+    from importlib import metadata
+
     try:
         return metadata.version("pdeloop")
     except metadata.PackageNotFoundError:  # run from its sources

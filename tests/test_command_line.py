@@ -160,6 +160,21 @@ def test_exit_codes(words: list[str], code: int, said: str) -> None:
     assert "Traceback" not in done.stderr
 
 
+def test_ctrl_c_finds_little_to_interrupt_before_it_is_caught() -> None:
+    code = "import sys, bringup.cli; print([m for m in ('numpy', 'yaml', 'email') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_ctrl_c_during_imports_is_one_line(monkeypatch, capsys) -> None:
+    def interrupted() -> argparse.ArgumentParser:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "parser", interrupted)
+    assert main(["problems"]) == cli.INTERRUPTED
+    assert capsys.readouterr().err == "pdeloop: interrupted\n"
+
+
 def test_a_bug_is_a_traceback_and_a_code_of_its_own(monkeypatch, capsys) -> None:
     def broken() -> dict[str, Path]:
         raise KeyError("a bug")
