@@ -6,6 +6,10 @@ The plant advances only on the action stamped with the run, episode and step it 
 one for `action_timeout` it sends its state again; after `max_repeats` the episode is void, which
 is not a cost. The answer to state T moves nothing: it says that the last state has arrived.
 
+Whoever is asked twice answers the same to the bit. So another answer to a state that was answered
+already comes from somebody else, or from a controller that cannot be relied on: which of the two was
+taken is chance, and the episode is void.
+
 A paused plant takes the answer it waits for and holds the next state back. Nothing is sent again and
 nothing is given up meanwhile; `episode/paused` tells everybody who waits for the plant.
 """
@@ -83,6 +87,10 @@ class Lockstep:
         self._rows = np.empty((0, START_COLUMNS))
         self._active = False
         self._reply: Send | None = None
+        self._taken: list[int] = []
+        """A digest of the action that was taken at each step of the episode."""
+        self.contradiction = ""
+        """Why the last episode that ended is void, if two answers to one state came in it."""
         self._repeats = 0
         self._tuner_heard = -np.inf
         self._deadline: float | None = None
@@ -227,6 +235,7 @@ class Lockstep:
             return [self._reply] if self._reply and not self._held else []
         states = self._plant.reset(rows[:, StartColumn.SEED].astype(np.int64), noise_seeds(rows))
         self.episode, self._rows, self._active = frame.episode, rows.copy(), True
+        self._taken, self.contradiction = [], ""
         self.time = max(self.time, frame.time) + self._sample_time
         self._stepping = False
         if self.pace:
@@ -247,6 +256,12 @@ class Lockstep:
             return []
         if frame.step != plant.step_index:
             self.tally["actions of another step"] += 1
+            if frame.step < plant.step_index and _digest(frame) != self._taken[frame.step]:
+                self.contradiction = (
+                    f"two different actions came for step {frame.step} of episode {frame.episode}; "
+                    "expected one controller, which answers a repeated state with the same action"
+                )
+                return [self._finish(now, void=True)]
             return []
         expected = (plant.batch, plant.n_a)
         if frame.values.shape != expected:
@@ -259,6 +274,7 @@ class Lockstep:
         self._tuner_heard = now
         if plant.step_index == plant.horizon:
             return [self._finish(now, void=False)]
+        self._taken.append(_digest(frame))
         states = plant.step(frame.values)
         self.steps_total += plant.batch
         self.rounds_total += 1
@@ -347,3 +363,7 @@ class Lockstep:
         if noise.size and (noise.min() < 0 or (noise != np.floor(noise)).any()):
             raise FrameError("expected noise seeds that are whole numbers of at least 0")
         return rows
+
+
+def _digest(frame: Frame) -> int:
+    return hash(frame.values.tobytes())

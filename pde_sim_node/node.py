@@ -170,6 +170,11 @@ class PlantNode:
         for send in sends:
             if send.topic is COST:
                 self._bundler.flush()  # who waits for the cost has the episode by then
+                if self._lockstep.contradiction:
+                    self._node.get_logger().error(
+                        f"episode is void: {self._lockstep.contradiction}",
+                        throttle_duration_sec=1.0,
+                    )
             self._senders[send.topic].send(send.frame)
             if send.topic is STATE and self._clock is not None and send.frame.time < MAX_TIME:
                 self._tell_time(round(send.frame.time * 1e9))

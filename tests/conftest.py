@@ -18,6 +18,11 @@ def _own_environment(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.delenv(name, raising=False)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest test first, so that at the end no worker waits for it."""
+    items.sort(key=lambda item: "test_soak" not in item.nodeid)
+
+
 def shared_memory() -> set[str]:
     """Fast DDS's files in shared memory."""
     folder = Path("/dev/shm")

@@ -91,6 +91,32 @@ def test_answers_of_other_runs_episodes_and_shapes_change_nothing():
     assert sum(served.tally.values()) == 2
 
 
+def test_two_different_costs_of_one_episode_end_the_run():
+    served = dispatcher()
+    ((_, first),) = starts(served.assign(batch(1), 0.0))
+    cost = replace(costs_of(first), plant=5)
+    served.cost(0, cost, 0.0)
+    assert served.cost(0, cost, 0.0) == []
+    assert served.cost(0, void_of(first), 0.0) == []  # gave up what another one has done
+    assert served.cost(0, replace(cost, plant=6, values=2 * cost.values), 0.0) == []
+    with pytest.raises(DispatchError, match=r"two different messages on episode/cost answer"):
+        served.cost(0, replace(cost, values=np.nextafter(cost.values, 9.0)), 0.0)
+
+
+def test_two_different_models_of_one_episode_end_the_run():
+    served = dispatcher()
+    rows = np.array([[3.0, 4.0, 0.1, 0.0]])
+    ((_, first),) = starts(served.assign(Batch(rows, None), 0.0))
+    model = Frame(RUN, first.episode, 0, 1.0, np.ones((1, 7)))
+    served.model(0, model, 0.0)
+    served.model(0, model, 0.0)
+    served.cost(0, costs_of(first), 0.0)
+    assert served.result() is not None
+    assert served.model(0, model, 0.0) == []
+    with pytest.raises(DispatchError, match=r"two different messages on model/identified answer"):
+        served.model(0, replace(model, values=2 * model.values), 0.0)
+
+
 def test_a_void_episode_is_repeated_under_a_new_number_and_given_up_at_last():
     served = dispatcher()
     ((_, first),) = starts(served.assign(batch(1), 0.0))

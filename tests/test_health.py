@@ -53,7 +53,7 @@ def test_a_plant_is_ready_runs_is_overdue_is_paused_and_is_void():
     assert running.values["steps/s"] == 10.0
     assert running.values["environment steps/s"] == 20.0
     assert (running.values["horizon"], running.values["environments"]) == (30, 2)
-    protocol.action(replace(answer(send.frame), step=3), 1.0)  # too late
+    protocol.action(replace(answer(send.frame), step=13), 1.0)  # too early
     assert health.report(2.0).values["stale messages"] == 1
     protocol.pause(2.0)
     paused = health.report(3.0)

@@ -40,16 +40,21 @@ def answer(state: Frame, scale: float = 0.1) -> Frame:
     return replace(state, values=actions)
 
 
+def kept(frame: Frame) -> Frame:
+    """The frame for later: the plant writes its next state into the same memory."""
+    return replace(frame, values=frame.values.copy())
+
+
 def run_episode(protocol: Lockstep, episode: int, now: float = 0.0, disturb=None) -> list[Frame]:
     """All frames of an episode; `disturb(protocol, state, now)` may interfere before each answer."""
     (send,) = protocol.start(start(episode), now)
-    frames = [send.frame]
+    frames = [kept(send.frame)]
     while send.topic is STATE:
         now += 0.01
         if disturb:
             disturb(protocol, send.frame, now)
         (send,) = protocol.action(answer(send.frame), now)
-        frames.append(send.frame)
+        frames.append(kept(send.frame))
     assert send.topic is COST
     return frames
 
@@ -74,7 +79,6 @@ def test_foreign_late_repeated_and_malformed_messages_change_no_number():
             replace(wrong, run=99),
             replace(wrong, episode=wrong.episode + 1),
             replace(wrong, step=wrong.step + 1),
-            replace(wrong, step=wrong.step - 1),
             replace(wrong, plant=PLANT + 1),
         ):
             assert protocol.action(bad, now) == []
@@ -87,10 +91,32 @@ def test_foreign_late_repeated_and_malformed_messages_change_no_number():
         (again,) = protocol.start(start(1), now)
         assert again.frame.step == state.step
 
+        if state.step:
+            before = replace(states[state.step - 1], time=now)
+            assert protocol.action(answer(before), now) == []  # the same answer, late
+
+    states = quiet
     noisy_protocol = plant_protocol()
     noisy = run_episode(noisy_protocol, 1, disturb=disturb)
     assert [f.values.tobytes() for f in noisy[-1:]] == [f.values.tobytes() for f in quiet[-1:]]
     assert noisy_protocol.tally["actions of another step"] > 0
+
+
+def test_two_different_actions_for_one_state_void_the_episode():
+    quiet = run_episode(plant_protocol(), 1)
+    protocol = plant_protocol()
+    (send,) = protocol.start(start(1), 0.0)
+    for step in range(20):
+        assert send.frame.step == step
+        (send,) = protocol.action(answer(send.frame, scale=7.0 if step == 3 else 0.1), 0.0)
+    assert protocol.action(answer(quiet[3 - 1]), 0.0) == []
+    (void,) = protocol.action(answer(quiet[3]), 0.0)
+    assert void.topic is COST
+    assert (void.frame.values[:, CostColumn.ENDED] == VOID).all()
+    assert protocol.contradiction.startswith("two different actions came for step 3 of episode 1;")
+    again = run_episode(protocol, 2)
+    assert again[-1].values.tobytes() == quiet[-1].values.tobytes()
+    assert protocol.contradiction == ""
 
 
 def test_silence_repeats_the_state_and_then_voids_the_episode():
@@ -209,7 +235,7 @@ def test_the_answer_on_its_way_is_taken_in_a_pause_and_then_every_step_lets_one_
     quiet = run_episode(plant_protocol(), 1)
     protocol = plant_protocol()
     (send,) = protocol.start(start(1), 0.0)
-    frames = [send.frame]
+    frames = [kept(send.frame)]
     protocol.pause(0.0)
     assert protocol.action(answer(send.frame), 0.0) == []  # state 1 is held back
     now = 0.0
@@ -217,7 +243,7 @@ def test_the_answer_on_its_way_is_taken_in_a_pause_and_then_every_step_lets_one_
         now += 0.5
         assert protocol.start(start(1), now) == []  # the tuner asks again: nothing slips out
         (send,) = protocol.step_once(now)
-        frames.append(send.frame)
+        frames.append(kept(send.frame))
         with pytest.raises(ValueError, match="still waits for its action"):
             protocol.step_once(now)
         again, report = protocol.tick(now + 0.2)  # an answer that is lost is asked for again
@@ -270,7 +296,7 @@ def paced(protocol: Lockstep, episode: int, change=None) -> list[Frame]:
                 return [*frames, send.frame]
             if send.topic is STATE:
                 waiting = send.frame
-                frames.append(send.frame)
+                frames.append(kept(send.frame))
         now += 0.004
         if waiting is not None:
             frame, waiting = waiting, None
@@ -315,7 +341,7 @@ def test_a_pause_moves_the_instants_of_a_paced_plant():
         nexts = protocol.tick(now)
         for send in sends:
             if send.topic is STATE:
-                steps.append((now, send.frame))
+                steps.append((now, kept(send.frame)))
                 nexts += protocol.action(answer(send.frame), now)
                 nexts += change(protocol, send.frame, now)
         if protocol.paused and now - steps[-1][0] > 1.0:

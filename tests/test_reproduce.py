@@ -64,7 +64,7 @@ def test_the_curve_is_the_cost_of_each_iterations_policy(loop, tmp_path):
 
 
 def test_an_interrupted_reproduction_continues_to_the_same_bits(loop, tmp_path):
-    options = ("--seeds", "3", "--iterations", "800", "--processes", "1")
+    options = ("--seeds", "3", "--iterations", "400", "--processes", "1")
     run = loop.pdeloop("reproduce", str(SMALL), *options, "--out", str(tmp_path / "a"))
     until(lambda: list((tmp_path / "a").glob("small/*/progress")), LIMIT, "saved progress")
     time.sleep(0.5)

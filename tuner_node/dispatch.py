@@ -19,7 +19,17 @@ from numpy.typing import NDArray
 
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import ModelFailure, Send, Tally
-from loop_interfaces.topics import MODEL, POLICY, START, START_COLUMNS, VOID, CostColumn
+from loop_interfaces.topics import (
+    COST,
+    MODEL,
+    MODEL_IDENTIFIED,
+    POLICY,
+    START,
+    START_COLUMNS,
+    VOID,
+    CostColumn,
+    Topic,
+)
 from tuner_node.training import UNKNOWN_PLANT, Batch, BatchResult
 from tuner_node.work import Chunk, Pair
 
@@ -129,7 +139,7 @@ class Dispatcher:
 
     def cost(self, pair: int, frame: Frame, now: float) -> list[Order]:
         """Take an episode's costs. Raises FrameError when their shape is not the episode's."""
-        known = self._answering(pair, frame)
+        known = self._answering(pair, frame, COST)
         if known is None or known.chunk is None or self._batch is None:
             return []
         count = known.chunk.rows.stop - known.chunk.rows.start
@@ -154,9 +164,11 @@ class Dispatcher:
         known.heard, known.strange_since = now, math.inf
         if (frame.values[:, CostColumn.ENDED] == VOID).any():
             self._retry(
-                known, f"episode {known.episode} is void: no action came from the controller"
+                known,
+                f"the plant declared episode {known.episode} void: no action came, or different ones",
             )
         else:
+            known.answers[COST.name] = frame.episode, _digest(frame)
             known.chunk.costs = frame.values.copy()
             self.last_costs = known.chunk.costs[:, CostColumn.MEAN]
             if self._batch.trajectories:
@@ -218,7 +230,7 @@ class Dispatcher:
 
     def model(self, pair: int, frame: Frame, now: float) -> list[Order]:
         """Take the reduced models of an exploratory episode."""
-        known = self._answering(pair, frame)
+        known = self._answering(pair, frame, MODEL_IDENTIFIED)
         if known is None or known.chunk is None or self._batch is None:
             return []
         count = known.chunk.rows.stop - known.chunk.rows.start
@@ -227,6 +239,7 @@ class Dispatcher:
         if self.plant not in (UNKNOWN_PLANT, frame.plant):
             raise FrameError(f"expected a model of plant {self.plant}, got one of {frame.plant}")
         known.heard = now
+        known.answers[MODEL_IDENTIFIED.name] = frame.episode, _digest(frame)
         known.chunk.models = frame.values.copy()
         self._release_if_done(known)
         return self._hand_out(now)
@@ -309,11 +322,24 @@ class Dispatcher:
     def _present(self) -> list[Pair]:
         return [pair for pair in self.pairs if not pair.missing]
 
-    def _answering(self, pair: int, frame: Frame) -> Pair | None:
+    def _answering(self, pair: int, frame: Frame, topic: Topic) -> Pair | None:
+        """The pair, if this answers its episode.
+
+        Raises DispatchError if that was answered already, and otherwise: then it is chance which
+        answer was taken.
+        """
         known = self.pairs[pair]
         if frame.run != self.run:
             self.tally["answers of another run"] += 1
             return None
+        episode, digest = known.answers.get(topic.name, (-1, 0))
+        void = topic is COST and bool((frame.values[:, -1:] == VOID).any())
+        same_plant = self.plant in (UNKNOWN_PLANT, frame.plant)
+        if frame.episode == episode and same_plant and not void and _digest(frame) != digest:
+            raise DispatchError(
+                f"two different messages on {topic.name} answer episode {episode}; expected one "
+                "plant and one controller in this namespace: stop the other and start a new run"
+            )
         if known.chunk is None or frame.episode != known.episode:
             self.tally["answers of another episode"] += 1
             return None
@@ -397,3 +423,7 @@ class Dispatcher:
         pair.last = Send(START, frame(self._batch.rows[chunk.rows]))
         sends.append(pair.last)
         return [(number, send) for send in sends]
+
+
+def _digest(frame: Frame) -> int:
+    return hash(frame.values.tobytes())

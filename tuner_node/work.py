@@ -55,5 +55,7 @@ class Pair:
     """Since when only another plant's costs come."""
     paused_until: float = -math.inf
     """How long what its plant said of being paused holds."""
+    answers: dict[str, tuple[int, int]] = field(default_factory=dict)
+    """By topic: the episode that was answered last, and a digest of the answer that was taken."""
     last: Send | None = None
     """The last start, which keeps the plant for this run while nothing new is handed out."""

@@ -127,13 +127,13 @@ def test_a_node_that_keeps_dying_is_given_up_with_its_last_words(loop, tmp_path)
 def test_a_second_tuner_is_refused_and_the_first_one_unharmed(loop, tmp_path):
     start_pair(loop)
     out = tmp_path / "run"
-    first = start_tuner(loop, out, iterations=1500)
+    first = start_tuner(loop, out, iterations=1000)
     until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
     second = start_tuner(loop, tmp_path / "second", seed=9)
     text = loop.wait(second, 20.0, code=1)
     assert "another tuner publishes /episode/start" in text.strip().splitlines()[-1]
     loop.wait(first, LIMIT)
-    assert_same_training(out, in_process(iterations=1500))
+    assert_same_training(out, in_process(iterations=1000))
     assert iterations_done(tmp_path / "second") == 0
 
 
@@ -317,6 +317,43 @@ while True:
     k += 1
     publisher.publish(codec.encode(Frame(1, 2 + k % 50, k % 31, 0.5, np.full((2, 4), 1e3))))
     time.sleep(0.001)
+"""
+
+
+def test_a_second_controller_that_answers_otherwise_never_mixes_in(loop, tmp_path):
+    """It listens to the loop and so has all the right ids."""
+    running = start_pair(loop)
+    out = tmp_path / "run"
+    tuner = start_tuner(loop, out, iterations=600, max_attempts=1000)
+    until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
+    second = loop.start("-c", SECOND_CONTROLLER, name="second")
+    until(
+        lambda: "two different actions came for step" in loop.output(running["plant"]),
+        LIMIT,
+        "contradiction",
+    )
+    second.kill()
+    text = loop.wait(tuner, LIMIT)
+    assert "the plant declared episode" in text
+    assert_same_training(out, in_process(iterations=600))
+
+
+SECOND_CONTROLLER = """
+from dataclasses import replace
+import numpy as np, rclpy
+from std_msgs.msg import Float64MultiArray
+from loop_interfaces.frames import ArrayCodec
+from loop_interfaces.endpoints import reader_qos, writer_qos
+from loop_interfaces.topics import ACTION, STATE
+rclpy.init()
+node = rclpy.create_node("second_controller")
+publisher = node.create_publisher(Float64MultiArray, "action", writer_qos(ACTION))
+states, actions = ArrayCodec(STATE.labels), ArrayCodec(ACTION.labels)
+def answer(message):
+    state = states.decode(message)
+    publisher.publish(actions.encode(replace(state, values=np.full((len(state.values), 4), 0.5))))
+node.create_subscription(Float64MultiArray, "state", answer, reader_qos(STATE), raw=True)
+rclpy.spin(node)
 """
 
 

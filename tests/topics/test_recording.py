@@ -268,12 +268,12 @@ def test_a_bag_that_cannot_be_begun_is_refused_in_one_line(loop, tmp_path):
 
 def test_a_second_recording_of_a_run_gets_a_bag_of_its_own(loop, tmp_path):
     out = tmp_path / "run"
-    run = loop.pdeloop("train", str(SMALL), "--iterations", "400", "--out", str(out), "--record")
+    run = loop.pdeloop("train", str(SMALL), "--iterations", "150", "--out", str(out), "--record")
     until(lambda: iterations_done(out) >= 30, LIMIT, "iteration 30")
     run.send_signal(signal.SIGINT)
     loop.wait(run, 10.0, code=130)
     loop.wait(loop.pdeloop("train", "--resume", str(out), "--record"), LIMIT)
-    assert_same_training(out, in_process(iterations=400))
+    assert_same_training(out, in_process(iterations=150))
     for name in ("bag", "bag-2"):
         report = verify(out / name)
         assert report.count == 0, report.text()
@@ -281,7 +281,7 @@ def test_a_second_recording_of_a_run_gets_a_bag_of_its_own(loop, tmp_path):
     both = verify(out / "bag", out / "bag-2")
     assert (both.count, both.notes) == (0, [])
     assert len(both.incomplete) <= 1  # the one that Ctrl-C cut short
-    assert both.compared["policies"] == 8 + 2 * 400 + 30
+    assert both.compared["policies"] == 8 + 2 * 150 + 30
 
 
 def test_one_recorder_records_several_pairs(loop, tmp_path):
@@ -312,7 +312,7 @@ def _index(bag: Path) -> list[str]:
 
 def test_a_killed_recorder_is_started_again_and_goes_on_in_another_bag(loop, tmp_path):
     out = tmp_path / "run"
-    run = loop.pdeloop("train", str(SMALL), "--iterations", "900", "--out", str(out), "--record")
+    run = loop.pdeloop("train", str(SMALL), "--iterations", "600", "--out", str(out), "--record")
     for bag, after in (("bag", 30), ("bag-2", 330)):
         until(lambda n=after: iterations_done(out) >= n, LIMIT, f"iteration {after}")
         until(lambda b=bag: (out / b / "parameters.json").exists(), LIMIT, f"recording in {bag}")
@@ -321,7 +321,7 @@ def test_a_killed_recorder_is_started_again_and_goes_on_in_another_bag(loop, tmp
     text = loop.wait(run, LIMIT)
     assert text.count("recorder_node was killed by SIGKILL; starting it again") == 2
     assert f"recorded in {out / 'bag'}, {out / 'bag-2'}, {out / 'bag-3'}\n" in text
-    assert_same_training(out, in_process(iterations=900))
+    assert_same_training(out, in_process(iterations=600))
     report = verify(out)
     assert report.count == 0, report.text()
     assert describe(out / "bag-3")["finished"]

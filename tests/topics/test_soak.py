@@ -26,5 +26,6 @@ def test_a_minute_of_random_faults_changes_no_bit(tmp_path: Path):
     assert report.mismatches == 0, told
     assert report.trainings >= 1, told
     assert sum(report.faults.values()) >= 10, told
-    assert report.environment_steps >= 60 * 2 * 30, told
+    # The shortest of the trainings: 6 Gauss-Newton iterations of a rollout on each of 3 fields.
+    assert report.environment_steps >= report.trainings * 6 * 3 * 30, told
     assert all(last < first + 30 for first, last in report.memory_mb.values()), told

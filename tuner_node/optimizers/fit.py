@@ -36,6 +36,8 @@ IndexArray = NDArray[np.int64]
 # move.
 _LINEAR_RIDGE = 1e-5
 _ACTION_RIDGE = 1e-8
+# Samples whose features are in memory at a time.
+_BLOCK = 1024
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,20 +142,18 @@ def fit(
     centre: Array = share @ x
     spread = _spread(share, x - centre)
     action_spread = _spread(share, a)
-    e = (x - centre) / spread
     pairs, triples = _products(r, 2), _products(leading, 3)
     affine = 1 + r + n_a
     bent = affine + len(pairs)
-    features = np.empty((len(x), bent + len(triples)))
-    features[:, 0] = 1.0
-    features[:, 1 : 1 + r] = e
-    features[:, 1 + r : affine] = a / action_spread
-    np.multiply(e[:, pairs[:, 0]], e[:, pairs[:, 1]], out=features[:, affine:bent])
-    for column, (i, j, m) in enumerate(triples, bent):
-        features[:, column] = e[:, i] * e[:, j] * e[:, m]
-    features *= np.sqrt(share)[:, None]
-    gram = features.T @ features
-    moment = features.T @ (change * np.sqrt(share)[:, None])
+    gram = np.zeros((bent + len(triples),) * 2)
+    moment = np.zeros((len(gram), r))
+    root = np.sqrt(share)
+    for start in range(0, len(x), _BLOCK):
+        block = slice(start, start + _BLOCK)
+        e = np.ascontiguousarray(((x[block] - centre) / spread).T)
+        features = _features(e, (a[block] / action_spread).T, root[block], pairs, triples)
+        gram += features @ features.T
+        moment += features @ (change[block] * root[block, None])
 
     models = []
     for most in (bent, len(gram)) if len(triples) else (bent,):
@@ -165,7 +165,8 @@ def fit(
             penalty[1 + r : affine] = _ACTION_RIDGE
             matrix = gram[:size, :size].copy()
             matrix[np.diag_indices(size)] += penalty
-            solution = linalg.cho_solve(linalg.cho_factor(matrix), moment[:size]).T
+            factor = linalg.cho_factor(matrix, overwrite_a=True, check_finite=False)
+            solution = linalg.cho_solve(factor, moment[:size], check_finite=False).T
             models.append(
                 LocalModel(
                     centre=centre,
@@ -179,6 +180,27 @@ def fit(
                 )
             )
     return models
+
+
+def _features(e: Array, a: Array, root: Array, pairs: IndexArray, triples: IndexArray) -> Array:
+    """root [1, e, a, e_i e_j, e_i e_j e_m] of some samples, (features, samples).
+
+    e (r, samples) and a (n_a, samples) are scaled. A row per feature, so that what is written lies
+    together.
+    """
+    r, affine = len(e), 1 + len(e) + len(a)
+    features = np.empty((affine + len(pairs) + len(triples), e.shape[1]))
+    features[0] = 1.0
+    features[1 : 1 + r] = e
+    features[1 + r : affine] = a
+    features[:affine] *= root
+    row_of = {}
+    for row, (i, j) in enumerate(pairs.tolist(), affine):
+        np.multiply(features[1 + i], e[j], out=features[row])
+        row_of[i, j] = row
+    for row, (i, j, m) in enumerate(triples.tolist(), affine + len(pairs)):
+        np.multiply(features[row_of[i, j]], e[m], out=features[row])
+    return features
 
 
 def _products(count: int, degree: int) -> IndexArray:

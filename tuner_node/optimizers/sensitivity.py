@@ -175,13 +175,15 @@ def predict_difference(
     else:
         closed[..., :n_s] += (B * free[..., None, :]) @ K
         drive = (forcing * free) @ B.T
-    difference = np.empty((gammas.size, pairs, steps, r))
-    delta = np.broadcast_to(initial, (gammas.size, pairs, r)).copy()
-    for k in range(steps):
-        difference[:, :, k] = delta
-        moved = np.einsum("pij,cpj->cpi", closed[:, k], delta) + drive[:, k]
-        delta = gammas[:, None, None] * moved
-    return difference
+    # Steps first and gammas last: every step is one product of matrices, of memory that lies together.
+    closed = np.ascontiguousarray(closed.swapaxes(0, 1))
+    difference = np.empty((steps, pairs, r, gammas.size))
+    difference[0] = initial[..., None]
+    for k in range(steps - 1):
+        np.matmul(closed[k], difference[k], out=difference[k + 1])
+        difference[k + 1] += drive[:, k, :, None]
+        difference[k + 1] *= gammas
+    return np.ascontiguousarray(difference.transpose(3, 1, 0, 2))
 
 
 def damped_step(
