@@ -34,7 +34,7 @@ ROLES = (
         "pde_sim_node",
         (
             *(topics.STATE.name, topics.COST.name, topics.TARGET.name, topics.PAUSED.name),
-            *(topics.SAMPLES, "/clock"),
+            *(topics.SAMPLES, topics.SAMPLES_THROTTLED, "/clock"),
         ),
         (topics.START.name, topics.ACTION.name),
         ("pause", "resume", "step"),
@@ -72,7 +72,7 @@ ROLES = (
         VIEWS,
         (
             *(topics.START.name, topics.POLICY.name, topics.MODEL.name, topics.COST.name),
-            *(topics.TARGET.name, topics.SAMPLES),
+            *(topics.TARGET.name, topics.SAMPLES_THROTTLED),
         ),
         of_others=_SAMPLED,
     ),

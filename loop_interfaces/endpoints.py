@@ -18,8 +18,14 @@ from rclpy.subscription import Subscription
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
 from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.samples import AGE, STATE_KIND, Bundle
-from loop_interfaces.topics import READER_DEPTH, SAMPLES, WRITER_DEPTH, Topic
+from loop_interfaces.samples import AGE, STATE_KIND, Allowance, Bundle
+from loop_interfaces.topics import (
+    READER_DEPTH,
+    SAMPLES,
+    SAMPLES_THROTTLED,
+    WRITER_DEPTH,
+    Topic,
+)
 
 KEPT = 16
 """Bundles of samples that their writer keeps for a reader which lost one."""
@@ -80,35 +86,76 @@ def scoped(namespace: str, name: str) -> str:
     return ("/" if namespace.startswith("/") else "") + (f"{inner}/{name}" if inner else name)
 
 
+class _Outlet:
+    """A topic of bundles."""
+
+    def __init__(self, node: Node, name: str) -> None:
+        self._publisher = node.create_publisher(UInt8MultiArray, name, samples_qos(KEPT))
+        self._publish = self._publisher.handle.publish_raw
+        self._bundle = Bundle()
+        self._began = 0.0
+
+    def add(self, kind: int, stamp: int, raw: bytes) -> None:
+        if self._bundle.add(kind, stamp, raw):
+            self.flush()
+
+    def flush(self) -> None:
+        if self._bundle.size:
+            self._publish(self._bundle.take(time.monotonic_ns()))
+        self._began = time.monotonic()
+
+    def look(self, now: float) -> bool:
+        """Whether somebody listens; publishes what has waited for long."""
+        if now - self._began > AGE:
+            self.flush()
+        return self._publisher.get_subscription_count() > 0
+
+
 class Bundler:
-    """Publishes `samples` for those who record or watch; nothing is kept while there are none.
+    """Publishes `samples` for those who record or learn, and some episodes on `samples_throttled`
+    for those who look; nothing is kept while there are none.
 
     Make it before the publisher of the states: who knows of the states then knows of the samples.
     """
 
     def __init__(self, node: Node) -> None:
-        self._publisher = node.create_publisher(UInt8MultiArray, SAMPLES, samples_qos(KEPT))
-        self._publish = self._publisher.handle.publish_raw
-        self._bundle = Bundle()
-        self._began = 0.0
+        self._all, self._some = _Outlet(node, SAMPLES), _Outlet(node, SAMPLES_THROTTLED)
+        self._allowance = Allowance()
+        self._read = self._looked_at = self._shown = False
         self.wanted = False
+
+    def begin(self, now: float) -> None:
+        """An episode begins: whether it is shown to those who look."""
+        self._shown = self._looked_at and self._allowance.admits(now)
+        self.wanted = self._read or self._shown
+
+    def show(self, raw: bytes | None) -> None:
+        """From now on show the episode in any case, beginning with the state `raw`."""
+        if raw is not None and self._looked_at and not self._shown:
+            self._some.add(STATE_KIND, time.monotonic_ns(), raw)
+        self._shown = self._looked_at
+        self.wanted = self._read or self._shown
 
     def add(self, kind: int, raw: bytes) -> None:
         """Keep a message for the next bundle. Call it only while `wanted`."""
-        if self._bundle.add(kind, time.monotonic_ns(), raw):
-            self.flush()
+        stamp = time.monotonic_ns()
+        if self._read:
+            self._all.add(kind, stamp, raw)
+        if self._shown:
+            self._some.add(kind, stamp, raw)
+            self._allowance.use(len(raw))
 
     def flush(self) -> None:
         """Publish what has been kept."""
-        if self._bundle.size:
-            self._publish(self._bundle.take(time.monotonic_ns()))
-        self._began = time.monotonic()
+        self._all.flush()
+        self._some.flush()
 
     def look(self, now: float) -> None:
-        """Now and then: whether somebody listens, and whether the bundle has waited for long."""
-        self.wanted = self._publisher.get_subscription_count() > 0
-        if now - self._began > AGE:
-            self.flush()
+        """Now and then: whether somebody listens, and whether a bundle has waited for long."""
+        before = self._looked_at
+        self._read, self._looked_at = self._all.look(now), self._some.look(now)
+        self._shown = self._looked_at and (self._shown or not before)
+        self.wanted = self._read or self._shown
 
 
 class Sender:
@@ -125,6 +172,10 @@ class Sender:
 
         # Past rclpy's wrapper, which locks the handle and looks at the type of every message.
         self._publish = self.publisher.handle.publish_raw
+
+    def encoded(self, frame: Frame) -> bytes:
+        """What `send` would publish."""
+        return self._codec.encode(frame)
 
     def send(self, frame: Frame) -> None:
         raw = self._codec.encode_into_own(frame)

@@ -14,6 +14,7 @@ the message as it was on its own topic (the time also if nobody else reads /cloc
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -25,6 +26,8 @@ LIMIT = 256 * 1024
 """Bytes after which a bundle is sent: a few milliseconds of a fast loop."""
 AGE = 0.1
 """Seconds after which a bundle is sent that has not reached LIMIT."""
+RATE, COUNTED = 1000.0, 4096
+"""Samples a second of up to so many bytes that those who only look get."""
 
 _MESSAGE = struct.Struct("<4sIIIQ")
 """CDR of an UInt8MultiArray without dims up to its data, and the first eight bytes of those."""
@@ -32,6 +35,28 @@ _ENCODING = b"\x00\x01\x00\x00"
 _SAMPLE = struct.Struct("<IIQ")
 _TYPICAL_OFFSET = 100_000_000
 """Nanoseconds by which the delay of a bundle may vary before its clock is taken to be another one."""
+
+
+class Allowance:
+    """Which episodes go to those who only look: whole ones, about RATE samples a second.
+
+    A sample of at most COUNTED bytes uses one up, a larger one more. Time gives them back, so after
+    an episode that used up more than there were the next ones are left out; never for longer than a
+    second, and in a loop that is slower none is.
+    """
+
+    def __init__(self) -> None:
+        self._left, self._when = 0.0, -math.inf
+
+    def admits(self, now: float) -> bool:
+        """Whether to show the episode that begins now (monotonic s)."""
+        self._left = min(RATE, max(self._left, -RATE) + RATE * (now - self._when))
+        self._when = now
+        return self._left >= 0.0
+
+    def use(self, size: int) -> None:
+        """A sample of `size` bytes was shown."""
+        self._left -= max(1.0, size / COUNTED)
 
 
 class Bundle:

@@ -93,6 +93,9 @@ MODEL_FAILED = "model/failed"
 SAMPLES = "samples"
 """std_msgs/UInt8MultiArray: the plant's states and actions, many in one message (samples.py)."""
 
+SAMPLES_THROTTLED = "samples_throttled"
+"""The same of some episodes only: for people, who see a few pictures a second."""
+
 RECORDER_STATUS = "recorder/status"
 """std_msgs/String, latched: a recorder that is matched with the whole loop says so here (JSON)."""
 

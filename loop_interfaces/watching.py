@@ -16,7 +16,7 @@ from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
 from loop_interfaces.endpoints import OutsideExecutor, reader_qos, samples_qos, scoped
 from loop_interfaces.samples import ACTION_KIND, CLOCK_KIND, STATE_KIND, ClockOffset, unpack
-from loop_interfaces.topics import ACTION, SAMPLES, STATE
+from loop_interfaces.topics import ACTION, SAMPLES, SAMPLES_THROTTLED, STATE
 
 SAMPLE_DEPTH = 4000
 """Single states or actions that wait for a reader: most of a second of the fastest loop."""
@@ -32,15 +32,22 @@ _SINGLES: dict[int, tuple[Any, str]] = {
 class Watcher:
     """The states and actions of one pair, as serialised messages with the time of their arrival.
 
-    clock: also read /clock where a plant does not bundle it. `handles` are the subscriptions to
+    clock: also read /clock where a plant does not bundle it; throttled: of some episodes only, as many
+    as people can see, where the plant offers that. `handles` are the subscriptions to
     wait for; they may change with `look`.
     """
 
-    def __init__(self, node: Node, namespace: str = "", *, clock: bool = False) -> None:
+    def __init__(
+        self, node: Node, namespace: str = "", *, clock: bool = False, throttled: bool = False
+    ) -> None:
         self._node, self._namespace = node, namespace
         self._kinds = (STATE_KIND, ACTION_KIND, CLOCK_KIND) if clock else (STATE_KIND, ACTION_KIND)
         self._offset = ClockOffset()
-        self._bundles = self._subscribe(UInt8MultiArray, SAMPLES, samples_qos(BUNDLE_DEPTH))
+        self._bundles = self._subscribe(
+            UInt8MultiArray,
+            SAMPLES_THROTTLED if throttled else SAMPLES,
+            samples_qos(BUNDLE_DEPTH),
+        )
         self._singles: dict[int, Subscription] = {}
         self._state_topic = node.resolve_topic_name(scoped(namespace, STATE.name))
         self.handles: list[Any] = [self._bundles.handle]

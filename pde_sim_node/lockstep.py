@@ -112,6 +112,11 @@ class Lockstep:
         return self._active
 
     @property
+    def last_state(self) -> Frame | None:
+        """The state of the episode under way, sent or held back."""
+        return self._reply.frame if self._active and self._reply is not None else None
+
+    @property
     def step(self) -> int:
         return self._plant.step_index
 

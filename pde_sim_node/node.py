@@ -132,6 +132,8 @@ class PlantNode:
 
     def _pause(self) -> str:
         self._send(self._lockstep.pause(self._loop.now()))
+        last = self._lockstep.last_state
+        self._bundler.show(self._senders[STATE].encoded(last) if last else None)
         return f"paused at step {self._lockstep.step}; an answer on its way is still taken"
 
     def _resume(self) -> str:
@@ -168,7 +170,9 @@ class PlantNode:
 
     def _send(self, sends: list[Send]) -> None:
         for send in sends:
-            if send.topic is COST:
+            if send.topic is STATE and send.frame.step == 0:
+                self._bundler.begin(self._loop.now())
+            elif send.topic is COST:
                 self._bundler.flush()  # who waits for the cost has the episode by then
                 if self._lockstep.contradiction:
                     self._node.get_logger().error(

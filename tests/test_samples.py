@@ -12,6 +12,7 @@ from loop_interfaces.samples import (
     CLOCK_KIND,
     LIMIT,
     STATE_KIND,
+    Allowance,
     Bundle,
     ClockOffset,
     Sample,
@@ -55,6 +56,33 @@ def test_it_asks_to_be_sent_when_it_is_large_and_is_empty_afterwards():
     bundle.take(0)
     assert bundle.size == 0
     assert list(unpack(bundle.take(0))[1]) == []
+
+
+@pytest.mark.parametrize(
+    ("steps", "rate", "size", "least", "most"),
+    [
+        (100, 8000.0, 2048, 0.10, 0.14),  # a fast loop: about RATE of its samples
+        (100, 900.0, 2048, 1.0, 1.0),  # a slow one: all of them
+        (20_000, 8000.0, 2048, 0.60, 0.75),  # after a long episode a second of others
+        (100, 4000.0, 131_072, 0.02, 0.03),  # large samples count as many
+    ],
+)
+def test_people_get_whole_episodes_of_a_fast_loop_and_all_of_a_slow_one(
+    steps, rate, size, least, most
+):
+    allowance, now, shown, episodes = Allowance(), 100.0, 0, 0
+    longest_wait, since = 0.0, now
+    while now < 160.0:
+        episodes += 1
+        admitted = allowance.admits(now)
+        now += steps / rate
+        if admitted:
+            shown += 1
+            longest_wait, since = max(longest_wait, now - steps / rate - since), now
+            for _ in range(steps):
+                allowance.use(size)
+    assert least <= shown / episodes <= most
+    assert longest_wait <= 1.0 + 1.1 * steps / rate
 
 
 def test_every_truncation_is_refused():

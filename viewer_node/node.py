@@ -1,6 +1,6 @@
 """viewer_node: shows a running loop to RViz, Foxglove and PlotJuggler, as a ROS 2 node.
 
-Subscribes  state, action (or samples), target, episode/start, policy, model, episode/cost
+Subscribes  state, action (or samples_throttled), target, episode/start, policy, model, episode/cost
 Publishes   view/field, view/target (visualization_msgs/Marker), view/spacetime (sensor_msgs/Image),
             view/... (std_msgs/Float64), at view_rate and only what somebody subscribes to
 It takes no part in the loop, and nothing waits for it. What is shown: viewer_node.view, docs/views.md.
@@ -77,8 +77,8 @@ class ViewerNode:
     def _wire(self, node: Node, loop: NodeLoop) -> None:
         self._node, self._loop = node, loop
         view = self._view
-        loop.observe(STATE, lambda frame: view.state(frame, loop.now()))
-        loop.observe(ACTION, view.action)
+        loop.observe(STATE, lambda frame: view.state(frame, loop.now()), throttled=True)
+        loop.observe(ACTION, view.action, throttled=True)
         for topic, take in (
             (TARGET, view.target),
             (MODEL, view.model),

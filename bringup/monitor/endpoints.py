@@ -62,7 +62,7 @@ class Samples:
     """Takes states and actions, from when it is made until it is closed."""
 
     def __init__(self, node: Node, namespace: str, view: View) -> None:
-        self._watcher = Watcher(node, namespace)
+        self._watcher = Watcher(node, namespace, throttled=True)
         self._watcher.look()
         self._handlers: dict[int, tuple[Callable[[bytes], Frame], Handler]] = {
             STATE_KIND: (ArrayCodec(STATE.labels).decode, view.state),

@@ -74,9 +74,9 @@ class GaussNewton:
     fields : int
         M, initial fields that judge a policy: more fit the distribution better, at M rollouts a
         step.
-    most_fields : int, optional
-        Up to how many they grow, one after each accepted step that gains less than 2 % of the cost;
-        they stay M without it.
+    most_fields : int
+        Up to how many they grow, one after each accepted step that gains less than 2 % of the cost:
+        a short step needs more of them to be judged. At or below `fields` they stay M.
     modes : int, optional
         Coordinates of the fitted model, at least n_s; 32 by default, or n_s where that is more.
     cubic_modes : int
@@ -96,7 +96,7 @@ class GaussNewton:
         iterations: int,
         context: Context,
         fields: int = 3,
-        most_fields: int | None = None,
+        most_fields: int = 6,
         modes: int | None = None,
         cubic_modes: int = 12,
         learning_rate: float | None = None,
@@ -110,7 +110,7 @@ class GaussNewton:
         self._proposer = Proposer(context, self._policy, modes, min(cubic_modes, modes))
         self._seed = seed
         self._budget = 2 * iterations
-        self._field_count, self._most_fields = fields, max(fields, most_fields or 0)
+        self._field_count, self._most_fields = fields, max(fields, most_fields)
         self._fields = np.arange(fields, dtype=np.int64)
         # Stamps of the records of the incumbent, the candidate, and what the incumbent is compared
         # to.
