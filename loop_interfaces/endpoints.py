@@ -18,7 +18,7 @@ from rclpy.subscription import Subscription
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
 from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.samples import AGE, STATE_KIND, Allowance, Bundle
+from loop_interfaces.samples import AGE, CLOCK_KIND, STATE_KIND, Allowance, Bundle
 from loop_interfaces.topics import (
     READER_DEPTH,
     SAMPLES,
@@ -141,7 +141,7 @@ class Bundler:
         stamp = time.monotonic_ns()
         if self._read:
             self._all.add(kind, stamp, raw)
-        if self._shown:
+        if self._shown and kind != CLOCK_KIND:
             self._some.add(kind, stamp, raw)
             self._allowance.use(len(raw))
 

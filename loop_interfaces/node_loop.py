@@ -107,23 +107,14 @@ class NodeLoop:
         self._receivers.append(receiver)
         return receiver.subscription
 
-    def observe(
-        self,
-        topic: Topic,
-        callback: Callable[[Frame], None],
-        namespace: str = "",
-        *,
-        throttled: bool = False,
-    ) -> None:
+    def observe(self, topic: Topic, callback: Callable[[Frame], None], namespace: str = "") -> None:
         """Call `callback` with every state or action, without taking part in the loop.
 
-        throttled: with those of some episodes. The loop neither waits for an observer nor repeats for
-        it (loop_interfaces.watching).
+        The loop neither waits for an observer nor repeats for it (loop_interfaces.watching).
         """
         watched = self._watched.get(namespace)
         if watched is None:
-            watched = _Watched(Watcher(self.node, namespace, throttled=throttled))
-            self._watched[namespace] = watched
+            watched = self._watched[namespace] = _Watched(Watcher(self.node, namespace))
         kind = {STATE: STATE_KIND, ACTION: ACTION_KIND}[topic]
         watched.callbacks[kind] = (ArrayCodec(topic.labels).decode, callback)
 

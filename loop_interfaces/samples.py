@@ -26,7 +26,7 @@ LIMIT = 256 * 1024
 """Bytes after which a bundle is sent: a few milliseconds of a fast loop."""
 AGE = 0.1
 """Seconds after which a bundle is sent that has not reached LIMIT."""
-RATE, COUNTED = 1000.0, 4096
+RATE, COUNTED = 600.0, 4096
 """Samples a second of up to so many bytes that those who only look get."""
 
 _MESSAGE = struct.Struct("<4sIIIQ")
@@ -50,7 +50,7 @@ class Allowance:
 
     def admits(self, now: float) -> bool:
         """Whether to show the episode that begins now (monotonic s)."""
-        self._left = min(RATE, max(self._left, -RATE) + RATE * (now - self._when))
+        self._left = max(-RATE, min(RATE, self._left + RATE * (now - self._when)))
         self._when = now
         return self._left >= 0.0
 

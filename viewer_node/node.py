@@ -11,6 +11,8 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -22,12 +24,14 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import ColorRGBA, Float64
 from visualization_msgs.msg import Marker
 
+from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
+from loop_interfaces.looking import DRAIN, Handler, Reader, Samples, drain
 from loop_interfaces.node_loop import NodeLoop
 from loop_interfaces.node_main import node_main
 from loop_interfaces.parameters import PROBLEM, VIEWER
 from loop_interfaces.ros_parameters import declare, given_parameters, on_change
-from loop_interfaces.topics import ACTION, COST, MODEL, POLICY, START, STATE, TARGET
+from loop_interfaces.topics import COST, MODEL, POLICY, START, TARGET
 from viewer_node.health import ViewerHealth
 from viewer_node.view import SCALARS, LoopView
 
@@ -77,16 +81,17 @@ class ViewerNode:
     def _wire(self, node: Node, loop: NodeLoop) -> None:
         self._node, self._loop = node, loop
         view = self._view
-        loop.observe(STATE, lambda frame: view.state(frame, loop.now()), throttled=True)
-        loop.observe(ACTION, view.action, throttled=True)
-        for topic, take in (
-            (TARGET, view.target),
-            (MODEL, view.model),
-            (POLICY, view.policy),
-            (START, view.start),
-            (COST, view.cost),
-        ):
-            loop.receive(topic, take)
+        self._samples = Samples(node, "", view.state, _whenever(view.action))
+        *self._starts, self._costs = (
+            Reader(node, topic, topic.name, _whenever(take))
+            for topic, take in (
+                (TARGET, view.target),
+                (MODEL, view.model),
+                (POLICY, view.policy),
+                (START, view.start),
+                (COST, view.cost),
+            )
+        )
         self._markers = {name: node.create_publisher(Marker, f"view/{name}", 1) for name in COLOURS}
         self._image = node.create_publisher(Image, "view/spacetime", 1)
         self._scalars = {
@@ -96,8 +101,18 @@ class ViewerNode:
         on_change(node, VIEWER, self._adjust)
 
     def run(self) -> int:
-        self._loop.run(tick=self._show, deadline=lambda: self._due, housekeeping=lambda now: None)
+        self._loop.run(
+            tick=self._tick,
+            deadline=lambda: 0.0,
+            housekeeping=lambda now: self._samples.look(),
+        )
         return 0
+
+    def _tick(self, now: float) -> None:
+        time.sleep(min(DRAIN, self._period))
+        drain(self._starts, self._samples, [self._costs])
+        if now >= self._due:
+            self._show(now)
 
     def _adjust(self, values: dict[str, Any]) -> None:
         self._changed = values
@@ -142,6 +157,11 @@ class ViewerNode:
     def _subscribers(self) -> int:
         publishers = (*self._markers.values(), self._image, *self._scalars.values())
         return sum(publisher.get_subscription_count() for publisher in publishers)
+
+
+def _whenever(take: Callable[[Frame], None]) -> Handler:
+    """A handler that does not care for the time."""
+    return lambda frame, now: take(frame)
 
 
 def _wanted(publisher: Publisher) -> bool:

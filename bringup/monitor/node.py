@@ -27,19 +27,18 @@ from bringup.display import ProgressFile
 from bringup.live import Live
 from bringup.monitor.attention import Attention
 from bringup.monitor.commands import VERBS, Commands, Watch
-from bringup.monitor.endpoints import Handler, Reader, Samples, ServiceCall
+from bringup.monitor.endpoints import ServiceCall
 from bringup.monitor.finder import Finder, run_id
 from bringup.monitor.health import ROLES, Endpoint
 from bringup.monitor.view import View
 from loop_interfaces.isolation import keep_on_this_machine
+from loop_interfaces.looking import DRAIN, Handler, Reader, Samples, drain
 from loop_interfaces.node_loop import NodeLoop
 from loop_interfaces.node_main import ConfigurationError, ros_node
 from loop_interfaces.ros_parameters import RemoteParameters
 from loop_interfaces.topics import COST, PAUSED, POLICY, START, TARGET, Topic
 from pde_sim_node.equations import EQUATIONS
 
-DRAIN = 0.03
-"""Seconds between two looks at what has come in."""
 REFRESH = 0.5
 """Seconds between two looks at rates and at the progress of the run."""
 LOOK = 1.0
@@ -129,15 +128,7 @@ class MonitorNode:
 
     def _tick(self, now: float) -> None:
         time.sleep(DRAIN)
-        # Taken in one order and handled in another: when a cost has come in, so have all samples of
-        # its episode, and its start.
-        costs = [(reader, reader.take()) for reader in self._latched[3:]]
-        for reader in self._latched[:3]:
-            reader.handle(reader.take())
-        if self._samples is not None:
-            self._attention.took(*self._samples.drain())
-        for reader, messages in costs:
-            reader.handle(messages)
+        self._attention.took(*drain(self._latched[:3], self._samples, self._latched[3:]))
         namespace = self._namespace
         wanted = namespace is not None and self._attention.decide(
             now, watched=self._watched(), complete=self._view.complete
@@ -145,7 +136,7 @@ class MonitorNode:
         if not wanted:
             self._stop_reading()
         elif self._samples is None and namespace is not None:
-            self._samples = Samples(self._node, namespace, self._view)
+            self._samples = Samples(self._node, namespace, self._view.state, self._view.action)
 
     def _housekeeping(self, now: float) -> None:
         self._obey()
