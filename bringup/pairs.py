@@ -46,6 +46,10 @@ class LoopNode:
         return [*self.arguments(parameter_file), *own]
 
 
+PAIR = ("pde_sim_node", "controller_node")
+"""The packages of a pair's nodes."""
+
+
 @dataclass(frozen=True)
 class Recording:
     """How a run is recorded; required: it stops if the recorder does."""
@@ -77,7 +81,7 @@ def pair_nodes(
         )
     nodes = []
     for number, namespace in enumerate(namespaces(pairs)):
-        for place, package in enumerate(("pde_sim_node", "controller_node")):
+        for place, package in enumerate(PAIR):
             parameters = [f"pin:={cores[2 * number + place]}"] if pin else []
             if number and package == "pde_sim_node":  # /clock is one topic for all
                 parameters.append("publish_clock:=false")

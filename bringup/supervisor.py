@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from bringup.shared_core import SharedCores
 from loop_interfaces.protocol import STOPPED
 
 STOP_GRACE = 1.5
@@ -38,7 +39,7 @@ class Child:
     """One node: how it is started and how its life went.
 
     optional: the others go on without it when it ends by itself, or dies too often. before_start:
-    called before each start, to change the arguments.
+    called before each start, to change the arguments. pair: number of the pair that it belongs to.
     """
 
     name: str
@@ -51,6 +52,7 @@ class Child:
     due: float | None = 0.0
     optional: bool = False
     before_start: Callable[[], None] | None = None
+    pair: int | None = None
     ended: bool = False
 
     def last_words(self) -> str:
@@ -76,6 +78,8 @@ class Supervisor:
     tell: Callable[[str], None]
     isolation: Mapping[str, str]
     """Environment variables that say where messages may go (loop_interfaces.isolation)."""
+    shared: SharedCores | None = None
+    """Where the processes of pairs run; None: wherever the scheduler puts them."""
     stopped: bool = False
     """Whether the main node ended because an operator asked it to, through its service."""
     _environment: dict[str, str] = field(default_factory=dict)
@@ -95,6 +99,8 @@ class Supervisor:
         Raises NodeError when a node refuses to run or keeps dying.
         """
         now = time.monotonic()
+        if self.shared is not None:
+            self.shared.look(now)
         for child in self.children:
             if child.process is None:
                 if child.due is not None and now >= child.due:
@@ -147,6 +153,8 @@ class Supervisor:
                 start_new_session=True,  # Ctrl-C in the terminal reaches the supervisor only
                 preexec_fn=die_with_parent,
             )
+        if self.shared is not None and child.pair is not None:
+            self.shared.place(child.pair, child.process.pid)
         child.started, child.due = now, None
 
     def _bury(self, child: Child, code: int, now: float) -> None:

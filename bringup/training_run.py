@@ -23,7 +23,8 @@ from bringup.domain import own_domain
 from bringup.in_process import LocalPair, train
 from bringup.live import announced
 from bringup.output import print_json
-from bringup.pairs import Layout, Recording, pair_nodes, quoted
+from bringup.pairs import PAIR, Layout, Recording, namespaces, pair_nodes, quoted
+from bringup.shared_core import SharedCores, worthwhile
 from bringup.supervisor import Child, NodeError, Supervisor, node_command
 from loop_interfaces.isolation import NETWORK, PROFILE, loopback_environment
 from loop_interfaces.parameters import ParameterError
@@ -65,7 +66,8 @@ class Transport:
 
     in_process: without ROS; network: let the messages leave this machine; faulty_line: 'LOSS,
     DUPLICATION,DELAY' of a relay between plant and controller; pairs: of plant and controller; pin:
-    give each of their nodes a core; view: a viewer_node of the first pair beside them.
+    give each of their nodes a core; view: a viewer_node of the first pair beside them; spread: leave
+    the cores to the scheduler (bringup.shared_core).
     """
 
     in_process: bool = False
@@ -75,6 +77,7 @@ class Transport:
     pairs: int = 1
     pin: bool = False
     view: bool = False
+    spread: bool = False
 
     def __post_init__(self) -> None:
         if self.in_process and (self.recording or self.network or self.faulty_line):
@@ -86,9 +89,13 @@ class Transport:
                 f"--network and {PROFILE}={os.environ[PROFILE]} both say where messages go; leave "
                 "out --network to use that profile, or unset the variable"
             )
-        if self.in_process and (self.pairs > 1 or self.pin or self.view):
+        if self.in_process and (self.pairs > 1 or self.pin or self.spread or self.view):
             raise ParameterError(
-                "--pairs, --pin and --view are about nodes; leave out --in-process"
+                "--pairs, --pin, --spread and --view are about nodes; leave out --in-process"
+            )
+        if self.pin and self.spread:
+            raise ParameterError(
+                "--pin gives each node a core, --spread none; leave out one of them"
             )
         if self.pairs > 1 and self.faulty_line:
             raise ParameterError("--faulty-line is the line of one pair; leave out --pairs")
@@ -101,6 +108,14 @@ class Transport:
         remaps = {"pde_sim_node": ["state:=state_sent"], "controller_node": ["action:=action_sent"]}
         remaps = remaps if self.faulty_line else {}
         return Layout(self.pairs, self.pin, self.recording, remaps, self.view)
+
+    def shared_cores(self, values: Mapping[str, Any]) -> SharedCores | None:
+        """Where plants and controllers run, if not wherever the scheduler puts them."""
+        directions = values["directions"] if values["optimizer"] == "directions" else 1
+        environments = 2 * directions * values["seeds"] / self.pairs
+        if self.pin or self.spread or not worthwhile(environments):
+            return None
+        return SharedCores(self.pairs)
 
     def line_arguments(self) -> list[str]:
         """The relay's ROS parameters."""
@@ -224,12 +239,14 @@ def _train_over_topics(
         )
     logs = folder / "logs"
     logs.mkdir(exist_ok=True)
+    pairs = namespaces(transport.pairs)
     children = {
         node.name: Child(
             node.name,
             node_command(node.package, *node.ros_arguments(folder / "parameters.yaml")),
             logs / f"{node.name}.log",
             optional=node.package in ("recorder_node", "viewer_node"),
+            pair=pairs.index(node.namespace) if node.package in PAIR else None,
         )
         for node in transport.layout().nodes(folder)
     }
@@ -252,6 +269,7 @@ def _train_over_topics(
             logs,
             display.line,
             {NETWORK: "1"} if transport.network else loopback_environment(),
+            transport.shared_cores(RunFolder(folder).values()),
         )
         try:
             done = False

@@ -52,6 +52,8 @@ def test_pinning_gives_every_node_its_own_core_or_refuses(monkeypatch: pytest.Mo
         (["--directions", "99"], "'directions' is 99; expected at most 40"),
         (["--in-process", "--pairs", "2"], "leave out --in-process"),
         (["--in-process", "--pin"], "leave out --in-process"),
+        (["--in-process", "--spread"], "leave out --in-process"),
+        (["--pin", "--spread"], "leave out one of them"),
         (["--pairs", "65"], "--pairs is 65"),
     ],
 )

@@ -204,7 +204,8 @@ def test_what_train_takes_is_a_launch_argument_too() -> None:
     )
     actions = subcommands.choices["train"]._actions
     known = {argument.spec.name for argument in TRAIN_ARGUMENTS}
-    not_for_launch = {"help", "in_process", "faulty_line", "json"}
+    # `ros2 launch` does not place processes, whence no spread.
+    not_for_launch = {"help", "in_process", "faulty_line", "json", "spread"}
     assert {action.dest for action in actions} - not_for_launch <= known
 
 

@@ -172,6 +172,7 @@ def _stand_back() -> None:
     """Let the loop's processes go first: what arrives here must not preempt its sender."""
     with contextlib.suppress(OSError, AttributeError):
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+        os.nice(19)
 
 
 def main(args: list[str] | None = None) -> int:

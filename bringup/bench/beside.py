@@ -20,9 +20,13 @@ from pathlib import Path
 from typing import Any
 
 from bringup.domain import own_domain
+from bringup.shared_core import SharedCores, worthwhile
 from bringup.supervisor import node_command
 from loop_interfaces.isolation import loopback_environment
 from loop_interfaces.problem import find_problem
+
+ENVIRONMENTS = 2
+"""Of an episode of the two-point method with one seed."""
 
 
 @dataclass
@@ -72,6 +76,10 @@ def measure(
 
         try:
             nodes = [start("pde_sim_node"), start("controller_node")]
+            if worthwhile(ENVIRONMENTS):  # as `pdeloop train` does it
+                cores = SharedCores(1)
+                for node in nodes:
+                    cores.place(0, node.pid)
             start("tuner_node", f"out:={run}", "iterations:=100000", "optimizer:=two_point", *tuner)
             progress = run / "progress.jsonl"
 

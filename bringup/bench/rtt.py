@@ -12,33 +12,46 @@ from statistics import median
 from typing import Any
 
 from bringup.bench.processes import Bench, bench, machine, markdown
+from bringup.shared_core import SharedCores, worthwhile
 from loop_interfaces.affinity import free_cores
 from loop_interfaces.problem import load_parameters
 
 PROBLEM = "allen-cahn"
 """P2: of the paper's problems the one whose step is shortest."""
 BATCHES = (2, 64)
+CORES = ("any", "shared", "pinned")
+"""Where plant and controller are: wherever the scheduler puts them (nodes started by hand), on one
+core for both (`pdeloop train` with few environments; not for many), on one each (`--pin`). The
+ping-pong is on any two, and pinned with `pinned`."""
 PAYLOAD = 256
 """Numbers in a request of the bare ping-pong."""
 
 
 def measure(
-    batches: tuple[int, ...], turns: int, seconds: float, pinned: bool
+    batches: tuple[int, ...], turns: int, seconds: float, cores: str
 ) -> list[dict[str, Any]]:
-    """One row for each batch."""
+    """One row for each batch. cores: one of CORES."""
+    if cores == "shared":
+        batches = tuple(batch for batch in batches if worthwhile(batch))
     with bench() as running:
-        return _measure(running, batches, turns, seconds, pinned)
+        return _measure(running, batches, turns, seconds, cores)
 
 
 def _measure(
-    running: Bench, batches: tuple[int, ...], turns: int, seconds: float, pinned: bool
+    running: Bench, batches: tuple[int, ...], turns: int, seconds: float, cores: str
 ) -> list[dict[str, Any]]:
-    one, two = free_cores(2) if pinned else (-1, -1)
+    one, two = free_cores(2) if cores == "pinned" else (-1, -1)
     ping = running.start("bringup.bench.ping", f"pin:={one}")
     running.start("bringup.bench.ping", "end:=pong", f"pin:={two}")
     horizon = "horizon:=1000"
-    running.start("pde_sim_node", horizon, f"pin:={one}", problem=PROBLEM)
-    running.start("controller_node", f"pin:={two}", problem=PROBLEM)
+    pair = (
+        running.start("pde_sim_node", horizon, f"pin:={one}", problem=PROBLEM),
+        running.start("controller_node", f"pin:={two}", problem=PROBLEM),
+    )
+    if cores == "shared":
+        placement = SharedCores(1)
+        for node in pair:
+            placement.place(0, node.process.pid)
     driver = running.start("bringup.bench.driver", horizon, f"solver_pin:={one}", problem=PROBLEM)
     n_z = load_parameters(PROBLEM, {})["n_z"]
     for batch in batches:  # compile, find each other, warm up
@@ -75,7 +88,7 @@ def _measure(
         }
         rows.append(
             {
-                "pinned": pinned,
+                "cores": cores,
                 "batch": batch,
                 "ping_us": us["ping"],
                 "ping_same_payload_us": us["ping_same"],
@@ -90,23 +103,21 @@ def _measure(
     return rows
 
 
-def run(
-    turns: int = 7, seconds: float = 0.4, modes: tuple[bool, ...] = (False, True)
-) -> dict[str, Any]:
+def run(turns: int = 7, seconds: float = 0.4, cores: tuple[str, ...] = CORES) -> dict[str, Any]:
     """Everything, as JSON-able data."""
-    rows = [row for pinned in modes for row in measure(BATCHES, turns, seconds, pinned)]
+    rows = [row for where in cores for row in measure(BATCHES, turns, seconds, where)]
     return {"problem": PROBLEM, "machine": machine(), "rows": rows}
 
 
 def text(result: dict[str, Any]) -> str:
     """A table of `result`."""
     head = (
-        "pinned", "batch", "rounds/s", "round µs", "solver µs", "overhead µs",
+        "cores", "batch", "rounds/s", "round µs", "solver µs", "overhead µs",
         "ping-pong µs", "ratio", "same payload µs", "ratio",
     )  # fmt: skip
     rows = [
         (
-            "yes" if row["pinned"] else "no",
+            row["cores"],
             row["batch"],
             f"{row['rounds_per_second']:.0f}",
             f"{row['round_us']:.0f}",

@@ -32,6 +32,7 @@ def run(
     ways: dict[str, list[str]] = {"in-process": ["--in-process"], "topics": []}
     if pin:
         free_cores(2)
+        ways["topics --spread"] = ["--spread"]
         ways["topics --pin"] = ["--pin"]
     runs: dict[str, list[dict[str, Any]]] = {way: [] for way in ways}
     with tempfile.TemporaryDirectory() as folder:

@@ -31,7 +31,11 @@ def add(commands: Commands) -> None:
     )
     rtt.add_argument("--turns", type=int, default=9, metavar="N", help="turns of each [9]")
     rtt.add_argument("--seconds", type=float, default=0.4, metavar="S", help="of a turn [0.4]")
-    rtt.add_argument("--only", choices=("pinned", "unpinned"), help="one of the two")
+    rtt.add_argument(
+        "--only",
+        choices=("any", "shared", "pinned"),
+        help="plant and controller on any cores, on one for both, or on one each; one of the three",
+    )
     batch = _add(
         programs, "batch", "environment-steps a second against the batch", "--problem kdv --turns 5"
     )
@@ -237,8 +241,7 @@ def _measure(program: str, given: dict[str, Any]) -> tuple[Any, str]:
         return [asdict(row) for row in rows], module.table(rows)
     if program == "rtt":
         only = given.pop("only", None)
-        given["modes"] = tuple(
-            p for p in (False, True) if only in (None, "pinned" if p else "unpinned")
-        )
+        if only:
+            given["cores"] = (only,)
     result = module.run(**given)
     return result, module.text(result)

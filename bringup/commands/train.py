@@ -108,6 +108,11 @@ def add(commands: Commands) -> None:
         action="store_true",
         help="a core for each plant and controller, and polling: less time per step, more power",
     )
+    train.add_argument(
+        "--spread",
+        action="store_true",
+        help="plant and controller on any cores, instead of one for both (docs/performance.md)",
+    )
     for spec in INSTRUMENTS:
         train.add_argument(
             f"--{spec.name.replace('_', '-')}",
@@ -143,6 +148,7 @@ def _train(options: argparse.Namespace) -> int:
         options.pairs,
         options.pin,
         options.view,
+        options.spread,
     )
     names = ["iterations", "seed", "seeds", "start", "optimizer", "directions", "policy_features"]
     names += [spec.name for spec in INSTRUMENTS]

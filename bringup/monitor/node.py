@@ -262,7 +262,7 @@ def stand_back() -> None:
     """Let the loop's processes go first: a message that arrives here must not preempt its sender."""
     with contextlib.suppress(OSError, AttributeError):
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
-        os.nice(5)
+        os.nice(19)
 
 
 def watch(

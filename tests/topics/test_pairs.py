@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,9 +16,9 @@ from bringup.bench.hosts import can_make_hosts, hosts
 from bringup.bench.processes import bench
 from bringup.in_process import LocalPair, train
 from bringup.training_run import resolve
-from tests.loop_harness import Processes
+from tests.loop_harness import Processes, until
 from tests.small import SMALL, same_bits
-from tests.topics.test_loop import LIMIT, assert_same_training, in_process
+from tests.topics.test_loop import LIMIT, assert_same_training, in_process, iterations_done
 from tuner_node.build import build_training
 
 pytestmark = pytest.mark.topics
@@ -63,6 +65,28 @@ def test_a_pinned_training_is_the_same(loop: Processes, tmp_path) -> None:
     )
     loop.wait(run, LIMIT)
     assert_same_training(tmp_path / "a", in_process(iterations=6))
+
+
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
+@pytest.mark.parametrize(("seeds", "flags"), [("1", ()), ("1", ("--spread",)), ("5", ())])
+def test_plant_and_controller_of_a_small_batch_share_a_core(loop, tmp_path, seeds, flags) -> None:
+    options = ("--optimizer", "two_point", "--iterations", "100000", "--seeds", seeds, *flags)
+    run = loop.pdeloop("train", str(SMALL), *options, "--out", str(tmp_path / "a"))
+    until(lambda: iterations_done(tmp_path / "a") >= 3, LIMIT, "iteration 3")
+    cores = [
+        {
+            frozenset(os.sched_getaffinity(int(thread.name)))
+            for pid in loop.pids(node)
+            for thread in Path(f"/proc/{pid}/task").iterdir()
+        }
+        for node in ("pde_sim_node", "controller_node", "tuner_node")
+    ]
+    free = {frozenset(os.sched_getaffinity(0))}
+    shared = seeds == "1" and not flags
+    assert cores[0] == cores[1] and cores[2] == free
+    assert (len(cores[0]) == 1 and len(next(iter(cores[0]))) == 1) if shared else cores[0] == free
+    run.send_signal(signal.SIGINT)
+    loop.wait(run, 20.0, code=130)
 
 
 def test_a_node_refuses_a_core_that_is_not_there(loop: Processes) -> None:

@@ -1,0 +1,117 @@
+"""Plant and controller of a pair on one core: they take turns, so one is enough.
+
+A message to a process on another core has to wake that core if it is idle, which takes longer than
+the rest of a round where idle cores sleep deeply (in virtual machines above all). On one core the
+receiver goes on where the sender waits. It also leaves the other cores to the tuner and to those who
+record or watch. A large batch wants all cores for its solver instead.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from loop_interfaces.affinity import free_cores
+
+MOST_ENVIRONMENTS = 8
+"""Environments of an episode up to which one core for both is faster than the solver on all."""
+PERIOD = 2.0
+"""Seconds between two looks at how busy the cores are."""
+CROWDED = 0.3
+"""Share of a core taken by others, beyond that on the freest one, from which a pair moves there."""
+
+_STAT = Path("/proc/stat")
+
+
+def worthwhile(environments: float) -> bool:
+    """Whether pairs of this many environments an episode should share a core, on this system."""
+    several = hasattr(os, "sched_setaffinity") and len(os.sched_getaffinity(0)) > 1
+    return several and _STAT.exists() and environments <= MOST_ENVIRONMENTS
+
+
+def freest(taken: Mapping[int, float], present: int) -> int:
+    """The core to be on.
+
+    taken: share of each core that others take; present: the core now, left only for one that is
+    clearly freer.
+    """
+    best = min(taken, key=lambda core: (taken[core], core))
+    return best if taken.get(present, 1.0) > taken[best] + CROWDED else present
+
+
+@dataclass
+class _Pair:
+    core: int
+    processes: set[int] = field(default_factory=set)
+    ticks: int = 0
+
+
+class SharedCores:
+    """Keeps the processes of each pair on one core, and moves a pair whose core others need."""
+
+    def __init__(self, pairs: int) -> None:
+        self._pairs = [_Pair(core) for core in free_cores(pairs)]
+        self._cores = sorted(set(free_cores(os.cpu_count() or 1)))
+        self._busy = self._total = dict.fromkeys(self._cores, 0)
+        self._next = float("-inf")
+
+    def place(self, pair: int, process: int) -> None:
+        """A process of a pair has been started."""
+        place = self._pairs[pair]
+        place.processes.add(process)
+        _move(process, place.core)
+
+    def look(self, now: float) -> None:
+        """Call it often; now: monotonic s."""
+        if now < self._next:
+            return
+        first, self._next = self._next < 0.0, now + PERIOD
+        busy, total = _ticks(self._cores)
+        for pair in self._pairs:
+            before, pair.ticks = pair.ticks, sum(_used(process) for process in pair.processes)
+            if first:
+                continue
+            taken = {
+                core: (busy[core] - self._busy[core]) / max(total[core] - self._total[core], 1)
+                for core in self._cores
+            }
+            own = max(0, pair.ticks - before)
+            taken[pair.core] -= own / max(total[pair.core] - self._total[pair.core], 1)
+            core = freest(taken, pair.core)
+            if core != pair.core:
+                pair.core = core
+                for process in pair.processes:
+                    _move(process, core)
+        self._busy, self._total = busy, total
+
+
+def _move(process: int, core: int) -> None:
+    with contextlib.suppress(OSError):  # it has ended meanwhile
+        threads = [int(thread.name) for thread in Path(f"/proc/{process}/task").iterdir()]
+        for thread in threads:
+            with contextlib.suppress(ProcessLookupError):
+                os.sched_setaffinity(thread, {core})
+
+
+def _ticks(cores: list[int]) -> tuple[dict[int, int], dict[int, int]]:
+    """Ticks that each core was busy, and all of them, since the machine was started."""
+    busy, total = dict.fromkeys(cores, 0), dict.fromkeys(cores, 0)
+    for line in _STAT.read_text().splitlines():
+        name, *numbers = line.split()
+        if name.startswith("cpu") and name[3:].isdigit() and int(name[3:]) in busy:
+            spent = [int(number) for number in numbers[:8]]
+            total[int(name[3:])] = sum(spent)
+            busy[int(name[3:])] = sum(spent) - spent[3] - spent[4]  # idle, waiting for a disk
+    return busy, total
+
+
+def _used(process: int) -> int:
+    """Ticks that a process has used; 0 of one that has ended."""
+    try:
+        fields = Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()
+    except OSError:
+        return 0
+    return int(fields[11]) + int(fields[12])
