@@ -128,6 +128,28 @@ def test_resuming_with_changed_parameters_shows_the_difference(tmp_path, capsys)
     assert "has other parameters (seed: 0 there, 5 now)" in line
 
 
+def test_a_run_of_a_version_with_fewer_parameters_can_be_resumed(tmp_path, capsys):
+    out = tmp_path / "run"
+    assert train(out) == 0
+    policy = (out / "policy.npz").read_bytes()
+    (out / "result.json").unlink()
+    text = (out / "parameters.yaml").read_text()
+    lines = [line for line in text.splitlines() if "measurement_noise" not in line]
+    (out / "parameters.yaml").write_text("\n".join(lines) + "\n")
+    known = json.loads((out / "run.json").read_text())
+    assert known["parameters"].pop("measurement_noise") == 0.0
+    (out / "run.json").write_text(json.dumps(known))
+    assert main(["train", "--resume", str(out), "--in-process"]) == 0
+    assert (out / "policy.npz").read_bytes() == policy
+    (out / "result.json").unlink()
+    (out / "parameters.yaml").write_text(
+        text.replace("measurement_noise: 0.0", "measurement_noise: 0.5")
+    )
+    (out / "run.json").write_text(json.dumps(known))
+    line = error_of(capsys, "train", "--resume", str(out), "--in-process")
+    assert "has other parameters (measurement_noise: 0.0 there, 0.5 now)" in line
+
+
 def test_damaged_run_files_are_one_clear_line(tmp_path, capsys):
     out = tmp_path / "run"
     assert train(out) == 0

@@ -129,11 +129,17 @@ class RunFolder:
         return {**given, **check(table(), given)}
 
     def _check_same(self, known: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-        """RunFolderError showing every difference that would change the results."""
+        """RunFolderError showing every difference that would change the results.
+
+        A parameter that a run of an older version does not know has its default there: a new one's is
+        always what was done before.
+        """
+        defaults = {spec.name: spec.default for spec in table()}
+        there = {name: known.get(name, defaults.get(name)) for name in {*known, *now}}
         changes = [
-            f"{name}: {known.get(name)!r} there, {now.get(name)!r} now"
-            for name in sorted({*known, *now} - set(TRANSIENT))
-            if known.get(name) != now.get(name)
+            f"{name}: {there[name]!r} there, {now.get(name)!r} now"
+            for name in sorted(set(there) - set(TRANSIENT))
+            if there[name] != now.get(name)
         ]
         if changes:
             raise RunFolderError(
