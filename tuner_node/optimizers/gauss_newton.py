@@ -13,7 +13,8 @@ iteration
 3. rolls out theta + d on the M fields of the moment, one by one, giving up as soon as the mean is
    clearly above the incumbent's, accepts it if the mean over all fields fell, and adapts lambda,
    An incumbent that diverges is halved instead,
-4. after an acceptance replaces the oldest field, so that the policy does not fit M fields.
+4. after an acceptance replaces the oldest field, so that the policy does not fit M fields, or adds one
+   if the step was small.
 
 Sources and equations: docs/optimizers.md.
 """
