@@ -15,6 +15,7 @@ WITH_ROS = {
     "node.py",
     "node_loop.py",
     "watching.py",
+    "looking.py",
     "node_main.py",
     "endpoints.py",
     "introspection.py",

@@ -107,7 +107,12 @@ def test_a_paused_tuner_begins_no_episode_and_keeps_the_plant(loop: Processes, t
         assert iterations_done(out) == done
         assert iterations_done(tmp_path / "second") == 0
         assert desk.values("pde_sim_node")["episodes"] == episodes
-        assert desk.status("tuner_node")[2].startswith("paused in iteration ")
+        # The last report of that name may be the refused one's.
+        until(
+            lambda: desk.status("tuner_node")[2].startswith("paused in iteration "),
+            LIMIT,
+            "report of the first tuner",
+        )
         assert desk.call("/tuner_node/resume") == "resumed"
         loop.wait(tuner, LONG)
     assert_same_training(out, in_process(iterations=ITERATIONS))
