@@ -110,6 +110,8 @@ def test_two_different_actions_for_one_state_void_the_episode():
         assert send.frame.step == step
         (send,) = protocol.action(answer(send.frame, scale=7.0 if step == 3 else 0.1), 0.0)
     assert protocol.action(answer(quiet[3 - 1]), 0.0) == []
+    other = answer(quiet[3])
+    assert protocol.action(replace(other, values=other.values[:1]), 0.0) == []
     (void,) = protocol.action(answer(quiet[3]), 0.0)
     assert void.topic is COST
     assert (void.frame.values[:, CostColumn.ENDED] == VOID).all()
