@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import secrets
 import sys
+import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -51,6 +52,8 @@ from tuner_node.session import Session
 
 RIVAL_GRACE = 6.0
 """Seconds a second tuner may be seen before it counts as one: a killed one is seen for 3 s."""
+FAREWELL = 0.5
+"""Seconds in which the answer to a request to stop goes out, before its writer is gone."""
 ABSENCE_REPORT = 5.0
 """Seconds between two reports of a missing plant or controller."""
 
@@ -133,6 +136,7 @@ class TunerNode:
             raise ConfigurationError(self._failure)
         if self._session.stopped:
             self._log.info("stopped on request after an iteration")
+            time.sleep(FAREWELL)
             return STOPPED
         self._log.info(f"stopped by {reason} before the end")
         return 130
