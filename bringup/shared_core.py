@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import random
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,7 +20,7 @@ from loop_interfaces.affinity import free_cores
 MOST_ENVIRONMENTS = 8
 """Environments of an episode up to which one core for both is faster than the solver on all."""
 PERIOD = 2.0
-"""Seconds between two looks at how busy the cores are."""
+"""Seconds between two looks at how busy the cores are, on average."""
 CROWDED = 0.3
 """Share of a core taken by others, beyond that on the freest one, from which a pair moves there."""
 
@@ -45,7 +46,7 @@ def freest(taken: Mapping[int, float], present: int) -> int:
 @dataclass
 class _Pair:
     core: int
-    processes: set[int] = field(default_factory=set)
+    processes: dict[str, int] = field(default_factory=dict)
     ticks: int = 0
 
 
@@ -58,20 +59,21 @@ class SharedCores:
         self._busy = self._total = dict.fromkeys(self._cores, 0)
         self._next = float("-inf")
 
-    def place(self, pair: int, process: int) -> None:
-        """A process of a pair has been started."""
+    def place(self, pair: int, name: str, process: int) -> None:
+        """A process of a pair has been started, perhaps in place of one of the same name."""
         place = self._pairs[pair]
-        place.processes.add(process)
+        place.processes[name] = process
         _move(process, place.core)
 
     def look(self, now: float) -> None:
         """Call it often; now: monotonic s."""
         if now < self._next:
             return
-        first, self._next = self._next < 0.0, now + PERIOD
+        # At no regular times: two runs that look together would leave for the same core together.
+        first, self._next = self._next < 0.0, now + PERIOD * random.uniform(0.5, 1.5)
         busy, total = _ticks(self._cores)
         for pair in self._pairs:
-            before, pair.ticks = pair.ticks, sum(_used(process) for process in pair.processes)
+            before, pair.ticks = pair.ticks, sum(map(_used, pair.processes.values()))
             if first:
                 continue
             taken = {
@@ -83,7 +85,7 @@ class SharedCores:
             core = freest(taken, pair.core)
             if core != pair.core:
                 pair.core = core
-                for process in pair.processes:
+                for process in pair.processes.values():
                     _move(process, core)
         self._busy, self._total = busy, total
 

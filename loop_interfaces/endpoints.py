@@ -44,6 +44,18 @@ class OutsideExecutor(CallbackGroup):
         return None
 
 
+def raw_subscription(node: Node, message_type: Any, name: str, qos: QoSProfile) -> Subscription:
+    """A subscription whose serialised messages its owner takes itself, whenever it likes."""
+    return node.create_subscription(
+        message_type,
+        name,
+        lambda _: None,  # never called: see OutsideExecutor
+        qos,
+        callback_group=OutsideExecutor(),
+        raw=True,
+    )
+
+
 def writer_qos(topic: Topic) -> QoSProfile:
     """What a publisher offers: reliable, so that it serves every kind of reader."""
     return QoSProfile(
@@ -199,13 +211,8 @@ class Receiver:
         self.callback = callback
         self.bundler = bundler
         self.decode = ArrayCodec(topic.labels).decode
-        self.subscription: Subscription = node.create_subscription(
-            Float64MultiArray,
-            scoped(namespace, topic.name),
-            lambda _: None,  # never called: see OutsideExecutor
-            reader_qos(topic),
-            callback_group=OutsideExecutor(),
-            raw=True,
+        self.subscription = raw_subscription(
+            node, Float64MultiArray, scoped(namespace, topic.name), reader_qos(topic)
         )
         self.handle = self.subscription.handle
         self.take = self.handle.take_message

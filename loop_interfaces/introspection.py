@@ -16,6 +16,8 @@ from std_srvs.srv import Trigger
 
 from loop_interfaces.health import Health, Level
 
+NAMELESS = "_NODE_NAME_UNKNOWN_"
+"""What the graph says of an endpoint whose node it has not heard of yet."""
 DIAGNOSTICS = "/diagnostics"
 PERIOD = 1.0
 """Seconds between two reports, and between two looks at the graph."""

@@ -12,10 +12,9 @@ import time
 from collections.abc import Callable, Sequence
 
 from rclpy.node import Node
-from rclpy.subscription import Subscription
 from std_msgs.msg import Float64MultiArray
 
-from loop_interfaces.endpoints import OutsideExecutor, reader_qos
+from loop_interfaces.endpoints import raw_subscription, reader_qos
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.samples import ACTION_KIND, STATE_KIND
 from loop_interfaces.topics import ACTION, STATE, Topic
@@ -50,14 +49,7 @@ class Reader:
     def __init__(self, node: Node, topic: Topic, name: str, handle: Handler) -> None:
         self._node, self._handle = node, handle
         self._decode = ArrayCodec(topic.labels).decode
-        self._subscription: Subscription = node.create_subscription(
-            Float64MultiArray,
-            name,
-            lambda _: None,  # never called: see OutsideExecutor
-            reader_qos(topic),
-            callback_group=OutsideExecutor(),
-            raw=True,
-        )
+        self._subscription = raw_subscription(node, Float64MultiArray, name, reader_qos(topic))
 
     def take(self) -> list[bytes]:
         """What has come in."""

@@ -14,7 +14,7 @@ from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
-from loop_interfaces.endpoints import OutsideExecutor, reader_qos, samples_qos, scoped
+from loop_interfaces.endpoints import raw_subscription, reader_qos, samples_qos, scoped
 from loop_interfaces.samples import ACTION_KIND, CLOCK_KIND, STATE_KIND, ClockOffset, unpack
 from loop_interfaces.topics import ACTION, SAMPLES, SAMPLES_THROTTLED, STATE
 
@@ -95,11 +95,4 @@ class Watcher:
         self._singles, self.handles = {}, []
 
     def _subscribe(self, message_type: Any, name: str, qos: Any) -> Subscription:
-        return self._node.create_subscription(
-            message_type,
-            scoped(self._namespace, name),
-            lambda _: None,  # never called: see OutsideExecutor
-            qos,
-            callback_group=OutsideExecutor(),
-            raw=True,
-        )
+        return raw_subscription(self._node, message_type, scoped(self._namespace, name), qos)

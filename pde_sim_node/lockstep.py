@@ -264,7 +264,7 @@ class Lockstep:
             self.tally["actions of another step"] += 1
             # One of another shape could never have been taken: it puts nothing in doubt.
             past = frame.step < plant.step_index and frame.values.shape == expected
-            if past and _digest(frame) != self._taken[frame.step]:
+            if past and frame.digest() != self._taken[frame.step]:
                 self.contradiction = (
                     f"two different actions came for step {frame.step} of episode {frame.episode}; "
                     "expected one controller, which answers a repeated state with the same action"
@@ -281,7 +281,7 @@ class Lockstep:
         self._tuner_heard = now
         if plant.step_index == plant.horizon:
             return [self._finish(now, void=False)]
-        self._taken.append(_digest(frame))
+        self._taken.append(frame.digest())
         states = plant.step(frame.values)
         self.steps_total += plant.batch
         self.rounds_total += 1
@@ -370,7 +370,3 @@ class Lockstep:
         if noise.size and (noise.min() < 0 or (noise != np.floor(noise)).any()):
             raise FrameError("expected noise seeds that are whole numbers of at least 0")
         return rows
-
-
-def _digest(frame: Frame) -> int:
-    return hash(frame.values.tobytes())

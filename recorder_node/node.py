@@ -12,7 +12,6 @@ import json
 import os
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,18 +21,19 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.subscription import Subscription
 from std_msgs.msg import Float64MultiArray, String
 
-from loop_interfaces.endpoints import OutsideExecutor, reader_qos, scoped
+from loop_interfaces.endpoints import raw_subscription, reader_qos, scoped
 from loop_interfaces.frames import FrameError
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.node_loop import NodeLoop
 from loop_interfaces.node_main import ConfigurationError, node_main
-from loop_interfaces.parameters import RECORDER, TUNER, table
-from loop_interfaces.ros_parameters import RemoteParameters, declare, given_parameters
+from loop_interfaces.parameters import RECORDER, TUNER
+from loop_interfaces.ros_parameters import declare, given_parameters
 from loop_interfaces.samples import ACTION_KIND, CLOCK_KIND, STATE_KIND
 from loop_interfaces.topics import ACTION, RECORDER_STATUS, START, STATE
 from loop_interfaces.watching import Watcher
 from recorder_node.bag import BagError
 from recorder_node.health import RecorderHealth
+from recorder_node.peers import Peers
 from recorder_node.recording import (
     ARRAY_TYPE,
     CLOCK_TYPE,
@@ -52,10 +52,6 @@ FLUSH = 0.5
 """Seconds of recording that a SIGKILL may lose at the most."""
 DEPTH = 100
 """Samples a reader of a latched topic keeps: a few an episode, should this process be held up."""
-NAMELESS = "_NODE_NAME_UNKNOWN_"
-"""What the graph says of an endpoint whose node it has not heard of yet."""
-PATIENCE = 3.0
-"""Seconds in which a node is expected to answer a request for its parameters."""
 REPORT = 1.0
 """Seconds between two messages on recorder/status."""
 QUIET = 0.1
@@ -70,84 +66,6 @@ STATUS_QOS = QoSProfile(
     depth=1,
 )
 """Latched: a tuner that starts later learns of the recorder, too."""
-
-
-@dataclass
-class _Peer:
-    """A process that publishes a topic of the loop, and since when we know of it."""
-
-    since: float
-    name: str = ""
-    parameters: RemoteParameters | None = None
-
-    def matched(self, now: float) -> bool:
-        """Whether it knows of our readers; one without parameter services counts in the end."""
-        answered = self.parameters is not None and self.parameters.values is not None
-        return answered or now - self.since > PATIENCE
-
-
-class Peers:
-    """The nodes of the loop: whether they know of our readers, and their parameters.
-
-    required: full names of topics that somebody must publish; others: whose publishers, if there
-    are any, are asked, too.
-    """
-
-    def __init__(self, node: Node, required: list[str], others: list[str]) -> None:
-        self._node, self._required, self._topics = node, required, [*others, *required]
-        self._peers: dict[bytes, _Peer] = {}
-        self._lacking = list(required)
-        self._told: object = None
-
-    def look(self, now: float) -> None:
-        """Look at the graph, ask who is new, take answers."""
-        seen: set[bytes] = set()
-        self._lacking = []
-        for topic in self._topics:
-            found = self._node.get_publishers_info_by_topic(topic)
-            if topic in self._required and not found:
-                self._lacking.append(topic)
-            for endpoint in found:
-                # The first 12 bytes of an endpoint's id are its process's.
-                process = bytes(endpoint.endpoint_gid)[:12]
-                seen.add(process)
-                peer = self._peers.setdefault(process, _Peer(now))
-                if not peer.name and endpoint.node_name != NAMELESS:
-                    peer.name = f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
-                    peer.parameters = RemoteParameters(self._node, peer.name)
-        for process in set(self._peers) - seen:
-            self._drop(process)
-        for peer in self._peers.values():
-            if peer.parameters is not None:
-                peer.parameters.poll()
-
-    def all_matched(self, now: float) -> bool:
-        """Whether every required topic has a publisher, and all of them know of us."""
-        return not self._lacking and all(peer.matched(now) for peer in self._peers.values())
-
-    def changed(self, run: int) -> bool:
-        """Whether `parameters` may have changed since the last call with the same run."""
-        answered = [
-            p for p, peer in self._peers.items() if peer.parameters and peer.parameters.values
-        ]
-        changed, self._told = (run, answered) != self._told, (run, answered)
-        return changed
-
-    def parameters(self) -> dict[str, object]:
-        """The loop's parameters, as far as its nodes told them; of a node started again the new."""
-        known = {spec.name for spec in table()}
-        answers = [peer.parameters.values for peer in self._peers.values() if peer.parameters]
-        return {
-            name: value
-            for values in answers
-            for name, value in (values or {}).items()
-            if name in known or name.startswith("physical.")
-        }
-
-    def _drop(self, process: bytes) -> None:
-        peer = self._peers.pop(process)
-        if peer.parameters is not None:
-            peer.parameters.close()
 
 
 def _declare(node: Node) -> dict[str, Any]:
@@ -233,14 +151,8 @@ class RecorderNode:
         return 0
 
     def _subscribe(self, source: Source) -> Subscription:
-        return self._node.create_subscription(
-            _TYPES[source.channel.type],
-            source.channel.topic,
-            lambda _: None,  # never called: see OutsideExecutor
-            reader_qos(START, DEPTH),
-            callback_group=OutsideExecutor(),
-            raw=True,
-        )
+        kind = _TYPES[source.channel.type]
+        return raw_subscription(self._node, kind, source.channel.topic, reader_qos(START, DEPTH))
 
     def _tick(self, now: float) -> None:
         time.sleep(DRAIN)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import pytest
@@ -21,6 +21,18 @@ def _own_environment(monkeypatch: pytest.MonkeyPatch) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The longest test first, so that at the end no worker waits for it."""
     items.sort(key=lambda item: "test_soak" not in item.nodeid)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item,
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """A failure shows what the test's processes printed."""
+    report = yield
+    running = getattr(item, "funcargs", {}).get("loop")
+    if report.failed and isinstance(running, Processes):
+        report.sections.append(("processes", running.everything()))
+    return report
 
 
 def shared_memory() -> set[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import signal
 import subprocess
@@ -11,7 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from bringup.domain import own_domain
+from bringup.domain import DOMAINS, DOMAINS_FOLDER, own_domain
 from loop_interfaces.isolation import loopback_environment
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -132,3 +133,20 @@ def processes(folder: Path) -> Iterator[Processes]:
             yield running
         finally:
             running.stop()
+
+
+@contextlib.contextmanager
+def without_domain(loop: Processes) -> Iterator[None]:
+    """As a person uses it: no domain is given, commands take one, and find each other's loops.
+
+    They find those of this test only, and take one of two domains that this test holds: with a
+    temporary folder of their own they would not see which ones the tests beside them hold.
+    """
+    own = loop.environment.pop("ROS_DOMAIN_ID")
+    folder = loop.folder / DOMAINS_FOLDER.name
+    folder.mkdir()
+    loop.environment["TMPDIR"] = str(loop.folder)
+    with own_domain() as another, contextlib.ExitStack() as held:
+        for domain in set(map(str, DOMAINS)) - {own, str(another)}:
+            fcntl.flock(held.enter_context((folder / domain).open("w")), fcntl.LOCK_EX)
+        yield

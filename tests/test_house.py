@@ -16,6 +16,7 @@ WITH_ROS = {
     "node_loop.py",
     "watching.py",
     "looking.py",
+    "peers.py",
     "node_main.py",
     "endpoints.py",
     "introspection.py",

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from bringup import shared_core
+from bringup.pairs import PAIR
 from bringup.shared_core import SharedCores, freest, worthwhile
 
 several = pytest.mark.skipif(
@@ -49,8 +50,8 @@ def test_processes_share_a_core_and_leave_it_to_who_needs_it(monkeypatch, tmp_pa
     cores = SharedCores(1)
     started = [subprocess.Popen(["sleep", "60"]) for _ in range(2)]
     try:
-        for process in started:
-            cores.place(0, process.pid)
+        for name, process in zip(PAIR, started, strict=True):
+            cores.place(0, name, process.pid)
         (first,) = os.sched_getaffinity(started[0].pid)
         assert os.sched_getaffinity(started[1].pid) == {first}
         taken(0.0, set())
@@ -59,7 +60,7 @@ def test_processes_share_a_core_and_leave_it_to_who_needs_it(monkeypatch, tmp_pa
         cores.look(10.0)
         assert os.sched_getaffinity(started[0].pid) == {first}  # none is freer
         taken(9.0, {first})
-        cores.look(11.0)
+        cores.look(10.5)
         assert os.sched_getaffinity(started[0].pid) == {first}  # too early for another look
         cores.look(20.0)
         (second,) = os.sched_getaffinity(started[0].pid)
@@ -76,6 +77,6 @@ def test_a_process_that_has_ended_is_nothing_to_move():
     ended.wait()
     assert not Path(f"/proc/{ended.pid}").exists()
     cores = SharedCores(1)
-    cores.place(0, ended.pid)
+    cores.place(0, "controller_node", ended.pid)
     cores.look(0.0)
     cores.look(10.0)

@@ -168,7 +168,7 @@ class Dispatcher:
                 f"the plant declared episode {known.episode} void: no action came, or different ones",
             )
         else:
-            known.answers[COST.name] = frame.episode, _digest(frame)
+            known.answers[COST.name] = frame.episode, frame.digest()
             known.chunk.costs = frame.values.copy()
             self.last_costs = known.chunk.costs[:, CostColumn.MEAN]
             if self._batch.trajectories:
@@ -239,7 +239,7 @@ class Dispatcher:
         if self.plant not in (UNKNOWN_PLANT, frame.plant):
             raise FrameError(f"expected a model of plant {self.plant}, got one of {frame.plant}")
         known.heard = now
-        known.answers[MODEL_IDENTIFIED.name] = frame.episode, _digest(frame)
+        known.answers[MODEL_IDENTIFIED.name] = frame.episode, frame.digest()
         known.chunk.models = frame.values.copy()
         self._release_if_done(known)
         return self._hand_out(now)
@@ -335,7 +335,7 @@ class Dispatcher:
         episode, digest = known.answers.get(topic.name, (-1, 0))
         void = topic is COST and bool((frame.values[:, -1:] == VOID).any())
         same_plant = self.plant in (UNKNOWN_PLANT, frame.plant)
-        if frame.episode == episode and same_plant and not void and _digest(frame) != digest:
+        if frame.episode == episode and same_plant and not void and frame.digest() != digest:
             raise DispatchError(
                 f"two different messages on {topic.name} answer episode {episode}; expected one "
                 "plant and one controller in this namespace: stop the other and start a new run"
@@ -423,7 +423,3 @@ class Dispatcher:
         pair.last = Send(START, frame(self._batch.rows[chunk.rows]))
         sends.append(pair.last)
         return [(number, send) for send in sends]
-
-
-def _digest(frame: Frame) -> int:
-    return hash(frame.values.tobytes())

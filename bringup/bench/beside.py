@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from bringup.domain import own_domain
+from bringup.pairs import PAIR
 from bringup.shared_core import SharedCores, worthwhile
 from bringup.supervisor import node_command
 from loop_interfaces.isolation import loopback_environment
@@ -75,11 +76,11 @@ def measure(
             return setting.start(command, node)
 
         try:
-            nodes = [start("pde_sim_node"), start("controller_node")]
+            nodes = [start(name) for name in PAIR]
             if worthwhile(ENVIRONMENTS):  # as `pdeloop train` does it
                 cores = SharedCores(1)
-                for node in nodes:
-                    cores.place(0, node.pid)
+                for name, node in zip(PAIR, nodes, strict=True):
+                    cores.place(0, name, node.pid)
             start("tuner_node", f"out:={run}", "iterations:=100000", "optimizer:=two_point", *tuner)
             progress = run / "progress.jsonl"
 

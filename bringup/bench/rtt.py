@@ -12,6 +12,7 @@ from statistics import median
 from typing import Any
 
 from bringup.bench.processes import Bench, bench, machine, markdown
+from bringup.pairs import PAIR
 from bringup.shared_core import SharedCores, worthwhile
 from loop_interfaces.affinity import free_cores
 from loop_interfaces.problem import load_parameters
@@ -50,8 +51,8 @@ def _measure(
     )
     if cores == "shared":
         placement = SharedCores(1)
-        for node in pair:
-            placement.place(0, node.process.pid)
+        for name, node in zip(PAIR, pair, strict=True):
+            placement.place(0, name, node.process.pid)
     driver = running.start("bringup.bench.driver", horizon, f"solver_pin:={one}", problem=PROBLEM)
     n_z = load_parameters(PROBLEM, {})["n_z"]
     for batch in batches:  # compile, find each other, warm up

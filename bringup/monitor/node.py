@@ -31,6 +31,7 @@ from bringup.monitor.endpoints import ServiceCall
 from bringup.monitor.finder import Finder, run_id
 from bringup.monitor.health import ROLES, Endpoint
 from bringup.monitor.view import View
+from loop_interfaces.introspection import NAMELESS
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.looking import DRAIN, Handler, Reader, Samples, drain
 from loop_interfaces.node_loop import NodeLoop
@@ -43,8 +44,6 @@ REFRESH = 0.5
 """Seconds between two looks at rates and at the progress of the run."""
 LOOK = 1.0
 """Seconds between two looks at the graph and at which loop runs."""
-NAMELESS = "_NODE_NAME_UNKNOWN_"
-"""What the graph says of an endpoint whose node it has not heard of yet."""
 
 
 class MonitorNode:

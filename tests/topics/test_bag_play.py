@@ -12,7 +12,7 @@ import pytest
 from bringup.bags.playback import Playback, channels
 from bringup.bags.reader import Bag, Message
 from tests.browser import browser
-from tests.loop_harness import Processes, processes, until
+from tests.loop_harness import Processes, processes, until, without_domain
 from tests.small import SMALL
 from tests.topics.test_monitor import FIELD, ITERATION, LIMIT, PAINTED, STATE, address, card
 
@@ -91,12 +91,10 @@ def test_a_bag_is_not_played_beside_a_live_loop_nor_further_when_one_appears(loo
 
 
 def test_the_monitor_shows_a_bag_that_is_played(loop: Processes, tmp_path, bag):
-    del loop.environment["ROS_DOMAIN_ID"]
-    loop.environment["TMPDIR"] = str(tmp_path)
     rate = str(lasting(bag, 20.0))
-    player = loop.pdeloop("bag", "play", str(bag), "--loop", "--rate", rate, "--wait")
-    monitor = loop.pdeloop("monitor", "--port", "0")
-    with browser(tmp_path) as page:
+    with without_domain(loop), browser(tmp_path) as page:
+        player = loop.pdeloop("bag", "play", str(bag), "--loop", "--rate", rate, "--wait")
+        monitor = loop.pdeloop("monitor", "--port", "0")
         page.go(address(loop, monitor))
         page.until(f"{STATE} === 'running'", LIMIT)
         page.until(f"{ITERATION} >= 2", LIMIT)
@@ -106,8 +104,8 @@ def test_the_monitor_shows_a_bag_that_is_played(loop: Processes, tmp_path, bag):
         assert page.ask("document.querySelector('#problem').textContent") == "small"
         assert page.ask("document.querySelector('#plant-pause').disabled")
         assert page.console == []
-    player.send_signal(signal.SIGINT)
-    text = loop.wait(player, LIMIT, code=130)
+        player.send_signal(signal.SIGINT)
+        text = loop.wait(player, LIMIT, code=130)
     assert re.search(r"\d+ messages published, stopped by SIGINT", text)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from tests.browser import Browser, browser
-from tests.loop_harness import Processes, until
+from tests.loop_harness import Processes, until, without_domain
 from tests.small import SMALL
 
 pytestmark = pytest.mark.topics
@@ -151,36 +151,34 @@ def at_step(page: Browser) -> str | None:
 def test_the_monitor_finds_a_training_that_starts_after_it_and_the_page_a_new_monitor(
     loop, page, tmp_path
 ):
-    # As a person uses it: no domain given, so that the training takes one of its own.
-    del loop.environment["ROS_DOMAIN_ID"]
-    loop.environment["TMPDIR"] = str(tmp_path)  # nobody else's trainings are found
-    monitor = loop.pdeloop("monitor", "--port", "0")
-    url = address(loop, monitor)
-    page.go(url)
-    page.until(f"{STATE} === 'looking for a training'", LIMIT)
-    out = tmp_path / "run"
-    run = loop.pdeloop("train", str(SMALL), "--iterations", "100000", "--out", str(out))
-    page.until(f"{STATE} === 'running'", LIMIT)
-    page.until(f"{ITERATION} >= 3", LIMIT)
-    assert "ROS domain" in page.ask("document.querySelector('#place').textContent")
+    with without_domain(loop):
+        monitor = loop.pdeloop("monitor", "--port", "0")
+        url = address(loop, monitor)
+        page.go(url)
+        page.until(f"{STATE} === 'looking for a training'", LIMIT)
+        out = tmp_path / "run"
+        run = loop.pdeloop("train", str(SMALL), "--iterations", "100000", "--out", str(out))
+        page.until(f"{STATE} === 'running'", LIMIT)
+        page.until(f"{ITERATION} >= 3", LIMIT)
+        assert "ROS domain" in page.ask("document.querySelector('#place').textContent")
 
-    monitor.send_signal(signal.SIGKILL)
-    page.until(f"{STATE} === 'no connection to the monitor'", LIMIT)
-    before = page.ask(ITERATION)
-    port = url.rstrip("/").rpartition(":")[2]
-    again = loop.pdeloop("monitor", "--port", port)
-    page.until(f"{STATE} === 'running' && {ITERATION} > {before}", LIMIT)
-    assert [text for text in page.console if REFUSED not in text] == []
+        monitor.send_signal(signal.SIGKILL)
+        page.until(f"{STATE} === 'no connection to the monitor'", LIMIT)
+        before = page.ask(ITERATION)
+        port = url.rstrip("/").rpartition(":")[2]
+        again = loop.pdeloop("monitor", "--port", port)
+        page.until(f"{STATE} === 'running' && {ITERATION} > {before}", LIMIT)
+        assert [text for text in page.console if REFUSED not in text] == []
 
-    run.send_signal(signal.SIGINT)
-    loop.wait(run, LIMIT, code=130)
-    page.until(f"{STATE} === 'ended'", LIMIT)
-    second = tmp_path / "second"
-    loop.pdeloop("train", str(SMALL), "--iterations", "100000", "--out", str(second))
-    page.until("document.querySelector('#place').textContent.includes('second')", LIMIT)
-    page.until(f"{STATE} === 'running' && {ITERATION} >= 1", LIMIT)
-    again.send_signal(signal.SIGTERM)
-    loop.wait(again, 10.0)
+        run.send_signal(signal.SIGINT)
+        loop.wait(run, LIMIT, code=130)
+        page.until(f"{STATE} === 'ended'", LIMIT)
+        second = tmp_path / "second"
+        loop.pdeloop("train", str(SMALL), "--iterations", "100000", "--out", str(second))
+        page.until("document.querySelector('#place').textContent.includes('second')", LIMIT)
+        page.until(f"{STATE} === 'running' && {ITERATION} >= 1", LIMIT)
+        again.send_signal(signal.SIGTERM)
+        loop.wait(again, 10.0)
 
 
 def test_a_pair_in_a_namespace_and_an_environment_are_chosen_on_the_page(loop, page, tmp_path):

@@ -23,6 +23,7 @@ from bringup.bags.playback import Channel, Playback, channels
 from bringup.bags.reader import Bag
 from bringup.domain import own_domain
 from bringup.live import announced
+from loop_interfaces.introspection import NAMELESS
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.node_loop import NodeLoop
 from loop_interfaces.node_main import ConfigurationError, ros_node
@@ -35,8 +36,6 @@ LOOK = 1.0
 """Seconds between two looks for one while playing."""
 UNKNOWN = 1.0
 """Seconds in which the name of a publisher's node should come."""
-NAMELESS = "_NODE_NAME_UNKNOWN_"
-"""What the graph says of an endpoint whose node it has not heard of yet."""
 NAP = 0.02
 """Longest sleep, so that signals are noticed."""
 LINGER = 0.5
