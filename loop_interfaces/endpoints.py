@@ -18,7 +18,7 @@ from rclpy.subscription import Subscription
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
 from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.samples import AGE, CLOCK_KIND, STATE_KIND, Allowance, Bundle
+from loop_interfaces.samples import AGE, NO_TIME, STATE_KIND, Allowance, Bundle
 from loop_interfaces.topics import (
     READER_DEPTH,
     SAMPLES,
@@ -104,16 +104,12 @@ class _Outlet:
     def __init__(self, node: Node, name: str) -> None:
         self._publisher = node.create_publisher(UInt8MultiArray, name, samples_qos(KEPT))
         self._publish = self._publisher.handle.publish_raw
-        self._bundle = Bundle()
+        self.bundle = Bundle()
         self._began = 0.0
 
-    def add(self, kind: int, stamp: int, raw: bytes) -> None:
-        if self._bundle.add(kind, stamp, raw):
-            self.flush()
-
     def flush(self) -> None:
-        if self._bundle.size:
-            self._publish(self._bundle.take(time.monotonic_ns()))
+        if self.bundle.size:
+            self._publish(self.bundle.take(time.monotonic_ns()))
         self._began = time.monotonic()
 
     def look(self, now: float) -> bool:
@@ -128,13 +124,14 @@ class Bundler:
     for those who look; nothing is kept while there are none.
 
     Make it before the publisher of the states: who knows of the states then knows of the samples.
+    timed: whether the time of each state goes on /clock.
     """
 
     def __init__(self, node: Node) -> None:
         self._all, self._some = _Outlet(node, SAMPLES), _Outlet(node, SAMPLES_THROTTLED)
         self._allowance = Allowance()
         self._read = self._looked_at = self._shown = False
-        self.wanted = False
+        self.wanted = self.timed = False
 
     def begin(self, now: float) -> None:
         """An episode begins: whether it is shown to those who look."""
@@ -144,18 +141,22 @@ class Bundler:
     def show(self, raw: bytes | None) -> None:
         """From now on show the episode in any case, beginning with the state `raw`."""
         if raw is not None and self._looked_at and not self._shown:
-            self._some.add(STATE_KIND, time.monotonic_ns(), raw)
+            self._some.bundle.add(STATE_KIND, time.monotonic_ns(), raw)
         self._shown = self._looked_at
         self.wanted = self._read or self._shown
 
-    def add(self, kind: int, raw: bytes) -> None:
-        """Keep a message for the next bundle. Call it only while `wanted`."""
+    def add(self, kind: int, raw: bytes, simulated: float = NO_TIME) -> None:
+        """Keep a message for the next bundle. Call it only while `wanted`.
+
+        simulated: the time of a state in s.
+        """
         stamp = time.monotonic_ns()
-        if self._read:
-            self._all.add(kind, stamp, raw)
-        if self._shown and kind != CLOCK_KIND:
-            self._some.add(kind, stamp, raw)
+        if self._read and self._all.bundle.add(kind, stamp, raw, simulated):
+            self._all.flush()
+        if self._shown:
             self._allowance.use(len(raw))
+            if self._some.bundle.add(kind, stamp, raw):
+                self._some.flush()
 
     def flush(self) -> None:
         """Publish what has been kept."""
@@ -190,11 +191,13 @@ class Sender:
         return self._codec.encode(frame)
 
     def send(self, frame: Frame) -> None:
-        raw = self._codec.encode_into_own(frame)
-        self._publish(raw)
         bundler = self._bundler
-        if bundler is not None and bundler.wanted:
-            bundler.add(STATE_KIND, bytes(raw))
+        if bundler is None or not bundler.wanted:
+            self._publish(self._codec.encode_into_own(frame))
+            return
+        raw = self._codec.encode(frame)
+        self._publish(raw)
+        bundler.add(STATE_KIND, raw, frame.time if bundler.timed else NO_TIME)
 
 
 class Receiver:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import select
 import threading
 import time
 from collections.abc import Callable
@@ -11,6 +12,13 @@ BEAT = 0.1
 IDLE = 0.05
 """Share of a gap between two beats that a suspended process can have spent working: it worked at
 most BEAT before it was stopped. One that is starved by others still gets more."""
+
+
+def nap(seconds: float) -> None:
+    """Sleep for so long, and not until a point of a clock: clocks jump, and tools that move them for
+    tests (libfaketime) let time.sleep fail.
+    """
+    select.select((), (), (), seconds)
 
 
 class Pulse:
@@ -42,9 +50,8 @@ class Pulse:
         return self._longest
 
     def _run(self) -> None:
-        # Not Event.wait: it waits for a point of the wall clock on some systems, which may jump.
         while not self._stopped:
-            time.sleep(BEAT)
+            nap(BEAT)
             self._beat()
 
     def _beat(self) -> None:

@@ -5,11 +5,13 @@ and reader. Instead the plant keeps the bytes of the states it sends and of the 
 and publishes them together, some hundred at a time, on the topic `samples`
 (std_msgs/UInt8MultiArray, data_offset 0, no dims). Its data are, little-endian,
 
-    sent                               uint64, ns on the plant's monotonic clock
-    kind, length, stamp, bytes, ...    uint32, uint32, uint64 (ns, the same clock), `length` bytes
+    sent                                     uint64, ns on the plant's monotonic clock
+    kind, length, stamp, time, bytes, ...    uint32, uint32, uint64 (ns, the same clock), float64,
+                                             `length` bytes
 
-repeated; kind 0 is a state, 1 an action, 2 the simulated time that goes with a state, and bytes are
-the message as it was on its own topic (the time also if nobody else reads /clock).
+repeated; kind 0 is a state, 1 an action, and bytes are the message as it was on its own topic. time
+is the simulated time in s that goes on /clock with a state, also if nobody reads it there; NO_TIME
+where none does.
 """
 
 from __future__ import annotations
@@ -22,17 +24,23 @@ from dataclasses import dataclass
 from loop_interfaces.frames import FrameError
 
 STATE_KIND, ACTION_KIND, CLOCK_KIND = 0, 1, 2
-LIMIT = 256 * 1024
+LIMIT = 512 * 1024
 """Bytes after which a bundle is sent: a few milliseconds of a fast loop."""
+NO_TIME = -1.0
+"""Of an action, and of a state of a plant that does not publish /clock."""
 AGE = 0.1
 """Seconds after which a bundle is sent that has not reached LIMIT."""
+MAX_TIME = 2.0**31
+"""Simulated time in s up to which /clock, whose seconds are an int32, can tell it."""
 RATE, COUNTED = 600.0, 4096
 """Samples a second of up to so many bytes that those who only look get."""
 
 _MESSAGE = struct.Struct("<4sIIIQ")
 """CDR of an UInt8MultiArray without dims up to its data, and the first eight bytes of those."""
 _ENCODING = b"\x00\x01\x00\x00"
-_SAMPLE = struct.Struct("<IIQ")
+_SAMPLE = struct.Struct("<IIQd")
+_CLOCK = struct.Struct("<BBHiI")
+"""CDR of a rosgraph_msgs/Clock."""
 _TYPICAL_OFFSET = 100_000_000
 """Nanoseconds by which the delay of a bundle may vary before its clock is taken to be another one."""
 
@@ -60,35 +68,36 @@ class Allowance:
 
 
 class Bundle:
-    """Collects samples. `add` is on the hot path: two appends and an addition."""
+    """Collects samples. `add` is on the hot path: an append and an addition."""
 
     def __init__(self) -> None:
-        self._parts: list[bytes] = []
+        self._samples: list[tuple[int, int, bytes, float]] = []
         self.size = 0
 
-    def add(self, kind: int, stamp: int, raw: bytes) -> bool:
+    def add(self, kind: int, stamp: int, raw: bytes, time: float = NO_TIME) -> bool:
         """Keep a serialised message; whether the bundle should be sent now."""
-        self._parts.append(_SAMPLE.pack(kind, len(raw), stamp))
-        self._parts.append(raw)
+        self._samples.append((kind, stamp, raw, time))
         self.size += _SAMPLE.size + len(raw)
         return self.size >= LIMIT
 
     def take(self, sent: int) -> bytes:
         """CDR bytes of the message that holds them all; the bundle is empty afterwards."""
-        head = _MESSAGE.pack(_ENCODING, 0, 0, 8 + self.size, sent)
-        message = b"".join((head, *self._parts))
-        self._parts.clear()
+        parts = [_MESSAGE.pack(_ENCODING, 0, 0, 8 + self.size, sent)]
+        for kind, stamp, raw, time in self._samples:
+            parts += _SAMPLE.pack(kind, len(raw), stamp, time), raw
+        self._samples.clear()
         self.size = 0
-        return message
+        return b"".join(parts)
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """A message of the bundle: one of the three kinds, ns on the plant's clock, its CDR bytes."""
+    """A message of the bundle: its kind, ns on the plant's clock, its CDR bytes, simulated time."""
 
     kind: int
     stamp: int
     raw: bytes
+    time: float = NO_TIME
 
 
 def unpack(message: bytes) -> tuple[int, Iterator[Sample]]:
@@ -112,11 +121,18 @@ def _samples(message: bytes, end: int) -> Iterator[Sample]:
         start = position + _SAMPLE.size
         if start > end:
             raise FrameError("a bundle of samples ends within a sample")
-        kind, length, stamp = _SAMPLE.unpack_from(message, position)
+        kind, length, stamp, time = _SAMPLE.unpack_from(message, position)
         position = start + length
-        if kind > CLOCK_KIND or position > end:
-            raise FrameError("a bundle of samples holds something that is no state, action or time")
-        yield Sample(kind, stamp, message[start:position])
+        if kind > ACTION_KIND or position > end:
+            raise FrameError("a bundle of samples holds something that is no state or action")
+        yield Sample(kind, stamp, message[start:position], time)
+
+
+def clock_message(time: float) -> bytes | None:
+    """CDR bytes of a message on /clock with a simulated time in s; None if it has no such time."""
+    if not 0.0 <= time < MAX_TIME:
+        return None
+    return _CLOCK.pack(0, 1, 0, *divmod(round(time * 1e9), 10**9))
 
 
 class ClockOffset:

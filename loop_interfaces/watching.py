@@ -15,7 +15,14 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
 from loop_interfaces.endpoints import raw_subscription, reader_qos, samples_qos, scoped
-from loop_interfaces.samples import ACTION_KIND, CLOCK_KIND, STATE_KIND, ClockOffset, unpack
+from loop_interfaces.samples import (
+    ACTION_KIND,
+    CLOCK_KIND,
+    STATE_KIND,
+    ClockOffset,
+    clock_message,
+    unpack,
+)
 from loop_interfaces.topics import ACTION, SAMPLES, SAMPLES_THROTTLED, STATE
 
 SAMPLE_DEPTH = 4000
@@ -32,7 +39,7 @@ _SINGLES: dict[int, tuple[Any, str]] = {
 class Watcher:
     """The states and actions of one pair, as serialised messages with the time of their arrival.
 
-    clock: also read /clock where a plant does not bundle it; throttled: of some episodes only, as many
+    clock: also the messages on /clock; throttled: of some episodes only, as many
     as people can see, where the plant offers that. `handles` are the subscriptions to
     wait for; they may change with `look`.
     """
@@ -40,7 +47,7 @@ class Watcher:
     def __init__(
         self, node: Node, namespace: str = "", *, clock: bool = False, throttled: bool = False
     ) -> None:
-        self._node, self._namespace = node, namespace
+        self._node, self._namespace, self._clock = node, namespace, clock
         self._kinds = (STATE_KIND, ACTION_KIND, CLOCK_KIND) if clock else (STATE_KIND, ACTION_KIND)
         self._offset = ClockOffset()
         self._bundles = self._subscribe(
@@ -81,6 +88,8 @@ class Watcher:
             offset = self._offset.update(sent, taken[1]["received_timestamp"])
             for sample in samples:
                 yield sample.kind, sample.stamp + offset, sample.raw
+                if self._clock and (told := clock_message(sample.time)) is not None:
+                    yield CLOCK_KIND, sample.stamp + offset, told
         for kind, subscription in self._singles.items():
             for _ in range(SAMPLE_DEPTH):
                 taken = subscription.handle.take_message(_SINGLES[kind][0], True)

@@ -20,6 +20,7 @@ import numpy as np
 
 from loop_interfaces.frames import MAX_VALUES, Frame, FrameError
 from loop_interfaces.protocol import Send, Tally
+from loop_interfaces.samples import MAX_TIME
 from loop_interfaces.topics import (
     COMPLETED,
     COST,
@@ -35,8 +36,6 @@ from loop_interfaces.topics import (
 from pde_sim_node.pace import Pace
 from pde_sim_node.plant import Plant
 
-MAX_TIME = 2.0**31
-"""Simulated time (s) that /clock can tell, and a start can set."""
 PAUSED_REPORT = 1.0
 """Seconds between two messages on `episode/paused` while the plant is paused."""
 

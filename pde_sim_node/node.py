@@ -8,7 +8,6 @@ Messages, order and parameters: docs/interfaces.md. The protocol is pde_sim_node
 
 from __future__ import annotations
 
-import struct
 import sys
 from collections.abc import Mapping
 from dataclasses import fields
@@ -25,12 +24,12 @@ from loop_interfaces.node_main import node_main
 from loop_interfaces.parameters import EXECUTION, PLANT, PROBLEM, Spec
 from loop_interfaces.protocol import Send
 from loop_interfaces.ros_parameters import declare, given_parameters, on_change
-from loop_interfaces.samples import CLOCK_KIND
+from loop_interfaces.samples import clock_message
 from loop_interfaces.topics import ACTION, COST, PAUSED, START, STATE, TARGET
 from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.equations import configured_equation
 from pde_sim_node.health import PlantHealth
-from pde_sim_node.lockstep import MAX_TIME, Lockstep
+from pde_sim_node.lockstep import Lockstep
 
 
 def declare_parameters(node: Node, changed: Mapping[str, Any] | None = None) -> dict[str, Any]:
@@ -63,9 +62,6 @@ PLANT_PARAMETERS = tuple(
     if not spec.name.startswith(("dmdc", "reduced", "exploration", "learning", "smoothing"))
 )
 """The problem parameters that concern the plant."""
-
-_CLOCK = struct.Struct("<BBHiI")
-"""The CDR bytes of a rosgraph_msgs/Clock: encoding, seconds, nanoseconds."""
 
 
 class PlantNode:
@@ -109,6 +105,7 @@ class PlantNode:
             PAUSED: loop.sender(PAUSED),
         }
         self._clock = node.create_publisher(Clock, "/clock", 1) if publish_clock else None
+        self._bundler.timed = publish_clock
         self._clock_wanted = False
         loop.receive(START, self._on_start)
         loop.receive(ACTION, self._on_action, bundled=True)
@@ -180,16 +177,12 @@ class PlantNode:
                         throttle_duration_sec=1.0,
                     )
             self._senders[send.topic].send(send.frame)
-            if send.topic is STATE and self._clock is not None and send.frame.time < MAX_TIME:
-                self._tell_time(round(send.frame.time * 1e9))
+            if self._clock_wanted and send.topic is STATE:
+                self._tell_time(send.frame.time)
 
-    def _tell_time(self, nanoseconds: int) -> None:
-        if not (self._clock_wanted or self._bundler.wanted):
-            return
-        raw = _CLOCK.pack(0, 1, 0, *divmod(nanoseconds, 10**9))
-        if self._bundler.wanted:
-            self._bundler.add(CLOCK_KIND, raw)
-        if self._clock_wanted and self._clock is not None:
+    def _tell_time(self, simulated: float) -> None:
+        raw = clock_message(simulated)
+        if raw is not None and self._clock is not None:
             self._clock.publish(raw)
 
     def _housekeeping(self, now: float) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 
 import pytest
@@ -9,13 +10,13 @@ import pytest
 from loop_interfaces.frames import FrameError
 from loop_interfaces.samples import (
     ACTION_KIND,
-    CLOCK_KIND,
     LIMIT,
     STATE_KIND,
     Allowance,
     Bundle,
     ClockOffset,
     Sample,
+    clock_message,
     unpack,
 )
 
@@ -23,14 +24,14 @@ from loop_interfaces.samples import (
 def bundled(*samples: Sample, sent: int = 99) -> bytes:
     bundle = Bundle()
     for sample in samples:
-        bundle.add(sample.kind, sample.stamp, sample.raw)
+        bundle.add(sample.kind, sample.stamp, sample.raw, sample.time)
     return bundle.take(sent)
 
 
 def test_what_goes_in_comes_out_in_order():
     samples = [
         Sample(STATE_KIND, 7, b"state bytes"),
-        Sample(CLOCK_KIND, 2**63, b""),
+        Sample(STATE_KIND, 2**63, b"", 0.25),
         Sample(ACTION_KIND, 9, bytes(range(256))),
     ]
     sent, found = unpack(bundled(*samples, sent=12))
@@ -45,14 +46,14 @@ def test_a_bundle_is_an_ordinary_uint8_array():
     raw = bundled(Sample(STATE_KIND, 7, b"abc"))
     message = deserialize_message(raw, UInt8MultiArray)
     assert message.layout.data_offset == 0 and not message.layout.dim
-    assert bytes(message.data) == struct.pack("<QIIQ", 99, STATE_KIND, 3, 7) + b"abc"
+    assert bytes(message.data) == struct.pack("<QIIQd", 99, 0, 3, 7, -1.0) + b"abc"
 
 
 def test_it_asks_to_be_sent_when_it_is_large_and_is_empty_afterwards():
     bundle, count = Bundle(), 1
     while not bundle.add(STATE_KIND, 0, bytes(1000)):
         count += 1
-    assert LIMIT // 1016 <= count <= LIMIT // 1016 + 1
+    assert LIMIT // 1024 <= count <= LIMIT // 1024 + 1
     bundle.take(0)
     assert bundle.size == 0
     assert list(unpack(bundle.take(0))[1]) == []
@@ -102,11 +103,27 @@ def test_another_layout_is_refused(position: int):
 
 def test_an_unknown_kind_and_a_length_beyond_the_end_are_refused():
     raw = bytearray(bundled(Sample(STATE_KIND, 7, b"state")))
-    for offset, number in ((24, 3), (28, 2**32 - 1)):
+    for offset, number in ((24, 2), (28, 2**32 - 1)):
         broken = bytearray(raw)
         struct.pack_into("<I", broken, offset, number)
-        with pytest.raises(FrameError, match="no state, action or time"):
+        with pytest.raises(FrameError, match="no state or action"):
             list(unpack(bytes(broken))[1])
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.05, 1.9999999996, 2.0**31 - 1])
+def test_simulated_time_is_told_as_ros_does_it(seconds: float):
+    from rclpy.serialization import deserialize_message
+    from rosgraph_msgs.msg import Clock
+
+    raw = clock_message(seconds)
+    assert raw is not None
+    told = deserialize_message(raw, Clock).clock
+    assert told.sec + told.nanosec * 1e-9 == pytest.approx(seconds, abs=1e-9)
+
+
+@pytest.mark.parametrize("seconds", [-1.0, 2.0**31, math.inf, math.nan])
+def test_a_time_that_the_clock_cannot_tell_is_none(seconds: float):
+    assert clock_message(seconds) is None
 
 
 def test_stamps_are_put_on_the_readers_clock():

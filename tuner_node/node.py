@@ -12,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import secrets
 import sys
-import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -29,6 +28,7 @@ from loop_interfaces.node_loop import NodeLoop
 from loop_interfaces.node_main import ConfigurationError, node_main
 from loop_interfaces.parameters import PROBLEM, TUNER
 from loop_interfaces.protocol import STOPPED, ModelFailure
+from loop_interfaces.pulse import nap
 from loop_interfaces.ros_parameters import declare, given_parameters, on_change
 from loop_interfaces.topics import (
     ACTION,
@@ -53,7 +53,8 @@ from tuner_node.session import Session
 RIVAL_GRACE = 6.0
 """Seconds a second tuner may be seen before it counts as one: a killed one is seen for 3 s."""
 FAREWELL = 0.5
-"""Seconds in which the answer to a request to stop goes out, before its writer is gone."""
+"""Seconds in which the last messages, and the answer to a request to stop, are taken: when a writer
+is gone, its readers lose what they have not taken yet."""
 ABSENCE_REPORT = 5.0
 """Seconds between two reports of a missing plant or controller."""
 
@@ -127,6 +128,12 @@ class TunerNode:
         )
         if self._loop.suspended:
             return 0
+        try:
+            return self._end(reason)
+        finally:
+            nap(FAREWELL)
+
+    def _end(self, reason: str) -> int:
         if self._session.done:
             return self._finish()
         self._send(self._session.dispatcher.release())
@@ -136,7 +143,6 @@ class TunerNode:
             raise ConfigurationError(self._failure)
         if self._session.stopped:
             self._log.info("stopped on request after an iteration")
-            time.sleep(FAREWELL)
             return STOPPED
         self._log.info(f"stopped by {reason} before the end")
         return 130

@@ -17,7 +17,7 @@ from tests.topics.test_loop import LIMIT, assert_same_training, in_process, iter
 from viewer_node.view import SCALARS
 
 pytestmark = pytest.mark.topics
-ITERATIONS = 150
+ITERATIONS = 300
 
 WATCH = """
 import json, sys, time
