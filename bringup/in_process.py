@@ -40,6 +40,14 @@ class LocalPair:
             action_limit=values["action_limit"],
         )
         self._law: ProjectedLaw | None = None
+        self._generation = 0
+
+    def follow(self, training: Training) -> None:
+        """Use the models of a training, if they are others than before."""
+        if training.ready and self._generation != training.generation:
+            assert training.models is not None
+            self._generation = training.generation
+            self.use_models(training.models)
 
     def use_models(self, models: Array) -> None:
         """Take the reduced models (S, rows, n_s) that policies refer to."""
@@ -117,8 +125,7 @@ class LocalPair:
 
 def train(training: Training, pair: LocalPair, report: Report, *, max_batch: int = 1024) -> None:
     """Run `training` to its end on `pair`."""
-    if training.models is not None:
-        pair.use_models(training.models)
+    pair.follow(training)
     phase = ""
     while True:
         batch = training.next_batch()
@@ -130,5 +137,4 @@ def train(training: Training, pair: LocalPair, report: Report, *, max_batch: int
         result = pair.run(batch, max_batch)
         for row in training.finish(result):
             report(row)
-        if result.models is not None and training.models is not None:
-            pair.use_models(training.models)
+        pair.follow(training)

@@ -100,6 +100,7 @@ _TRAINING = (
     "optimizer",
     "directions",
     "policy_features",
+    "extra_modes",
 )
 TRAIN_ARGUMENTS = (
     *LOOP_ARGUMENTS,

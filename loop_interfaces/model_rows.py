@@ -11,11 +11,14 @@ Every part has n_s columns (or is transposed to have), so the parts stack:
     1                 s_r      U^T z_r, the target in reduced coordinates
 
 n_s is the number of columns, n_a that of the axis `actuator`; n_z follows from the row count.
+
+U may have room for modes of the rollouts, which are none of the reduced model: its last columns,
+where A, B and both gains are zero.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +45,11 @@ class ModelRows:
         """[K_a K_b], shape (n_a, 2 n_s)."""
         return np.hstack([self.K_a, self.K_b])
 
+    @property
+    def order(self) -> int:
+        """Modes of the reduced model: n_s without the room for others."""
+        return int(np.count_nonzero(np.abs(self.A).max(axis=1)))
+
 
 def pack(model: ModelRows) -> Array:
     """The rows of `model`, shape (n_z + n_s + 3 n_a + 1, n_s)."""
@@ -59,3 +67,23 @@ def unpack(rows: Array, n_a: int) -> ModelRows:
         )
     U, A, Bt, K_a, K_b, s_r = np.split(rows, np.cumsum([n_z, n_s, n_a, n_a, n_a]))
     return ModelRows(A=A, B=Bt.T.copy(), U=U, K_a=K_a, K_b=K_b, s_r=s_r[0])
+
+
+def with_room(rows: Array, n_a: int, modes: int) -> Array:
+    """The model in `rows` with `modes` further columns of zeros: the same law."""
+    model = unpack(rows, n_a)
+    right = ((0, 0), (0, modes))
+    wider = ModelRows(
+        A=np.pad(model.A, (0, modes)),
+        B=np.pad(model.B, ((0, modes), (0, 0))),
+        U=np.pad(model.U, right),
+        K_a=np.pad(model.K_a, right),
+        K_b=np.pad(model.K_b, right),
+        s_r=np.pad(model.s_r, (0, modes)),
+    )
+    return pack(wider)
+
+
+def with_basis(rows: Array, n_a: int, U: Array, target: Array) -> Array:
+    """The model in `rows` on the basis U (n_z, n_s), of which the modes of the model are the same."""
+    return pack(replace(unpack(rows, n_a), U=U, s_r=np.sum(U * target[:, np.newaxis], axis=0)))

@@ -327,6 +327,13 @@ TUNER = (
         choices=("affine", "quadratic"),
     ),
     Spec(
+        "extra_modes",
+        0,
+        "POD modes of the first rollouts that the optimizer gauss_newton adds to the basis U",
+        0,
+        64,
+    ),
+    Spec(
         "directions",
         4,
         "directions D of an iteration of the optimizer 'directions': 2 D environments a seed; the "

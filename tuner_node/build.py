@@ -59,6 +59,15 @@ def build_training(values: Mapping[str, Any]) -> Training:
             f"'{values['optimizer']}': only '{GaussNewton.name}' adapts another law"
         )
 
+    extra = values["extra_modes"]
+    if extra:
+        if values["optimizer"] != GaussNewton.name:
+            raise ValueError(
+                f"parameter 'extra_modes' is {extra}; expected 0 with the optimizer "
+                f"'{values['optimizer']}': only '{GaussNewton.name}' adds modes to the basis"
+            )
+        options["extra_modes"] = extra
+
     def make_optimizer(
         policy: NDArray[np.float64], seed: int, context: Context | None
     ) -> Optimizer:
@@ -88,5 +97,6 @@ def build_training(values: Mapping[str, Any]) -> Training:
         action_limit=values["action_limit"],
         model=read_model(Path(values["model"]), values["n_a"]) if values["model"] else None,
         policy_features=features,
+        extra_modes=extra,
     )
     return Training(settings, make_optimizer, plant=values["plant"] or UNKNOWN_PLANT)

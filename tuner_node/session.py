@@ -33,6 +33,7 @@ class Session:
         self.stopped = False
         """Whether that end has come; the training's state is that of a checkpoint."""
         self._checked: dict[int, Mapping[str, Any]] = {}
+        self._generation = 0
 
     def begin(self, now: float) -> list[Order]:
         """The first messages; after a resume with the models that are already there.
@@ -41,11 +42,7 @@ class Session:
         """
         if self._phase:
             return self.dispatcher.ask_again(now)
-        orders: list[Order] = []
-        training = self.training
-        if training.models is not None and training.phase != "identify":
-            orders += self.dispatcher.models(training.models, training.generation)
-        return orders + self._next(now)
+        return self._hand_out_models() + self._next(now)
 
     def baseline(self, name: str) -> float | None:
         """Mean cost of the controller `none` or `lqt` when the warm starts were checked, if known."""
@@ -112,11 +109,19 @@ class Session:
             if row["event"] == "checked":
                 self._checked[row["seed"]] = row
             self._report(row)
-        if result.models is not None and training.models is not None:
-            orders = orders + self.dispatcher.models(training.models, training.generation)
+        orders = orders + self._hand_out_models()
         if self.stopping and training.phase != "done":
             return orders + self._end()
         return orders + self._next(now)
+
+    def _hand_out_models(self) -> list[Order]:
+        """The models, if they are others than before."""
+        training = self.training
+        if not training.ready or self._generation == training.generation:
+            return []
+        assert training.models is not None
+        self._generation = training.generation
+        return self.dispatcher.models(training.models, training.generation)
 
     def _end(self) -> list[Order]:
         self.stopped = True

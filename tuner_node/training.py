@@ -89,6 +89,8 @@ class TrainingSettings:
     model: Array | None = None
     """Rows of a reduced model to start from instead of identifying one."""
     policy_features: str = "affine"
+    extra_modes: int = 0
+    """Columns that the models get for modes of the rollouts."""
 
 
 OptimizerFactory = Callable[[Array, int, Context | None], Optimizer]
@@ -190,8 +192,14 @@ class Training:
 
     @property
     def generation(self) -> int:
-        """Number of the present models: grows whenever one of them is identified again."""
-        return 1 + sum(self.attempts)
+        """Number of the present models: grows whenever one of them is another one."""
+        rebased = sum(optimizer.basis is not None for optimizer in self.optimizers)
+        return 1 + sum(self.attempts) + rebased
+
+    @property
+    def ready(self) -> bool:
+        """Whether there are the models that the next rollouts are about."""
+        return self.models is not None and self.phase != "identify"
 
     @property
     def iteration(self) -> int:
@@ -267,8 +275,8 @@ class Training:
         if self.models is None:
             if len(models) != self.settings.seeds:
                 raise ValueError(f"expected {self.settings.seeds} models, got {len(models)}")
-            self.models = models.copy()
-        self.models[self.pending] = models
+            self.models = self._with_room(models)
+        self.models[self.pending] = self._with_room(models)
         rows = []
         for m, own in zip(self.pending, models, strict=True):
             A = model_rows.unpack(own, self.settings.n_a).A
@@ -286,6 +294,12 @@ class Training:
             self._start_adapting()
         return rows
 
+    def _with_room(self, models: Array) -> Array:
+        settings = self.settings
+        return np.stack(
+            [model_rows.with_room(rows, settings.n_a, settings.extra_modes) for rows in models]
+        )
+
     def _given(self, identified: Array) -> list[dict[str, Any]]:
         """The given model instead of the identified ones, if it is one of this plant's size."""
         assert self.settings.model is not None
@@ -296,7 +310,9 @@ class Training:
                 f"the given model is of a state of {own - 3 * self.settings.n_a - 1} numbers, the "
                 f"plant's has {size - 3 * self.settings.n_a - 1}; identify one of this plant"
             )
-        self.models = np.repeat(self.settings.model[np.newaxis], self.settings.seeds, axis=0)
+        self.models = self._with_room(
+            np.repeat(self.settings.model[np.newaxis], self.settings.seeds, axis=0)
+        )
         self._start_adapting()
         return []
 
@@ -391,8 +407,18 @@ class Training:
             )
             rows.append({"event": "iteration", "seed": seed, **told})
         self.history += rows
+        self._take_bases()
         self._leave_adapt_if_done()
         return rows
+
+    def _take_bases(self) -> None:
+        """The models on the bases that the optimisers have chosen."""
+        for m, optimizer in enumerate(self.optimizers):
+            if optimizer.basis is not None:
+                assert self.models is not None and self.target is not None
+                self.models[m] = model_rows.with_basis(
+                    self.models[m], self.settings.n_a, optimizer.basis, self.target
+                )
 
     def _leave_adapt_if_done(self) -> None:
         done = all(optimizer.done for optimizer in self.optimizers)

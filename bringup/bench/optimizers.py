@@ -16,7 +16,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
 from typing import Any
@@ -148,12 +148,22 @@ def design(
     return track(model, **weights).policy, context
 
 
+def with_room(policy: Array, context: Context, modes: int) -> tuple[Array, Context]:
+    """The same law on a basis with `modes` more columns, which are zero."""
+    n_a, n_s = len(policy), context.U.shape[1]
+    K_a, K_b = np.split(policy, [n_s], axis=1)
+    room = np.zeros((n_a, modes))
+    U = np.hstack([context.U, np.zeros((len(context.U), modes))])
+    return np.hstack([K_a, room, K_b, room]), replace(context, U=U)
+
+
 def train(job: Job) -> dict[str, Any]:
     """One training with its evaluations, as JSON-able numbers."""
     options = {} if job.attempts is None else {"identification_attempts": job.attempts}
     parameters = load_parameters(job.problem, options)
     plant = build_plant(parameters)
     policy, context = warm_start(plant, parameters, job.seed)
+    policy, context = with_room(policy, context, job.options.get("extra_modes", 0))
     policy = with_features(policy, job.features)
     optimizer = OPTIMIZERS[job.optimizer](
         policy,
@@ -169,9 +179,12 @@ def train(job: Job) -> dict[str, Any]:
         for i in range(job.evaluation_fields)
     ]
 
+    def basis() -> Array:
+        return context.U if optimizer.basis is None else optimizer.basis
+
     def evaluate(candidate: Array) -> list[float]:
         rollouts = [Rollout(candidate, seed) for seed in held_out]
-        return [result.cost for result in run_rollouts(plant, context.U, rollouts)]
+        return [result.cost for result in run_rollouts(plant, basis(), rollouts)]
 
     budget = 2 * job.iterations
     costs = {"0": evaluate(policy)}
@@ -183,7 +196,7 @@ def train(job: Job) -> dict[str, Any]:
         rollouts = optimizer.ask()
         while marks and used + len(rollouts) > marks[0]:
             costs[str(marks.pop(0))] = evaluate(optimizer.best_policy)
-        results = run_rollouts(plant, context.U, rollouts)
+        results = run_rollouts(plant, basis(), rollouts)
         used += len(results)
         diverged += sum(result.diverged for result in results)
         begin = time.perf_counter()
@@ -194,7 +207,7 @@ def train(job: Job) -> dict[str, Any]:
         derive(job.evaluation_seed + 1 + job.seed, Purpose.EVALUATION_FIELD, i)
         for i in range(job.fresh_fields)
     ]
-    last = run_rollouts(plant, context.U, [Rollout(optimizer.best_policy, seed) for seed in fresh])
+    last = run_rollouts(plant, basis(), [Rollout(optimizer.best_policy, seed) for seed in fresh])
     return {
         "problem": job.problem,
         "seed": job.seed,

@@ -98,8 +98,7 @@ class _Curve:
         self._policies: list[Array] = []
         self._restore()
         self._pair = _single_threaded_pair(values)
-        if self.training.models is not None:
-            self._pair.use_models(self.training.models)
+        self._pair.follow(self.training)
         self._saved_at = self._at = time.monotonic()
 
     @property
@@ -126,8 +125,7 @@ class _Curve:
         first = not training.optimizers
         result = self._pair.run(batch, self._values["max_batch"])
         training.finish(result)
-        if result.models is not None and training.models is not None:
-            self._pair.use_models(training.models)
+        self._pair.follow(training)
         if training.optimizers and (first or training.iteration > before):
             policies = training.policies()
             self._policies.append(policies)

@@ -133,6 +133,11 @@ class Optimizer(Protocol):
         ...
 
     @property
+    def basis(self) -> Array | None:
+        """U of its policies, of the shape it was given; None where it is the given one."""
+        ...
+
+    @property
     def iteration(self) -> int:
         """How many times `tell` was called."""
         ...

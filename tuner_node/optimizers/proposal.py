@@ -61,6 +61,24 @@ class Proposal:
         }
 
 
+class _Columns:
+    """Where the gains of a policy are.
+
+    The last columns of U may be zeros: room for modes to come (`GaussNewton`), and no part of the
+    law yet.
+
+    order: how many are not; K_a, K_b, Q: their columns of the policy.
+    """
+
+    def __init__(self, U: Array, columns: int) -> None:
+        n_s = U.shape[1]
+        self.order = int(np.count_nonzero(np.abs(U).max(axis=0)))
+        self.K_a, self.K_b = slice(0, self.order), slice(n_s, n_s + self.order)
+        rows, others = np.triu_indices(n_s)
+        Q = 2 * n_s + np.flatnonzero(np.maximum(rows, others) < self.order)
+        self.Q = Q if columns > 2 * n_s else Q[:0]
+
+
 class Proposer:
     """Proposes policies for one problem.
 
@@ -95,9 +113,11 @@ class Proposer:
             )
         if modes < U.shape[1]:
             raise ValueError(f"modes must be at least n_s = {U.shape[1]}, but it is {modes}.")
-        self.n_z, self.n_s, self.n_a = U.shape[0], U.shape[1], n_a
         if not 0 <= cubic_modes <= modes:
             raise ValueError(f"cubic_modes must be 0 .. modes = {modes}, but it is {cubic_modes}.")
+        self._columns = _Columns(U, columns)
+        U = U[:, : self._columns.order]
+        self.n_z, self.n_s, self.n_a = U.shape[0], U.shape[1], n_a
         self._U, self._target, self._modes = U, target, modes
         self._cubic_modes = cubic_modes
         self._q, self._r = context.state_weight, context.action_weight
@@ -109,21 +129,21 @@ class Proposer:
         self._s_r_square = float(np.sum(self._s_r * self._s_r))
         # A target outside of U leaves the law without a constant part.
         self._one = 1.0 if self._s_r_square > 1e-20 * float(np.sum(target * target)) else 0.0
-        self._features = Features(self._s_r, self._one, quadratic=columns > 2 * self.n_s)
+        self._features = Features(self._s_r, self._one, quadratic=self._columns.Q.size > 0)
 
     def theta(self, policy: Array) -> Array:
         """[K_a b] or [K_a b Q] of a policy, (n_a, n_f)."""
-        b = policy[:, self.n_s : 2 * self.n_s] @ self._s_r
-        return np.column_stack([policy[:, : self.n_s], b, policy[:, 2 * self.n_s :]])
+        at = self._columns
+        return np.column_stack([policy[:, at.K_a], policy[:, at.K_b] @ self._s_r, policy[:, at.Q]])
 
     def moved(self, policy: Array, step: Array) -> Array:
         """The policy after a step of theta; K_b moves least among those with the wanted b."""
-        moved = policy.copy()
-        moved[:, : self.n_s] += step[:, : self.n_s]
+        at, moved = self._columns, policy.copy()
+        moved[:, at.K_a] += step[:, : self.n_s]
         if self._one:
             constant = np.outer(step[:, self.n_s], self._s_r / self._s_r_square)
-            moved[:, self.n_s : 2 * self.n_s] += constant
-        moved[:, 2 * self.n_s :] += step[:, self.n_s + 1 :]
+            moved[:, at.K_b] += constant
+        moved[:, at.Q] += step[:, self.n_s + 1 :]
         return moved
 
     def propose(
