@@ -55,8 +55,6 @@ _MEMORY = 40
 # An accepted step that gains less than this share of the cost is small: what is left to gain is less
 # than how much fields differ, so more of them have to judge.
 _SMALL = 0.02
-# The basis grows when one rollout in so many is told.
-_GROW = 4
 _NONE = -1
 # Attributes that a checkpoint holds besides the policies and the records.
 _STAMPS = ("fields", "incumbents", "trials", "others")
@@ -87,9 +85,9 @@ class GaussNewton:
     cubic_modes : int
         How many of them, at most, its cubic part acts on; 0 leaves it out.
     extra_modes : int
-        How many of the last columns of U are room for modes to come. They are zero; when a quarter
-        of the rollouts are told, they become the leading POD modes of those outside of the
-        others. The gains on them are zero until then, so that the law stays the same.
+        How many of the last columns of U are room for modes to come. They are zero; after the first
+        rollouts they become the leading POD modes of those outside of the other columns. The gains on
+        them are zero, so that the law stays the same.
     learning_rate, smoothing_radius : float, optional
         Not used; every optimiser takes them.
     """
@@ -201,8 +199,7 @@ class GaussNewton:
         row["rollouts"] = self._records.count
         row["damping"] = self._damping
         if decided:
-            due = self._records.count >= self._budget // _GROW
-            if self._extra_modes and due and not self._grown:
+            if self._extra_modes and not self._grown:
                 self._grow_basis()
             if not (self._incumbents == _NONE).any():
                 self._propose(row)
