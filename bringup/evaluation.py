@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from bringup.in_process import LocalPair
-from loop_interfaces.parameters import check, noisy, table
+from loop_interfaces.parameters import noisy, table
+from loop_interfaces.spec import check
 from loop_interfaces.topics import CostColumn
 from pde_sim_node.plant import DIVERGED_COST
 from tuner_node.noise import evaluation_noise

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from loop_interfaces.affinity import free_cores
-from loop_interfaces.parameters import ParameterError
+from loop_interfaces.spec import ParameterError
 from pde_sim_node.build import fingerprint
 from tuner_node.results import RunFolder
 

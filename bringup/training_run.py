@@ -27,8 +27,8 @@ from bringup.pairs import PAIR, Layout, Recording, namespaces, pair_nodes, quote
 from bringup.shared_core import SharedCores, worthwhile
 from bringup.supervisor import Child, NodeError, Supervisor, node_command
 from loop_interfaces.isolation import NETWORK, PROFILE, loopback_environment
-from loop_interfaces.parameters import ParameterError
 from loop_interfaces.problem import load_parameters
+from loop_interfaces.spec import ParameterError
 from pde_sim_node.build import build_equation, build_plant
 from tuner_node.build import build_training
 from tuner_node.record import Recorder

@@ -1,108 +1,16 @@
-"""Parameters as data: name, type, default, range, unit and meaning, in one table. No ROS import.
+"""The parameters of all nodes: name, type, default, range, unit and meaning, in one table.
 
-A problem is one YAML file in ROS parameter-file form (`/**: ros__parameters: ...`), read unchanged
-by the three nodes (`--params-file`) and by the command line. The nodes declare from this table,
-the command line validates by it and docs/interfaces.md lists it.
+A problem is one YAML file (loop_interfaces.spec), read unchanged by the three nodes
+(`--params-file`) and by the command line. The nodes declare from this table, the command line
+validates by it and docs/interfaces.md lists it. No ROS import.
 """
 
 from __future__ import annotations
 
-import difflib
-import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
-import yaml
-
-Value = bool | int | float | str | list[str]
-MAX_YAML_BYTES = 1_000_000
-MAX_PARAMETERS = 10_000
-
-
-class ParameterError(ValueError):
-    """A parameter that is missing, unknown or out of range; the text names it, its value and range."""
-
-
-@dataclass(frozen=True)
-class Spec:
-    """One parameter. The type is the default's; `required` ones have no usable default.
-
-    minimum, maximum: inclusive, unless `positive` (then value > 0). choices: the allowed words.
-    live: it may be changed while the node runs, because no result depends on it.
-    """
-
-    name: str
-    default: Value
-    description: str
-    minimum: float | None = None
-    maximum: float | None = None
-    unit: str = ""
-    choices: tuple[str, ...] = ()
-    positive: bool = False
-    multiple_of: int = 1
-    live: bool = False
-
-    @property
-    def type(self) -> type:
-        return type(self.default)
-
-    @property
-    def range(self) -> str:
-        """The allowed values in words."""
-        if self.choices:
-            return "one of " + ", ".join(self.choices)
-        words = {int: "a whole number", float: "a number", str: "a text", bool: "true or false"}
-        text = words.get(self.type, "a list of texts")
-        if self.multiple_of == 2:
-            text = "an even whole number"
-        if self.positive:
-            text += " above 0"
-        elif self.minimum is not None and self.maximum is not None:
-            return f"{text} from {_plain(self.minimum)} to {_plain(self.maximum)}"
-        elif self.minimum is not None:
-            text += f" of at least {_plain(self.minimum)}"
-        if self.maximum is not None:
-            text += f", at most {_plain(self.maximum)}"
-        return text
-
-    def check(self, value: Any) -> Value:
-        """`value` in the parameter's type; raises ParameterError naming value and range."""
-        good: Value | None = self._coerce(value)
-        if good is None:
-            raise ParameterError(
-                f"parameter '{self.name}' is {value!r}; expected {self.range}"
-                + (f" ({self.unit})" if self.unit else "")
-            )
-        return good
-
-    def _coerce(self, value: Any) -> Any:
-        if self.type is float and isinstance(value, int) and not isinstance(value, bool):
-            value = float(value) if abs(value) < 2**1000 else math.inf
-        if not isinstance(value, self.type) or (self.type is int and isinstance(value, bool)):
-            return None
-        if isinstance(value, list):
-            return value if all(isinstance(item, str) for item in value) else None
-        if self.choices:
-            return value if value in self.choices else None
-        if isinstance(value, (int, float)) and not isinstance(value, bool):
-            if not math.isfinite(value) or (self.positive and value <= 0):
-                return None
-            if self.minimum is not None and value < self.minimum:
-                return None
-            if self.maximum is not None and value > self.maximum:
-                return None
-            if isinstance(value, int) and value % self.multiple_of:
-                return None
-        return value
-
-
-def _plain(number: float) -> str:
-    """A bound as people write it: 1000000, not 1e+06."""
-    whole = float(number).is_integer() and abs(number) < 1e17
-    return str(int(number)) if whole else f"{number:g}"
-
+from loop_interfaces.spec import Spec
 
 MAX_SEED = 2**53 - 1
 
@@ -383,72 +291,3 @@ def table() -> tuple[Spec, ...]:
 def noisy(values: Mapping[str, Any]) -> bool:
     """Whether the plant of these parameters has noise, so that a rollout has a seed of it."""
     return bool(values["measurement_noise"] or values["process_noise"])
-
-
-def check_names(names: Iterable[str], known: Iterable[str]) -> None:
-    """Raises ParameterError for the first name that is not known, with the nearest known one."""
-    known = list(known)
-    for name in names:
-        if name not in known and not name.startswith("physical."):
-            close = difflib.get_close_matches(name, known, n=1)
-            hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known)}"
-            raise ParameterError(f"unknown parameter '{name}'; {hint}")
-
-
-def check(specs: Iterable[Spec], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Every parameter of `specs`, from `given` or its default, checked against its range."""
-    return {spec.name: spec.check(given.get(spec.name, spec.default)) for spec in specs}
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """The parameters of a ROS parameter file, flattened with dots.
-
-    Raises ParameterError when the file cannot be read or is not in that form.
-    """
-    try:
-        with path.open("rb") as file:
-            raw = file.read(MAX_YAML_BYTES + 1)
-    except OSError as error:
-        raise ParameterError(f"cannot read {path}: {error.strerror}") from error
-    if len(raw) > MAX_YAML_BYTES:
-        raise ParameterError(f"{path} is larger than {MAX_YAML_BYTES} bytes; not a parameter file")
-    try:
-        document = yaml.safe_load(raw)
-    except (yaml.YAMLError, UnicodeDecodeError, ValueError, RecursionError) as error:
-        first = str(error).splitlines()[0]
-        raise ParameterError(f"{path} is not valid YAML: {first}") from error
-    flat: dict[str, Any] = {}
-    sections = document.values() if isinstance(document, dict) else [None]
-    for section in sections:
-        body = section.get("ros__parameters") if isinstance(section, dict) else None
-        if not isinstance(body, dict):
-            raise ParameterError(
-                f"{path} is not a ROS parameter file; expected '/**:' with 'ros__parameters:' in it"
-            )
-        flat.update(_flatten(body))
-    return flat
-
-
-def _flatten(body: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in body.items():
-        if isinstance(value, dict):
-            flat.update(_flatten(value, f"{prefix}{key}."))
-        else:
-            flat[f"{prefix}{key}"] = value
-        if len(flat) > MAX_PARAMETERS:
-            raise ParameterError(f"more than {MAX_PARAMETERS} parameters in one file")
-    return flat
-
-
-def yaml_text(values: Mapping[str, Any], comment: str = "") -> str:
-    """`values` as a ROS parameter file; dotted names become nested maps."""
-    nested: dict[str, Any] = {}
-    for name, value in values.items():
-        *groups, last = name.split(".")
-        place = nested
-        for group in groups:
-            place = place.setdefault(group, {})
-        place[last] = value
-    text = yaml.safe_dump({"/**": {"ros__parameters": nested}}, sort_keys=False)
-    return "".join(f"# {line}\n" for line in comment.splitlines()) + text

@@ -7,7 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from loop_interfaces.parameters import ParameterError, check, check_names, read_yaml, table
+from loop_interfaces.parameters import table
+from loop_interfaces.spec import (
+    ParameterError,
+    check,
+    check_names,
+    read_yaml,
+)
 
 
 def config_folder() -> Path:

@@ -18,7 +18,8 @@ from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 
-from loop_interfaces.parameters import ParameterError, Spec, check_names, table
+from loop_interfaces.parameters import table
+from loop_interfaces.spec import ParameterError, Spec, check_names
 
 _LARGEST = 1.7976931348623157e308
 

@@ -21,10 +21,11 @@ from loop_interfaces.introspection import offer
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.node_loop import NodeLoop
 from loop_interfaces.node_main import node_main
-from loop_interfaces.parameters import EXECUTION, PLANT, PROBLEM, Spec
+from loop_interfaces.parameters import EXECUTION, PLANT, PROBLEM
 from loop_interfaces.protocol import Send
 from loop_interfaces.ros_parameters import declare, given_parameters, on_change
 from loop_interfaces.samples import clock_message
+from loop_interfaces.spec import Spec
 from loop_interfaces.topics import ACTION, COST, PAUSED, START, STATE, TARGET
 from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.equations import configured_equation

@@ -31,7 +31,7 @@ from bringup.commands import problems
 from bringup.display import Display
 from bringup.output import print_json
 from bringup.progress import Share, duration
-from loop_interfaces.parameters import read_yaml
+from loop_interfaces.spec import read_yaml
 from tests.loop_harness import ROOT
 from tests.small import SMALL
 

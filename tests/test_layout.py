@@ -13,7 +13,7 @@ from bringup.bench import batch as bench_batch
 from bringup.bench import train as bench_train
 from bringup.cli import main
 from loop_interfaces import affinity
-from loop_interfaces.parameters import ParameterError
+from loop_interfaces.spec import ParameterError
 
 
 def test_one_pair_has_no_namespace_and_several_share_one_clock() -> None:

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import pytest
 
-from loop_interfaces.parameters import (
-    PROBLEM,
+from loop_interfaces.parameters import PROBLEM, table
+from loop_interfaces.problem import load_parameters, shipped_problems
+from loop_interfaces.spec import ParameterError as Refused
+from loop_interfaces.spec import (
     Spec,
     check,
     check_names,
     read_yaml,
-    table,
     yaml_text,
 )
-from loop_interfaces.parameters import ParameterError as Refused
-from loop_interfaces.problem import load_parameters, shipped_problems
 from pde_sim_node.build import build_plant
 from pde_sim_node.equations import EQUATIONS
 

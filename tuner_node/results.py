@@ -34,10 +34,12 @@ from loop_interfaces.parameters import (
     PLANT,
     RECORDER,
     VIEWER,
+    table,
+)
+from loop_interfaces.spec import (
     ParameterError,
     check,
     read_yaml,
-    table,
     yaml_text,
 )
 from loop_interfaces.topics import COMPLETED

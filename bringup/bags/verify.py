@@ -21,7 +21,8 @@ from bringup.bags.reader import Bag, RecordedEpisode
 from controller_node.identification import DesignSettings, design
 from controller_node.policy import ProjectedLaw, excitation
 from loop_interfaces import model_rows
-from loop_interfaces.parameters import check, read_yaml, table
+from loop_interfaces.parameters import table
+from loop_interfaces.spec import check, read_yaml
 from loop_interfaces.topics import COMPLETED, VOID, CostColumn, StartColumn, noise_seeds
 from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.instruments import InstrumentedPlant

@@ -23,7 +23,7 @@ from bringup.bench.processes import Bench, BenchError, BenchProcess, bench, mach
 from bringup.in_process import LocalPair, train
 from bringup.pairs import namespaces
 from bringup.training_run import resolve
-from loop_interfaces.parameters import yaml_text
+from loop_interfaces.spec import yaml_text
 from tuner_node.build import build_training
 
 SEEDS = 4

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from bringup.commands.common import Commands, add_json, command
 from bringup.output import print_json
-from loop_interfaces.parameters import ParameterError
+from loop_interfaces.spec import ParameterError
 
 
 def add(commands: Commands) -> None:

@@ -8,7 +8,7 @@ import webbrowser
 from pathlib import Path
 
 from bringup.commands.common import Commands, command
-from loop_interfaces.parameters import ParameterError
+from loop_interfaces.spec import ParameterError
 
 PORT = 8420
 

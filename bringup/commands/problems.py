@@ -7,8 +7,8 @@ from typing import Any
 
 from bringup.commands.common import Commands, add_json, command
 from bringup.output import print_json
-from loop_interfaces.parameters import read_yaml
 from loop_interfaces.problem import shipped_problems
+from loop_interfaces.spec import read_yaml
 
 
 def add(commands: Commands) -> None:

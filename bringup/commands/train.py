@@ -6,8 +6,9 @@ import argparse
 from pathlib import Path
 
 from bringup.commands.common import DEFAULTS, Commands, add_json, command
-from loop_interfaces.parameters import INSTRUMENTS, ParameterError
+from loop_interfaces.parameters import INSTRUMENTS
 from loop_interfaces.problem import shipped_problems
+from loop_interfaces.spec import ParameterError
 
 
 def add(commands: Commands) -> None:

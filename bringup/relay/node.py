@@ -19,8 +19,8 @@ from loop_interfaces.endpoints import reader_qos, writer_qos
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.node_loop import NodeLoop
 from loop_interfaces.node_main import node_main
-from loop_interfaces.parameters import Spec
 from loop_interfaces.ros_parameters import declare
+from loop_interfaces.spec import Spec
 from loop_interfaces.topics import ACTION, STATE
 
 PARAMETERS = (

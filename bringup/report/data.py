@@ -16,7 +16,8 @@ from bringup.reproduce import experiment as reproduce
 from controller_node.policy import ProjectedLaw
 from loop_interfaces import model_rows
 from loop_interfaces.model_rows import ModelRows
-from loop_interfaces.parameters import check, table
+from loop_interfaces.parameters import table
+from loop_interfaces.spec import check
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD, Plant
 from tuner_node.results import RunFolder, RunFolderError

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loop_interfaces.parameters import yaml_text
+from loop_interfaces.spec import yaml_text
 from loop_interfaces.topics import MAX_GAIN
 from tests.loop_harness import Processes, until
 from tests.small import SMALL, parameters, same_bits, train_here

@@ -25,8 +25,9 @@ from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.node_loop import NodeLoop
 from loop_interfaces.node_main import ConfigurationError, node_main
-from loop_interfaces.parameters import PROBLEM, Spec
+from loop_interfaces.parameters import PROBLEM
 from loop_interfaces.ros_parameters import declare
+from loop_interfaces.spec import Spec
 from loop_interfaces.topics import COST, MODEL, POLICY, START, CostColumn
 from pde_sim_node.build import build_plant
 

@@ -23,8 +23,8 @@ from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.node_loop import NodeLoop
 from loop_interfaces.node_main import node_main
-from loop_interfaces.parameters import Spec
 from loop_interfaces.ros_parameters import declare
+from loop_interfaces.spec import Spec
 from loop_interfaces.topics import ACTION, STATE, Topic
 
 PARAMETERS = (
