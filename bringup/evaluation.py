@@ -13,10 +13,11 @@ from loop_interfaces.parameters import noisy, table
 from loop_interfaces.spec import check
 from loop_interfaces.topics import CostColumn
 from pde_sim_node.plant import DIVERGED_COST
+from tuner_node.batch import Batch
 from tuner_node.noise import evaluation_noise
 from tuner_node.results import RunFolder, RunFolderError
 from tuner_node.seeds import Purpose, derive
-from tuner_node.training import CONTROLLERS, Batch
+from tuner_node.training import CONTROLLERS
 
 
 def evaluate(folder: Path, *, fields: int, seed: int, mean_field: bool) -> dict[str, Any]:

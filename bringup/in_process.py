@@ -18,8 +18,9 @@ from loop_interfaces import model_rows
 from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn, noise_seeds
 from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.plant import Plant
+from tuner_node.batch import Batch, BatchResult
 from tuner_node.observer import cut
-from tuner_node.training import Batch, BatchResult, Training
+from tuner_node.training import Training
 
 Array = NDArray[np.float64]
 Report = Callable[[Mapping[str, Any]], None]

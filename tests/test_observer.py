@@ -9,8 +9,8 @@ import numpy as np
 from loop_interfaces.frames import Frame
 from loop_interfaces.topics import COMPLETED
 from tests.test_dispatch import RUN, batch, costs_of, dispatcher, starts
+from tuner_node.batch import Batch
 from tuner_node.observer import Observer
-from tuner_node.training import Batch
 
 STEPS = 30
 

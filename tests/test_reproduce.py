@@ -14,8 +14,8 @@ from bringup.reproduce import experiment as reproduce
 from loop_interfaces.topics import CostColumn
 from tests.loop_harness import Processes, until
 from tests.small import SMALL, parameters, same_bits, train_here
+from tuner_node.batch import Batch
 from tuner_node.seeds import Purpose, derive
-from tuner_node.training import Batch
 
 LIMIT = 120.0
 

@@ -15,7 +15,7 @@ from loop_interfaces.protocol import ModelFailure
 from loop_interfaces.topics import ACTION, COMPLETED, MODEL_IDENTIFIED
 from pde_sim_node.build import build_plant
 from tests.small import parameters, same_bits
-from tuner_node.training import Batch
+from tuner_node.batch import Batch
 
 RUN = 5
 SETTINGS = DesignSettings(

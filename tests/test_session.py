@@ -10,10 +10,11 @@ from bringup.in_process import LocalPair
 from loop_interfaces.frames import Frame
 from loop_interfaces.topics import MODEL, POLICY, START, StartColumn
 from tests.small import parameters, same_bits, train_here
+from tuner_node.batch import Batch
 from tuner_node.build import build_training
 from tuner_node.dispatch import Dispatcher
 from tuner_node.session import Session
-from tuner_node.training import Batch, Training
+from tuner_node.training import Training
 
 ITERATIONS = 5
 

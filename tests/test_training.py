@@ -13,8 +13,8 @@ from loop_interfaces.model_rows import unpack
 from loop_interfaces.topics import COMPLETED, StartColumn
 from tests.small import parameters, same_bits, train_here
 from tuner_node import checkpoint
+from tuner_node.batch import BatchResult
 from tuner_node.build import build_training
-from tuner_node.training import BatchResult
 
 
 def test_a_seed_has_one_policy_alone_and_beside_others_and_however_episodes_are_cut():

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from loop_interfaces.model_rows import unpack
 from loop_interfaces.parameters import noisy
+from tuner_node.batch import UNKNOWN_PLANT, TrainingSettings
 from tuner_node.optimizers import NEED_TRAJECTORIES, OPTIMIZERS, Context, GaussNewton, Optimizer
-from tuner_node.training import UNKNOWN_PLANT, Training, TrainingSettings
+from tuner_node.training import Training
 
 MAX_MODEL_BYTES = 1 << 30
 

@@ -30,7 +30,7 @@ from loop_interfaces.topics import (
     CostColumn,
     Topic,
 )
-from tuner_node.training import UNKNOWN_PLANT, Batch, BatchResult
+from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult
 from tuner_node.work import Chunk, Pair
 
 Array = NDArray[np.float64]

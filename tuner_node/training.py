@@ -21,76 +21,17 @@ from numpy.typing import NDArray
 
 from loop_interfaces import model_rows
 from loop_interfaces.policy_columns import with_features
-from loop_interfaces.topics import COMPLETED, MAX_GAIN, START_COLUMNS, CostColumn, StartColumn
+from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn
+from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, TrainingSettings, batch_of
 from tuner_node.noise import PURPOSES, evaluation_noise, rollout_noise
 from tuner_node.optimizers import Context, Optimizer, Rollout, RolloutResult, Trajectory
 from tuner_node.seeds import Purpose, derive
 
 Array = NDArray[np.float64]
-UNKNOWN_PLANT = -1
-"""The plant's fingerprint before the first cost."""
 CHECK_FIELDS = 4
 """Sampled fields on which a warm start must beat no control."""
 CONTROLLERS = ("none", "lqt", "adapted")
 """The controllers of the closing evaluation, in the order of its rows."""
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Rollouts wanted together; any split into episodes gives the same results.
-
-    rows (R, 4), with noise (R, 5): the columns of `episode/start`; policies (R, n_a, columns), or
-    None for an exploratory batch, whose result is a model a row instead of a cost.
-    """
-
-    rows: Array
-    policies: Array | None
-    trajectories: bool = False
-    """Whether the result must carry the trajectories."""
-
-    @property
-    def exploratory(self) -> bool:
-        return self.policies is None
-
-
-@dataclass(frozen=True)
-class BatchResult:
-    """Results of a batch.
-
-    costs (R, 3): mean, total, ended of each row; models (R, rows, n_s) after exploration;
-    plant: fingerprint of the plant; where the batch asked for trajectories: these, and the target.
-    """
-
-    costs: Array
-    models: Array | None = None
-    plant: int = UNKNOWN_PLANT
-    trajectories: list[Trajectory] | None = None
-    target: Array | None = None
-
-
-@dataclass(frozen=True)
-class TrainingSettings:
-    """What defines a training besides the problem; see loop_interfaces.parameters.TUNER."""
-
-    n_a: int
-    seed: int
-    seeds: int
-    evaluation_fields: int
-    evaluation_seed: int
-    start: str
-    exploration_variance: float
-    identification_attempts: int
-    state_weight: float
-    action_weight: float
-    trajectories: bool
-    noise: bool = False
-    """Whether rollouts get seeds of the plant's noise."""
-    action_limit: float = 0.0
-    model: Array | None = None
-    """Rows of a reduced model to start from instead of identifying one."""
-    policy_features: str = "affine"
-    extra_modes: int = 0
-    """Columns that the models get for modes of the rollouts."""
 
 
 OptimizerFactory = Callable[[Array, int, Context | None], Optimizer]
@@ -145,12 +86,12 @@ class Training:
             ]
             batch = Batch(np.array(rows, dtype=np.float64), None, self.settings.trajectories)
         elif self.phase == "check":
-            batch = _batch(self._check_rollouts())
+            batch = batch_of(self._check_rollouts())
         elif self.phase == "adapt":
             wanted = [(m, rollout) for m, asked in enumerate(self._asked()) for rollout in asked]
-            batch = _batch(wanted, self.settings.trajectories)
+            batch = batch_of(wanted, self.settings.trajectories)
         elif self.phase == "evaluate":
-            batch = _batch(self._evaluation_rollouts())
+            batch = batch_of(self._evaluation_rollouts())
         else:
             return None
         if not self.settings.noise:
@@ -451,11 +392,3 @@ class Training:
             }
             for seed, costs in zip(self._seeds(), self.evaluation, strict=True)
         ]
-
-
-def _batch(wanted: Sequence[tuple[int, Rollout]], trajectories: bool = False) -> Batch:
-    rows = np.empty((len(wanted), START_COLUMNS))
-    for row, (model, rollout) in zip(rows, wanted, strict=True):
-        row[:] = (rollout.field_seed, -1, 0.0, model)
-    policies = np.stack([rollout.policy for _, rollout in wanted])
-    return Batch(rows, np.clip(policies, -MAX_GAIN, MAX_GAIN), trajectories)

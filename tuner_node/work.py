@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from loop_interfaces.frames import Frame
 from loop_interfaces.protocol import Send
+from tuner_node.batch import Batch
 from tuner_node.observer import Observer
 from tuner_node.optimizers import Trajectory
-from tuner_node.training import Batch
 
 Array = NDArray[np.float64]
 

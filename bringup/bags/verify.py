@@ -27,10 +27,10 @@ from loop_interfaces.topics import COMPLETED, VOID, CostColumn, StartColumn, noi
 from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.instruments import InstrumentedPlant
 from pde_sim_node.plant import DIVERGED_COST, Plant
+from tuner_node.batch import Batch, BatchResult
 from tuner_node.build import build_training
 from tuner_node.observer import cut
 from tuner_node.optimizers import NEED_TRAJECTORIES, Trajectory
-from tuner_node.training import Batch, BatchResult
 
 Array = NDArray[np.float64]
 _TUNERS = ("seed", "seeds", "iterations", "start", "optimizer")

@@ -25,10 +25,11 @@ from bringup.training_run import resolve
 from loop_interfaces.topics import CostColumn
 from pde_sim_node.plant import DIVERGED_COST
 from tuner_node import checkpoint
+from tuner_node.batch import Batch
 from tuner_node.build import build_training
 from tuner_node.results import RunFolder, RunFolderError
 from tuner_node.seeds import Purpose, derive
-from tuner_node.training import Batch, Training
+from tuner_node.training import Training
 
 Array = NDArray[np.float64]
 SAVE_PERIOD = 2.0

@@ -1,0 +1,83 @@
+"""What a training asks for and gets: batches of rollouts and their results; and what defines it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loop_interfaces.topics import MAX_GAIN, START_COLUMNS
+from tuner_node.optimizers import Rollout, Trajectory
+
+Array = NDArray[np.float64]
+UNKNOWN_PLANT = -1
+"""The plant's fingerprint before the first cost."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Rollouts wanted together; any split into episodes gives the same results.
+
+    rows (R, 4), with noise (R, 5): the columns of `episode/start`; policies (R, n_a, columns), or
+    None for an exploratory batch, whose result is a model a row instead of a cost.
+    """
+
+    rows: Array
+    policies: Array | None
+    trajectories: bool = False
+    """Whether the result must carry the trajectories."""
+
+    @property
+    def exploratory(self) -> bool:
+        return self.policies is None
+
+
+@dataclass(frozen=True)
+class BatchResult:
+    """Results of a batch.
+
+    costs (R, 3): mean, total, ended of each row; models (R, rows, n_s) after exploration;
+    plant: fingerprint of the plant; where the batch asked for trajectories: these, and the target.
+    """
+
+    costs: Array
+    models: Array | None = None
+    plant: int = UNKNOWN_PLANT
+    trajectories: list[Trajectory] | None = None
+    target: Array | None = None
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """What defines a training besides the problem; see loop_interfaces.parameters.TUNER."""
+
+    n_a: int
+    seed: int
+    seeds: int
+    evaluation_fields: int
+    evaluation_seed: int
+    start: str
+    exploration_variance: float
+    identification_attempts: int
+    state_weight: float
+    action_weight: float
+    trajectories: bool
+    noise: bool = False
+    """Whether rollouts get seeds of the plant's noise."""
+    action_limit: float = 0.0
+    model: Array | None = None
+    """Rows of a reduced model to start from instead of identifying one."""
+    policy_features: str = "affine"
+    extra_modes: int = 0
+    """Columns that the models get for modes of the rollouts."""
+
+
+def batch_of(wanted: Sequence[tuple[int, Rollout]], trajectories: bool = False) -> Batch:
+    """A batch of rollouts, each with the index of the model of its policy."""
+    rows = np.empty((len(wanted), START_COLUMNS))
+    for row, (model, rollout) in zip(rows, wanted, strict=True):
+        row[:] = (rollout.field_seed, -1, 0.0, model)
+    policies = np.stack([rollout.policy for _, rollout in wanted])
+    return Batch(rows, np.clip(policies, -MAX_GAIN, MAX_GAIN), trajectories)
