@@ -15,7 +15,7 @@ from pathlib import Path
 from bringup.shared_core import SharedCores
 from loop_interfaces.protocol import STOPPED
 
-STOP_GRACE = 1.5
+STOP_GRACE = 2.0
 """Seconds between SIGINT and SIGKILL when the run ends."""
 RECORDER_GRACE = 10.0
 """The same for a recorder, which has a bag to finish."""

@@ -141,7 +141,7 @@ class Bundler:
     def show(self, raw: bytes | None) -> None:
         """From now on show the episode in any case, beginning with the state `raw`."""
         if raw is not None and self._looked_at and not self._shown:
-            self._some.bundle.add(STATE_KIND, time.monotonic_ns(), raw)
+            self._some.bundle.add(STATE_KIND, time.monotonic_ns(), raw, NO_TIME)
         self._shown = self._looked_at
         self.wanted = self._read or self._shown
 
@@ -155,7 +155,7 @@ class Bundler:
             self._all.flush()
         if self._shown:
             self._allowance.use(len(raw))
-            if self._some.bundle.add(kind, stamp, raw):
+            if self._some.bundle.add(kind, stamp, raw, simulated):
                 self._some.flush()
 
     def flush(self) -> None:

@@ -239,7 +239,7 @@ TUNER = (
         0,
         "POD modes of the first rollouts that the optimizer gauss_newton adds to the basis U",
         0,
-        64,
+        16,
     ),
     Spec(
         "directions",

@@ -10,8 +10,8 @@ and publishes them together, some hundred at a time, on the topic `samples`
                                              `length` bytes
 
 repeated; kind 0 is a state, 1 an action, and bytes are the message as it was on its own topic. time
-is the simulated time in s that goes on /clock with a state, also if nobody reads it there; NO_TIME
-where none does.
+is the simulated time in s that the plant tells on /clock with a state, whether or not somebody
+listens there; NO_TIME of an action and of a plant that tells none.
 """
 
 from __future__ import annotations
@@ -23,11 +23,13 @@ from dataclasses import dataclass
 
 from loop_interfaces.frames import FrameError
 
-STATE_KIND, ACTION_KIND, CLOCK_KIND = 0, 1, 2
+STATE_KIND, ACTION_KIND = 0, 1
+CLOCK_KIND = 2
+"""For who reads them, of the message on /clock that goes with a state; not in a bundle."""
 LIMIT = 512 * 1024
 """Bytes after which a bundle is sent: a few milliseconds of a fast loop."""
 NO_TIME = -1.0
-"""Of an action, and of a state of a plant that does not publish /clock."""
+"""Where no simulated time belongs to a sample."""
 AGE = 0.1
 """Seconds after which a bundle is sent that has not reached LIMIT."""
 MAX_TIME = 2.0**31
@@ -74,7 +76,7 @@ class Bundle:
         self._samples: list[tuple[int, int, bytes, float]] = []
         self.size = 0
 
-    def add(self, kind: int, stamp: int, raw: bytes, time: float = NO_TIME) -> bool:
+    def add(self, kind: int, stamp: int, raw: bytes, time: float) -> bool:
         """Keep a serialised message; whether the bundle should be sent now."""
         self._samples.append((kind, stamp, raw, time))
         self.size += _SAMPLE.size + len(raw)

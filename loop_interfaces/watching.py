@@ -39,16 +39,23 @@ _SINGLES: dict[int, tuple[Any, str]] = {
 class Watcher:
     """The states and actions of one pair, as serialised messages with the time of their arrival.
 
-    clock: also the messages on /clock; throttled: of some episodes only, as many
-    as people can see, where the plant offers that. `handles` are the subscriptions to
-    wait for; they may change with `look`.
+    clock: also the times that go with the states of a bundle; single_clock: also those on /clock
+    where nothing is bundled (once is enough for several pairs); throttled: of some episodes only, as
+    many as people can see, where the plant offers that. `handles` are the subscriptions to wait for;
+    they may change with `look`.
     """
 
     def __init__(
-        self, node: Node, namespace: str = "", *, clock: bool = False, throttled: bool = False
+        self,
+        node: Node,
+        namespace: str = "",
+        *,
+        clock: bool = False,
+        single_clock: bool = False,
+        throttled: bool = False,
     ) -> None:
         self._node, self._namespace, self._clock = node, namespace, clock
-        self._kinds = (STATE_KIND, ACTION_KIND, CLOCK_KIND) if clock else (STATE_KIND, ACTION_KIND)
+        self._kinds = (STATE_KIND, ACTION_KIND, *((CLOCK_KIND,) if single_clock else ()))
         self._offset = ClockOffset()
         self._bundles = self._subscribe(
             UInt8MultiArray,

@@ -113,7 +113,9 @@ class RecorderNode:
             mine = [s for s in self._what if s.namespace == namespace]
             kinds = {_KINDS[s.array]: s for s in mine if s.array in _KINDS} | times
             first = not self._watchers
-            self._watchers.append((Watcher(node, namespace, clock=first and bool(times)), kinds))
+            told = bool(times)
+            watcher = Watcher(node, namespace, clock=told, single_clock=first and told)
+            self._watchers.append((watcher, kinds))
         self._subscriptions = [
             (source, self._subscribe(source)) for source in self._what if source.channel.latched
         ]

@@ -11,6 +11,7 @@ from loop_interfaces.frames import FrameError
 from loop_interfaces.samples import (
     ACTION_KIND,
     LIMIT,
+    NO_TIME,
     STATE_KIND,
     Allowance,
     Bundle,
@@ -51,7 +52,7 @@ def test_a_bundle_is_an_ordinary_uint8_array():
 
 def test_it_asks_to_be_sent_when_it_is_large_and_is_empty_afterwards():
     bundle, count = Bundle(), 1
-    while not bundle.add(STATE_KIND, 0, bytes(1000)):
+    while not bundle.add(STATE_KIND, 0, bytes(1000), NO_TIME):
         count += 1
     assert LIMIT // 1024 <= count <= LIMIT // 1024 + 1
     bundle.take(0)

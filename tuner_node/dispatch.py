@@ -121,7 +121,7 @@ class Dispatcher:
         generation: their number; episodes name the one that they are about, so that a policy never
         meets the models before it.
         """
-        frame = self._models = Frame(self.run, 0, generation, self.sim_time, models)
+        frame = self._models = Frame(self.run, 0, generation, self.sim_time, models.copy())
         return [(pair, Send(MODEL, frame)) for pair in range(len(self.pairs))]
 
     def release(self) -> list[Order]:

@@ -355,8 +355,8 @@ class Training:
     def _take_bases(self) -> None:
         """The models on the bases that the optimisers have chosen."""
         for m, optimizer in enumerate(self.optimizers):
-            if optimizer.basis is not None:
-                assert self.models is not None and self.target is not None
+            if optimizer.basis is not None and self.models is not None:
+                assert self.target is not None
                 self.models[m] = model_rows.with_basis(
                     self.models[m], self.settings.n_a, optimizer.basis, self.target
                 )

@@ -197,7 +197,7 @@ class _Collector:
         self._open: dict[Key, RecordedEpisode] = {}
         self._ended: dict[Key, int] = {}
         self._closed: set[Key] = set()
-        self._models: dict[str, Frame] = {}
+        self._models: dict[tuple[str, int, int], Frame] = {}
 
     def take(self, message: Message) -> None:
         if message.topic.endswith(f"/{MODEL_FAILED}"):
@@ -216,7 +216,7 @@ class _Collector:
         if topic is TARGET:
             return
         if topic is MODEL:
-            self._models[namespace] = frame
+            self._models[namespace, frame.run, frame.step] = frame
             return
         if topic is START and not len(frame.values):
             return
@@ -232,6 +232,8 @@ class _Collector:
         for key in done:
             episode = self._open.pop(key)
             self._ended.pop(key, None)
+            if episode.start is not None:
+                episode.bases = self._models.get((key[0], key[1], episode.start.step))
             self._closed.add(key)
             yield episode
 
@@ -259,7 +261,6 @@ class _Collector:
             same = before.values.tobytes() == frame.values.tobytes()
             if topic is COST and episode.key not in self._ended:
                 self._ended[episode.key] = when
-                episode.bases = self._models.get(episode.key[0])
         if not same:
             episode.contradictions.append(
                 f"{topic.name} of step {frame.step} was recorded twice with different values"

@@ -2,14 +2,14 @@
 
 Of every complete episode: the initial fields from the seeds, the actions from states, policies and
 models (or from the excitation's seed), each z_{k+1} from z_k and a_k, the cost from states and
-actions, the reduced model from an exploratory episode. Of the run: every policy from the costs
-before it, by running the tuner's own training on the recorded costs.
+actions, the reduced model from an exploratory episode. Of the run: every policy and its models from
+the costs before it, by running the tuner's own training on the recorded costs.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from bringup.bags.reader import Bag, RecordedEpisode
 from controller_node.identification import DesignSettings, design
 from controller_node.policy import ProjectedLaw, excitation
 from loop_interfaces import model_rows
+from loop_interfaces.frames import Frame
 from loop_interfaces.parameters import table
 from loop_interfaces.spec import check, read_yaml
 from loop_interfaces.topics import COMPLETED, VOID, CostColumn, StartColumn, noise_seeds
@@ -31,6 +32,7 @@ from tuner_node.batch import Batch, BatchResult
 from tuner_node.build import build_training
 from tuner_node.observer import cut
 from tuner_node.optimizers import NEED_TRAJECTORIES, Trajectory
+from tuner_node.training import Training
 
 Array = NDArray[np.float64]
 _TUNERS = ("seed", "seeds", "iterations", "start", "optimizer")
@@ -122,6 +124,7 @@ class _Run:
     def __init__(self, number: int, values: Mapping[str, Any] | None, report: Report) -> None:
         self._number, self._report = number, report
         self._results: dict[bytes, tuple[Array, Array | None, int]] = {}
+        self._bases: dict[bytes, Frame | None] = {}
         self._rows: list[tuple[bytes, RecordedEpisode, int]] = []
         self._trajectories: dict[bytes, Trajectory] = {}
         self._values: dict[str, Any] | None = None
@@ -193,6 +196,7 @@ class _Run:
                 return
             if batch.policies is not None:
                 report.compared["policies"] += len(keys)
+                self._compare_models(training, keys)
             seen = None
             if batch.trajectories:
                 if any(key not in self._trajectories for key in keys):
@@ -213,6 +217,15 @@ class _Run:
                 f"episode {unused[0].number} is none of those that the training asks for"
             )
 
+    def _compare_models(self, training: Training, keys: Sequence[bytes]) -> None:
+        """The models that rollouts were about, against those of the replayed training."""
+        assert training.models is not None
+        for bases in {id(frame): frame for frame in map(self._bases.get, keys) if frame}.values():
+            where = f"models number {bases.step} of run {self._number}"
+            self._report.compare("models", where, bases.values, training.models)
+            if bases.step != training.generation:
+                self._report.differs(f"{where}: expected number {training.generation}")
+
     def _keep(self, episode: RecordedEpisode, where: str) -> None:
         """Note what each rollout of the episode gave, for the replay of the training."""
         assert episode.start is not None and episode.cost is not None
@@ -230,6 +243,7 @@ class _Run:
             model = episode.model.values[i] if episode.model is not None else None
             cost = episode.cost.values[i]
             self._rows.append((key, episode, i))
+            self._bases[key] = episode.bases
             if seen:
                 self._trajectories[key] = seen[i]
             if key not in self._results:

@@ -279,7 +279,19 @@ def reference_of(problem: str, settings: Mapping[str, Any]) -> Reference | None:
     names = {"attempts": "identification_attempts"}
     names |= {name: name for name in ("evaluation_seed", "evaluation_fields")}
     given = {new: settings[name] for name, new in names.items() if settings[name] is not None}
-    return find(load_parameters(problem, given))
+    law = {"policy_features": settings["features"], **_options(settings["settings"])}
+    return find({**load_parameters(problem, given), **law})
+
+
+def _options(settings: Sequence[str]) -> dict[str, Any]:
+    """What NAME=JSON words say."""
+    options = {}
+    for item in settings:
+        name, equals, value = item.partition("=")
+        if not equals:
+            raise ValueError(f"--set is {item!r}; expected NAME=VALUE like fields=4")
+        options[name] = json.loads(value)
+    return options
 
 
 def run(
@@ -303,12 +315,7 @@ def run(
     ValueError if a setting is not NAME=JSON.
     """
     given = dict(locals())
-    options = {}
-    for item in settings:
-        name, equals, value = item.partition("=")
-        if not equals:
-            raise ValueError(f"--set is {item!r}; expected NAME=VALUE like fields=4")
-        options[name] = json.loads(value)
+    options = _options(settings)
     wanted = [
         Job(
             each,

@@ -200,7 +200,7 @@ class GaussNewton:
         row["damping"] = self._damping
         if decided:
             if self._extra_modes and not self._grown:
-                self._grow_basis()
+                row["added_modes"] = self._grow_basis()
             if not (self._incumbents == _NONE).any():
                 self._propose(row)
         return row
@@ -285,8 +285,8 @@ class GaussNewton:
             self._fields[oldest] = self._fields.max() + 1
             self._others[oldest] = self._incumbents[oldest] = _NONE
 
-    def _grow_basis(self) -> None:
-        """Modes of the rollouts in the room that U has for them, once."""
+    def _grow_basis(self) -> int:
+        """Modes of the rollouts in the room that U has for them; how many there are."""
         U = self._context.U
         own = U.shape[1] - self._extra_modes
         states = [record.states for record in self._records.all() if record.usable]
@@ -295,6 +295,8 @@ class GaussNewton:
         wider = np.zeros_like(U)
         wider[:, : found.shape[1]] = found
         self._use_basis(wider)
+        added: int = found.shape[1] - own
+        return added
 
     def _use_basis(self, U: Array) -> None:
         self._context = replace(self._context, U=U)
