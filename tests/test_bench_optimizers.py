@@ -7,7 +7,9 @@ import json
 import numpy as np
 import pytest
 
+from bringup.bench import beyond
 from bringup.bench.optimizers import Job, run, table, train
+from pde_sim_node.plant import DIVERGED_COST
 from tests.small import SMALL, parameters, train_here
 
 
@@ -53,3 +55,19 @@ def test_the_table_has_means_worst_seeds_and_worst_fields():
 def test_a_setting_that_is_none_is_refused_in_one_sentence():
     with pytest.raises(ValueError, match="--set is 'fields'; expected NAME=VALUE"):
         run(problem=[str(SMALL)], settings=["fields"])
+
+
+def test_the_table_of_other_settings_says_what_diverged_and_where_there_was_no_model():
+    common = {"problem": "p", "none": [4.0, 4.0], "lqt": [2.0, 3.0], "attempts": [1, 5]}
+    noisy = {**common, "options": {"measurement_noise": 0.1}, "accepted": [3, 7]}
+    rows = [
+        {**noisy, "optimizer": "two_point", "adapted": [1.0, 0.1 * DIVERGED_COST]},
+        {**noisy, "optimizer": "gauss_newton", "adapted": [1.0, 2.0]},
+        {"problem": "p", "options": {"sensors": 2}, "optimizer": "two_point", "failed": "why"},
+    ]
+    lines = beyond.text(rows).splitlines()
+    assert lines[0] == "**p**"
+    assert lines[-2:] == [
+        "| measurement_noise 0.1 | 1/5 | 4 | 2.5 (3) | diverges (1 of 2) | 1.5 (2) | 3/7 |",
+        "| sensors 2 | no reduced model | | | | | |",
+    ]

@@ -16,11 +16,14 @@ import numpy as np
 from bringup.in_process import LocalPair, train
 from bringup.training_run import resolve
 from loop_interfaces.topics import COMPLETED
+from pde_sim_node.plant import DIVERGED_COST
 from tuner_node.build import build_training
 from tuner_node.training import Training
 
 PROBLEMS = ("burgers", "allen-cahn", "kdv")
 OPTIMIZERS = ("two_point", "gauss_newton")
+LOST = 1e-3 * DIVERGED_COST
+"""A mean cost in which rollouts that diverged count."""
 LEVELS: dict[str, list[dict[str, Any]]] = {
     "ideal": [{}],
     "measurement": [{"measurement_noise": level} for level in (0.01, 0.03, 0.1)],
@@ -84,13 +87,18 @@ def outcome(training: Training) -> dict[str, Any]:
 
 
 def text(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The rows as a Markdown table for each problem: mean over the seeds (worst seed)."""
+    """The rows as a Markdown table for each problem: mean over the seeds (worst seed).
+
+    explorations: episodes a seed until a warm start beat no control; accepted: steps of Gauss-Newton.
+    """
     lines: list[str] = []
     for problem in dict.fromkeys(row["problem"] for row in rows):
         own = [row for row in rows if row["problem"] == problem]
         lines += ["", f"**{problem}**", ""]
-        lines.append("| setting | explorations | no control | LQT | two-point | Gauss-Newton |")
-        lines.append("|---|---|---|---|---|---|")
+        lines.append(
+            "| setting | explorations | no control | LQT | two-point | Gauss-Newton | accepted |"
+        )
+        lines.append("|---|---|---|---|---|---|---|")
         settings = list(dict.fromkeys(str(row["options"]) for row in own))
         for setting in settings:
             pair = {row["optimizer"]: row for row in own if str(row["options"]) == setting}
@@ -102,14 +110,18 @@ def _line(options: Mapping[str, Any], rows: Mapping[str, Mapping[str, Any]]) -> 
     first = next(iter(rows.values()))
     name = ", ".join(f"{key} {value:g}" for key, value in options.items()) or "none of them"
     if "failed" in first:
-        return f"| {name} | no reduced model | | | | |"
+        return f"| {name} | no reduced model | | | | | |"
     cells = [name, "/".join(str(n) for n in first["attempts"])]
     cells += [f"{np.mean(first['none']):.4g}", _cell(first["lqt"])]
     cells += [
         _cell(rows[optimizer]["adapted"]) if optimizer in rows else "" for optimizer in OPTIMIZERS
     ]
+    cells.append("/".join(map(str, rows[OPTIMIZERS[-1]]["accepted"])) if len(rows) > 1 else "")
     return f"| {' | '.join(cells)} |"
 
 
 def _cell(costs: Sequence[float]) -> str:
+    lost = sum(cost >= LOST for cost in costs)
+    if lost:
+        return f"diverges ({lost} of {len(costs)})"
     return f"{np.mean(costs):.4g} ({max(costs):.4g})"
