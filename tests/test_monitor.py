@@ -256,6 +256,21 @@ def test_from_the_topics_alone_policies_are_points_and_a_row_without_control_is_
     assert curve.told()["points"][-1] == [2, None, None, None, 4]
 
 
+def test_episodes_that_come_in_at_once_are_a_point_each():
+    watched = Watched()
+    for episode in (1, 2, 3):
+        watched.policy(frame(np.ones((2, 2, 3)), episode=episode), 1.0)
+    for episode in (1, 2, 3):
+        watched.start(start([[3, -1, 0, 0], [4, -1, 0, 0]], episode=episode), 1.0)
+    watched.start(frame(np.empty((0, 4)), episode=0), 1.0)
+    for episode in (1, 2, 3):
+        watched.cost(cost([episode, episode + 2.0], episode=episode), 1.0)
+    points = watched.curve.told()["points"]
+    assert [point[:2] for point in points] == [[1, 2.0], [2, 3.0], [3, 4.0]]
+    watched.cost(cost([9.0, 9.0], episode=4), 1.0)  # nobody knows what it was
+    assert len(watched.curve.points) == 3
+
+
 # Nodes.
 
 

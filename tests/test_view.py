@@ -160,3 +160,19 @@ def test_a_viewer_that_sees_nothing_any_more_is_stale():
     assert good.values["samples/s"] == 0.5
     stale = health.report(8.0, 3)
     assert (stale.level, stale.message) == (Level.STALE, "no sample for 6 s")
+
+
+def test_several_episodes_that_come_in_at_once_are_told_apart():
+    shown = view()
+    lqt = MODEL.policy
+    shown.model(frame(pack(MODEL)[None], 0, step=1))
+    policies = {1: [np.zeros_like(lqt), lqt], 2: [lqt + 0.1, lqt + 0.1]}
+    for episode, gains in policies.items():
+        shown.policy(frame(gains, episode, step=1))
+    for episode in policies:
+        shown.start(frame([(i, -1.0, 0.0, 0.0) for i in range(2)], episode, step=1))
+    shown.start(frame(np.empty((0, 4)), 0))  # the end of the run
+    shown.cost(frame([(10.0, 100.0, -1), (5.0, 50.0, -1)], 1))
+    shown.cost(frame([(4.0, 40.0, -1), (2.0, 20.0, -1)], 2))
+    numbers = shown.numbers()
+    assert [numbers[name] for name in ("cost_no_control", "cost_lqt", "cost")] == [10.0, 5.0, 3.0]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces import model_rows
-from loop_interfaces.frames import Frame
+from loop_interfaces.frames import Frame, Recent
 from loop_interfaces.topics import COMPLETED, START_COLUMNS, CostColumn, StartColumn
 from viewer_node.spacetime import SpaceTime
 
@@ -75,8 +75,7 @@ class LoopView:
         self._targets: dict[int, Array] = {}
         self._plant = 0
         self._models: tuple[int, int, Array] | None = None
-        self._start: Frame | None = None
-        self._policy: Frame | None = None
+        self._starts, self._policies = Recent(MAX_KEPT), Recent(MAX_KEPT)
         self._episodes: OrderedDict[tuple[int, int], _Episode] = OrderedDict()
         self._state: Array | None = None
         self._action: Array | None = None
@@ -95,18 +94,19 @@ class LoopView:
     def model(self, frame: Frame) -> None:
         """Take a run's reduced models, which have the LQT gains in them."""
         self._models = frame.run, frame.step, frame.values.copy()
-        self._join()
+        if (newest := self._starts.newest) is not None:
+            self._join(newest)
 
     def start(self, frame: Frame) -> None:
         """Learn of an episode."""
         if frame.values.shape[1] in (START_COLUMNS, len(StartColumn)):
-            self._start = frame
-            self._join()
+            self._starts.add(frame)
+            self._join(frame)
 
     def policy(self, frame: Frame) -> None:
         """Take the gains of an episode."""
-        self._policy = frame
-        self._join()
+        self._policies.add(frame)
+        self._join(frame)
 
     def state(self, frame: Frame, now: float) -> None:
         """Take a sample z_k; now: monotonic s."""
@@ -195,14 +195,12 @@ class LoopView:
             return None
         return float(np.sqrt(np.mean((self._state - target) ** 2)))
 
-    def _join(self) -> None:
+    def _join(self, frame: Frame) -> None:
         """Note the gains of an episode once its start and its policy are both there."""
-        start, policy = self._start, self._policy
-        if start is None or policy is None or not len(start.values):
+        start, policy = self._starts.of(frame), self._policies.of(frame)
+        if start is None or policy is None or len(start.values) != len(policy.values):
             return
         key = (start.run, start.episode)
-        if key != (policy.run, policy.episode) or len(start.values) != len(policy.values):
-            return
         lqt = self._lqt(start, policy.values)
         self._episodes[key] = _Episode(policy.values.copy(), lqt)
         while len(self._episodes) > MAX_KEPT:

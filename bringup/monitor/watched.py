@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bringup.monitor.curve import Curve
 from bringup.monitor.episode import Episode, Key, key_of, rows_of
 from bringup.monitor.health import Health, Rate
-from loop_interfaces.frames import Frame
+from loop_interfaces.frames import Frame, Recent
 from loop_interfaces.topics import VOID, CostColumn, StartColumn
 
 JOIN = 0.5
@@ -51,8 +51,8 @@ class Watched:
         """What the newest episodes are, by run and number."""
         self._pending: Episode | None = None
         self._pending_since = 0.0
-        self._start: Frame | None = None
-        self._policy: Frame | None = None
+        self._started: int | None = None
+        self._starts, self._policies = Recent(), Recent()
         self._costs_of: tuple[int, int] | None = None
         self._counted: tuple[Key, int] | None = None
         self._plant_paused = False
@@ -94,9 +94,10 @@ class Watched:
         self._ended = not len(frame.values)
         if self._ended:
             return
-        if self._start is not None and self._start.run != frame.run and self.from_topics:
+        if self._started not in (None, frame.run) and self.from_topics:
             self.curve = Curve()
-        self._start = frame
+        self._started = frame.run
+        self._starts.add(frame)
         explores = (frame.values[:, StartColumn.EXCITATION] >= 0).any()
         self.kinds[frame.run, frame.episode] = "exploration" if explores else "policy"
         if len(self.kinds) > _MOST:
@@ -105,7 +106,7 @@ class Watched:
     def policy(self, frame: Frame, now: float) -> None:
         """Take the gains of an episode."""
         if self._wanted(frame, now, "tuner"):
-            self._policy = frame
+            self._policies.add(frame)
 
     def cost(self, frame: Frame, now: float) -> None:
         """Take the costs of an episode that is over."""
@@ -121,11 +122,9 @@ class Watched:
         if not (frame.values[:, CostColumn.ENDED] == VOID).any():
             self.episodes.add(1, now)
             self.health.heard(now, "controller")
-        start, policy = self._start, self._policy
-        if start is None or (start.run, start.episode) != ids or not self.from_topics:
-            return
-        known = policy is not None and (policy.run, policy.episode) == ids
-        self.curve.rollouts(start, policy if known else None, frame)
+        start = self._starts.of(frame)
+        if start is not None and self.from_topics:
+            self.curve.rollouts(start, self._policies.of(frame), frame)
 
     def target(self, frame: Frame, now: float) -> None:
         """Take z_r of a plant."""
