@@ -16,6 +16,7 @@ from std_msgs.msg import String
 
 from controller_node.health import ControllerHealth
 from controller_node.identification import DesignSettings
+from controller_node.policy import load_law
 from controller_node.responder import Responder
 from loop_interfaces.endpoints import writer_qos
 from loop_interfaces.frames import Frame
@@ -66,6 +67,7 @@ class ControllerNode:
         values = declare(node, CONTROLLER_PARAMETERS, given_parameters(node))
         settings = {k: v for k, v in values.items() if k not in ("problem", "pin")}
         loop.pin(values["pin"])
+        load_law()  # not when the first state waits for its answer
         responder = Responder(DesignSettings(**settings))
         self._responder = responder
         self._health = ControllerHealth(responder)

@@ -75,6 +75,13 @@ def control(
                     pair += 1
 
 
+def load_law() -> None:
+    """Load the compiled law, or compile it."""
+    law = ProjectedLaw([np.ones((1, 1))], np.zeros(1))
+    law.set(np.zeros((1, 1, 2)))
+    law.actions(np.zeros((1, 1)))
+
+
 class ProjectedLaw:
     """The projected law of M environments.
 

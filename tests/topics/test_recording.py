@@ -187,7 +187,13 @@ class Hand:
     """Nodes started by hand, with a recorder beside them."""
 
     def __init__(
-        self, loop: Processes, bag: Path, out: Path, recorder: str, **more: object
+        self,
+        loop: Processes,
+        bag: Path,
+        out: Path,
+        recorder: str,
+        iterations: int = 300,
+        **more: object,
     ) -> None:
         self.bag, self.out = bag, out
         self.recorder = loop.node(
@@ -199,18 +205,19 @@ class Hand:
         self.tuner = loop.node(
             "tuner_node",
             *("--params-file", str(SMALL), "-p", f"recorder:={recorder}"),
-            *tuner_arguments(out, iterations=300),
+            *tuner_arguments(out, iterations=iterations),
         )
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_a_killed_recorder_loses_a_second_at_most_and_the_training_goes_on(loop, tmp_path, storage):
-    hand = Hand(loop, tmp_path / "bag", tmp_path / "run", "start", bag_storage=storage)
-    until(lambda: iterations_done(hand.out) >= 150, LIMIT, "iteration 150")
+    hand = Hand(loop, tmp_path / "bag", tmp_path / "run", "start", 800, bag_storage=storage)
+    until(lambda: iterations_done(hand.out) >= 20, LIMIT, "iteration 20")
+    time.sleep(2.0)  # so that a second less leaves one
     hand.recorder.send_signal(signal.SIGKILL)
     killed = time.time()
     loop.wait(hand.tuner, LIMIT)
-    assert_same_training(hand.out, in_process(iterations=300))
+    assert_same_training(hand.out, in_process(iterations=800))
     content = describe(hand.bag)
     assert not content["finished"]
     assert content["last"] / 1e9 > killed - 1.0
@@ -226,7 +233,7 @@ def test_a_killed_recorder_loses_a_second_at_most_and_the_training_goes_on(loop,
 
 
 def test_a_training_that_must_be_recorded_stops_when_the_recorder_does(loop, tmp_path):
-    hand = Hand(loop, tmp_path / "bag", tmp_path / "run", "required")
+    hand = Hand(loop, tmp_path / "bag", tmp_path / "run", "required", 100_000)
     until(lambda: iterations_done(hand.out) >= 20, LIMIT, "iteration 20")
     hand.recorder.send_signal(signal.SIGTERM)
     loop.wait(hand.recorder, 5.0)
