@@ -14,12 +14,7 @@ from typing import Any
 from bringup.pairs import MAX_PAIRS, Layout, LoopNode, Recording, pair_nodes, quoted
 from bringup.training_run import begin, reopen, unused
 from loop_interfaces.isolation import NETWORK
-from loop_interfaces.parameters import (
-    INSTRUMENTS,
-    PLANT,
-    RECORDER,
-    TUNER,
-)
+from loop_interfaces.parameters import INSTRUMENTS, PLANT, RECORDER, TUNER
 from loop_interfaces.problem import find_problem, load_parameters, shipped_problems
 from loop_interfaces.spec import ParameterError, Spec
 from pde_sim_node.equations import ALLOWED, allow

@@ -50,6 +50,24 @@ class ModelRows:
         """Modes of the reduced model: n_s without the room for others."""
         return int(np.count_nonzero(np.abs(self.A).max(axis=1)))
 
+    def with_room(self, modes: int) -> ModelRows:
+        """The same law with `modes` further columns of zeros."""
+        right = ((0, 0), (0, modes))
+        return ModelRows(
+            A=np.pad(self.A, (0, modes)),
+            B=np.pad(self.B, ((0, modes), (0, 0))),
+            U=np.pad(self.U, right),
+            K_a=np.pad(self.K_a, right),
+            K_b=np.pad(self.K_b, right),
+            s_r=np.pad(self.s_r, (0, modes)),
+        )
+
+    def with_basis(self, U: Array, target: Array) -> ModelRows:
+        """The same law on the basis U (n_z, n_s), which has modes where this one has room."""
+        s_r = np.sum(U * target[:, np.newaxis], axis=0)
+        s_r[: self.order] = self.s_r[: self.order]
+        return replace(self, U=U, s_r=s_r)
+
 
 def pack(model: ModelRows) -> Array:
     """The rows of `model`, shape (n_z + n_s + 3 n_a + 1, n_s)."""
@@ -67,23 +85,3 @@ def unpack(rows: Array, n_a: int) -> ModelRows:
         )
     U, A, Bt, K_a, K_b, s_r = np.split(rows, np.cumsum([n_z, n_s, n_a, n_a, n_a]))
     return ModelRows(A=A, B=Bt.T.copy(), U=U, K_a=K_a, K_b=K_b, s_r=s_r[0])
-
-
-def with_room(rows: Array, n_a: int, modes: int) -> Array:
-    """The model in `rows` with `modes` further columns of zeros: the same law."""
-    model = unpack(rows, n_a)
-    right = ((0, 0), (0, modes))
-    wider = ModelRows(
-        A=np.pad(model.A, (0, modes)),
-        B=np.pad(model.B, ((0, modes), (0, 0))),
-        U=np.pad(model.U, right),
-        K_a=np.pad(model.K_a, right),
-        K_b=np.pad(model.K_b, right),
-        s_r=np.pad(model.s_r, (0, modes)),
-    )
-    return pack(wider)
-
-
-def with_basis(rows: Array, n_a: int, U: Array, target: Array) -> Array:
-    """The model in `rows` on the basis U (n_z, n_s), of which the modes of the model are the same."""
-    return pack(replace(unpack(rows, n_a), U=U, s_r=np.sum(U * target[:, np.newaxis], axis=0)))

@@ -107,13 +107,12 @@ class RecorderNode:
         # States, actions and /clock come from watchers, the rest from subscriptions of their own.
         self._watchers: list[tuple[Watcher, dict[int, Source]]] = []
         clocks = [source for source in self._what if source.channel.type == CLOCK_TYPE]
-        times = {CLOCK_KIND: clocks[0]} if clocks else {}
+        times, told = {CLOCK_KIND: clocks[0]} if clocks else {}, bool(clocks)
         for absolute in self._namespaces:
             namespace = absolute.rstrip("/") or "/"
             mine = [s for s in self._what if s.namespace == namespace]
             kinds = {_KINDS[s.array]: s for s in mine if s.array in _KINDS} | times
             first = not self._watchers
-            told = bool(times)
             watcher = Watcher(node, namespace, clock=told, single_clock=first and told)
             self._watchers.append((watcher, kinds))
         self._subscriptions = [

@@ -29,19 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.frames import MAX_ID
-from loop_interfaces.parameters import (
-    EXECUTION,
-    PLANT,
-    RECORDER,
-    VIEWER,
-    table,
-)
-from loop_interfaces.spec import (
-    ParameterError,
-    check,
-    read_yaml,
-    yaml_text,
-)
+from loop_interfaces.parameters import EXECUTION, PLANT, RECORDER, VIEWER, table
+from loop_interfaces.spec import ParameterError, check, read_yaml, yaml_text
 from loop_interfaces.topics import COMPLETED
 from tuner_node import checkpoint
 from tuner_node.training import CONTROLLERS, Training

@@ -236,10 +236,9 @@ class Training:
         return rows
 
     def _with_room(self, models: Array) -> Array:
-        settings = self.settings
-        return np.stack(
-            [model_rows.with_room(rows, settings.n_a, settings.extra_modes) for rows in models]
-        )
+        n_a, extra = self.settings.n_a, self.settings.extra_modes
+        found = [model_rows.unpack(rows, n_a).with_room(extra) for rows in models]
+        return np.stack([model_rows.pack(model) for model in found])
 
     def _given(self, identified: Array) -> list[dict[str, Any]]:
         """The given model instead of the identified ones, if it is one of this plant's size."""
@@ -325,7 +324,7 @@ class Training:
         return [[] if optimizer.done else optimizer.ask() for optimizer in self.optimizers]
 
     def _tell(self, result: BatchResult) -> list[dict[str, Any]]:
-        rows, first = [], 0
+        rows, first, generation = [], 0, self.generation
         for seed, optimizer, asked in zip(
             self._seeds(), self.optimizers, self._asked(), strict=True
         ):
@@ -348,18 +347,18 @@ class Training:
             )
             rows.append({"event": "iteration", "seed": seed, **told})
         self.history += rows
-        self._take_bases()
+        if self.generation != generation:
+            self._take_bases()
         self._leave_adapt_if_done()
         return rows
 
     def _take_bases(self) -> None:
         """The models on the bases that the optimisers have chosen."""
         for m, optimizer in enumerate(self.optimizers):
-            if optimizer.basis is not None and self.models is not None:
-                assert self.target is not None
-                self.models[m] = model_rows.with_basis(
-                    self.models[m], self.settings.n_a, optimizer.basis, self.target
-                )
+            if optimizer.basis is not None:
+                assert self.models is not None and self.target is not None
+                model = model_rows.unpack(self.models[m], self.settings.n_a)
+                self.models[m] = model_rows.pack(model.with_basis(optimizer.basis, self.target))
 
     def _leave_adapt_if_done(self) -> None:
         done = all(optimizer.done for optimizer in self.optimizers)

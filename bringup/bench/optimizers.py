@@ -16,7 +16,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
 from typing import Any
@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 
 from bringup.reference import Reference, find
 from bringup.reproduce.experiment import PAPER
-from controller_node.dmdc import identify
-from controller_node.lqt import track
+from controller_node import identification
+from controller_node.identification import DesignSettings
 from controller_node.policy import ProjectedLaw, excitation
 from loop_interfaces.policy_columns import with_features
 from loop_interfaces.problem import load_parameters
@@ -131,13 +131,15 @@ def design(
             f"the exploratory episode of seed {seed} diverged: explore with less variance"
         )
     exploration = result.trajectory
-    model = identify(
-        exploration.states,
-        exploration.actions,
-        p=parameters["dmdc_rank"],
-        n_s=parameters["reduced_order"],
-    )
     weights = {key: parameters[key] for key in ("state_weight", "action_weight")}
+    settings = DesignSettings(
+        n_a=plant.n_a,
+        dmdc_rank=parameters["dmdc_rank"],
+        reduced_order=parameters["reduced_order"],
+        **weights,
+    )
+    model = identification.design(exploration.states, exploration.actions, plant.target, settings)
+    model = model.with_room(parameters.get("extra_modes", 0))
     context = Context(
         U=model.U,
         target=plant.target,
@@ -145,16 +147,7 @@ def design(
         exploration=exploration,
         **weights,
     )
-    return track(model, **weights).policy, context
-
-
-def with_room(policy: Array, context: Context, modes: int) -> tuple[Array, Context]:
-    """The same law on a basis with `modes` more columns, which are zero."""
-    n_a, n_s = len(policy), context.U.shape[1]
-    K_a, K_b = np.split(policy, [n_s], axis=1)
-    room = np.zeros((n_a, modes))
-    U = np.hstack([context.U, np.zeros((len(context.U), modes))])
-    return np.hstack([K_a, room, K_b, room]), replace(context, U=U)
+    return model.policy, context
 
 
 def train(job: Job) -> dict[str, Any]:
@@ -162,8 +155,8 @@ def train(job: Job) -> dict[str, Any]:
     options = {} if job.attempts is None else {"identification_attempts": job.attempts}
     parameters = load_parameters(job.problem, options)
     plant = build_plant(parameters)
+    parameters["extra_modes"] = job.options.get("extra_modes", 0)
     policy, context = warm_start(plant, parameters, job.seed)
-    policy, context = with_room(policy, context, job.options.get("extra_modes", 0))
     policy = with_features(policy, job.features)
     optimizer = OPTIMIZERS[job.optimizer](
         policy,

@@ -51,7 +51,6 @@ class Watched:
         """What the newest episodes are, by run and number."""
         self._pending: Episode | None = None
         self._pending_since = 0.0
-        self._started: int | None = None
         self._starts, self._policies = Recent(), Recent()
         self._costs_of: tuple[int, int] | None = None
         self._counted: tuple[Key, int] | None = None
@@ -94,9 +93,9 @@ class Watched:
         self._ended = not len(frame.values)
         if self._ended:
             return
-        if self._started not in (None, frame.run) and self.from_topics:
+        before = self._starts.newest
+        if before is not None and before.run != frame.run and self.from_topics:
             self.curve = Curve()
-        self._started = frame.run
         self._starts.add(frame)
         explores = (frame.values[:, StartColumn.EXCITATION] >= 0).any()
         self.kinds[frame.run, frame.episode] = "exploration" if explores else "policy"

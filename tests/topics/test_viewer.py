@@ -154,8 +154,11 @@ def test_the_command_line_starts_a_viewer_and_goes_on_when_it_dies(loop: Process
         os.kill(pid, signal.SIGKILL)
         news = "viewer_node was killed by SIGKILL; starting it again"
         until(lambda: news in loop.output(run), LIMIT, "news of it")
+        until(lambda: loop.pids("viewer_node"), LIMIT, "another viewer")
+        assert pid not in loop.pids("viewer_node")
         done = iterations_done(out)
         until(lambda: iterations_done(out) >= done + 20, LIMIT, "further iterations")
+    assert loop.output(run).count(news) == 1
     run.send_signal(signal.SIGINT)
     loop.wait(run, 20.0, code=130)
 
