@@ -1,28 +1,19 @@
-"""The live page's pure parts: what is kept, what is told, when the loop is left alone, who may ask."""
+"""The live page's pure parts: what is kept, what is told, when the loop is left alone."""
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import json
 import struct
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
-import aiohttp
 import numpy as np
 import pytest
 
-from bringup.live import Live, announced, running
 from bringup.monitor.attention import Attention
-from bringup.monitor.commands import Call, Commands, Watch
 from bringup.monitor.curve import MOST, Curve
 from bringup.monitor.episode import COLUMNS, COMPONENTS, ROWS, Episode, rows_of
-from bringup.monitor.finder import Finder
 from bringup.monitor.health import Endpoint, Health, Rate
 from bringup.monitor.messages import Cursor
-from bringup.monitor.server import PAGE, TOKEN, TYPES, Server
 from bringup.monitor.view import View
 from bringup.monitor.watched import Watched
 from loop_interfaces.frames import Frame
@@ -453,193 +444,3 @@ def test_the_colours_span_the_field_and_the_target_and_do_not_flicker():
     assert first == [-10.0, pytest.approx(0.3, abs=0.01)]
     assert colours(1) == first
     assert colours(90)[1] > 80
-
-
-# Which loop.
-
-
-def test_a_loop_is_found_as_long_as_it_runs(tmp_path, monkeypatch):
-    monkeypatch.setattr("bringup.live.DOMAINS_FOLDER", tmp_path / "domains")
-    assert running() == []
-    with announced(17, tmp_path / "first"):
-        (live,) = running()
-        assert live.domain == 17 and live.folder == (tmp_path / "first").resolve()
-        with announced(18, tmp_path / "second"):
-            assert [live.domain for live in running()] == [18, 17]
-        assert [live.domain for live in running()] == [17]
-    assert running() == [] and list((tmp_path / "domains").iterdir()) == []
-
-
-def test_what_a_killed_loop_left_behind_is_not_found_and_goes_away(tmp_path, monkeypatch):
-    monkeypatch.setattr("bringup.live.DOMAINS_FOLDER", tmp_path)
-    left = tmp_path / "live-1-17"
-    left.write_text(json.dumps({"domain": 17, "folder": "x", "started": 1, "network": False}))
-    assert running() == [] and not left.exists()
-
-
-def live(domain: int, folder: str, started: float) -> Live:
-    return Live(domain, Path(folder).resolve(), started)
-
-
-def test_the_finder_stays_with_a_training_until_it_ends_and_takes_the_newest_next():
-    found = [live(1, "a", 1.0)]
-    finder = Finder(None, None, lambda: found)
-    assert finder.find() == live(1, "a", 1.0)
-    found.insert(0, live(2, "b", 2.0))
-    assert finder.find() == live(1, "a", 1.0)
-    del found[1]
-    assert finder.find() == live(2, "b", 2.0)
-    del found[0]
-    assert finder.find() == live(2, "b", 2.0)  # what it was stays on the page
-
-
-def test_a_given_folder_or_domain_is_the_only_one():
-    found = [live(2, "b", 2.0), live(1, "a", 1.0)]
-    assert Finder(Path("a"), None, lambda: found).find() == live(1, "a", 1.0)
-    assert Finder(Path("c"), None, lambda: found).find() is None
-    assert Finder(None, 1, lambda: found).find() == live(1, "a", 1.0)
-    assert Finder(None, 9, lambda: found).find() == Live(9, None, 0.0)
-
-
-# The server.
-
-
-@contextlib.contextmanager
-def served() -> Iterator[tuple[Server, Commands, View]]:
-    view, commands = View(), Commands()
-    view.look({}, [{"role": "plant", "node": "/p", "verbs": ["pause"]}])
-    server = Server(view, commands, 0)
-    server.start()
-    try:
-        yield server, commands, view
-    finally:
-        server.stop()
-
-
-async def ask(
-    server: Server, method: str, path: str, *, json: Any = None, **headers: str
-) -> tuple[int, str]:
-    url = f"http://127.0.0.1:{server.port}{path}"
-    headers = {name.replace("_", "-"): value for name, value in headers.items()}
-    async with (
-        aiohttp.ClientSession() as session,
-        session.request(method, url, json=json, headers=headers) as answer,
-    ):
-        return answer.status, await answer.text()
-
-
-async def connected(server: Server, origin: str) -> dict[str, Any]:
-    """The first message of the WebSocket to a page of `origin`."""
-    async with aiohttp.ClientSession() as session:
-        url = f"http://127.0.0.1:{server.port}/ws"
-        async with session.ws_connect(url, headers={"Origin": origin}) as page:
-            first: dict[str, Any] = await page.receive_json(timeout=10)
-            return first
-
-
-def test_every_file_of_the_page_is_served_and_nothing_else():
-    with served() as (server, _, _):
-        for name in ("", *TYPES):
-            status, text = asyncio.run(ask(server, "GET", f"/{name}"))
-            assert status == 200 and text == (PAGE / (name or "index.html")).read_text()
-        for name in ("node.py", "%2e%2e%2fserver.py", "server.py", "page", "style.css/x"):
-            status, _ = asyncio.run(ask(server, "GET", f"/{name}"))
-            assert status in (403, 404), name
-    assert sorted(path.name for path in PAGE.iterdir()) == sorted(TYPES)
-
-
-def test_a_foreign_host_name_or_page_is_refused():
-    with served() as (server, commands, _):
-        own = f"http://127.0.0.1:{server.port}"
-        token = asyncio.run(connected(server, own))["token"]
-        body = {"node": "/p", "verb": "pause"}
-        allowed = {"Origin": own, TOKEN: token}
-        for wrong in (
-            {"Host": f"evil.example:{server.port}"},
-            {"Host": "127.0.0.1"},
-            {"Origin": "http://evil.example"},
-            {"Origin": "null"},
-            {"Origin": f"https://127.0.0.1:{server.port}"},
-            {TOKEN: "x" * 43},
-            {TOKEN: ""},
-        ):
-            status, _ = asyncio.run(
-                ask(server, "POST", "/api/call", json=body, **{**allowed, **wrong})
-            )
-            assert status == 403, wrong
-        without = {TOKEN: token}
-        assert asyncio.run(ask(server, "POST", "/api/call", json=body, **without))[0] == 403
-        for wrong in ({"Host": "evil.example"}, {"Origin": "http://evil.example"}):
-            assert asyncio.run(ask(server, "GET", "/", **wrong))[0] == 403
-        assert commands.empty()
-        for origin in ("http://evil.example", "null", ""):
-            with pytest.raises(aiohttp.WSServerHandshakeError):
-                asyncio.run(connected(server, origin))
-
-
-def test_a_page_of_ours_reaches_the_nodes_and_nothing_but_what_they_offer():
-    with served() as (server, commands, view):
-        own = f"http://localhost:{server.port}"
-        allowed = {"Origin": own, TOKEN: asyncio.run(connected(server, own))["token"]}
-
-        async def call() -> tuple[int, str]:
-            asking = asyncio.create_task(
-                ask(server, "POST", "/api/call", json={"node": "/p", "verb": "pause"}, **allowed)
-            )
-            command = await asyncio.to_thread(commands.get, timeout=10)
-            assert isinstance(command, Call) and (command.node, command.verb) == ("/p", "pause")
-            command.tell(True, "held")
-            return await asking
-
-        assert asyncio.run(call()) == (200, '{"success": true, "message": "held"}')
-        for body in (
-            {"node": "/p", "verb": "stop"},
-            {"node": "/q", "verb": "pause"},
-            {"node": ["/p"], "verb": "pause"},
-            [],
-            None,
-        ):
-            assert asyncio.run(ask(server, "POST", "/api/call", json=body, **allowed))[0] == 400
-        view.watch({"domain": 1, "namespaces": ["/", "/lab"]}, run=None, from_topics=True)
-        watch = "/api/watch"
-        for body, status in (
-            ({"namespace": "/lab"}, 200),
-            ({"namespace": "/other"}, 400),
-            ({"environment": 3}, 200),
-            ({"environment": -1}, 400),
-            ({"environment": True}, 400),
-            ({"component": 1}, 200),
-            ({"component": "u"}, 400),
-        ):
-            assert asyncio.run(ask(server, "POST", watch, json=body, **allowed))[0] == status, body
-        assert commands.get(timeout=10) == Watch("/lab") and commands.empty()
-
-
-def test_the_headers_allow_nothing_from_elsewhere_and_no_inline_script():
-    async def headers(server: Server) -> Any:
-        async with (
-            aiohttp.ClientSession() as session,
-            session.get(server.url) as answer,
-        ):
-            return answer.headers
-
-    with served() as (server, _, _):
-        found = asyncio.run(headers(server))
-    policy = found["Content-Security-Policy"]
-    assert "default-src 'none'" in policy and "script-src 'self'" in policy
-    assert "unsafe" not in policy and "http" not in policy
-    assert found["X-Content-Type-Options"] == "nosniff"
-    for name in TYPES:
-        text = (PAGE / name).read_text().replace("http://www.w3.org/2000/svg", "")
-        assert "https://" not in text and "http://" not in text and "eval(" not in text, name
-
-
-def test_the_colour_map_is_that_of_the_report():
-    from matplotlib import colormaps
-
-    from bringup.report.figures import FIELD_MAP
-
-    text = "".join((PAGE / "cividis.js").read_text().split('"')[1::2])
-    ours = np.frombuffer(bytes.fromhex(text), np.uint8).reshape(-1, 3)
-    theirs = (colormaps[FIELD_MAP](np.arange(256))[:, :3] * 255).round()
-    np.testing.assert_array_equal(ours, theirs)
