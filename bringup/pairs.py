@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from loop_interfaces.affinity import free_cores
+from loop_interfaces.affinity import core_text, free_cores, usable_cores
 from loop_interfaces.spec import ParameterError
 from pde_sim_node.build import fingerprint
 from tuner_node.results import RunFolder
@@ -65,11 +65,16 @@ def namespaces(pairs: int) -> list[str]:
 
 
 def pair_nodes(
-    pairs: int, pin: bool, remaps: Mapping[str, Sequence[str]] | None = None
+    pairs: int,
+    pin: bool,
+    remaps: Mapping[str, Sequence[str]] | None = None,
+    *,
+    shared: bool = False,
 ) -> list[LoopNode]:
     """The nodes of `pairs` pairs; with `pin` each has a core of its own.
 
-    remaps: by package. ParameterError when there are too many for this machine.
+    remaps: by package; shared: each pair will be kept on one core (bringup.shared_core), but the
+    plant's solver has all of them. ParameterError when there are too many for this machine.
     """
     if not 1 <= pairs <= MAX_PAIRS:
         raise ParameterError(f"--pairs is {pairs}; expected a whole number from 1 to {MAX_PAIRS}")
@@ -85,6 +90,8 @@ def pair_nodes(
             parameters = [f"pin:={cores[2 * number + place]}"] if pin else []
             if number and package == "pde_sim_node":  # /clock is one topic for all
                 parameters.append("publish_clock:=false")
+            if shared and package == "pde_sim_node":
+                parameters.append(f"solver_cores:={quoted(core_text(usable_cores()))}")
             name = f"{package}-{namespace}" if namespace else package
             more = (remaps or {}).get(package, ())
             nodes.append(LoopNode(name, package, parameters, more, namespace))
@@ -95,7 +102,8 @@ def pair_nodes(
 class Layout:
     """The nodes of one training: `pairs` pairs, `pin`ned or not, their tuner, perhaps a recorder.
 
-    remaps: of plants and controllers, by package; view: with a viewer of the first pair.
+    remaps: of plants and controllers, by package; view: with a viewer of the first pair; shared:
+    see `pair_nodes`.
     """
 
     pairs: int = 1
@@ -103,6 +111,7 @@ class Layout:
     recording: Recording | None = None
     remaps: Mapping[str, Sequence[str]] = field(default_factory=dict)
     view: bool = False
+    shared: bool = False
 
     def nodes(self, folder: Path, bag: Path | None = None) -> list[LoopNode]:
         """Who is started for the training in `folder`; the recorder, if any, comes first.
@@ -114,7 +123,7 @@ class Layout:
         serving = tuner_parameter(self.pairs)
         tuner = [f"out:={quoted(folder.resolve())}", "resume:=true"]
         tuner.append(f"plant:={fingerprint(RunFolder(folder).values())}")
-        nodes = pair_nodes(self.pairs, self.pin, self.remaps)
+        nodes = pair_nodes(self.pairs, self.pin, self.remaps, shared=self.shared)
         if self.view:
             first = namespaces(self.pairs)[0]
             nodes.append(LoopNode("viewer_node", "viewer_node", namespace=first))

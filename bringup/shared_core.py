@@ -2,8 +2,8 @@
 
 A message to a process on another core has to wake that core if it is idle, which takes longer than
 the rest of a round where idle cores sleep deeply (in virtual machines above all). On one core the
-receiver goes on where the sender waits. It also leaves the other cores to the tuner and to those who
-record or watch. A large batch wants all cores for its solver instead.
+receiver goes on where the sender waits. It also leaves the other cores to the tuner, to those who
+record or watch, and to the threads that help the plant with the step of a large batch.
 """
 
 from __future__ import annotations
@@ -11,14 +11,12 @@ from __future__ import annotations
 import contextlib
 import os
 import random
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from loop_interfaces.affinity import free_cores
+from loop_interfaces.affinity import free_cores, helps_solver, usable_cores
 
-MOST_ENVIRONMENTS = 8
-"""Environments of an episode up to which one core for both is faster than the solver on all."""
 PERIOD = 2.0
 """Seconds between two looks at how busy the cores are, on average."""
 CROWDED = 0.3
@@ -27,10 +25,9 @@ CROWDED = 0.3
 _STAT = Path("/proc/stat")
 
 
-def worthwhile(environments: float) -> bool:
-    """Whether pairs of this many environments an episode should share a core, on this system."""
-    several = hasattr(os, "sched_setaffinity") and len(os.sched_getaffinity(0)) > 1
-    return several and _STAT.exists() and environments <= MOST_ENVIRONMENTS
+def possible() -> bool:
+    """Whether pairs can share a core on this system, and have more than one to choose from."""
+    return hasattr(os, "sched_setaffinity") and len(usable_cores()) > 1 and _STAT.exists()
 
 
 def freest(taken: Mapping[int, float], present: int) -> int:
@@ -55,7 +52,7 @@ class SharedCores:
 
     def __init__(self, pairs: int) -> None:
         self._pairs = [_Pair(core) for core in free_cores(pairs)]
-        self._cores = sorted(set(free_cores(os.cpu_count() or 1)))
+        self._cores = usable_cores()
         self._busy = self._total = dict.fromkeys(self._cores, 0)
         self._next = float("-inf")
 
@@ -63,7 +60,7 @@ class SharedCores:
         """A process of a pair has been started, perhaps in place of one of the same name."""
         place = self._pairs[pair]
         place.processes[name] = process
-        _move(process, place.core)
+        _move(process, place.core, self._cores)
 
     def look(self, now: float) -> None:
         """Call it often; now: monotonic s."""
@@ -86,16 +83,18 @@ class SharedCores:
             if core != pair.core:
                 pair.core = core
                 for process in pair.processes.values():
-                    _move(process, core)
+                    _move(process, core, self._cores)
         self._busy, self._total = busy, total
 
 
-def _move(process: int, core: int) -> None:
+def _move(process: int, core: int, cores: Collection[int]) -> None:
+    """Every thread but those that help the solver, which go to the others of `cores`."""
+    others = set(cores) - {core} or {core}
     with contextlib.suppress(OSError):  # it has ended meanwhile
         threads = [int(thread.name) for thread in Path(f"/proc/{process}/task").iterdir()]
         for thread in threads:
             with contextlib.suppress(ProcessLookupError):
-                os.sched_setaffinity(thread, {core})
+                os.sched_setaffinity(thread, others if helps_solver(process, thread) else {core})
 
 
 def _ticks(cores: list[int]) -> tuple[dict[int, int], dict[int, int]]:

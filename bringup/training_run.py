@@ -24,7 +24,7 @@ from bringup.in_process import LocalPair, train
 from bringup.live import announced
 from bringup.output import print_json
 from bringup.pairs import PAIR, Layout, Recording, namespaces, pair_nodes, quoted
-from bringup.shared_core import SharedCores, worthwhile
+from bringup.shared_core import SharedCores, possible
 from bringup.supervisor import Child, NodeError, Supervisor, node_command
 from loop_interfaces.isolation import NETWORK, PROFILE, loopback_environment
 from loop_interfaces.problem import load_parameters
@@ -107,15 +107,14 @@ class Transport:
         """The nodes of the training."""
         remaps = {"pde_sim_node": ["state:=state_sent"], "controller_node": ["action:=action_sent"]}
         remaps = remaps if self.faulty_line else {}
-        return Layout(self.pairs, self.pin, self.recording, remaps, self.view)
+        return Layout(
+            self.pairs, self.pin, self.recording, remaps, self.view, shared=self.shares_cores
+        )
 
-    def shared_cores(self, values: Mapping[str, Any]) -> SharedCores | None:
-        """Where plants and controllers run, if not wherever the scheduler puts them."""
-        directions = values["directions"] if values["optimizer"] == "directions" else 1
-        environments = 2 * directions * values["seeds"] / self.pairs
-        if self.pin or self.spread or not worthwhile(environments):
-            return None
-        return SharedCores(self.pairs)
+    @property
+    def shares_cores(self) -> bool:
+        """Whether plant and controller of a pair are kept on one core."""
+        return possible() and not (self.pin or self.spread)
 
     def line_arguments(self) -> list[str]:
         """The relay's ROS parameters."""
@@ -269,7 +268,7 @@ def _train_over_topics(
             logs,
             display.line,
             {NETWORK: "1"} if transport.network else loopback_environment(),
-            transport.shared_cores(RunFolder(folder).values()),
+            SharedCores(transport.pairs) if transport.shares_cores else None,
         )
         try:
             done = False

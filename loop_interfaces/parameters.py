@@ -146,6 +146,12 @@ PLANT = (
         1e6,
         live=True,
     ),
+    Spec(
+        "solver_cores",
+        "",
+        "cores of the threads that share a step of many environments, like 0-3,6; empty: those of "
+        "the node",
+    ),
 )
 
 EXECUTION = (

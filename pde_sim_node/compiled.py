@@ -17,7 +17,7 @@ from numba import carray, types  # type: ignore[attr-defined, unused-ignore]
 from numba.core.errors import NumbaError
 from numba.extending import register_jitable
 
-__all__ = ["fingerprint", "jit", "kept", "pointwise_loop"]
+__all__ = ["cache_misses", "fingerprint", "jit", "kept", "pointwise_loop"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -32,6 +32,11 @@ def kept(function: F) -> F:
     """Compile, keep on disk, and run without the interpreter's lock."""
     compiled: F = numba.njit(function, cache=True, nogil=True)
     return compiled
+
+
+def cache_misses(*functions: Any) -> int:
+    """How often one of these had to be compiled in this process, as it was not on disk."""
+    return sum(sum(function.stats.cache_misses.values()) for function in functions)
 
 
 def fingerprint(*sources: ModuleType | Callable[..., Any]) -> str:

@@ -1,19 +1,18 @@
 """z_{k+1} = f(z_k, a_k) of one equation on one grid: what the compiled step needs, laid out once."""
 
 import time
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .compiled import pointwise_loop
+from .compiled import cache_misses, pointwise_loop
 from .equations import Equation
 from .etdrk4 import etdrk4_coefficients
 from .fft import is_transform_length, plane_size
 from .kernel import PLAN, all_finite, step
 from .layout import Constants, checked_operator, lay_out, whole_lanes
 from .simd import WIDTH
-from .threads import PlanTeam
+from .threads import TEAMWORK, PlanTeam
 
 __all__ = ["Integrator"]
 
@@ -102,7 +101,8 @@ class Integrator:
             },
         )
 
-        began, misses = time.perf_counter(), cache_misses()
+        functions = step, all_finite, *TEAMWORK
+        began, misses = time.perf_counter(), cache_misses(*functions)
         self._loop, loop_is_new = pointwise_loop(equation.nonlinearity)
         plan["pointwise"] = self._loop.address
         self._team = PlanTeam(step, plan, constants, size, points_per_step=8 * steps * fine)
@@ -110,7 +110,7 @@ class Integrator:
         states, actions = np.zeros((1, n_z)), np.zeros((1, n_a))
         all_finite(actions)
         self.step(states, actions, np.zeros(1), np.zeros(1, dtype=np.int64), 0)
-        compiled = cache_misses() > misses or loop_is_new
+        compiled = cache_misses(*functions) > misses or loop_is_new
         self.compiled_in_seconds = time.perf_counter() - began if compiled else 0.0
 
     def step(
@@ -123,12 +123,6 @@ class Integrator:
     ) -> None:
         """Advance all environments in place, see `kernel.step`; arrays are contiguous and writable."""
         self._team.step(states, actions, totals, diverged_step, k)
-
-
-def cache_misses() -> int:
-    """How many functions had to be compiled in this process so far."""
-    compiled: tuple[Any, ...] = (step, all_finite)
-    return sum(sum(function.stats.cache_misses.values()) for function in compiled)
 
 
 def fine_length(n_z: int) -> int:

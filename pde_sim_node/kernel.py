@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import compiled, fft, simd, spectra
+from . import board, compiled, fft, simd, spectra
+from .board import claim, next_piece
 from .compiled import fingerprint, jit, kept
 from .simd import call, load, read, splat, store, write
 from .spectra import (
@@ -184,35 +185,42 @@ def compile_step(sources: str) -> Any:
         k: int,
         plans: NDArray[np.void],
         which: int,
-        begin: int,
-        end: int,
+        at: int,
+        turn: int,
+        pieces: int,
     ) -> None:
-        """Advance environments begin..end, in place, with the scratch of plans[which].
+        """Advance environments in place, with the scratch of plans[which].
+
+        They are in so many pieces; those of the turn on the board that no other thread has are done
+        here, or the one there is without a board.
 
         Adds the stage cost to `totals`. An environment whose new state is not within the bound
         keeps its state and gets k in `diverged_step`; one that has an entry there is left alone.
         """
         sources  # noqa: B018  # closed over to be part of the key on disk
-        plan = plans[which]
+        plan, batch = plans[which], len(totals)
         w, d, c, e = plan.scratch, plan.scratch_apart, plan.constants, plan.constants_apart
-        for i in range(begin, end):
-            if diverged_step[i] >= 0:
-                continue
-            state = states.ctypes.data + 8 * plan.n_z * i
-            action = actions.ctypes.data + 8 * plan.n_a * i
-            totals[i] += stage_cost(state, action, w, plan, c)
-            force(action, w, d, plan, c, e)
-            analyse(state, w, d, plan, c, e)
-            for _ in range(plan.steps):
-                integrate(w, d, plan, c, e)
-            synthesise(w + 8 * plan.state, w, d, plan, c, e)
-            if not accept(totals[i], state, w, plan):
-                diverged_step[i] = k
+        piece = claim(at, turn, pieces)
+        while piece >= 0:
+            for i in range(batch * piece // pieces, batch * (piece + 1) // pieces):
+                if diverged_step[i] >= 0:
+                    continue
+                state = states.ctypes.data + 8 * plan.n_z * i
+                action = actions.ctypes.data + 8 * plan.n_a * i
+                totals[i] += stage_cost(state, action, w, plan, c)
+                force(action, w, d, plan, c, e)
+                analyse(state, w, d, plan, c, e)
+                for _ in range(plan.steps):
+                    integrate(w, d, plan, c, e)
+                synthesise(w + 8 * plan.state, w, d, plan, c, e)
+                if not accept(totals[i], state, w, plan):
+                    diverged_step[i] = k
+            piece = next_piece(at, turn, pieces)
 
     return step
 
 
-step = compile_step(fingerprint(compiled, simd, fft, spectra))
+step = compile_step(fingerprint(compiled, simd, fft, spectra, board))
 
 
 @kept

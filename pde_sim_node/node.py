@@ -16,6 +16,7 @@ from typing import Any
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
+from loop_interfaces.affinity import core_list
 from loop_interfaces.frames import Frame
 from loop_interfaces.introspection import offer
 from loop_interfaces.isolation import keep_on_this_machine
@@ -31,6 +32,7 @@ from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.equations import configured_equation
 from pde_sim_node.health import PlantHealth
 from pde_sim_node.lockstep import Lockstep
+from pde_sim_node.threads import use_cores
 
 
 def declare_parameters(node: Node, changed: Mapping[str, Any] | None = None) -> dict[str, Any]:
@@ -71,6 +73,8 @@ class PlantNode:
     def __init__(self, node: Node, loop: NodeLoop) -> None:
         values = declare_parameters(node)
         loop.pin(values["pin"])  # before the plant counts the cores it has
+        if values["solver_cores"]:
+            use_cores(core_list(values["solver_cores"]))
         plant = build_plant(values)
         if plant.compiled_in_seconds > 0.0:
             node.get_logger().info(f"compiled the kernel in {plant.compiled_in_seconds:.1f} s")

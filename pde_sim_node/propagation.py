@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import compiled, fft, kernel, simd, spectra
+from . import board, compiled, fft, kernel, simd, spectra
+from .board import claim, next_piece
 from .compiled import fingerprint, jit, kept
 from .kernel import accept, stage_cost
 from .simd import read, splat
@@ -78,30 +79,34 @@ def compile_propagation(sources: str) -> Any:
         k: int,
         plans: NDArray[np.void],
         which: int,
-        begin: int,
-        end: int,
+        at: int,
+        turn: int,
+        pieces: int,
     ) -> None:
-        """Advance environments begin..end as `kernel.step` does."""
+        """Advance environments as `kernel.step` does."""
         sources  # noqa: B018  # closed over to be part of the key on disk
-        plan = plans[which]
+        plan, batch = plans[which], len(totals)
         w, d, c, e = plan.scratch, plan.scratch_apart, plan.constants, plan.constants_apart
-        for i in range(begin, end):
-            if diverged_step[i] >= 0:
-                continue
-            state = states.ctypes.data + 8 * plan.n_z * i
-            action = actions.ctypes.data + 8 * plan.n_a * i
-            totals[i] += stage_cost(state, action, w, plan, c)
-            for f in range(plan.components):
-                analyse(state + 8 * plan.n_x * f, w, d, plan, c, e)
-                for m in range(0, plan.modes, 8):
-                    put(w, plan.spectra + f * plan.modes + m, d, get(w, plan.x + m, d))
-            for f in range(plan.components):
-                advance(f, action, w, d, plan, c, e)
-                synthesise(w + 8 * (plan.state + f * plan.n_x), w, d, plan, c, e)
-            if not accept(totals[i], state, w, plan):
-                diverged_step[i] = k
+        piece = claim(at, turn, pieces)
+        while piece >= 0:
+            for i in range(batch * piece // pieces, batch * (piece + 1) // pieces):
+                if diverged_step[i] >= 0:
+                    continue
+                state = states.ctypes.data + 8 * plan.n_z * i
+                action = actions.ctypes.data + 8 * plan.n_a * i
+                totals[i] += stage_cost(state, action, w, plan, c)
+                for f in range(plan.components):
+                    analyse(state + 8 * plan.n_x * f, w, d, plan, c, e)
+                    for m in range(0, plan.modes, 8):
+                        put(w, plan.spectra + f * plan.modes + m, d, get(w, plan.x + m, d))
+                for f in range(plan.components):
+                    advance(f, action, w, d, plan, c, e)
+                    synthesise(w + 8 * (plan.state + f * plan.n_x), w, d, plan, c, e)
+                if not accept(totals[i], state, w, plan):
+                    diverged_step[i] = k
+            piece = next_piece(at, turn, pieces)
 
     return propagate
 
 
-propagate = compile_propagation(fingerprint(compiled, simd, fft, spectra, kernel))
+propagate = compile_propagation(fingerprint(compiled, simd, fft, spectra, kernel, board))

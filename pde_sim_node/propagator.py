@@ -1,18 +1,18 @@
 """z_{k+1} = f(z_k, a_k) of a linear equation: its exact solution for a held action."""
 
 import time
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .compiled import cache_misses
 from .equations import Equation, Spectrum
 from .fft import plane_size
 from .kernel import all_finite
 from .layout import Constants, checked_operator, lay_out, whole_lanes
 from .propagation import LINEAR_PLAN, propagate
 from .simd import WIDTH
-from .threads import PlanTeam
+from .threads import TEAMWORK, PlanTeam
 
 __all__ = ["Propagator", "exact_propagator"]
 
@@ -130,14 +130,16 @@ class Propagator:
                 "state": whole_lanes(components * n_x),
             },
         )
-        began, misses = time.perf_counter(), cache_misses()
+        functions = propagate, all_finite, *TEAMWORK
+        began, misses = time.perf_counter(), cache_misses(*functions)
         self._team = PlanTeam(
             propagate, plan, constants, size, points_per_step=2 * components * n_x
         )
         states, actions = np.zeros((1, components * n_x)), np.zeros((1, n_a))
         all_finite(actions)
         self.step(states, actions, np.zeros(1), np.zeros(1, dtype=np.int64), 0)
-        self.compiled_in_seconds = time.perf_counter() - began if cache_misses() > misses else 0.0
+        compiled = cache_misses(*functions) > misses
+        self.compiled_in_seconds = time.perf_counter() - began if compiled else 0.0
 
     def step(
         self,
@@ -149,9 +151,3 @@ class Propagator:
     ) -> None:
         """Advance all environments in place, see `kernel.step`; arrays are contiguous and writable."""
         self._team.step(states, actions, totals, diverged_step, k)
-
-
-def cache_misses() -> int:
-    """How many functions had to be compiled in this process so far."""
-    compiled: tuple[Any, ...] = (propagate, all_finite)
-    return sum(sum(function.stats.cache_misses.values()) for function in compiled)

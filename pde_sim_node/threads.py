@@ -1,21 +1,33 @@
 """Environments side by side in threads: a compiled step shared out to the cores."""
 
 import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+import time
+from _thread import LockType
+from collections.abc import Callable, Collection
+from contextlib import suppress
+from threading import Lock, Thread
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.affinity import join_solver, usable_cores
+
+from . import board
+from .board import BOARD, MAX_TURN, put_up, wait
+from .compiled import fingerprint, kept
 from .layout import Constants, aligned
 
-__all__ = ["PlanTeam", "ThreadTeam", "available_cores"]
+__all__ = ["TEAMWORK", "PlanTeam", "use_cores"]
 
-POINTS_PER_PIECE = 30_000
+POINTS_PER_PIECE = 15_000
 """Grid points, in all stages, of a piece of work for a thread: about 50 microseconds."""
-WORTHWHILE_PIECES = 3
+WORTHWHILE_PIECES = 6
 """Below this many pieces, waking another thread takes longer than it helps."""
+LOOKS = 1_000_000
+"""Looks for the end of what other threads have begun before the caller sleeps: longer than a piece."""
+NAP = 50e-6
+"""Seconds that it sleeps then: the thread it waits for has lost its core to somebody else."""
 
 
 class PlanTeam:
@@ -24,7 +36,8 @@ class PlanTeam:
     Parameters
     ----------
     step
-        The compiled step: (states, actions, totals, diverged_step, k, plans, which, begin, end).
+        The compiled step: (states, actions, totals, diverged_step, k, plans, which, board, turn,
+        pieces).
     plan
         Its plan; the addresses of constants and scratch are filled in here.
     constants, scratch
@@ -40,11 +53,17 @@ class PlanTeam:
         self._constants = constants.planes()
         plan["constants"] = self._constants.ctypes.data
         plan["constants_apart"] = self._constants.size // 2
-        self._threads = ThreadTeam(available_cores())
-        self._scratch = [aligned(2 * scratch) for _ in range(self._threads.size)]
-        self._plans = np.repeat(plan, self._threads.size)
+        self._crew = crew()
+        threads = 1 + self._crew.size
+        self._scratch = [aligned(2 * scratch) for _ in range(threads)]
+        self._plans = np.repeat(plan, threads)
         self._plans["scratch"] = [area.ctypes.data for area in self._scratch]
         self._points_per_step = points_per_step
+        self._board = aligned(BOARD)  # of words as long as a number
+        self._turn = 0
+        if threads > 1:  # load or compile what the first large batch would wait for
+            start(self._board.ctypes.data, 0)
+            done(self._board.ctypes.data, 0)
 
     def step(
         self,
@@ -55,51 +74,99 @@ class PlanTeam:
         k: int,
     ) -> None:
         """Advance all environments in place; arrays are contiguous and writable."""
-        batch = len(states)
+        batch, plans = len(states), self._plans
         pieces = min(batch, batch * self._points_per_step // POINTS_PER_PIECE)
-        if pieces < WORTHWHILE_PIECES or self._threads.size == 1:
-            self._step(states, actions, totals, diverged_step, k, self._plans, 0, 0, batch)
+        if pieces < WORTHWHILE_PIECES or len(plans) == 1:
+            self._step(states, actions, totals, diverged_step, k, plans, 0, 0, 0, 1)
             return
+        self._turn = turn = (self._turn + 1) % MAX_TURN
+        address = self._board.ctypes.data
 
-        def advance(thread: int, piece: int) -> None:
-            begin, end = batch * piece // pieces, batch * (piece + 1) // pieces
-            self._step(states, actions, totals, diverged_step, k, self._plans, thread, begin, end)
+        def help_out(thread: int) -> None:
+            self._step(
+                states, actions, totals, diverged_step, k, plans, thread, address, turn, pieces
+            )
 
-        self._threads.run(advance, pieces)
+        start(address, turn)
+        self._crew.call(help_out, pieces - 1)
+        help_out(0)
+        while not done(address, pieces):
+            time.sleep(NAP)
+        self._crew.dismiss()
 
 
-class ThreadTeam:
-    """The calling thread and others beside it, which exist from their first use on."""
+class Crew:
+    """Threads that lend a hand to whoever calls. They exist from the first call on, for ever.
 
-    def __init__(self, size: int) -> None:
-        self.size = size
+    Nobody waits for one that has not begun, so a busy machine costs little.
+    """
+
+    def __init__(self, cores: Collection[int]) -> None:
+        self.size = len(cores) - 1
+        self._cores = cores
         self._process = 0
-        self._pool: ThreadPoolExecutor | None = None
+        self._gates: list[LockType] = []
+        self._work: Callable[[int], None] | None = None
 
-    def run(self, work: Callable[[int, int], None], pieces: int) -> None:
-        """work(thread, piece) for every piece, each by whichever thread is free.
+    def call(self, work: Callable[[int], None], hands: int) -> None:
+        """work(thread) in at most so many threads, numbered from 1."""
+        if self._process != os.getpid():  # a fork has the gates, not the threads
+            self._begin()
+        self._work = work
+        for gate in self._gates[:hands]:
+            with suppress(RuntimeError):  # it is open still: that thread has not woken up yet
+                gate.release()
 
-        The caller waits for no thread that has not begun, so a busy machine costs little.
-        """
-        if (
-            self._pool is None or self._process != os.getpid()
-        ):  # a fork has the pool, not its threads
-            self._pool = ThreadPoolExecutor(self.size - 1, thread_name_prefix="plant")
-            self._process = os.getpid()
-        remaining = iter(range(pieces))
+    def _begin(self) -> None:
+        self._process = os.getpid()
+        self._gates = [Lock() for _ in range(self.size)]
+        for number, gate in enumerate(self._gates, 1):
+            gate.acquire()
+            Thread(target=self._stand_by, args=(number, gate), daemon=True).start()
 
-        def take(thread: int) -> None:
-            for piece in remaining:
-                work(thread, piece)
+    def dismiss(self) -> None:
+        """The work is done: there is nothing left to lend a hand with."""
+        self._work = None
 
-        others = [self._pool.submit(take, thread) for thread in range(1, min(self.size, pieces))]
-        take(0)
-        for other in others:
-            if not other.cancel():
-                other.result()
+    def _stand_by(self, number: int, gate: LockType) -> None:
+        join_solver(self._cores)
+        while gate.acquire():
+            work = self._work
+            if work is not None:
+                work(number)
+            del work  # it holds a plant
 
 
-def available_cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+_CREW: list[Crew] = []
+
+
+def crew() -> Crew:
+    """The one of this process; on the cores that it may use when the first plant is made."""
+    if not _CREW:
+        _CREW.append(Crew(usable_cores()))
+    return _CREW[0]
+
+
+def use_cores(cores: Collection[int]) -> None:
+    """Where the threads of the plants that are made from now on may be."""
+    _CREW[:] = [Crew(cores)]
+
+
+def compile_board() -> tuple[Any, Any]:
+    """What the threads call besides the step."""
+    sources = fingerprint(board)
+
+    @kept
+    def start(address: int, turn: int) -> None:
+        sources  # noqa: B018  # closed over to be part of the key on disk
+        put_up(address, turn)
+
+    @kept
+    def done(address: int, pieces: int) -> bool:
+        sources  # noqa: B018
+        return wait(address, pieces, LOOKS)
+
+    return start, done
+
+
+TEAMWORK = start, done = compile_board()

@@ -192,7 +192,7 @@ def test_batch_place_and_threads_change_no_bit(
         assert all(alone[s] == bits for s, bits in rollout(plant, seeds[:batch]).items())
     shuffled = [int(s) for s in np.random.default_rng(0).permutation(seeds)]
     assert rollout(plant, shuffled) == alone
-    monkeypatch.setattr(threads, "available_cores", lambda: 3)
+    monkeypatch.setattr(threads, "_CREW", [threads.Crew(range(3))])
     monkeypatch.setattr(threads, "POINTS_PER_PIECE", 1)
     threaded = make(equation, **grid)
     for batch in (3, 7, 64):

@@ -11,7 +11,7 @@ import pytest
 
 from bringup import shared_core
 from bringup.pairs import PAIR
-from bringup.shared_core import SharedCores, freest, worthwhile
+from bringup.shared_core import SharedCores, freest
 
 several = pytest.mark.skipif(
     len(os.sched_getaffinity(0)) < 2, reason="needs two cores to choose from"
@@ -26,13 +26,6 @@ def test_a_pair_leaves_its_core_only_for_one_that_is_clearly_freer():
     assert freest({0: 0.5, 3: 0.0, 5: 0.0}, present=5) == 5
     assert freest({0: 0.5, 3: 0.0, 5: 0.0}, present=0) == 3
     assert freest({0: 0.0, 1: 0.0}, present=7) == 0  # a core that this process may not use
-
-
-@several
-def test_large_batches_want_all_cores():
-    assert worthwhile(2)
-    assert worthwhile(8)
-    assert not worthwhile(9)
 
 
 @several

@@ -21,13 +21,10 @@ from typing import Any
 
 from bringup.domain import own_domain
 from bringup.pairs import PAIR
-from bringup.shared_core import SharedCores, worthwhile
+from bringup.shared_core import SharedCores, possible
 from bringup.supervisor import node_command
 from loop_interfaces.isolation import loopback_environment
 from loop_interfaces.problem import find_problem
-
-ENVIRONMENTS = 2
-"""Of an episode of the two-point method with one seed."""
 
 
 @dataclass
@@ -77,7 +74,7 @@ def measure(
 
         try:
             nodes = [start(name) for name in PAIR]
-            if worthwhile(ENVIRONMENTS):  # as `pdeloop train` does it
+            if possible():  # as `pdeloop train` does it
                 cores = SharedCores(1)
                 for name, node in zip(PAIR, nodes, strict=True):
                     cores.place(0, name, node.pid)

@@ -13,8 +13,8 @@ from typing import Any
 
 from bringup.bench.processes import Bench, bench, machine, markdown
 from bringup.pairs import PAIR
-from bringup.shared_core import SharedCores, worthwhile
-from loop_interfaces.affinity import free_cores
+from bringup.shared_core import SharedCores
+from loop_interfaces.affinity import core_text, free_cores, usable_cores
 from loop_interfaces.problem import load_parameters
 
 PROBLEM = "allen-cahn"
@@ -22,7 +22,7 @@ PROBLEM = "allen-cahn"
 BATCHES = (2, 64)
 CORES = ("any", "shared", "pinned")
 """Where plant and controller are: wherever the scheduler puts them (nodes started by hand), on one
-core for both (`pdeloop train` with few environments; not for many), on one each (`--pin`). The
+core for both (as `pdeloop train` does it), on one each (`--pin`). The
 ping-pong is on any two, and pinned with `pinned`."""
 PAYLOAD = 256
 """Numbers in a request of the bare ping-pong."""
@@ -32,8 +32,6 @@ def measure(
     batches: tuple[int, ...], turns: int, seconds: float, cores: str
 ) -> list[dict[str, Any]]:
     """One row for each batch. cores: one of CORES."""
-    if cores == "shared":
-        batches = tuple(batch for batch in batches if worthwhile(batch))
     with bench() as running:
         return _measure(running, batches, turns, seconds, cores)
 
@@ -45,8 +43,9 @@ def _measure(
     ping = running.start("bringup.bench.ping", f"pin:={one}")
     running.start("bringup.bench.ping", "end:=pong", f"pin:={two}")
     horizon = "horizon:=1000"
+    solver = [f"solver_cores:='{core_text(usable_cores())}'"] if cores == "shared" else []
     pair = (
-        running.start("pde_sim_node", horizon, f"pin:={one}", problem=PROBLEM),
+        running.start("pde_sim_node", horizon, f"pin:={one}", *solver, problem=PROBLEM),
         running.start("controller_node", f"pin:={two}", problem=PROBLEM),
     )
     if cores == "shared":
