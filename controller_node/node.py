@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 
 from rclpy.node import Node
 from std_msgs.msg import String
 
 from controller_node.health import ControllerHealth
 from controller_node.identification import DesignSettings
-from controller_node.policy import load_law
+from controller_node.reflex import Reflex
 from controller_node.responder import Responder
 from loop_interfaces.endpoints import writer_qos
 from loop_interfaces.frames import Frame
@@ -38,6 +39,7 @@ from loop_interfaces.topics import (
     START,
     STATE,
     TARGET,
+    Topic,
 )
 
 CONTROLLER_PARAMETERS = (
@@ -60,6 +62,9 @@ CONTROLLER_PARAMETERS = (
 """The parameters that concern the controller."""
 
 
+Handler = Callable[[Frame], Sequence[Send | ModelFailure]]
+
+
 class ControllerNode:
     """Moves messages between the topics and the responder."""
 
@@ -67,7 +72,6 @@ class ControllerNode:
         values = declare(node, CONTROLLER_PARAMETERS, given_parameters(node))
         settings = {k: v for k, v in values.items() if k not in ("problem", "pin")}
         loop.pin(values["pin"])
-        load_law()  # not when the first state waits for its answer
         responder = Responder(DesignSettings(**settings))
         self._responder = responder
         self._health = ControllerHealth(responder)
@@ -83,21 +87,50 @@ class ControllerNode:
         self._node, self._loop = node, loop
         self._senders = {topic: loop.sender(topic) for topic in (ACTION, MODEL_IDENTIFIED)}
         self._failed = node.create_publisher(String, MODEL_FAILED, writer_qos(MODEL))
-        handlers: dict[object, Callable[[Frame], Sequence[Send | ModelFailure]]] = {
-            STATE: responder.state,
+        self._publish = self._senders[ACTION].publish
+        handlers: dict[Topic, Handler] = {
             TARGET: responder.target,
             START: responder.start,
             POLICY: responder.policy,
             MODEL: responder.model,
             COST: responder.cost,
         }
-        for topic in (STATE, TARGET, START, POLICY, MODEL, COST):
-            loop.receive(topic, self._performer(handlers[topic]))
-
+        states = loop.receive(STATE, self._on_state)
+        states.swift = self._swiftly
+        self._reflex = Reflex(responder, states.codec)
+        for topic, handler in handlers.items():
+            loop.receive(topic, partial(self._on_other, handler))
         loop.listen(PAUSED, self._on_paused)
         loop.diagnose("responder", self._report)
 
+    def _swiftly(self, raw: bytes) -> bool:
+        message = self._reflex(raw)
+        if message is None:
+            return False
+        self._publish(message)
+        return True
+
+    def _on_state(self, frame: Frame) -> None:
+        self._reflex.forget()
+        self._perform(self._responder.state(frame))
+        self._reflex.learn(frame)
+
+    def _on_other(self, handler: Handler, frame: Frame) -> None:
+        self._reflex.forget()
+        self._perform(handler(frame))
+
+    def _perform(self, sends: Sequence[Send | ModelFailure]) -> None:
+        for send in sends:
+            if isinstance(send, Send):
+                self._senders[send.topic].send(send.frame)
+            else:
+                self._failed.publish(String(data=send.to_json()))
+                self._node.get_logger().error(
+                    f"no reduced model: {send.reason}", throttle_duration_sec=1.0
+                )
+
     def _report(self, now: float) -> Health:
+        self._reflex.settle()
         self._health.plants = self._node.count_publishers(self._node.resolve_topic_name(STATE.name))
         return self._health.report(now)
 
@@ -116,21 +149,6 @@ class ControllerNode:
                 f"a state waits for its action until there is: {', '.join(lacking)}",
                 throttle_duration_sec=5.0,
             )
-
-    def _performer(
-        self, handler: Callable[[Frame], Sequence[Send | ModelFailure]]
-    ) -> Callable[[Frame], None]:
-        def perform(frame: Frame) -> None:
-            for send in handler(frame):
-                if isinstance(send, Send):
-                    self._senders[send.topic].send(send.frame)
-                else:
-                    self._failed.publish(String(data=send.to_json()))
-                    self._node.get_logger().error(
-                        f"no reduced model: {send.reason}", throttle_duration_sec=1.0
-                    )
-
-        return perform
 
 
 def main(args: list[str] | None = None) -> int:

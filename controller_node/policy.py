@@ -6,8 +6,7 @@ saturated at +- action_limit if there is one. A policy [K_a K_b Q] with n_s (n_s
 adds sum_{i <= j} Q_ij e_i e_j with e = U^T (z - z_r); see `loop_interfaces.policy_columns`.
 
 An environment's action does not depend on how many environments are in the batch, nor on its place
-in it, to the last bit: every sum runs over its terms one after the other (no BLAS, no
-reassociation), and what is vectorised is the independent sums beside each other.
+in it, to the last bit: see `controller_node.law`.
 """
 
 from __future__ import annotations
@@ -16,70 +15,16 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from controller_node.law import LAW, control, padded
 from loop_interfaces.policy_columns import quadratic_columns
+from loop_interfaces.simd import whole_lanes
 
-__all__ = ["ProjectedLaw", "control", "excitation"]
+__all__ = ["ProjectedLaw", "excitation"]
 
 Array = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
-
-
-@njit(cache=True)
-def control(
-    feedback: Array,
-    constant: Array,
-    quadratic: Array,
-    bases: Array,
-    centres: Array,
-    model_index: IndexArray,
-    states: Array,
-    reduced: Array,
-    actions: Array,
-) -> None:
-    """Write a[m] = constant[m] + feedback[m]^T s[m] + quadratic[m]^T (e[m] x e[m]) into `actions`.
-
-    s[m] = U[model_index[m]]^T z[m] and e[m] = s[m] - centres[model_index[m]]; x: the products i <= j.
-    feedback : (M, n_s, n_a), K_a transposed; constant : (M, n_a), K_b s_r; quadratic : (M, n_s (n_s
-    + 1) / 2, n_a), Q transposed, or (M, 0, n_a); bases : (models, n_z, n_s); centres : (models,
-    n_s), s_r;
-    model_index : (M,); states : (M, n_z); reduced : (n_s,), workspace; actions : (M, n_a), written.
-    """
-    n_z, n_s = bases.shape[1], bases.shape[2]
-    n_a = actions.shape[1]
-    for m in range(states.shape[0]):
-        basis = bases[model_index[m]]
-        for j in range(n_s):
-            reduced[j] = 0.0
-        for i in range(n_z):
-            value = states[m, i]
-            for j in range(n_s):
-                reduced[j] += basis[i, j] * value
-        for k in range(n_a):
-            actions[m, k] = constant[m, k]
-        for j in range(n_s):
-            value = reduced[j]
-            for k in range(n_a):
-                actions[m, k] += feedback[m, j, k] * value
-        if quadratic.shape[1] > 0:
-            for j in range(n_s):
-                reduced[j] -= centres[model_index[m], j]
-            pair = 0
-            for i in range(n_s):
-                for j in range(i, n_s):
-                    value = reduced[i] * reduced[j]
-                    for k in range(n_a):
-                        actions[m, k] += quadratic[m, pair, k] * value
-                    pair += 1
-
-
-def load_law() -> None:
-    """Load the compiled law, or compile it."""
-    law = ProjectedLaw([np.ones((1, 1))], np.zeros(1))
-    law.set(np.zeros((1, 1, 2)))
-    law.actions(np.zeros((1, 1)))
 
 
 class ProjectedLaw:
@@ -101,7 +46,6 @@ class ProjectedLaw:
     def __init__(
         self, models: Sequence[ArrayLike], target: ArrayLike, action_limit: float = 0.0
     ) -> None:
-        self._action_limit = action_limit
         bases = [np.asarray(basis, dtype=np.float64) for basis in models]
         shapes = {basis.shape for basis in bases}
         if len(shapes) != 1 or bases[0].ndim != 2 or 0 in bases[0].shape:
@@ -109,7 +53,7 @@ class ProjectedLaw:
                 f"models must be one or more bases of one shape (n_z, n_s), but the shapes are "
                 f"{[basis.shape for basis in bases]}."
             )
-        self._bases = np.ascontiguousarray(np.stack(bases))
+        self._bases = padded(np.stack(bases))
         self._n_z, self._n_s = bases[0].shape
         z_r = np.asarray(target, dtype=np.float64)
         if z_r.shape != (self._n_z,):
@@ -120,26 +64,35 @@ class ProjectedLaw:
             raise ValueError(
                 "models and target must be finite, but there is NaN or infinity in them."
             )
+        self._plan = np.zeros(1, LAW)
+        plan = self._plan[0]
+        plan["n_z"], plan["n_s"] = self._n_z, self._n_s
+        plan["bases"] = self._bases.ctypes.data
         # The reduced targets come from the same kernel as the reduced states: an identity for the
         # feedback.
         count = len(bases)
-        self._reduced_targets = np.empty((count, self._n_s))
-        self._reduced = np.empty(self._n_s)
-        control(
-            np.ascontiguousarray(np.broadcast_to(np.eye(self._n_s), (count, self._n_s, self._n_s))),
-            np.zeros((count, self._n_s)),
-            np.zeros((count, 0, self._n_s)),
-            self._bases,
-            np.zeros((count, self._n_s)),
-            np.arange(count, dtype=np.int64),
-            np.ascontiguousarray(np.broadcast_to(z_r, (count, self._n_z))),
-            self._reduced,
-            self._reduced_targets,
-        )
-        self._feedback: Array | None = None
-        self._constant: Array = np.empty((0, 0))
-        self._quadratic: Array = np.empty((0, 0, 0))
-        self._model_index = np.empty(0, dtype=np.int64)
+        self._reduced_targets = np.zeros((count, self._n_s))
+        self._centres = padded(self._reduced_targets)
+        plan["centres"] = self._centres.ctypes.data
+        self._shape = (0, 0)
+        identity = np.broadcast_to(np.eye(self._n_s), (count, self._n_s, self._n_s))
+        self._take(np.concatenate([identity] * 2, axis=2), np.arange(count))
+        control(self._plan, np.tile(z_r, (count, 1)), self._reduced_targets)
+        self._centres = padded(self._reduced_targets)
+        plan["centres"] = self._centres.ctypes.data
+        plan["limit"] = action_limit
+        self._set = False
+
+    @property
+    def plan(self) -> np.void:
+        """What `controller_node.law` is to do, until the next `set`."""
+        plan: np.void = self._plan[0]
+        return plan
+
+    @property
+    def n_a(self) -> int:
+        """Actuators of the policies that were set."""
+        return self._shape[1]
 
     @property
     def reduced_targets(self) -> Array:
@@ -178,14 +131,25 @@ class ProjectedLaw:
                 f"model_index must lie in 0 .. {len(self._bases) - 1}, but it holds {index.min()} "
                 f".. {index.max()}."
             )
+        self._take(gains, index)
+        self._set = True
+
+    def _take(self, gains: Array, index: IndexArray) -> None:
         # A plain sum over the modes, one environment beside the other.
         constant: Array = np.zeros(gains.shape[:2])
         for j in range(self._n_s):
             constant += gains[:, :, self._n_s + j] * self._reduced_targets[index, j, None]
-        self._feedback = np.ascontiguousarray(gains[:, :, : self._n_s].transpose(0, 2, 1))
-        self._constant = constant
-        self._quadratic = np.ascontiguousarray(gains[:, :, affine:].transpose(0, 2, 1))
+        feedback = gains[:, :, : self._n_s].transpose(0, 2, 1)
+        quadratic = gains[:, :, 2 * self._n_s :].transpose(0, 2, 1)
+        self._shape = gains.shape[:2]
         self._model_index = index.astype(np.int64)
+        self._gains = padded(constant), padded(feedback), padded(quadratic)
+        plan = self._plan[0]
+        plan["n_a"], plan["pairs"] = gains.shape[1], quadratic.shape[1]
+        plan["index"] = self._model_index.ctypes.data
+        plan["constant"], plan["feedback"], plan["quadratic"] = (a.ctypes.data for a in self._gains)
+        self._scratch = np.zeros(4 * whole_lanes(self._n_s) + whole_lanes(gains.shape[1]))
+        plan["scratch"] = self._scratch.ctypes.data
 
     def actions(self, states: ArrayLike, out: Array | None = None) -> Array:
         """The actions that answer the states.
@@ -203,10 +167,10 @@ class ProjectedLaw:
         (M, n_a) array
             The actions held over [t_k, t_{k+1}).
         """
-        if self._feedback is None:
+        if not self._set:
             raise ValueError("the law has no policies yet; call set() before actions().")
         z = np.ascontiguousarray(states, dtype=np.float64)
-        shape = self._constant.shape
+        shape = self._shape
         if z.shape != (shape[0], self._n_z):
             raise ValueError(
                 f"states must have shape ({shape[0]}, {self._n_z}), one field per policy, but the "
@@ -219,19 +183,7 @@ class ProjectedLaw:
                 f"out must be a C-contiguous float64 array of shape {shape}, but it is {out.dtype} "
                 f"of shape {out.shape}."
             )
-        control(
-            self._feedback,
-            self._constant,
-            self._quadratic,
-            self._bases,
-            self._reduced_targets,
-            self._model_index,
-            z,
-            self._reduced,
-            out,
-        )
-        if self._action_limit:
-            np.clip(out, -self._action_limit, self._action_limit, out=out)
+        control(self._plan, z, out)
         return out
 
 

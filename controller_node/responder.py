@@ -68,6 +68,8 @@ class Responder:
         self._served = (-1, -1)
         """Run and plant of the last answer."""
         self._pending: Frame | None = None
+        self.law_in_use: ProjectedLaw | None = None
+        """The law of the last answer, set for its episode; None where it explored."""
         self.tally = Tally()
         self.answered = 0
         self.episode = self.step = -1
@@ -155,6 +157,7 @@ class Responder:
 
     def state(self, frame: Frame) -> list[Send]:
         """The action that answers a state; the state is kept until what it needs has arrived."""
+        self.law_in_use = None
         actions = self._actions(frame)
         if actions is None:
             self._pending = replace(frame, values=frame.values.copy())
@@ -166,6 +169,11 @@ class Responder:
         self.episode, self.step = frame.episode, frame.step
         answer = Frame(frame.run, frame.episode, frame.step, frame.time, actions, frame.plant)
         return [Send(ACTION, answer)]
+
+    def credit(self, answers: int, step: int) -> None:
+        """Count states of the present episode, up to `step`, that were answered by `reflex`."""
+        self.answered += answers
+        self.step = step
 
     def cost(self, frame: Frame) -> list[Send | ModelFailure]:
         """At the end of an exploratory episode: reduce and design."""
@@ -230,6 +238,7 @@ class Responder:
             if law is None:
                 return None
             run.laws[frame.plant] = (law, frame.episode)
+        self.law_in_use = law
         return law.actions(frame.values)
 
     @staticmethod

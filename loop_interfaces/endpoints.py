@@ -184,24 +184,30 @@ class Sender:
         )
 
         # Past rclpy's wrapper, which locks the handle and looks at the type of every message.
-        self._publish = self.publisher.handle.publish_raw
+        self.publish: Callable[[bytes | bytearray], None] = self.publisher.handle.publish_raw
+        """Publishes serialised bytes, and nowhere else."""
 
     def encoded(self, frame: Frame) -> bytes:
         """What `send` would publish."""
         return self._codec.encode(frame)
 
     def send(self, frame: Frame) -> None:
+        self.send_raw(self._codec.encode_into_own(frame), frame.time)
+
+    def send_raw(self, raw: bytearray, time: float) -> None:
+        """Send the bytes of a frame; they may be overwritten afterwards. time: of the frame, in s."""
+        self.publish(raw)
         bundler = self._bundler
-        if bundler is None or not bundler.wanted:
-            self._publish(self._codec.encode_into_own(frame))
-            return
-        raw = self._codec.encode(frame)
-        self._publish(raw)
-        bundler.add(STATE_KIND, raw, frame.time if bundler.timed else NO_TIME)
+        if bundler is not None and bundler.wanted:
+            bundler.add(STATE_KIND, bytes(raw), time if bundler.timed else NO_TIME)
 
 
 class Receiver:
-    """Takes frames from one topic and hands them to a callback, and their bytes to the bundler."""
+    """Takes frames from one topic and hands them to a callback, and their bytes to the bundler.
+
+    codec: decodes them; swift: is asked first, with the bytes alone, and returns whether it has dealt
+    with them.
+    """
 
     def __init__(
         self,
@@ -213,9 +219,12 @@ class Receiver:
     ) -> None:
         self.callback = callback
         self.bundler = bundler
-        self.decode = ArrayCodec(topic.labels).decode
+        self.swift: Callable[[bytes], bool] | None = None
+        self.codec = ArrayCodec(topic.labels)
+        self.decode = self.codec.decode
         self.subscription = raw_subscription(
             node, Float64MultiArray, scoped(namespace, topic.name), reader_qos(topic)
         )
+        self.name = self.subscription.topic_name
         self.handle = self.subscription.handle
         self.take = self.handle.take_message

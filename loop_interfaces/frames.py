@@ -114,6 +114,11 @@ class ArrayCodec:
         self._templates: dict[tuple[int, ...], tuple[bytearray, int, NDArray[np.float64]]] = {}
         self._last: _Layout | None = None
 
+    @property
+    def prefix(self) -> bytes | None:
+        """What stands in front of the header in the messages of the peer that was decoded last."""
+        return self._last.prefix if self._last else None
+
     def encode(self, frame: Frame) -> bytes:
         """CDR bytes of `frame`, little-endian. Raises FrameError on a wrong number of axes."""
         return bytes(self.encode_into_own(frame))

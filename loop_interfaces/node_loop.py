@@ -19,7 +19,6 @@ from typing import Any
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
-from rclpy.subscription import Subscription
 from std_msgs.msg import Float64MultiArray
 
 from loop_interfaces.affinity import pin_process
@@ -41,6 +40,9 @@ BUSY = 20
 POLL = 200e-6
 """Seconds that a node with a core of its own polls for the next message before it waits: longer
 than a round of a fast plant, shorter than what anyone would notice."""
+STREAM = 0.002
+"""Seconds without a message after which a stream of them has ended. Until then nothing else is
+waited for: every further subscription in a WaitSet costs, and within an episode nothing comes there."""
 SUSPENDED = 2.0
 """Seconds without being scheduled after which a process takes its peers to have dropped it.
 
@@ -73,6 +75,8 @@ class NodeLoop:
         self._watched: dict[str, _Watched] = {}
         self._stop_reason: str | None = None
         self._poll = 0.0
+        self._stream: Receiver | None = None
+        """The one whose messages stream in, as long as they do: the only one to wait for."""
         self.suspended = False
         """Whether `run` ended because the process had been suspended (SIGSTOP, a frozen machine)."""
         self._executor = SingleThreadedExecutor(context=node.context)
@@ -83,7 +87,7 @@ class NodeLoop:
         self._introspection = Introspection(
             node,
             refused=lambda: (sum(self.refused.values()), self._last_reason),
-            topics=lambda: [receiver.subscription.topic_name for receiver in self._receivers],
+            topics=lambda: [receiver.name for receiver in self._receivers],
         )
 
     def sender(self, topic: Topic, namespace: str = "", *, bundled: bool = False) -> Sender:
@@ -97,7 +101,7 @@ class NodeLoop:
         namespace: str = "",
         *,
         bundled: bool = False,
-    ) -> Subscription:
+    ) -> Receiver:
         """Call `callback` with every frame of `topic`; a ValueError it raises refuses the message.
 
         bundled: what has come in goes out on `samples`, too.
@@ -105,7 +109,7 @@ class NodeLoop:
         bundler = self.bundler if bundled else None
         receiver = Receiver(self.node, topic, callback, namespace, bundler)
         self._receivers.append(receiver)
-        return receiver.subscription
+        return receiver
 
     def observe(self, topic: Topic, callback: Callable[[Frame], None], namespace: str = "") -> None:
         """Call `callback` with every state or action, without taking part in the loop.
@@ -194,6 +198,7 @@ class NodeLoop:
         context = self.node.context
         receivers, clock = self._receivers, time.monotonic
         handles, take_from = self._sources()
+        self._stream = None
         wait_set = _rclpy.WaitSet(
             len(handles) + 2 * len(self._watched), 0, 0, 0, 0, 0, context.handle
         )
@@ -209,6 +214,7 @@ class NodeLoop:
                 if pulse.longest() > SUSPENDED:
                     self.suspended = True
                     return "suspended"
+                self._stream = None
                 self._executor.spin_once(timeout_sec=0)
                 if self._bundler is not None:
                     self._bundler.look(now)
@@ -226,7 +232,7 @@ class NodeLoop:
                 tick(now)
                 continue
             if now < poll_until:
-                for receiver in receivers:
+                for receiver in (self._stream,) if self._stream else receivers:
                     if self._take(receiver):
                         handled += 1
                         poll_until = clock() + self._poll
@@ -236,8 +242,12 @@ class NodeLoop:
             if due is not None:
                 wake = min(wake, due)
             clear()
-            for handle in handles:
-                add(handle)
+            if self._stream is None:
+                for handle in handles:
+                    add(handle)
+            else:
+                add(self._stream.handle)
+                wake, self._stream = min(wake, now + STREAM), None
             wait(int((wake - now) * 1e9))
             for pointer in ready("subscription"):
                 handled += take_from[pointer]()
@@ -266,10 +276,14 @@ class NodeLoop:
         bundler = receiver.bundler
         if bundler is not None and bundler.wanted:
             bundler.add(ACTION_KIND, taken[0])
+        if receiver.swift is not None and receiver.swift(taken[0]):
+            self._stream = receiver
+            return 1
+        self._stream = None
         try:
             receiver.callback(receiver.decode(taken[0]))
         except ValueError as error:
-            self._refuse(receiver.subscription.topic_name, error)
+            self._refuse(receiver.name, error)
         return 1
 
     def _drain(self, watched: _Watched) -> int:

@@ -35,14 +35,16 @@ from numba.core.errors import NumbaError
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from . import compiled, fft, kernel, simd, spectra
-from .compiled import fingerprint, jit, kept
+from loop_interfaces import compiled, simd
+from loop_interfaces.compiled import fingerprint, jit, kept
+from loop_interfaces.simd import call, load, read, splat, write
+
+from . import fft, kernel, spectra
 from .equations import Equation
 from .integrator import Integrator
 from .kernel import PLAN, force
 from .layout import aligned
 from .plant import Plant
-from .simd import call, load, read, splat, write
 from .spectra import (
     analyse,
     forward,

@@ -10,8 +10,8 @@ from typing import Any
 from llvmlite import ir
 from numba import types
 
-from .compiled import jit
-from .simd import intrinsic
+from loop_interfaces.compiled import jit
+from loop_interfaces.simd import intrinsic
 
 __all__ = ["BOARD", "MAX_TURN", "claim", "next_piece", "put_up", "wait"]
 

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .compiled import jit
-from .simd import WIDTH, load, read, splat, store, transpose
+from loop_interfaces.compiled import jit
+from loop_interfaces.simd import WIDTH, load, read, splat, store, transpose
 
 __all__ = ["fft", "is_transform_length", "plane_size", "radices_of", "twiddles_of"]
 

@@ -5,13 +5,15 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from .compiled import cache_misses, pointwise_loop
+from loop_interfaces.compiled import cache_misses
+from loop_interfaces.simd import WIDTH, whole_lanes
+
 from .equations import Equation
 from .etdrk4 import etdrk4_coefficients
 from .fft import is_transform_length, plane_size
 from .kernel import PLAN, all_finite, step
-from .layout import Constants, checked_operator, lay_out, whole_lanes
-from .simd import WIDTH
+from .layout import Constants, checked_operator, lay_out
+from .pointwise import pointwise_loop
 from .threads import TEAMWORK, PlanTeam
 
 __all__ = ["Integrator"]

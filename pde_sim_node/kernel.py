@@ -20,10 +20,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import board, compiled, fft, simd, spectra
+from loop_interfaces import compiled, simd
+from loop_interfaces.compiled import fingerprint, jit, kept
+from loop_interfaces.simd import call, load, read, splat, store, write
+
+from . import board, fft, spectra
 from .board import claim, next_piece
-from .compiled import fingerprint, jit, kept
-from .simd import call, load, read, splat, store, write
 from .spectra import (
     TRANSFORM,
     analyse,

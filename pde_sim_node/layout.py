@@ -6,15 +6,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from loop_interfaces.simd import WIDTH, whole_lanes
+
 from .equations import Spectrum
 from .fft import is_transform_length, radices_of, twiddles_of
-from .simd import WIDTH
 
-__all__ = ["Constants", "aligned", "checked_operator", "lay_out", "whole_lanes"]
-
-
-def whole_lanes(n: int) -> int:
-    return -(-n // WIDTH) * WIDTH
+__all__ = ["Constants", "aligned", "checked_operator", "lay_out"]
 
 
 def aligned(size: int) -> NDArray[np.float64]:

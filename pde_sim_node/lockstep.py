@@ -85,7 +85,12 @@ class Lockstep:
         """The rows of the last `episode/cost`."""
         self._rows = np.empty((0, START_COLUMNS))
         self._active = False
-        self._reply: Send | None = None
+        self._serial = -1
+        """Episodes begun before this one."""
+        self._state = np.empty((0, 0))
+        """What was measured last."""
+        self._cost: Send | None = None
+        """What the last episode that ended came to; None once another run has the plant."""
         self._taken: list[int] = []
         """A digest of the action that was taken at each step of the episode."""
         self.contradiction = ""
@@ -113,7 +118,23 @@ class Lockstep:
     @property
     def last_state(self) -> Frame | None:
         """The state of the episode under way, sent or held back."""
-        return self._reply.frame if self._active and self._reply is not None else None
+        return self._stamped(STATE, self._state).frame if self._active else None
+
+    @property
+    def flowing(self) -> int:
+        """A number of the episode under way, if all it awaits is its next action; else -1.
+
+        Not at its end, nor while it is paused or paced.
+        """
+        plant = self._plant
+        if not self._active or self.paused or self.pace or plant.step_index >= plant.horizon:
+            return -1
+        return self._serial
+
+    @property
+    def _reply(self) -> Send | None:
+        """What is to be sent again: the state that is not answered, or the cost."""
+        return self._stamped(STATE, self._state) if self._active else self._cost
 
     @property
     def step(self) -> int:
@@ -219,7 +240,7 @@ class Lockstep:
                     f"run {frame.run} asked for an episode, but run {self.run} has this plant "
                     f"(until it ends, or is silent for {self._run_hold:g} s)"
                 )
-            self.run, self.episode, self._reply = frame.run, -1, None
+            self.run, self.episode, self._cost = frame.run, -1, None
             self._idle(now)
         self._tuner_heard = now
         if not len(rows):
@@ -236,15 +257,18 @@ class Lockstep:
                     "a new episode needs a new number"
                 )
             self.tally["starts repeated"] += 1
-            return [self._reply] if self._reply and not self._held else []
+            reply = self._reply
+            return [reply] if reply and not self._held else []
         states = self._plant.reset(rows[:, StartColumn.SEED].astype(np.int64), noise_seeds(rows))
         self.episode, self._rows, self._active = frame.episode, rows.copy(), True
+        self._serial += 1
+        self._state = states
         self._taken, self.contradiction = [], ""
         self.time = max(self.time, frame.time) + self._sample_time
         self._stepping = False
         if self.pace:
             self.pace.begin(now)
-        return self._publish_state(states, now)
+        return self._publish_state(now)
 
     def action(self, frame: Frame, now: float) -> list[Send]:
         """Advance on the awaited action; ignore any other.
@@ -277,19 +301,31 @@ class Lockstep:
         if self._held:
             self.tally["actions before their state"] += 1
             return []
-        self._tuner_heard = now
         if plant.step_index == plant.horizon:
+            self._tuner_heard = now
             return [self._finish(now, void=False)]
-        self._taken.append(frame.digest())
-        states = plant.step(frame.values)
+        self.advance(frame.values, frame.digest(), now)
+        if self.pace and not self.paused:
+            self._held = True
+            self._deadline = self.pace.next(now)
+            return []
+        return self._publish_state(now)
+
+    def advance(self, action: np.ndarray, digest: int, now: float) -> np.ndarray:
+        """Apply the awaited action and wait for the next; the states, which are to be sent.
+
+        digest: of the action, see Frame.digest.
+        """
+        plant = self._plant
+        self._tuner_heard = now
+        self._taken.append(digest)
+        self._state = plant.step(action)
         self.steps_total += plant.batch
         self.rounds_total += 1
         self.time += self._sample_time
-        if self.pace and not self.paused:
-            self._reply, self._held = self._stamped(STATE, states), True
-            self._deadline = self.pace.next(now)
-            return []
-        return self._publish_state(states, now)
+        self._repeats = 0
+        self._deadline = now + self._action_timeout
+        return self._state
 
     def tick(self, now: float) -> list[Send]:
         """Send the state again when its answer is overdue; give the episode up after max_repeats.
@@ -299,19 +335,19 @@ class Lockstep:
         """
         if self.paused and not self._stepping:
             return self._still_paused(now)
-        if self._held and self.pace and self._reply and self.pace.ready(now):
+        if self._held and self.pace and self.pace.ready(now):
             return self._send_state(now)
-        if self._deadline is None or now < self._deadline or self._reply is None:
+        if not self._active or self._deadline is None or now < self._deadline:
             return []
         if self._repeats >= self._max_repeats and not self.paused:
             return [self._finish(now, void=True)]
         self._repeats += 1
         self.tally["states repeated"] += 1
         self._deadline = now + self._action_timeout
-        return [self._reply, self.paused_report()] if self.paused else [self._reply]
+        state = self._stamped(STATE, self._state)
+        return [state, self.paused_report()] if self.paused else [state]
 
-    def _publish_state(self, states: np.ndarray, now: float) -> list[Send]:
-        self._reply = self._stamped(STATE, states)
+    def _publish_state(self, now: float) -> list[Send]:
         if self.paused:
             self._held, self._stepping = True, False
             self._deadline = now + PAUSED_REPORT
@@ -319,10 +355,9 @@ class Lockstep:
         return self._send_state(now)
 
     def _send_state(self, now: float) -> list[Send]:
-        assert self._reply is not None
         self._held, self._repeats = False, 0
         self._deadline = now + self._action_timeout
-        return [self._reply]
+        return [self._stamped(STATE, self._state)]
 
     def _still_paused(self, now: float) -> list[Send]:
         if self._deadline is not None and now < self._deadline:
@@ -343,10 +378,10 @@ class Lockstep:
             self.tally["episodes void"] += 1
         values = np.column_stack([costs.mean, costs.total, ended.astype(np.float64)])
         self.last_cost = values
-        self._reply = self._stamped(COST, values)
+        self._cost = self._stamped(COST, values)
         self._idle(now)
         self.episodes_total += not void
-        return self._reply
+        return self._cost
 
     def _stamped(self, topic: Topic, values: np.ndarray) -> Send:
         step = self._plant.step_index

@@ -32,6 +32,7 @@ from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.equations import configured_equation
 from pde_sim_node.health import PlantHealth
 from pde_sim_node.lockstep import Lockstep
+from pde_sim_node.reflex import Reflex
 from pde_sim_node.threads import use_cores
 
 
@@ -113,7 +114,9 @@ class PlantNode:
         self._bundler.timed = publish_clock
         self._clock_wanted = False
         loop.receive(START, self._on_start)
-        loop.receive(ACTION, self._on_action, bundled=True)
+        actions = loop.receive(ACTION, self._on_action, bundled=True)
+        actions.swift = self._swiftly
+        self._reflex = Reflex(self._lockstep, actions.codec)
         loop.diagnose("lock-step", self._health.report)
         offer(node, "~/pause", self._pause)
         offer(node, "~/resume", self._resume)
@@ -158,10 +161,20 @@ class PlantNode:
         if not self._lockstep.run:
             self._report_pace()
 
+    def _swiftly(self, raw: bytes) -> bool:
+        message = self._reflex(raw, self._loop.now())
+        if message is None:
+            return False
+        self._senders[STATE].send_raw(message, self._lockstep.time)
+        if self._clock_wanted:
+            self._tell_time(self._lockstep.time)
+        return True
+
     def _on_action(self, frame: Frame) -> None:
         self._send(self._lockstep.action(frame, self._loop.now()))
         if self._paced:
             self._send(self._lockstep.tick(self._loop.now()))
+        self._reflex.learn(frame)
 
     def _report_pace(self) -> None:
         """How well the wall clock was kept, at the end of a run or of this node."""

@@ -13,11 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import board, compiled, fft, kernel, simd, spectra
+from loop_interfaces import compiled, simd
+from loop_interfaces.compiled import fingerprint, jit, kept
+from loop_interfaces.simd import read, splat
+
+from . import board, fft, kernel, spectra
 from .board import claim, next_piece
-from .compiled import fingerprint, jit, kept
 from .kernel import accept, stage_cost
-from .simd import read, splat
 from .spectra import TRANSFORM, analyse, get, plus, product, put, synthesise
 
 __all__ = ["LINEAR_PLAN", "propagate"]

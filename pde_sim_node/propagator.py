@@ -5,13 +5,14 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from .compiled import cache_misses
+from loop_interfaces.compiled import cache_misses
+from loop_interfaces.simd import WIDTH, whole_lanes
+
 from .equations import Equation, Spectrum
 from .fft import plane_size
 from .kernel import all_finite
-from .layout import Constants, checked_operator, lay_out, whole_lanes
+from .layout import Constants, checked_operator, lay_out
 from .propagation import LINEAR_PLAN, propagate
-from .simd import WIDTH
 from .threads import TEAMWORK, PlanTeam
 
 __all__ = ["Propagator", "exact_propagator"]

@@ -16,9 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from .compiled import jit
+from loop_interfaces.compiled import jit
+from loop_interfaces.simd import backwards, load, read, splat, store, write
+
 from .fft import fft, times
-from .simd import backwards, load, read, splat, store, write
 
 __all__ = [
     "TRANSFORM",

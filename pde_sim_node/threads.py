@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.affinity import join_solver, usable_cores
+from loop_interfaces.compiled import fingerprint, kept
 
 from . import board
 from .board import BOARD, MAX_TURN, put_up, wait
-from .compiled import fingerprint, kept
 from .layout import Constants, aligned
 
 __all__ = ["TEAMWORK", "PlanTeam", "use_cores"]

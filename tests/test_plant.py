@@ -424,7 +424,7 @@ def test_a_users_equation_is_compiled_once_for_all_processes(tmp_path: Path) -> 
     path = tmp_path / "fisher.py"
     program = (
         "import sys; from pde_sim_node.equations import load_equation;"
-        "from pde_sim_node.compiled import pointwise_loop;"
+        "from pde_sim_node.pointwise import pointwise_loop;"
         "print(pointwise_loop(load_equation(sys.argv[1]).nonlinearity)[1])"
     )
     root = str(Path(__file__).parent.parent)

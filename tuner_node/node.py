@@ -168,8 +168,8 @@ class TunerNode:
                 loop.observe(ACTION, partial(self._observe, session.action, number), namespace)
             cost = loop.receive(COST, self._handler(session.cost, number), namespace)
             model = loop.receive(MODEL_IDENTIFIED, self._handler(session.model, number), namespace)
-            self._cost_topics.append(cost.topic_name)
-            self._model_topics.append(model.topic_name)
+            self._cost_topics.append(cost.name)
+            self._model_topics.append(model.name)
             self._node.create_subscription(
                 String,
                 scoped(namespace, MODEL_FAILED),

@@ -20,11 +20,36 @@ from numba.core.datamodel import models
 from numba.extending import intrinsic as numba_intrinsic
 from numba.extending import overload, register_model
 
-__all__ = ["WIDTH", "backwards", "call", "load", "read", "splat", "store", "transpose", "write"]
+__all__ = [
+    "WIDTH",
+    "backwards",
+    "call",
+    "lane_sum",
+    "load",
+    "peek",
+    "peek_lanes",
+    "peek_word",
+    "poke",
+    "poke_lanes",
+    "read",
+    "read_word",
+    "splat",
+    "store",
+    "transpose",
+    "whole_lanes",
+    "write",
+    "write_word",
+]
 
 WIDTH = 8
 NUMBER = ir.DoubleType()
 VECTOR = ir.VectorType(NUMBER, WIDTH)
+WORD = ir.IntType(64)
+
+
+def whole_lanes(n: int) -> int:
+    """The least multiple of WIDTH that is at least n."""
+    return -(-n // WIDTH) * WIDTH
 
 
 class Lanes(types.Type):
@@ -60,46 +85,55 @@ def shuffle(builder: Any, a: Any, b: Any, order: Sequence[int]) -> Any:
     return builder.shuffle_vector(a, b, mask)
 
 
+def reader(kind: Any, result: Any, align: int) -> Any:
+    """Of what is at an offset."""
+
+    @intrinsic
+    def read_at(typing_context: Any, address: Any, offset: Any) -> Any:
+        def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            return builder.load(pointer(builder, args[0], args[1], kind), align=align)
+
+        return result(types.intp, types.intp), build
+
+    return read_at
+
+
+def writer(kind: Any, value: Any, align: int) -> Any:
+    """To an offset."""
+
+    @intrinsic
+    def write_at(typing_context: Any, address: Any, offset: Any, given: Any) -> Any:
+        def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            builder.store(args[2], pointer(builder, args[0], args[1], kind), align=align)
+            return context.get_dummy_value()
+
+        return types.void(types.intp, types.intp, value), build
+
+    return write_at
+
+
+read, write = reader(NUMBER, types.float64, 8), writer(NUMBER, types.float64, 8)
+load, store = reader(VECTOR, lanes, 8), writer(VECTOR, lanes, 8)
+read_word, write_word = reader(WORD, types.int64, 8), writer(WORD, types.int64, 8)
+# In a message numbers begin on a multiple of four bytes only.
+peek, poke = reader(NUMBER, types.float64, 1), writer(NUMBER, types.float64, 1)
+peek_lanes, poke_lanes = reader(VECTOR, lanes, 1), writer(VECTOR, lanes, 1)
+peek_word = reader(WORD, types.int64, 1)
+
+
 @intrinsic
-def read(typing_context: Any, address: Any, offset: Any) -> Any:
-    """The number at an offset."""
+def lane_sum(typing_context: Any, value: Any) -> Any:
+    """The sum of the lanes, from the first to the last."""
 
     def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.load(pointer(builder, *args))
+        index = ir.IntType(32)
+        found = [builder.extract_element(args[0], ir.Constant(index, i)) for i in range(WIDTH)]
+        total = found[0]
+        for number in found[1:]:
+            total = builder.fadd(total, number)
+        return total
 
-    return types.float64(types.intp, types.intp), build
-
-
-@intrinsic
-def write(typing_context: Any, address: Any, offset: Any, number: Any) -> Any:
-    """Put a number at an offset."""
-
-    def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        builder.store(args[2], pointer(builder, *args[:2]))
-        return context.get_dummy_value()
-
-    return types.void(types.intp, types.intp, types.float64), build
-
-
-@intrinsic
-def load(typing_context: Any, address: Any, offset: Any) -> Any:
-    """The eight numbers from an offset on."""
-
-    def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.load(pointer(builder, args[0], args[1], VECTOR), align=8)
-
-    return lanes(types.intp, types.intp), build
-
-
-@intrinsic
-def store(typing_context: Any, address: Any, offset: Any, value: Any) -> Any:
-    """Put eight numbers from an offset on."""
-
-    def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        builder.store(args[2], pointer(builder, args[0], args[1], VECTOR), align=8)
-        return context.get_dummy_value()
-
-    return types.void(types.intp, types.intp, lanes), build
+    return types.float64(lanes), build
 
 
 @intrinsic

@@ -1,0 +1,129 @@
+"""The projected control law, compiled.
+
+An environment's action does not depend on how many environments are in the batch, nor on its place
+in it, to the last bit: every sum runs over its terms one after the other (no BLAS, no
+reassociation). What stands side by side is sums that do not depend on each other: those of eight
+modes or actuators in the lanes of a vector, and those of four environments, which hide each other's
+latency.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loop_interfaces import compiled, simd
+from loop_interfaces.compiled import fingerprint, jit, kept
+from loop_interfaces.simd import load, peek, read, read_word, splat, store, whole_lanes, write
+
+__all__ = ["LAW", "act", "control", "padded"]
+
+LAW = np.dtype(
+    [
+        ("n_z", np.int64),
+        ("n_s", np.int64),
+        ("n_a", np.int64),
+        ("pairs", np.int64),  # n_s (n_s + 1) / 2, or 0 without quadratic terms
+        ("limit", np.float64),  # magnitude at which an action saturates; 0: none
+        # Addresses of arrays; the last axis of the first five is filled up to whole lanes.
+        ("bases", np.int64),  # U, models by n_z by n_s
+        ("centres", np.int64),  # s_r, models by n_s
+        ("constant", np.int64),  # K_b s_r, M by n_a
+        ("feedback", np.int64),  # K_a^T, M by n_s by n_a
+        ("quadratic", np.int64),  # Q^T, M by pairs by n_a
+        ("index", np.int64),  # model of every environment, M
+        ("scratch", np.int64),  # four times n_s and once n_a, each up to whole lanes
+    ]
+)
+
+
+def padded(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A copy whose last axis is filled up to whole lanes."""
+    missing = whole_lanes(values.shape[-1]) - values.shape[-1]
+    return np.ascontiguousarray(np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, missing)]))
+
+
+@jit
+def basis_of(law: Any, m: int) -> int:
+    """Address of the basis of an environment."""
+    size = law.n_z * (-(-law.n_s // 8) * 8)
+    address: int = law.bases + 8 * size * read_word(law.index, m)
+    return address
+
+
+@jit
+def reduce(law: Any, states: int, first: int, batch: int) -> None:
+    """s = U^T z of four environments, into the scratch; of the last one again beyond the batch."""
+    n_z, width, s = law.n_z, -(-law.n_s // 8) * 8, law.scratch
+    last = batch - 1
+    m0, m1 = first, min(first + 1, last)
+    m2, m3 = min(first + 2, last), min(first + 3, last)
+    z0, z1 = states + 8 * n_z * m0, states + 8 * n_z * m1
+    z2, z3 = states + 8 * n_z * m2, states + 8 * n_z * m3
+    u0, u1, u2, u3 = basis_of(law, m0), basis_of(law, m1), basis_of(law, m2), basis_of(law, m3)
+    for block in range(0, width, 8):
+        a0, a1, a2, a3 = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
+        k = block
+        for i in range(n_z):
+            a0 = a0 + load(u0, k) * splat(peek(z0, i))
+            a1 = a1 + load(u1, k) * splat(peek(z1, i))
+            a2 = a2 + load(u2, k) * splat(peek(z2, i))
+            a3 = a3 + load(u3, k) * splat(peek(z3, i))
+            k += width
+        store(s, block, a0)
+        store(s, width + block, a1)
+        store(s, 2 * width + block, a2)
+        store(s, 3 * width + block, a3)
+
+
+@jit
+def answer(law: Any, m: int, s: int, action: int) -> None:
+    """The action of an environment whose reduced state is at the address s."""
+    n_s, n_a, pairs = law.n_s, law.n_a, law.pairs
+    width, wide = -(-n_s // 8) * 8, -(-n_a // 8) * 8
+    centre = law.centres + 8 * width * read_word(law.index, m)
+    sums = law.scratch + 8 * 4 * width
+    for block in range(0, wide, 8):
+        a = load(law.constant, m * wide + block)
+        for j in range(n_s):
+            a = a + load(law.feedback, (m * n_s + j) * wide + block) * splat(read(s, j))
+        if pairs > 0:
+            row = m * pairs
+            for i in range(n_s):
+                for j in range(i, n_s):
+                    e_i, e_j = read(s, i) - read(centre, i), read(s, j) - read(centre, j)
+                    a = a + load(law.quadratic, row * wide + block) * splat(e_i * e_j)
+                    row += 1
+        store(sums, block, a)
+    for k in range(n_a):
+        value, limit = read(sums, k), law.limit
+        if limit > 0.0 and value > limit:
+            value = limit
+        elif limit > 0.0 and value < -limit:
+            value = -limit
+        write(action, k, value)
+
+
+@jit
+def act(law: Any, states: int, actions: int, batch: int) -> None:
+    """a = K_a s + K_b s_r + Q (e x e) of every environment, with s = U^T z and e = s - s_r."""
+    width = -(-law.n_s // 8) * 8
+    for first in range(0, batch, 4):
+        reduce(law, states, first, batch)
+        for m in range(first, min(first + 4, batch)):
+            answer(law, m, law.scratch + 8 * width * (m - first), actions + 8 * law.n_a * m)
+
+
+def compile_control(sources: str) -> Any:
+    @kept
+    def control(
+        laws: NDArray[np.void], states: NDArray[np.float64], actions: NDArray[np.float64]
+    ) -> None:
+        """Write the actions (M, n_a) that answer the states (M, n_z)."""
+        sources  # noqa: B018  # closed over to be part of the key on disk
+        act(laws[0], states.ctypes.data, actions.ctypes.data, len(states))
+
+    return control
+
+
+control = compile_control(fingerprint(compiled, simd))
