@@ -242,17 +242,19 @@ class NodeLoop:
             if due is not None:
                 wake = min(wake, due)
             clear()
-            if self._stream is None:
+            stream, self._stream = self._stream, None
+            if stream is not None:
+                add(stream.handle)
+                wait(int((min(wake, now + STREAM) - now) * 1e9))
+                taken = self._take(stream)
+            else:
                 for handle in handles:
                     add(handle)
-            else:
-                add(self._stream.handle)
-                wake, self._stream = min(wake, now + STREAM), None
-            wait(int((wake - now) * 1e9))
-            for pointer in ready("subscription"):
-                handled += take_from[pointer]()
-                if self._poll:
-                    poll_until = clock() + self._poll
+                wait(int((wake - now) * 1e9))
+                taken = sum(take_from[pointer]() for pointer in ready("subscription"))
+            handled += taken
+            if taken and self._poll:
+                poll_until = clock() + self._poll
         return self._stop_reason or "shutdown"
 
     def _sources(self) -> tuple[list[Any], dict[int, Callable[[], int]]]:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import secrets
 import sys
+from collections import deque
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -106,7 +107,8 @@ class TunerNode:
             max_attempts=values["max_attempts"],
             plant=training.plant,
         )
-        self._session = Session(training, dispatcher, self._report)
+        self._news: deque[Mapping[str, Any]] = deque()
+        self._session = Session(training, dispatcher, self._news.append)
         self._health = TunerHealth(self._session, values["iterations"])
         self._pairs = pairs
         self._changed: dict[str, Any] = {}
@@ -122,7 +124,7 @@ class TunerNode:
 
     def run(self) -> int:
         """Train to the end; 0 when done, 130 when interrupted, STOPPED on request."""
-        self._perform(self._session.begin(self._loop.now()))
+        self._guarded(self._session.begin)
         reason = self._loop.run(
             tick=lambda now: None, deadline=lambda: None, housekeeping=self._housekeeping
         )
@@ -232,9 +234,12 @@ class TunerNode:
         except DispatchError as error:
             self._failure = str(error)
             self._loop.stop("failure")
+        finally:
+            self._tell()
 
     def _perform(self, orders: list[Order]) -> None:
         self._send(orders)
+        self._tell()
         if self._recorder:
             self._recorder.keep(now=self._loop.now())
         if self._session.done or self._session.stopped:
@@ -318,6 +323,11 @@ class TunerNode:
                 return
             self._failure = f"{found}stop it, or start this one in another namespace or ROS domain"
             self._loop.stop("failure")
+
+    def _tell(self) -> None:
+        """What has happened, once everybody has been told what to do next, and before it is kept."""
+        while self._news:
+            self._report(self._news.popleft())
 
     def _report(self, row: Mapping[str, Any]) -> None:
         if self._recorder:
