@@ -17,6 +17,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args, try_shutdown
 
 from loop_interfaces.isolation import PROFILE, is_confined, outside_sockets
+from loop_interfaces.memory import release_compiler
 from loop_interfaces.node_loop import NodeLoop
 
 CRASHED = 70
@@ -89,6 +90,7 @@ def node_main(name: str, args: list[str] | None, make: Callable[[Node, NodeLoop]
                         node.get_logger().warning("was suspended; joined the network again")
                 except ValueError as error:
                     raise ConfigurationError(str(error)) from error
+                release_compiler()
                 code = body.run()
                 if not loop.suspended:
                     return code

@@ -102,6 +102,8 @@ class Reflex:
             return None
         values = np.ndarray(self._shape, np.float64, raw, self._values)
         states = lockstep.advance(values, hash(raw[self._values :]), now)
+        if not states.flags.c_contiguous:  # what is measured may be chosen columns
+            states = np.ascontiguousarray(states)
         fill_in(self._plans, lockstep.step, lockstep.time, states)
         return self._message.raw
 
