@@ -49,6 +49,16 @@ class BenchProcess:
         """What the node has logged."""
         return self._log.read_text(errors="replace")
 
+    def processor_times(self) -> dict[str, float]:
+        """Seconds of processor time so far: `own`, of the node's threads, and `middleware` (Linux)."""
+        times = {"own": 0.0, "middleware": 0.0}
+        for thread in Path(f"/proc/{self.process.pid}/task").iterdir():
+            with contextlib.suppress(OSError):  # it has ended meanwhile
+                whose = (thread / "comm").read_text().startswith("dds.")
+                nanoseconds = int((thread / "schedstat").read_text().split()[0])
+                times["middleware" if whose else "own"] += 1e-9 * nanoseconds
+        return times
+
     def end(self) -> None:
         """Ask the node to end, and wait for it."""
         self.process.terminate()

@@ -3,7 +3,8 @@
 Both run all the time, in processes of their own, and take turns of a fraction of a second, so that
 what else the machine does weighs on both alike; the figures are medians over the turns. A round of
 the loop is: state, action, one step of the plant. Its overhead is the round without the solver,
-which is measured in turns as well.
+which is measured in turns as well. The last columns are processor time a round, in µs: of the plant's
+and the controller's own threads, and of the middleware's threads in both.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 from statistics import median
 from typing import Any
 
-from bringup.bench.processes import Bench, bench, machine, markdown
+from bringup.bench.processes import Bench, BenchProcess, bench, machine, markdown
 from bringup.pairs import PAIR
 from bringup.shared_core import SharedCores
 from loop_interfaces.affinity import core_text, free_cores, usable_cores
@@ -68,14 +69,17 @@ def _measure(
             for what, numbers in (("ping", PAYLOAD), ("ping_same", batch * n_z)):
                 got = ping.ask(seconds=seconds, numbers=numbers)
                 note(what, batch, got["seconds"] / got["rounds"])
+            before = _processor_times(pair)
             got = driver.ask(do="episodes", batch=batch, seconds=seconds)
             note("round", batch, got["seconds"] / got["rounds"])
+            for what, used in _processor_times(pair).items():
+                note(what, batch, (used - before[what]) / got["rounds"])
             note(
                 "solver", batch, driver.ask(do="solver", batch=batch, seconds=seconds / 4)["median"]
             )
     rows = []
     for batch in batches:
-        us = {w: 1e6 * median(samples[w, batch]) for w in ("ping", "ping_same", "round", "solver")}
+        us = {what: 1e6 * median(samples[what, batch]) for what, own in samples if own == batch}
         overheads = [
             1e6 * (r - s)
             for r, s in zip(samples["round", batch], samples["solver", batch], strict=True)
@@ -98,9 +102,22 @@ def _measure(
                 "overhead_us": median(overheads),
                 "ratio": ratios["ping"],
                 "ratio_same_payload": ratios["ping_same"],
+                "plant_us": us["plant"],
+                "controller_us": us["controller"],
+                "middleware_us": us["middleware"],
             }
         )
     return rows
+
+
+def _processor_times(pair: tuple[BenchProcess, BenchProcess]) -> dict[str, float]:
+    """Seconds that the two nodes' own threads have used, and those of the middleware in both."""
+    plant, controller = (node.processor_times() for node in pair)
+    return {
+        "plant": plant["own"],
+        "controller": controller["own"],
+        "middleware": plant["middleware"] + controller["middleware"],
+    }
 
 
 def run(turns: int = 7, seconds: float = 0.4, cores: tuple[str, ...] = CORES) -> dict[str, Any]:
@@ -114,6 +131,7 @@ def text(result: dict[str, Any]) -> str:
     head = (
         "cores", "batch", "rounds/s", "round µs", "solver µs", "overhead µs",
         "ping-pong µs", "ratio", "same payload µs", "ratio",
+        "plant", "controller", "middleware",
     )  # fmt: skip
     rows = [
         (
@@ -127,6 +145,9 @@ def text(result: dict[str, Any]) -> str:
             f"{row['ratio']:.2f}",
             f"{row['ping_same_payload_us']:.0f}",
             f"{row['ratio_same_payload']:.2f}",
+            f"{row['plant_us']:.0f}",
+            f"{row['controller_us']:.0f}",
+            f"{row['middleware_us']:.0f}",
         )
         for row in result["rows"]
     ]
