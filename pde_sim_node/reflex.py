@@ -6,6 +6,7 @@ the long way.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,7 @@ PLAN = np.dtype(
         ("message", np.int64),  # address of the header of the message to be sent
     ]
 )
+IDS = ("run", "episode", "step", "plant")
 NONE = -2
 """Number of no episode, nor of a lock-step that does not flow."""
 
@@ -111,7 +113,12 @@ class Reflex:
         """The lock-step was given the action `frame`: from now on take more of its kind."""
         serial, state = self._lockstep.flowing, self._lockstep.last_state
         self._serial = NONE
-        if serial < 0 or state is None or not self._expectation.learn(self._actions, frame):
+        if serial < 0 or state is None:
+            return
+        taken = replace(state, step=state.step - 1)
+        if any(getattr(frame, name) != getattr(taken, name) for name in IDS):
+            return  # somebody else's, or too late: nothing to learn from
+        if not self._expectation.learn(self._actions, frame):
             return
         if self._message.shape != state.values.shape:
             self._message = OwnMessage(self._states, state)

@@ -280,6 +280,28 @@ def test_a_plant_takes_the_long_way_with_everything_else() -> None:
     assert plant.reflex(good, 0.0) is None  # a duplicate of what was taken
     assert plant.lockstep.step == 2
 
+    # Nor does it learn from what was not taken: an action for another plant, another episode or step.
+    state = ArrayCodec(STATE.labels).decode(bytes(first))
+    strangers = (
+        replace(state, plant=PLANT + 1),
+        replace(state, run=RUN + 1),
+        replace(state, episode=2),
+        replace(state, step=1),
+        replace(state, plant=PLANT + 1, values=state.values[:1]),
+    )
+    for stranger in strangers:
+        raw = plant.peer.encode(replace(stranger, values=np.full((len(stranger.values), 4), 0.5)))
+        frame = plant.own.decode(raw)
+        if stranger.step == 1:
+            continue  # to another answer the plant objects, see below
+        assert plant.lockstep.action(frame, 0.0) == []
+        plant.reflex.learn(frame)
+        assert plant.reflex(raw, 0.0) is None
+        assert plant.reflex(plant.action(state), 0.0) is None
+    assert plant.lockstep.step == 2
+    plant.long_way(plant.action(state))
+    assert plant.lockstep.step == 3
+
     # Nothing of an episode is taken for one of the next.
     plant.begin(2, (5, 6))
     late = with_number(good, 8, STEP_AT, 0.0)

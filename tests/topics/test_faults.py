@@ -127,13 +127,14 @@ def test_a_node_that_keeps_dying_is_given_up_with_its_last_words(loop, tmp_path)
 def test_a_second_tuner_is_refused_and_the_first_one_unharmed(loop, tmp_path):
     start_pair(loop)
     out = tmp_path / "run"
-    first = start_tuner(loop, out, iterations=1000)
+    # Long enough to outlast the 6 s after which a second one is refused, on a fast machine, too.
+    first = start_tuner(loop, out, iterations=3000)
     until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
     second = start_tuner(loop, tmp_path / "second", seed=9)
     text = loop.wait(second, 20.0, code=1)
     assert "another tuner publishes /episode/start" in text.strip().splitlines()[-1]
     loop.wait(first, LIMIT)
-    assert_same_training(out, in_process(iterations=1000))
+    assert_same_training(out, in_process(iterations=3000))
     assert iterations_done(tmp_path / "second") == 0
 
 
@@ -324,7 +325,7 @@ def test_a_second_controller_that_answers_otherwise_never_mixes_in(loop, tmp_pat
     """It listens to the loop and so has all the right ids."""
     running = start_pair(loop)
     out = tmp_path / "run"
-    tuner = start_tuner(loop, out, iterations=600, max_attempts=1000)
+    tuner = start_tuner(loop, out, iterations=2000, max_attempts=1000)
     until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
     second = loop.start("-c", SECOND_CONTROLLER, name="second")
     until(
@@ -335,7 +336,7 @@ def test_a_second_controller_that_answers_otherwise_never_mixes_in(loop, tmp_pat
     second.kill()
     text = loop.wait(tuner, LIMIT)
     assert "the plant declared episode" in text
-    assert_same_training(out, in_process(iterations=600))
+    assert_same_training(out, in_process(iterations=2000))
 
 
 SECOND_CONTROLLER = """
