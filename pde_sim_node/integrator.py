@@ -14,7 +14,6 @@ from .fft import is_transform_length, plane_size
 from .kernel import PLAN, all_finite, step
 from .layout import Constants, checked_operator, lay_out
 from .pointwise import pointwise_loop
-from .spectra import kind_of
 from .threads import TEAMWORK, PlanTeam
 
 __all__ = ["Integrator"]
@@ -85,8 +84,6 @@ class Integrator:
         plan["fine"] = constants.add_transform(fine, modes)
         constants.add_grid(plan, n_z)
         spectra = constants.add_spectra
-        plan["linear"] = kind_of(c.e, c.e2, c.q)
-        plan["nonlinear"] = kind_of(c.q * m, c.f1 * m, c.f2 * m, c.f3 * m)
         plan["e"], plan["e2"], plan["q"] = spectra(c.e), spectra(c.e2), spectra(c.q)
         plan["qm"], plan["f1m"] = spectra(c.q * m), spectra(c.f1 * m)
         plan["f2m"], plan["f3m"] = spectra(2 * c.f2 * m), spectra(c.f3 * m)

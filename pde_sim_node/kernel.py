@@ -37,7 +37,6 @@ from .spectra import (
     plus,
     product,
     put,
-    scaled,
     split,
     synthesise,
 )
@@ -70,8 +69,6 @@ PLAN = np.dtype(
         ("f2m", np.int64),  # twice f2
         ("f3m", np.int64),
         ("f", np.int64),  # f1 + 4 f2 + f3
-        ("linear", np.int64),  # kind of e, e2 and q, see `spectra.scaled`
-        ("nonlinear", np.int64),  # kind of those with an m
         ("supports", np.int64),  # their spectra, n_a by modes
         ("target", np.int64),
         ("analysis", np.int64),  # matrices of the coarse transform, n_z by modes
@@ -107,34 +104,33 @@ def integrate(w: int, d: int, plan: Any, c: int, e: int) -> None:
     # Read here, as the compiler cannot know that what is stored below is not the plan.
     m, factors, modes = plan.fine.m, plan.fine.split, plan.modes
     x, next_x, to_b, to_c = plan.x, plan.next, plan.b, plan.c
-    ours, theirs = plan.linear, plan.nonlinear
     e1, e2, qm, f2m = plan.e, plan.e2, plan.qm, plan.f2m
     f1m, f3m, qfs, ffs = plan.f1m, plan.f3m, plan.qf, plan.ff
     z = nonlinear(w, d, plan, c, e)
     for k in range(0, modes, 8):
         g, v, qf = joined(w, z, d, m, factors, k, c, e), get(w, x + k, d), get(w, qfs + k, d)
-        half, qg = plus(scaled(ours, c, e2 + k, e, v), qf), scaled(theirs, c, qm + k, e, g)
+        half, qg = plus(product(c, e2 + k, e, v), qf), product(c, qm + k, e, g)
         a = plus(half, qg)
         put(w, x + k, d, a)
         put(w, to_b + k, d, half)
-        put(w, to_c + k, d, minus(plus(scaled(ours, c, e2 + k, e, a), qf), qg))
-        whole = plus(scaled(ours, c, e1 + k, e, v), get(w, ffs + k, d))
-        put(w, next_x + k, d, plus(whole, scaled(theirs, c, f1m + k, e, g)))
+        put(w, to_c + k, d, minus(plus(product(c, e2 + k, e, a), qf), qg))
+        whole = plus(product(c, e1 + k, e, v), get(w, ffs + k, d))
+        put(w, next_x + k, d, plus(whole, product(c, f1m + k, e, g)))
     z = nonlinear(w, d, plan, c, e)
     for k in range(0, modes, 8):
         g = joined(w, z, d, m, factors, k, c, e)
-        put(w, x + k, d, plus(get(w, to_b + k, d), scaled(theirs, c, qm + k, e, g)))
-        put(w, next_x + k, d, plus(get(w, next_x + k, d), scaled(theirs, c, f2m + k, e, g)))
+        put(w, x + k, d, plus(get(w, to_b + k, d), product(c, qm + k, e, g)))
+        put(w, next_x + k, d, plus(get(w, next_x + k, d), product(c, f2m + k, e, g)))
     z = nonlinear(w, d, plan, c, e)
     for k in range(0, modes, 8):
         g = joined(w, z, d, m, factors, k, c, e)
-        qg = scaled(theirs, c, qm + k, e, g)
+        qg = product(c, qm + k, e, g)
         put(w, x + k, d, plus(get(w, to_c + k, d), plus(qg, qg)))
-        put(w, next_x + k, d, plus(get(w, next_x + k, d), scaled(theirs, c, f2m + k, e, g)))
+        put(w, next_x + k, d, plus(get(w, next_x + k, d), product(c, f2m + k, e, g)))
     z = nonlinear(w, d, plan, c, e)
     for k in range(0, modes, 8):
         g = joined(w, z, d, m, factors, k, c, e)
-        put(w, x + k, d, plus(get(w, next_x + k, d), scaled(theirs, c, f3m + k, e, g)))
+        put(w, x + k, d, plus(get(w, next_x + k, d), product(c, f3m + k, e, g)))
 
 
 @jit

@@ -15,7 +15,6 @@ planes, `c` and `e` those of the constants, and `plan` says what stands where.
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from loop_interfaces.compiled import jit
 from loop_interfaces.simd import backwards, load, read, splat, store, write
@@ -29,28 +28,15 @@ __all__ = [
     "get",
     "inverse",
     "joined",
-    "kind_of",
     "minus",
     "plus",
     "product",
     "put",
-    "scaled",
     "split",
 ]
 
 Complex = Any
 """A pair (real, imaginary) of lanes."""
-
-REAL, IMAGINARY, COMPLEX = range(3)
-"""Kinds of constants."""
-
-
-def kind_of(*constants: NDArray[Any]) -> int:
-    """What all of these are."""
-    if all(not np.imag(values).any() for values in constants):
-        return REAL
-    return COMPLEX if any(np.real(values).any() for values in constants) else IMAGINARY
-
 
 TRANSFORM = np.dtype(
     [
@@ -87,21 +73,6 @@ def minus(a: Complex, b: Complex) -> Complex:
 def product(c: int, at: int, e: int, value: Complex) -> Complex:
     """Constants times a value."""
     return times(load(c, at), load(c, at + e), value[0], value[1])
-
-
-@jit
-def scaled(kind: int, c: int, at: int, e: int, value: Complex) -> Complex:
-    """As `product`, of constants that are all REAL or all IMAGINARY with a third of the work.
-
-    To the bit, but for the sign of a zero: what is left out is a product with 0.
-    """
-    if kind == REAL:
-        r = load(c, at)
-        return r * value[0], r * value[1]
-    if kind == IMAGINARY:
-        i = load(c, at + e)
-        return splat(0.0) - i * value[1], i * value[0]
-    return product(c, at, e, value)
 
 
 @jit
