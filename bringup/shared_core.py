@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import os
 import random
+from collections import deque
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +20,8 @@ from loop_interfaces.affinity import free_cores, helps_solver, usable_cores
 
 PERIOD = 2.0
 """Seconds between two looks at how busy the cores are, on average."""
+START_UP = 1.2
+"""Seconds after its start in which a process is on all cores: the two of a pair start side by side."""
 CROWDED = 0.3
 """Share of a core taken by others, beyond that on the freest one, from which a pair moves there."""
 
@@ -55,15 +58,26 @@ class SharedCores:
         self._cores = usable_cores()
         self._busy = self._total = dict.fromkeys(self._cores, 0)
         self._next = float("-inf")
+        self._starting: deque[tuple[float, int, _Pair]] = deque()
 
-    def place(self, pair: int, name: str, process: int) -> None:
-        """A process of a pair has been started, perhaps in place of one of the same name."""
+    def place(self, pair: int, name: str, process: int, started: float | None = None) -> None:
+        """A process of a pair is there, perhaps in place of one of the same name.
+
+        started: when (monotonic s), if just now: it joins the other one START_UP later.
+        """
         place = self._pairs[pair]
         place.processes[name] = process
-        _move(process, place.core, self._cores)
+        if started is None:
+            _move(process, place.core, self._cores)
+        else:
+            self._starting.append((started + START_UP, process, place))
 
     def look(self, now: float) -> None:
         """Call it often; now: monotonic s."""
+        while self._starting and self._starting[0][0] <= now:
+            _, process, place = self._starting.popleft()
+            if process in place.processes.values():
+                _move(process, place.core, self._cores)
         if now < self._next:
             return
         # At no regular times: two runs that look together would leave for the same core together.

@@ -154,7 +154,7 @@ class Supervisor:
                 preexec_fn=die_with_parent,
             )
         if self.shared is not None and child.pair is not None:
-            self.shared.place(child.pair, child.name, child.process.pid)
+            self.shared.place(child.pair, child.name, child.process.pid, now)
         child.started, child.due = now, None
 
     def _bury(self, child: Child, code: int, now: float) -> None:

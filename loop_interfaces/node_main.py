@@ -79,6 +79,7 @@ def node_main(name: str, args: list[str] | None, make: Callable[[Node, NodeLoop]
     """
     try:
         _refuse_other_words(name, args)
+        release_compiler()  # of what importing it has touched; loading needs little of that
         body: NodeBody | None = None
         while True:
             with ros_node(name, args) as (node, loop):

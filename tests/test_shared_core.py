@@ -43,12 +43,14 @@ def test_processes_share_a_core_and_leave_it_to_who_needs_it(monkeypatch, tmp_pa
     cores = SharedCores(1)
     started = [subprocess.Popen(["sleep", "60"]) for _ in range(2)]
     try:
-        for name, process in zip(PAIR, started, strict=True):
-            cores.place(0, name, process.pid)
+        cores.place(0, PAIR[0], started[0].pid)
         (first,) = os.sched_getaffinity(started[0].pid)
-        assert os.sched_getaffinity(started[1].pid) == {first}
+        cores.place(0, PAIR[1], started[1].pid, started=0.0)  # loads what it needs on all cores
         taken(0.0, set())
-        cores.look(0.0)
+        cores.look(0.9 * shared_core.START_UP)
+        assert os.sched_getaffinity(started[1].pid) == os.sched_getaffinity(0)
+        cores.look(1.1 * shared_core.START_UP)
+        assert os.sched_getaffinity(started[1].pid) == {first}
         taken(1.0, set(os.sched_getaffinity(0)))
         cores.look(10.0)
         assert os.sched_getaffinity(started[0].pid) == {first}  # none is freer

@@ -55,6 +55,9 @@ def run(
             "megabytes": {
                 k: max(r["megabytes"].get(k, 0.0) for r in own) for k in own[0]["megabytes"]
             },
+            "running_megabytes": {
+                k: max(r["running"].get(k, 0.0) for r in own) for k in own[0]["running"]
+            },
             "growth_megabytes": {
                 k: max(r["growth"].get(k, 0.0) for r in own) for k in own[0]["growth"]
             },
@@ -106,6 +109,7 @@ def _train(problem: str, iterations: int, out: Path, words: list[str]) -> dict[s
         "seconds": last - first,
         "startup": first - began,
         "megabytes": {name: max(sizes) for name, sizes in memory.items()},
+        "running": middle,
         "growth": {name: sizes[-1] - middle[name] for name, sizes in memory.items()},
         "policy": _policy(out),
     }
@@ -135,7 +139,10 @@ def _memory(pid: int) -> dict[str, float]:
 
 def text(result: dict[str, Any]) -> str:
     """A table of `result`."""
-    head = ("way", "s without start-up", "ratio", "s to the first model", "MB", "growth MB")
+    head = (
+        "way", "s without start-up", "ratio", "s to the first model",
+        "MB at most", "MB in the middle", "growth MB",
+    )  # fmt: skip
 
     def sizes(values: dict[str, float]) -> str:
         return ", ".join(f"{k.removesuffix('_node')} {v:.0f}" for k, v in values.items())
@@ -147,6 +154,7 @@ def text(result: dict[str, Any]) -> str:
             f"{row['ratio']:.2f}",
             f"{row['startup_seconds']:.2f}",
             sizes(row["megabytes"]),
+            sizes(row["running_megabytes"]),
             sizes(row["growth_megabytes"]),
         )
         for row in result["rows"]
