@@ -80,6 +80,7 @@ class ControllerNode:
 
     def join(self, node: Node, loop: NodeLoop) -> None:
         declare(node, CONTROLLER_PARAMETERS, given_parameters(node))
+        self._reflex.forget()
         self._wire(node, loop)
 
     def _wire(self, node: Node, loop: NodeLoop) -> None:
