@@ -15,12 +15,9 @@ from loop_interfaces import model_rows
 from loop_interfaces.frames import HEADER, ArrayCodec, Frame
 from loop_interfaces.policy_columns import quadratic_columns
 from loop_interfaces.topics import ACTION, COST, STATE, VOID, CostColumn
-from pde_sim_node.build import build_plant
-from pde_sim_node.lockstep import Lockstep
 from pde_sim_node.reflex import Reflex as PlantReflex
-from tests.small import parameters
+from tests.test_lockstep import PLANT, RUN, plant_protocol
 
-RUN, PLANT = 11, 77
 N_Z, N_S, N_A = 37, 5, 3
 RNG = np.random.default_rng(0)
 
@@ -168,19 +165,8 @@ class Plant:
     """A lock-step with its reflex, and one that only goes the long way."""
 
     def __init__(self, **overrides: object) -> None:
-        values = parameters(**overrides)
         self.now = 0.0
-        self.lockstep, self.judge = (
-            Lockstep(
-                build_plant(values),
-                fingerprint=PLANT,
-                sample_time=0.05,
-                action_timeout=0.1,
-                max_repeats=3,
-                run_hold=10.0,
-            )
-            for _ in range(2)
-        )
+        self.lockstep, self.judge = (plant_protocol(**overrides) for _ in range(2))
         self.peer, self.own, self.sent = (
             ArrayCodec(ACTION.labels),
             ArrayCodec(ACTION.labels),
