@@ -21,8 +21,8 @@ from .layout import Constants, aligned
 __all__ = ["TEAMWORK", "PlanTeam", "use_cores"]
 
 POINTS_PER_PIECE = 15_000
-"""Grid points, in all stages, of a piece of work for a thread: about 50 microseconds."""
-WORTHWHILE_PIECES = 7
+"""Grid points, in all stages, of a piece of work for a thread: 30 to 40 microseconds."""
+WORTHWHILE_PIECES = 6
 """Below this many pieces, waking another thread takes longer than it helps."""
 LOOKS = 1_000_000
 """Looks for the end of what other threads have begun before the caller sleeps: longer than a piece."""

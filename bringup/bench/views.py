@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -54,7 +55,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         yield
         for child in children:
             child.send_signal(signal.SIGINT)
-            child.wait()
+            try:
+                child.wait(5.0)
+            except subprocess.TimeoutExpired:  # rclpy.spin now and then sleeps through a signal
+                child.kill()
+                child.wait()
 
     tuner = ("optimizer:=two_point",)  # whose own share of the processor is small
     print(
