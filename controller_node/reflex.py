@@ -20,7 +20,15 @@ from loop_interfaces.compiled import fingerprint, kept
 from loop_interfaces.frames import MAX_ID, ArrayCodec, Frame
 from loop_interfaces.simd import peek, poke, read
 from loop_interfaces.topics import ACTION
-from loop_interfaces.wire import EXPECTED, FIRST, STEP, TIME, Expectation, OwnMessage, is_expected
+from loop_interfaces.wire import (
+    EXPECTED,
+    FIRST,
+    STEP,
+    TIME,
+    Expectation,
+    OwnMessage,
+    expected_header,
+)
 
 __all__ = ["Reflex"]
 
@@ -42,11 +50,10 @@ def compile_answer(sources: str) -> Any:
     def answer(raw: bytes, plans: NDArray[np.void]) -> bool:
         """Fill in the action that answers the message; False, if it is not the one expected."""
         sources  # noqa: B018  # closed over to be part of the key on disk
-        data, plan = np.frombuffer(raw, np.uint8), plans[0]
-        address, expected = data.ctypes.data, plan.expected
-        if not is_expected(address, len(data), expected):
+        plan = plans[0]
+        head = expected_header(raw, plan.expected)
+        if head == 0:
             return False
-        head = address + expected.start
         step = peek(head, STEP)
         if not (0.0 <= step < MAX_ID and step == math.floor(step)):
             return False

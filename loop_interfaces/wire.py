@@ -18,7 +18,7 @@ from loop_interfaces.compiled import jit
 from loop_interfaces.frames import HEADER, ArrayCodec, Frame
 from loop_interfaces.simd import WIDTH, lane_sum, peek, peek_lanes, peek_word, splat
 
-__all__ = ["EXPECTED", "FIRST", "STEP", "TIME", "Expectation", "OwnMessage", "is_expected"]
+__all__ = ["EXPECTED", "FIRST", "STEP", "TIME", "Expectation", "OwnMessage", "expected_header"]
 
 RUN, EPISODE, STEP, TIME, PLANT, FIRST = range(HEADER + 1)
 """Places of the numbers of the header, and of the first value behind it."""
@@ -35,21 +35,22 @@ EXPECTED = np.dtype(
 
 
 @jit
-def is_expected(raw: int, length: int, expected: Any) -> bool:
-    """Whether the bytes at an address are a message of the expected kind, all of it finite."""
-    start, values = expected.start, expected.values
-    if length != start + 8 * (FIRST + values):
-        return False
+def expected_header(message: bytes, expected: Any) -> int:
+    """Address of the header of a message of the expected kind, all of it finite; 0 of any other."""
+    data = np.frombuffer(message, np.uint8)
+    raw, start, values = data.ctypes.data, expected.start, expected.values
+    if len(data) != start + 8 * (FIRST + values):
+        return 0
     for at in range(0, start - 7, 8):
         if peek_word(raw + at, 0) != peek_word(expected.prefix + at, 0):
-            return False
+            return 0
     if peek_word(raw + start - 8, 0) != peek_word(expected.prefix + start - 8, 0):
-        return False
-    head = raw + start
+        return 0
+    head: int = raw + start
     if peek(head, RUN) != expected.run or peek(head, EPISODE) != expected.episode:
-        return False
+        return 0
     if peek(head, PLANT) != expected.plant:
-        return False
+        return 0
     step, time = peek(head, STEP), peek(head, TIME)
     # x - x is 0, and NaN if x is NaN or infinite.
     lanes, last = splat(0.0), values % WIDTH
@@ -59,14 +60,13 @@ def is_expected(raw: int, length: int, expected: Any) -> bool:
     total = lane_sum(lanes) + (step - step) + (time - time)
     for i in range(values - last, values):
         total += peek(head, FIRST + i) - peek(head, FIRST + i)
-    finite: bool = total == 0.0
-    return finite
+    return head if total == 0.0 else 0
 
 
 class Expectation:
     """What is expected, learnt from a message that was decoded.
 
-    expected: the record that `is_expected` wants, filled in by `learn`.
+    expected: the record that `expected_header` wants, filled in by `learn`.
     """
 
     def __init__(self, expected: np.void) -> None:

@@ -24,7 +24,7 @@ from loop_interfaces.wire import (
     TIME,
     Expectation,
     OwnMessage,
-    is_expected,
+    expected_header,
 )
 from pde_sim_node.lockstep import Lockstep
 
@@ -46,12 +46,8 @@ def compile_reflex(sources: str) -> Any:
     def awaited(raw: bytes, plans: NDArray[np.void], step: int) -> bool:
         """Whether the message is the action for a step."""
         sources  # noqa: B018  # closed over to be part of the key on disk
-        data, expected = np.frombuffer(raw, np.uint8), plans[0].expected
-        address = data.ctypes.data
-        if not is_expected(address, len(data), expected):
-            return False
-        answers: bool = peek(address + expected.start, STEP) == step
-        return answers
+        head = expected_header(raw, plans[0].expected)
+        return head != 0 and bool(peek(head, STEP) == step)
 
     @kept
     def fill_in(
