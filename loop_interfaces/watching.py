@@ -27,13 +27,44 @@ from loop_interfaces.topics import ACTION, SAMPLES, SAMPLES_THROTTLED, STATE
 
 SAMPLE_DEPTH = 4000
 """Single states or actions that wait for a reader: most of a second of the fastest loop."""
-BUNDLE_DEPTH = 128
-"""Bundles that wait for a reader: about as long."""
+BUNDLE_DEPTH = 512
+"""Bundles that wait for a reader: seconds of the fastest loop, for a bundle is not repeated."""
 _SINGLES: dict[int, tuple[Any, str]] = {
     STATE_KIND: (Float64MultiArray, STATE.name),
     ACTION_KIND: (Float64MultiArray, ACTION.name),
     CLOCK_KIND: (Clock, "/clock"),
 }
+
+
+class Intake:
+    """Takes serialised messages of one raw subscription, with what the middleware says of each.
+
+    depth: the most that one `take` gives.
+    """
+
+    def __init__(self, subscription: Subscription, message_type: Any, depth: int) -> None:
+        self.subscription = subscription
+        self._take = subscription.handle.take_message
+        self._type, self._depth = message_type, depth
+        self._left: tuple[bytes, dict[str, Any]] | None = None
+
+    def take(self, until: int | None = None) -> Iterator[tuple[bytes, dict[str, Any]]]:
+        """What has come in. until: only what arrived by then (ns since the epoch).
+
+        The first message that arrived later is kept for the next call, which gives it in any case:
+        the clock may have been set back.
+        """
+        left, self._left = self._left, None
+        if left is not None:
+            yield left
+        for _ in range(self._depth):
+            taken = self._take(self._type, True)
+            if taken is None:
+                return
+            if until is not None and taken[1]["received_timestamp"] > until:
+                self._left = taken
+                return
+            yield taken
 
 
 class Watcher:
@@ -57,58 +88,55 @@ class Watcher:
         self._node, self._namespace, self._clock = node, namespace, clock
         self._kinds = (STATE_KIND, ACTION_KIND, *((CLOCK_KIND,) if single_clock else ()))
         self._offset = ClockOffset()
-        self._bundles = self._subscribe(
-            UInt8MultiArray,
-            SAMPLES_THROTTLED if throttled else SAMPLES,
-            samples_qos(BUNDLE_DEPTH),
-        )
-        self._singles: dict[int, Subscription] = {}
+        name = SAMPLES_THROTTLED if throttled else SAMPLES
+        depth = BUNDLE_DEPTH
+        self._bundles = self._subscribe(UInt8MultiArray, name, samples_qos(depth), depth)
+        self._singles: dict[int, Intake] = {}
         self._state_topic = node.resolve_topic_name(scoped(namespace, STATE.name))
-        self.handles: list[Any] = [self._bundles.handle]
+        self.handles: list[Any] = [self._bundles.subscription.handle]
 
     def look(self) -> bool:
         """Look at the graph, and read single samples if they are not bundled; whether that changed."""
-        bundled = self._node.count_publishers(self._bundles.topic_name) > 0
+        bundled = self._node.count_publishers(self._bundles.subscription.topic_name) > 0
         wanted = not bundled and self._node.count_publishers(self._state_topic) > 0
         if wanted == bool(self._singles):
             return False
         if wanted:
-            depth = reader_qos(STATE, SAMPLE_DEPTH)
-            self._singles = {k: self._subscribe(*_SINGLES[k], depth) for k in self._kinds}
+            qos = reader_qos(STATE, SAMPLE_DEPTH)
+            self._singles = {
+                k: self._subscribe(*_SINGLES[k], qos, SAMPLE_DEPTH) for k in self._kinds
+            }
         else:
-            for subscription in self._singles.values():
-                self._node.destroy_subscription(subscription)
+            for intake in self._singles.values():
+                self._node.destroy_subscription(intake.subscription)
             self._singles = {}
-        self.handles = [s.handle for s in (self._bundles, *self._singles.values())]
+        intakes = (self._bundles, *self._singles.values())
+        self.handles = [intake.subscription.handle for intake in intakes]
         return True
 
-    def drain(self) -> Iterator[tuple[int, int, bytes]]:
+    def drain(self, until: int | None = None) -> Iterator[tuple[int, int, bytes]]:
         """Kind, time of arrival (ns since the epoch) and CDR bytes of everything that has come in.
 
-        Raises FrameError, after which it can be called again, for a bundle that is none.
+        until: as of Intake.take. Raises FrameError, after which it can be called again, for a bundle
+        that is none.
         """
-        for _ in range(BUNDLE_DEPTH):
-            taken = self._bundles.handle.take_message(UInt8MultiArray, True)
-            if taken is None:
-                break
-            sent, samples = unpack(taken[0])
-            offset = self._offset.update(sent, taken[1]["received_timestamp"])
+        for bundle, info in self._bundles.take(until):
+            sent, samples = unpack(bundle)
+            offset = self._offset.update(sent, info["received_timestamp"])
             for sample in samples:
                 yield sample.kind, sample.stamp + offset, sample.raw
                 if self._clock and (told := clock_message(sample.time)) is not None:
                     yield CLOCK_KIND, sample.stamp + offset, told
-        for kind, subscription in self._singles.items():
-            for _ in range(SAMPLE_DEPTH):
-                taken = subscription.handle.take_message(_SINGLES[kind][0], True)
-                if taken is None:
-                    break
-                yield kind, taken[1]["received_timestamp"], taken[0]
+        for kind, intake in self._singles.items():
+            for raw, info in intake.take(until):
+                yield kind, info["received_timestamp"], raw
 
     def close(self) -> None:
         """Stop reading; the plant then keeps no samples for this one."""
-        for subscription in (self._bundles, *self._singles.values()):
-            self._node.destroy_subscription(subscription)
+        for intake in (self._bundles, *self._singles.values()):
+            self._node.destroy_subscription(intake.subscription)
         self._singles, self.handles = {}, []
 
-    def _subscribe(self, message_type: Any, name: str, qos: Any) -> Subscription:
-        return raw_subscription(self._node, message_type, scoped(self._namespace, name), qos)
+    def _subscribe(self, message_type: Any, name: str, qos: Any, depth: int) -> Intake:
+        name = scoped(self._namespace, name)
+        return Intake(raw_subscription(self._node, message_type, name, qos), message_type, depth)

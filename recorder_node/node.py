@@ -18,7 +18,6 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.subscription import Subscription
 from std_msgs.msg import Float64MultiArray, String
 
 from loop_interfaces.endpoints import raw_subscription, reader_qos, scoped
@@ -30,7 +29,7 @@ from loop_interfaces.parameters import RECORDER, TUNER
 from loop_interfaces.ros_parameters import declare, given_parameters
 from loop_interfaces.samples import ACTION_KIND, CLOCK_KIND, STATE_KIND
 from loop_interfaces.topics import ACTION, RECORDER_STATUS, START, STATE
-from loop_interfaces.watching import Watcher
+from loop_interfaces.watching import Intake, Watcher
 from recorder_node.bag import BagError
 from recorder_node.health import RecorderHealth
 from recorder_node.peers import Peers
@@ -48,10 +47,11 @@ RECORDING_FAILED = 3
 """Exit code when writing fails later on; 1 is a recording that cannot begin."""
 DRAIN = 0.02
 """Seconds between two batches: often enough for the depth below, seldom enough to cost little."""
-FLUSH = 0.5
+FLUSH = 0.3
 """Seconds of recording that a SIGKILL may lose at the most."""
-DEPTH = 100
-"""Samples a reader of a latched topic keeps: a few an episode, should this process be held up."""
+DEPTH = 1000
+"""Messages of a latched topic that wait here: of seconds of the fastest loop, should this process
+be held up."""
 REPORT = 1.0
 """Seconds between two messages on recorder/status."""
 QUIET = 0.1
@@ -115,9 +115,7 @@ class RecorderNode:
             first = not self._watchers
             watcher = Watcher(node, namespace, clock=told, single_clock=first and told)
             self._watchers.append((watcher, kinds))
-        self._subscriptions = [
-            (source, self._subscribe(source)) for source in self._what if source.channel.latched
-        ]
+        self._intakes = [(s, self._subscribe(s)) for s in self._what if s.channel.latched]
         self._peers = Peers(
             node,
             required=[f"{n}{topic.name}" for n in self._namespaces for topic in (STATE, ACTION)],
@@ -151,9 +149,9 @@ class RecorderNode:
         )
         return 0
 
-    def _subscribe(self, source: Source) -> Subscription:
-        kind = _TYPES[source.channel.type]
-        return raw_subscription(self._node, kind, source.channel.topic, reader_qos(START, DEPTH))
+    def _subscribe(self, source: Source) -> Intake:
+        kind, qos = _TYPES[source.channel.type], reader_qos(START, DEPTH)
+        return Intake(raw_subscription(self._node, kind, source.channel.topic, qos), kind, DEPTH)
 
     def _tick(self, now: float) -> None:
         time.sleep(DRAIN)
@@ -163,22 +161,22 @@ class RecorderNode:
             self._recording.flush(time.time_ns())
 
     def _drain(self) -> int:
-        """Record what has come in, in the order of arrival."""
+        """Record what has come in by now, in the order of arrival.
+
+        Of all topics up to the same moment: what is written next to each other then belongs
+        together, even if this process is held up between two of them and killed after it.
+        """
+        until = time.time_ns()
         taken: list[tuple[int, int, Source, bytes]] = []
         for watcher, by_kind in self._watchers:
             try:
-                for kind, when, raw in watcher.drain():
+                for kind, when, raw in watcher.drain(until):
                     if kind in by_kind:
                         taken.append((when, len(taken), by_kind[kind], raw))
             except FrameError as error:
                 self._log.warning(f"samples: {error}", throttle_duration_sec=1.0)
-        for source, subscription in self._subscriptions:
-            message_type, handle = _TYPES[source.channel.type], subscription.handle
-            for _ in range(DEPTH):
-                got = handle.take_message(message_type, True)
-                if got is None:
-                    break
-                raw, info = got
+        for source, intake in self._intakes:
+            for raw, info in intake.take(until):
                 taken.append((info["received_timestamp"], len(taken), source, raw))
         taken.sort(key=lambda item: item[:2])
         for when, _, source, raw in taken:

@@ -232,6 +232,56 @@ def test_a_killed_recorder_loses_a_second_at_most_and_the_training_goes_on(loop,
     assert verify(target).count == 0
 
 
+def test_a_recorder_that_is_held_up_for_a_second_misses_nothing(loop, tmp_path):
+    hand = Hand(loop, tmp_path / "bag", tmp_path / "run", "start", 400)
+    until(lambda: iterations_done(hand.out) >= 20, LIMIT, "iteration 20")
+    hand.recorder.send_signal(signal.SIGSTOP)
+    before = iterations_done(hand.out)
+    time.sleep(1.0)
+    assert iterations_done(hand.out) > before + 20  # the loop did not wait
+    hand.recorder.send_signal(signal.SIGCONT)
+    loop.wait(hand.tuner, LIMIT)
+    hand.recorder.send_signal(signal.SIGINT)
+    loop.wait(hand.recorder, LIMIT)
+    report = verify(hand.bag)
+    assert (report.count, report.incomplete, report.episodes) == (0, [], 403)
+
+
+INTAKE = """
+import rclpy, time
+from std_msgs.msg import String
+from loop_interfaces.endpoints import raw_subscription
+from loop_interfaces.watching import Intake
+rclpy.init()
+node = rclpy.create_node("intake")
+intake = Intake(raw_subscription(node, String, "words", 50), String, 50)
+publisher = node.create_publisher(String, "words", 50)
+while not publisher.get_subscription_count():
+    time.sleep(0.01)
+
+def tell(*words):
+    for word in words:
+        publisher.publish(String(data=word))
+    time.sleep(0.3)
+
+def taken(until=None):
+    return [bytes(raw)[8:].rstrip(b"\\0").decode() for raw, _ in intake.take(until)]
+
+tell("a", "b")
+moment = time.time_ns()
+tell("c", "d")
+print("until the moment", taken(moment))
+print("again", taken(moment))  # as if the clock had been set back: no message waits for ever
+tell("e")
+print("rest", taken())
+"""
+
+
+def test_what_came_after_a_moment_is_left_for_the_next_time(loop):
+    lines = loop.wait(loop.start("-c", INTAKE, name="intake"), LIMIT).splitlines()
+    assert lines == ["until the moment ['a', 'b']", "again ['c']", "rest ['d', 'e']"]
+
+
 def test_a_training_that_must_be_recorded_stops_when_the_recorder_does(loop, tmp_path):
     hand = Hand(loop, tmp_path / "bag", tmp_path / "run", "required", 100_000)
     until(lambda: iterations_done(hand.out) >= 20, LIMIT, "iteration 20")
