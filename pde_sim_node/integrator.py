@@ -11,7 +11,7 @@ from loop_interfaces.simd import WIDTH, whole_lanes
 from .equations import Equation
 from .etdrk4 import etdrk4_coefficients
 from .fft import is_transform_length, plane_size
-from .kernel import PLAN, all_finite, step
+from .kernel import PLAN, all_finite, environments
 from .layout import Constants, checked_operator, lay_out
 from .pointwise import pointwise_loop
 from .threads import TEAMWORK, PlanTeam
@@ -103,16 +103,17 @@ class Integrator:
             },
         )
 
-        functions = step, all_finite, *TEAMWORK
+        functions = all_finite, *TEAMWORK
         began, misses = time.perf_counter(), cache_misses(*functions)
         self._loop, loop_is_new = pointwise_loop(equation.nonlinearity)
         plan["pointwise"] = self._loop.address
-        self._team = PlanTeam(step, plan, constants, size, points_per_step=8 * steps * fine)
+        code, code_is_new = environments()
+        self._team = PlanTeam(code, plan, constants, size, points_per_step=8 * steps * fine)
 
         states, actions = np.zeros((1, n_z)), np.zeros((1, n_a))
         all_finite(actions)
         self.step(states, actions, np.zeros(1), np.zeros(1, dtype=np.int64), 0)
-        compiled = cache_misses(*functions) > misses or loop_is_new
+        compiled = cache_misses(*functions) > misses or loop_is_new or code_is_new
         self.compiled_in_seconds = time.perf_counter() - began if compiled else 0.0
 
     def step(
@@ -123,7 +124,7 @@ class Integrator:
         diverged_step: NDArray[np.int64],
         k: int,
     ) -> None:
-        """Advance all environments in place, see `kernel.step`; arrays are contiguous and writable."""
+        """Advance all environments in place, see `kernel`; arrays are contiguous and writable."""
         self._team.step(states, actions, totals, diverged_step, k)
 
 

@@ -17,15 +17,17 @@ the multiplier m is contained in the coefficients (names with an m).
 import math
 from typing import Any
 
+import numba
 import numpy as np
+from numba import carray, types  # type: ignore[attr-defined, unused-ignore]
 from numpy.typing import NDArray
 
-from loop_interfaces import compiled, simd
+from loop_interfaces import simd
 from loop_interfaces.compiled import fingerprint, jit, kept
-from loop_interfaces.simd import call, load, read, splat, store, write
+from loop_interfaces.native import MachineCode
+from loop_interfaces.simd import call, load, read, read_word, splat, store, write, write_word
 
-from . import board, fft, spectra
-from .board import claim, next_piece
+from . import fft, spectra
 from .spectra import (
     TRANSFORM,
     analyse,
@@ -41,7 +43,7 @@ from .spectra import (
     synthesise,
 )
 
-__all__ = ["PLAN", "accept", "all_finite", "stage_cost", "step"]
+__all__ = ["PLAN", "accept", "all_finite", "environments", "stage_cost", "step_signature"]
 
 PLAN = np.dtype(
     [
@@ -85,6 +87,12 @@ PLAN = np.dtype(
         ("state", np.int64),
     ]
 )
+
+
+def step_signature(plan: Any) -> Any:
+    """Of the machine code that advances environments: its plan, and seven addresses and numbers."""
+    plans = types.CPointer(numba.from_dtype(plan))  # type: ignore[no-untyped-call]
+    return types.void(plans, *[types.intp] * 7)
 
 
 @jit
@@ -177,52 +185,46 @@ def accept(total: float, state: int, w: int, plan: Any) -> bool:
     return valid
 
 
-def compile_step(sources: str) -> Any:
-    @kept
-    def step(
-        states: NDArray[np.float64],
-        actions: NDArray[np.float64],
-        totals: NDArray[np.float64],
-        diverged_step: NDArray[np.int64],
-        k: int,
-        plans: NDArray[np.void],
-        which: int,
-        at: int,
-        turn: int,
-        pieces: int,
-    ) -> None:
-        """Advance environments in place, with the scratch of plans[which].
+def compile_environments() -> Any:
+    sources = fingerprint(simd, fft, spectra)
 
-        They are in so many pieces; those of the turn on the board that no other thread has are done
-        here, or the one there is without a board.
+    @numba.cfunc(step_signature(PLAN), cache=True)
+    def environments(
+        plans: Any,
+        states: int,
+        actions: int,
+        totals: int,
+        diverged_step: int,
+        first: int,
+        last: int,
+        k: int,
+    ) -> None:
+        """Advance the environments first, ..., last - 1 in place; all but the plan are addresses.
 
         Adds the stage cost to `totals`. An environment whose new state is not within the bound
         keeps its state and gets k in `diverged_step`; one that has an entry there is left alone.
         """
         sources  # noqa: B018  # closed over to be part of the key on disk
-        plan, batch = plans[which], len(totals)
+        plan = carray(plans, 1)[0]
         w, d, c, e = plan.scratch, plan.scratch_apart, plan.constants, plan.constants_apart
-        piece = claim(at, turn, pieces)
-        while piece >= 0:
-            for i in range(batch * piece // pieces, batch * (piece + 1) // pieces):
-                if diverged_step[i] >= 0:
-                    continue
-                state = states.ctypes.data + 8 * plan.n_z * i
-                action = actions.ctypes.data + 8 * plan.n_a * i
-                totals[i] += stage_cost(state, action, w, plan, c)
-                force(action, w, d, plan, c, e)
-                analyse(state, w, d, plan, c, e)
-                for _ in range(plan.steps):
-                    integrate(w, d, plan, c, e)
-                synthesise(w + 8 * plan.state, w, d, plan, c, e)
-                if not accept(totals[i], state, w, plan):
-                    diverged_step[i] = k
-            piece = next_piece(at, turn, pieces)
+        for i in range(first, last):
+            if read_word(diverged_step, i) >= 0:
+                continue
+            state, action = states + 8 * plan.n_z * i, actions + 8 * plan.n_a * i
+            total = read(totals, i) + stage_cost(state, action, w, plan, c)
+            write(totals, i, total)
+            force(action, w, d, plan, c, e)
+            analyse(state, w, d, plan, c, e)
+            for _ in range(plan.steps):
+                integrate(w, d, plan, c, e)
+            synthesise(w + 8 * plan.state, w, d, plan, c, e)
+            if not accept(total, state, w, plan):
+                write_word(diverged_step, i, k)
 
-    return step
+    return environments
 
 
-step = compile_step(fingerprint(compiled, simd, fft, spectra, board))
+environments = MachineCode(compile_environments)
 
 
 @kept

@@ -10,16 +10,17 @@ alone and by the same instructions whatever stands beside it.
 
 from typing import Any
 
+import numba
 import numpy as np
-from numpy.typing import NDArray
+from numba import carray  # type: ignore[attr-defined, unused-ignore]
 
-from loop_interfaces import compiled, simd
-from loop_interfaces.compiled import fingerprint, jit, kept
-from loop_interfaces.simd import read, splat
+from loop_interfaces import simd
+from loop_interfaces.compiled import fingerprint, jit
+from loop_interfaces.native import MachineCode
+from loop_interfaces.simd import read, read_word, splat, write, write_word
 
-from . import board, fft, kernel, spectra
-from .board import claim, next_piece
-from .kernel import accept, stage_cost
+from . import fft, kernel, spectra
+from .kernel import accept, stage_cost, step_signature
 from .spectra import TRANSFORM, analyse, get, plus, product, put, synthesise
 
 __all__ = ["LINEAR_PLAN", "propagate"]
@@ -71,44 +72,41 @@ def advance(component: int, action: int, w: int, d: int, plan: Any, c: int, e: i
         put(w, plan.x + k, d, total)
 
 
-def compile_propagation(sources: str) -> Any:
-    @kept
+def compile_propagation() -> Any:
+    sources = fingerprint(simd, fft, spectra, kernel)
+
+    @numba.cfunc(step_signature(LINEAR_PLAN), cache=True)
     def propagate(
-        states: NDArray[np.float64],
-        actions: NDArray[np.float64],
-        totals: NDArray[np.float64],
-        diverged_step: NDArray[np.int64],
+        plans: Any,
+        states: int,
+        actions: int,
+        totals: int,
+        diverged_step: int,
+        first: int,
+        last: int,
         k: int,
-        plans: NDArray[np.void],
-        which: int,
-        at: int,
-        turn: int,
-        pieces: int,
     ) -> None:
-        """Advance environments as `kernel.step` does."""
+        """Advance environments as those of `kernel`."""
         sources  # noqa: B018  # closed over to be part of the key on disk
-        plan, batch = plans[which], len(totals)
+        plan = carray(plans, 1)[0]
         w, d, c, e = plan.scratch, plan.scratch_apart, plan.constants, plan.constants_apart
-        piece = claim(at, turn, pieces)
-        while piece >= 0:
-            for i in range(batch * piece // pieces, batch * (piece + 1) // pieces):
-                if diverged_step[i] >= 0:
-                    continue
-                state = states.ctypes.data + 8 * plan.n_z * i
-                action = actions.ctypes.data + 8 * plan.n_a * i
-                totals[i] += stage_cost(state, action, w, plan, c)
-                for f in range(plan.components):
-                    analyse(state + 8 * plan.n_x * f, w, d, plan, c, e)
-                    for m in range(0, plan.modes, 8):
-                        put(w, plan.spectra + f * plan.modes + m, d, get(w, plan.x + m, d))
-                for f in range(plan.components):
-                    advance(f, action, w, d, plan, c, e)
-                    synthesise(w + 8 * (plan.state + f * plan.n_x), w, d, plan, c, e)
-                if not accept(totals[i], state, w, plan):
-                    diverged_step[i] = k
-            piece = next_piece(at, turn, pieces)
+        for i in range(first, last):
+            if read_word(diverged_step, i) >= 0:
+                continue
+            state, action = states + 8 * plan.n_z * i, actions + 8 * plan.n_a * i
+            total = read(totals, i) + stage_cost(state, action, w, plan, c)
+            write(totals, i, total)
+            for f in range(plan.components):
+                analyse(state + 8 * plan.n_x * f, w, d, plan, c, e)
+                for m in range(0, plan.modes, 8):
+                    put(w, plan.spectra + f * plan.modes + m, d, get(w, plan.x + m, d))
+            for f in range(plan.components):
+                advance(f, action, w, d, plan, c, e)
+                synthesise(w + 8 * (plan.state + f * plan.n_x), w, d, plan, c, e)
+            if not accept(total, state, w, plan):
+                write_word(diverged_step, i, k)
 
     return propagate
 
 
-propagate = compile_propagation(fingerprint(compiled, simd, fft, spectra, kernel, board))
+propagate = MachineCode(compile_propagation)

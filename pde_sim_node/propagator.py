@@ -131,15 +131,14 @@ class Propagator:
                 "state": whole_lanes(components * n_x),
             },
         )
-        functions = propagate, all_finite, *TEAMWORK
+        functions = all_finite, *TEAMWORK
         began, misses = time.perf_counter(), cache_misses(*functions)
-        self._team = PlanTeam(
-            propagate, plan, constants, size, points_per_step=2 * components * n_x
-        )
+        code, code_is_new = propagate()
+        self._team = PlanTeam(code, plan, constants, size, points_per_step=2 * components * n_x)
         states, actions = np.zeros((1, components * n_x)), np.zeros((1, n_a))
         all_finite(actions)
         self.step(states, actions, np.zeros(1), np.zeros(1, dtype=np.int64), 0)
-        compiled = cache_misses(*functions) > misses
+        compiled = cache_misses(*functions) > misses or code_is_new
         self.compiled_in_seconds = time.perf_counter() - began if compiled else 0.0
 
     def step(
@@ -150,5 +149,5 @@ class Propagator:
         diverged_step: NDArray[np.int64],
         k: int,
     ) -> None:
-        """Advance all environments in place, see `kernel.step`; arrays are contiguous and writable."""
+        """Advance all environments in place, see `kernel`; arrays are contiguous and writable."""
         self._team.step(states, actions, totals, diverged_step, k)

@@ -11,11 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces import native
 from loop_interfaces.affinity import join_solver, usable_cores
 from loop_interfaces.compiled import fingerprint, kept
+from loop_interfaces.native import call_c
 
 from . import board
-from .board import BOARD, MAX_TURN, put_up, wait
+from .board import BOARD, MAX_TURN, claim, next_piece, put_up, wait
 from .layout import Constants, aligned
 
 __all__ = ["TEAMWORK", "PlanTeam", "use_cores"]
@@ -31,13 +33,12 @@ NAP = 50e-6
 
 
 class PlanTeam:
-    """A compiled step with its constants, and with a scratch for each thread.
+    """Machine code that advances environments, with its constants and a scratch for each thread.
 
     Parameters
     ----------
-    step
-        The compiled step: (states, actions, totals, diverged_step, k, plans, which, board, turn,
-        pieces).
+    code
+        Its address, see `kernel.environments`.
     plan
         Its plan; the addresses of constants and scratch are filled in here.
     constants, scratch
@@ -47,9 +48,9 @@ class PlanTeam:
     """
 
     def __init__(
-        self, step: Any, plan: Any, constants: Constants, scratch: int, *, points_per_step: int
+        self, code: int, plan: Any, constants: Constants, scratch: int, *, points_per_step: int
     ) -> None:
-        self._step = step
+        self._code = code
         self._constants = constants.planes()
         plan["constants"] = self._constants.ctypes.data
         plan["constants_apart"] = self._constants.size // 2
@@ -58,6 +59,8 @@ class PlanTeam:
         self._scratch = [aligned(2 * scratch) for _ in range(threads)]
         self._plans = np.repeat(plan, threads)
         self._plans["scratch"] = [area.ctypes.data for area in self._scratch]
+        address, size = self._plans.ctypes.data, self._plans.itemsize
+        self._addresses = [address + thread * size for thread in range(threads)]
         self._points_per_step = points_per_step
         self._board = aligned(BOARD)  # of words as long as a number
         self._turn = 0
@@ -74,18 +77,19 @@ class PlanTeam:
         k: int,
     ) -> None:
         """Advance all environments in place; arrays are contiguous and writable."""
-        batch, plans = len(states), self._plans
-        pieces = min(batch, batch * self._points_per_step // POINTS_PER_PIECE)
+        code, plans = self._code, self._addresses
+        pieces = self.pieces(len(states))
         if pieces < WORTHWHILE_PIECES or len(plans) == 1:
-            self._step(states, actions, totals, diverged_step, k, plans, 0, 0, 0, 1)
+            work_off(code, plans[0], states, actions, totals, diverged_step, k, 0, 0, 1)
             return
         self._turn = turn = (self._turn + 1) % MAX_TURN
         address = self._board.ctypes.data
 
         def help_out(thread: int) -> None:
-            self._step(
-                states, actions, totals, diverged_step, k, plans, thread, address, turn, pieces
-            )
+            work_off(
+                code, plans[thread], states, actions, totals, diverged_step, k,
+                address, turn, pieces,
+            )  # fmt: skip
 
         start(address, turn)
         self._crew.call(help_out, pieces - 1)
@@ -93,6 +97,10 @@ class PlanTeam:
         while not done(address, pieces):
             time.sleep(NAP)
         self._crew.dismiss()
+
+    def pieces(self, batch: int) -> int:
+        """How many pieces of work for a thread a step is."""
+        return min(batch, batch * self._points_per_step // POINTS_PER_PIECE)
 
 
 class Crew:
@@ -152,13 +160,39 @@ def use_cores(cores: Collection[int]) -> None:
     _CREW[:] = [Crew(cores)]
 
 
-def compile_board() -> tuple[Any, Any]:
-    """What the threads call besides the step."""
-    sources = fingerprint(board)
+def compile_board() -> tuple[Any, Any, Any]:
+    """What the threads call."""
+    sources = fingerprint(board, native)
+
+    @kept
+    def work_off(
+        code: int,
+        plan: int,
+        states: NDArray[np.float64],
+        actions: NDArray[np.float64],
+        totals: NDArray[np.float64],
+        diverged_step: NDArray[np.int64],
+        k: int,
+        at: int,
+        turn: int,
+        pieces: int,
+    ) -> None:
+        """Advance the environments of those pieces of the turn on the board that no other thread has;
+        of the one there is without a board.
+        """
+        sources  # noqa: B018  # closed over to be part of the key on disk
+        batch = len(totals)
+        z, a = states.ctypes.data, actions.ctypes.data
+        c, ended = totals.ctypes.data, diverged_step.ctypes.data
+        piece = claim(at, turn, pieces)
+        while piece >= 0:
+            first, last = batch * piece // pieces, batch * (piece + 1) // pieces
+            call_c(code, (plan, z, a, c, ended, first, last, k))
+            piece = next_piece(at, turn, pieces)
 
     @kept
     def start(address: int, turn: int) -> None:
-        sources  # noqa: B018  # closed over to be part of the key on disk
+        sources  # noqa: B018
         put_up(address, turn)
 
     @kept
@@ -166,7 +200,7 @@ def compile_board() -> tuple[Any, Any]:
         sources  # noqa: B018
         return wait(address, pieces, LOOKS)
 
-    return start, done
+    return work_off, start, done
 
 
-TEAMWORK = start, done = compile_board()
+TEAMWORK = work_off, start, done = compile_board()

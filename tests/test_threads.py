@@ -58,15 +58,15 @@ def test_who_comes_late_takes_nothing_of_the_next_step() -> None:
     team = plant._integrator._team
     plant.reset(np.arange(4))
     before = plant.states.copy()
-    board, (start, done) = team._board.ctypes.data, TEAMWORK
+    board, (work_off, start, done) = team._board.ctypes.data, TEAMWORK
     costs, diverged = np.zeros(4), np.full(4, -1)
+    code, plan = team._code, team._addresses[0]
+    what = code, plan, plant.states, np.zeros((4, 6)), costs, diverged, 0
     start(board, 8)
     for turn in (7, 9):
-        team._step(
-            plant.states, np.zeros((4, 6)), costs, diverged, 0, team._plans, 0, board, turn, 4
-        )
+        work_off(*what, board, turn, 4)
     assert np.array_equal(plant.states, before)
-    team._step(plant.states, np.zeros((4, 6)), costs, diverged, 0, team._plans, 0, board, 8, 4)
+    work_off(*what, board, 8, 4)
     assert (plant.states != before).any(axis=1).all()
     assert done(board, 4)
     assert not done(board, 5)
