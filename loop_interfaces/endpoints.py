@@ -7,9 +7,10 @@ on the hot path. The receivers are driven by loop_interfaces.node_loop.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -26,6 +27,9 @@ from loop_interfaces.topics import (
     WRITER_DEPTH,
     Topic,
 )
+
+if TYPE_CHECKING:  # not every node needs the compiler
+    from loop_interfaces.line import Line
 
 KEPT = 16
 """Bundles of samples that their writer keeps for a reader which lost one."""
@@ -158,6 +162,33 @@ class Bundler:
             if self._some.bundle.add(kind, stamp, raw, simulated):
                 self._some.flush()
 
+    def lend(self, records: np.ndarray, room: int) -> None:
+        """Let compiled functions add to both bundles, to be settled afterwards.
+
+        records: two of wire.BUNDLE; room: bytes that they may add when a bundle should be sent.
+        """
+        for record, outlet, wanted in zip(records, self._outlets, self._open, strict=True):
+            record["open"] = wanted
+            if wanted:
+                outlet.bundle.lend(record, room)
+
+    def settle(self, records: np.ndarray, sizes: Sequence[int], count: int) -> None:
+        """They are done, and have added `count` messages of each of the sizes."""
+        for record, outlet, wanted in zip(records, self._outlets, self._open, strict=True):
+            if wanted and outlet.bundle.settle(record):
+                outlet.flush()
+        if self._shown:
+            for size in sizes:
+                self._allowance.use(size, count)
+
+    @property
+    def _outlets(self) -> tuple[_Outlet, _Outlet]:
+        return self._all, self._some
+
+    @property
+    def _open(self) -> tuple[bool, bool]:
+        return self._read, self._shown
+
     def flush(self) -> None:
         """Publish what has been kept."""
         self._all.flush()
@@ -202,11 +233,19 @@ class Sender:
             bundler.add(STATE_KIND, bytes(raw), time if bundler.timed else NO_TIME)
 
 
+Flow = Callable[["Line", int, int], tuple[int, int]]
+"""Deals with messages as they come in on a line, so many, the next within so many ns; how many it
+were, and why it ends."""
+MORE, QUIET, OTHER, UNABLE = range(4)
+"""Why a flow ends: it has done enough for once, nothing came in for long, something came that is not
+its business (`Line.message`), or there is nothing that it could deal with."""
+
+
 class Receiver:
     """Takes frames from one topic and hands them to a callback, and their bytes to the bundler.
 
     codec: decodes them; swift: is asked first, with the bytes alone, and returns whether it has dealt
-    with them.
+    with them; flow: deals with many of them by itself, on the line (NodeLoop.stream).
     """
 
     def __init__(
@@ -220,6 +259,8 @@ class Receiver:
         self.callback = callback
         self.bundler = bundler
         self.swift: Callable[[bytes], bool] | None = None
+        self.flow: Flow | None = None
+        self.line: Line | None = None
         self.codec = ArrayCodec(topic.labels)
         self.decode = self.codec.decode
         self.subscription = raw_subscription(

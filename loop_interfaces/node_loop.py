@@ -1,7 +1,8 @@
 """The event loop of a node: raw array topics on a WaitSet, everything else on an executor.
 
 The hot path takes serialised bytes from the middleware, decodes them with one `frombuffer`, and
-publishes bytes; it is driven by a WaitSet of the node's array subscriptions alone. Parameter
+publishes bytes; it is driven by a WaitSet of the node's array subscriptions alone. Within an episode
+compiled functions do that for many messages in a row (`stream`). Parameter
 services, timers and whatever else the node has are served by an ordinary executor now and then
 (`HOUSEKEEPING`), off the critical path. Array subscriptions sit in a callback group that the
 executor never runs, so both can share one node and ROS tools see one node.
@@ -22,7 +23,17 @@ from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 
 from loop_interfaces.affinity import pin_process
-from loop_interfaces.endpoints import Bundler, Receiver, Sender, reader_qos, scoped
+from loop_interfaces.endpoints import (
+    MORE,
+    OTHER,
+    UNABLE,
+    Bundler,
+    Flow,
+    Receiver,
+    Sender,
+    reader_qos,
+    scoped,
+)
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.health import Health
 from loop_interfaces.introspection import Introspection
@@ -43,6 +54,8 @@ than a round of a fast plant, shorter than what anyone would notice."""
 STREAM = 0.002
 """Seconds without a message after which a stream of them has ended. Until then nothing else is
 waited for: every further subscription in a WaitSet costs, and within an episode nothing comes there."""
+ROUNDS = 50
+"""Messages of a stream that compiled functions deal with before the node looks around."""
 SUSPENDED = 2.0
 """Seconds without being scheduled after which a process takes its peers to have dropped it.
 
@@ -110,6 +123,20 @@ class NodeLoop:
         receiver = Receiver(self.node, topic, callback, namespace, bundler)
         self._receivers.append(receiver)
         return receiver
+
+    def stream(self, receiver: Receiver, sender: Sender, flow: Flow) -> None:
+        """Let `flow` deal with the messages of `receiver` while they stream in; it answers on `sender`.
+
+        Where rcl is not to be had, `receiver.swift` goes on alone.
+        """
+        from loop_interfaces.line import Line  # not every node needs the compiler
+
+        try:
+            line = Line(self.node, receiver.handle, sender.publisher.handle, poll=self._poll)
+        except (OSError, AttributeError) as error:
+            self.node.get_logger().warning(f"the loop is slower than it could be: {error}")
+            return
+        receiver.line, receiver.flow = line, flow
 
     def observe(self, topic: Topic, callback: Callable[[Frame], None], namespace: str = "") -> None:
         """Call `callback` with every state or action, without taking part in the loop.
@@ -231,8 +258,13 @@ class NodeLoop:
             if due is not None and now >= due:
                 tick(now)
                 continue
+            stream, self._stream = self._stream, None
+            if stream is not None and (dealt_with := self._flow(stream)) is not None:
+                handled += dealt_with
+                continue
             if now < poll_until:
-                for receiver in (self._stream,) if self._stream else receivers:
+                self._stream = stream
+                for receiver in (stream,) if stream else receivers:
                     if self._take(receiver):
                         handled += 1
                         poll_until = clock() + self._poll
@@ -242,7 +274,6 @@ class NodeLoop:
             if due is not None:
                 wake = min(wake, due)
             clear()
-            stream, self._stream = self._stream, None
             if stream is not None:
                 add(stream.handle)
                 wait(int((min(wake, now + STREAM) - now) * 1e9))
@@ -270,20 +301,35 @@ class NodeLoop:
         handles = [handle for handle, _ in found.values()]
         return handles, {pointer: take for pointer, (_, take) in found.items()}
 
+    def _flow(self, stream: Receiver) -> int | None:
+        """Let a stream flow: how many messages that were; None where it cannot."""
+        if stream.line is None or stream.flow is None:
+            return None
+        count, ended = stream.flow(stream.line, ROUNDS, int(STREAM * 1e9))
+        if ended == UNABLE:
+            return None
+        if ended == MORE:
+            self._stream = stream
+        elif ended == OTHER:
+            count += self._handle(stream, stream.line.message())
+        return count
+
     def _take(self, receiver: Receiver) -> int:
         """Handle the next message of `receiver`; how many there were."""
         taken = receiver.take(Float64MultiArray, True)
-        if taken is None:
-            return 0
+        return 0 if taken is None else self._handle(receiver, taken[0])
+
+    def _handle(self, receiver: Receiver, raw: bytes) -> int:
+        """Handle a message of `receiver`; 1."""
         bundler = receiver.bundler
         if bundler is not None and bundler.wanted:
-            bundler.add(ACTION_KIND, taken[0])
-        if receiver.swift is not None and receiver.swift(taken[0]):
+            bundler.add(ACTION_KIND, raw)
+        if receiver.swift is not None and receiver.swift(raw):
             self._stream = receiver
             return 1
         self._stream = None
         try:
-            receiver.callback(receiver.decode(taken[0]))
+            receiver.callback(receiver.decode(raw))
         except ValueError as error:
             self._refuse(receiver.name, error)
         return 1

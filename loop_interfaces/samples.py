@@ -21,6 +21,8 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import numpy as np
+
 from loop_interfaces.frames import FrameError
 
 STATE_KIND, ACTION_KIND = 0, 1
@@ -41,6 +43,8 @@ _MESSAGE = struct.Struct("<4sIIIQ")
 """CDR of an UInt8MultiArray without dims up to its data, and the first eight bytes of those."""
 _ENCODING = b"\x00\x01\x00\x00"
 _SAMPLE = struct.Struct("<IIQd")
+SAMPLE_HEADER = _SAMPLE.size
+"""Bytes in front of a sample's own."""
 _CLOCK = struct.Struct("<BBHiI")
 """CDR of a rosgraph_msgs/Clock."""
 _TYPICAL_OFFSET = 100_000_000
@@ -64,32 +68,49 @@ class Allowance:
         self._when = now
         return self._left >= 0.0
 
-    def use(self, size: int) -> None:
-        """A sample of `size` bytes was shown."""
-        self._left -= max(1.0, size / COUNTED)
+    def use(self, size: int, count: int = 1) -> None:
+        """Samples of `size` bytes were shown."""
+        self._left -= count * max(1.0, size / COUNTED)
 
 
 class Bundle:
-    """Collects samples. `add` is on the hot path: an append and an addition."""
+    """Collects samples, one behind the other, as they will be sent."""
 
     def __init__(self) -> None:
-        self._samples: list[tuple[int, int, bytes, float]] = []
+        self._memory = bytearray(_MESSAGE.size)
         self.size = 0
 
     def add(self, kind: int, stamp: int, raw: bytes, time: float) -> bool:
         """Keep a serialised message; whether the bundle should be sent now."""
-        self._samples.append((kind, stamp, raw, time))
-        self.size += _SAMPLE.size + len(raw)
+        at = _MESSAGE.size + self.size
+        self._make_room(SAMPLE_HEADER + len(raw))
+        _SAMPLE.pack_into(self._memory, at, kind, len(raw), stamp, time)
+        self._memory[at + SAMPLE_HEADER : at + SAMPLE_HEADER + len(raw)] = raw
+        self.size += SAMPLE_HEADER + len(raw)
+        return self.size >= LIMIT
+
+    def lend(self, record: np.void, room: int) -> None:
+        """Let compiled functions append, at most `room` bytes beyond the limit; then `settle`."""
+        self._make_room(max(LIMIT - self.size, 0) + room)
+        begin = np.frombuffer(self._memory, np.uint8).ctypes.data + _MESSAGE.size
+        record["end"], record["limit"] = begin + self.size, begin + LIMIT
+
+    def settle(self, record: np.void) -> bool:
+        """They are done; whether the bundle should be sent now."""
+        self.size = int(record["end"] - record["limit"]) + LIMIT
         return self.size >= LIMIT
 
     def take(self, sent: int) -> bytes:
         """CDR bytes of the message that holds them all; the bundle is empty afterwards."""
-        parts = [_MESSAGE.pack(_ENCODING, 0, 0, 8 + self.size, sent)]
-        for kind, stamp, raw, time in self._samples:
-            parts += _SAMPLE.pack(kind, len(raw), stamp, time), raw
-        self._samples.clear()
+        _MESSAGE.pack_into(self._memory, 0, _ENCODING, 0, 0, 8 + self.size, sent)
+        whole = bytes(memoryview(self._memory)[: _MESSAGE.size + self.size])
         self.size = 0
-        return b"".join(parts)
+        return whole
+
+    def _make_room(self, more: int) -> None:
+        lacking = _MESSAGE.size + self.size + more - len(self._memory)
+        if lacking > 0:
+            self._memory += bytes(lacking + len(self._memory) // 2)
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,6 +31,7 @@ __all__ = [
     "peek_word",
     "poke",
     "poke_lanes",
+    "poke_word",
     "read",
     "read_word",
     "splat",
@@ -118,7 +119,7 @@ read_word, write_word = reader(WORD, types.int64, 8), writer(WORD, types.int64, 
 # In a message numbers begin on a multiple of four bytes only.
 peek, poke = reader(NUMBER, types.float64, 1), writer(NUMBER, types.float64, 1)
 peek_lanes, poke_lanes = reader(VECTOR, lanes, 1), writer(VECTOR, lanes, 1)
-peek_word = reader(WORD, types.int64, 1)
+peek_word, poke_word = reader(WORD, types.int64, 1), writer(WORD, types.int64, 1)
 
 
 @intrinsic

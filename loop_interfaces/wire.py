@@ -16,9 +16,29 @@ from numpy.typing import NDArray
 
 from loop_interfaces.compiled import jit
 from loop_interfaces.frames import HEADER, ArrayCodec, Frame
-from loop_interfaces.simd import WIDTH, lane_sum, peek, peek_lanes, peek_word, splat
+from loop_interfaces.samples import SAMPLE_HEADER
+from loop_interfaces.simd import (
+    WIDTH,
+    lane_sum,
+    peek,
+    peek_lanes,
+    peek_word,
+    poke,
+    poke_word,
+    splat,
+)
 
-__all__ = ["EXPECTED", "FIRST", "STEP", "TIME", "Expectation", "OwnMessage", "expected_header"]
+__all__ = [
+    "BUNDLE",
+    "EXPECTED",
+    "FIRST",
+    "STEP",
+    "TIME",
+    "Expectation",
+    "OwnMessage",
+    "append",
+    "expected_header",
+]
 
 RUN, EPISODE, STEP, TIME, PLANT, FIRST = range(HEADER + 1)
 """Places of the numbers of the header, and of the first value behind it."""
@@ -35,18 +55,20 @@ EXPECTED = np.dtype(
 
 
 @jit
-def expected_header(message: bytes, expected: Any) -> int:
-    """Address of the header of a message of the expected kind, all of it finite; 0 of any other."""
-    data = np.frombuffer(message, np.uint8)
-    raw, start, values = data.ctypes.data, expected.start, expected.values
-    if len(data) != start + 8 * (FIRST + values):
+def expected_header(raw: int, length: int, expected: Any) -> int:
+    """Address of the header of a message of the expected kind, all of it finite; 0 of any other.
+
+    raw, length: where the message is.
+    """
+    start, values = expected.start, expected.values
+    if length != start + 8 * (FIRST + values):
         return 0
     for at in range(0, start - 7, 8):
         if peek_word(raw + at, 0) != peek_word(expected.prefix + at, 0):
             return 0
     if peek_word(raw + start - 8, 0) != peek_word(expected.prefix + start - 8, 0):
         return 0
-    head: int = raw + start
+    head = raw + start
     if peek(head, RUN) != expected.run or peek(head, EPISODE) != expected.episode:
         return 0
     if peek(head, PLANT) != expected.plant:
@@ -61,6 +83,34 @@ def expected_header(message: bytes, expected: Any) -> int:
     for i in range(values - last, values):
         total += peek(head, FIRST + i) - peek(head, FIRST + i)
     return head if total == 0.0 else 0
+
+
+BUNDLE = np.dtype(
+    [
+        ("end", np.int64),  # address behind the last sample
+        ("limit", np.int64),  # the address from which on the bundle should be sent
+        ("open", np.int64),  # whether it takes samples
+    ]
+)
+"""A bundle (samples.Bundle) inside compiled functions."""
+
+
+@jit
+def append(bundle: Any, kind: int, stamp: int, time: float, raw: int, length: int) -> None:
+    """Keep the serialised message at an address, if the bundle is open; there must be room."""
+    if not bundle.open:
+        return
+    at = bundle.end
+    poke_word(at, 0, kind | (length << 32))
+    poke_word(at, 1, stamp)
+    poke(at, 2, time)
+    at += SAMPLE_HEADER
+    whole = length // 8
+    for i in range(whole):
+        poke_word(at, i, peek_word(raw, i))
+    if length > 8 * whole:  # bytes up to the last one, some of them again
+        poke_word(at + length - 8, 0, peek_word(raw + length - 8, 0))
+    bundle.end = at + length
 
 
 class Expectation:
@@ -90,14 +140,15 @@ class Expectation:
 class OwnMessage:
     """A message in memory of its own, to be filled in by compiled code and sent again and again.
 
-    raw: its bytes; address: of its header.
+    raw: its bytes; begin: their address; address: of its header.
     """
 
     def __init__(self, codec: ArrayCodec, frame: Frame) -> None:
         self.raw = bytearray(codec.encode(frame))
         start = len(self.raw) - 8 * (HEADER + math.prod(frame.values.shape))
         self._held = np.frombuffer(self.raw, np.uint8)
-        self.address = self._held.ctypes.data + start
+        self.begin = self._held.ctypes.data
+        self.address = self.begin + start
         self._start, self.shape = start, frame.values.shape
 
     def address_to(self, frame: Frame) -> None:

@@ -127,6 +127,10 @@ class Integrator:
         """Advance all environments in place, see `kernel`; arrays are contiguous and writable."""
         self._team.step(states, actions, totals, diverged_step, k)
 
+    def lone(self, batch: int) -> tuple[int, int] | None:
+        """Addresses of code and plan that do a step of a batch alone; None where helpers are better."""
+        return self._team.lone(batch)
+
 
 def fine_length(n_z: int) -> int:
     """Complex length, half the points, of the dealiased grid."""

@@ -34,7 +34,7 @@ from loop_interfaces.topics import (
     noise_seeds,
 )
 from pde_sim_node.pace import Pace
-from pde_sim_node.plant import Plant
+from pde_sim_node.plant import Machine, Plant
 
 PAUSED_REPORT = 1.0
 """Seconds between two messages on `episode/paused` while the plant is paused."""
@@ -135,6 +135,11 @@ class Lockstep:
     def _reply(self) -> Send | None:
         """What is to be sent again: the state that is not answered, or the cost."""
         return self._stamped(STATE, self._state) if self._active else self._cost
+
+    @property
+    def sample_time(self) -> float:
+        """Simulated time of a step in s."""
+        return self._sample_time
 
     @property
     def step(self) -> int:
@@ -326,6 +331,27 @@ class Lockstep:
         self._repeats = 0
         self._deadline = now + self._action_timeout
         return self._state
+
+    @property
+    def machine(self) -> Machine | None:
+        """What it takes to advance in compiled functions while it is `flowing`; then `credit`."""
+        return self._plant.machine
+
+    def credit(self, actions: np.ndarray, time: float, now: float) -> None:
+        """So many actions, one in each row, were applied by the `machine`, the last one right now.
+
+        time: simulated time in s, which has gone on with every one.
+        """
+        plant, count = self._plant, len(actions)
+        plant.credit(count)
+        self._tuner_heard = now
+        self._taken += [hash(action.tobytes()) for action in actions]
+        self._state = plant.states
+        self.steps_total += count * plant.batch
+        self.rounds_total += count
+        self.time = time
+        self._repeats = 0
+        self._deadline = now + self._action_timeout
 
     def tick(self, now: float) -> list[Send]:
         """Send the state again when its answer is overdue; give the episode up after max_repeats.

@@ -17,9 +17,11 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
 from loop_interfaces.affinity import core_list
+from loop_interfaces.endpoints import UNABLE
 from loop_interfaces.frames import Frame
 from loop_interfaces.introspection import offer
 from loop_interfaces.isolation import keep_on_this_machine
+from loop_interfaces.line import Line
 from loop_interfaces.node_loop import NodeLoop
 from loop_interfaces.node_main import node_main
 from loop_interfaces.parameters import EXECUTION, PLANT, PROBLEM
@@ -117,6 +119,7 @@ class PlantNode:
         actions = loop.receive(ACTION, self._on_action, bundled=True)
         actions.swift = self._swiftly
         self._reflex = Reflex(self._lockstep, actions.codec)
+        loop.stream(actions, self._senders[STATE], self._flow)
         loop.diagnose("lock-step", self._health.report)
         offer(node, "~/pause", self._pause)
         offer(node, "~/resume", self._resume)
@@ -169,6 +172,11 @@ class PlantNode:
         if self._clock_wanted:
             self._tell_time(self._lockstep.time)
         return True
+
+    def _flow(self, line: Line, rounds: int, patience: int) -> tuple[int, int]:
+        if self._clock_wanted:
+            return 0, UNABLE
+        return self._reflex.flow(self._bundler, line, rounds, patience)
 
     def _on_action(self, frame: Frame) -> None:
         self._send(self._lockstep.action(frame, self._loop.now()))

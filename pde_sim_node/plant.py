@@ -3,6 +3,7 @@
 import math
 import operator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,7 +14,7 @@ from .kernel import all_finite
 from .propagator import Propagator
 from .supports import indicator_supports
 
-__all__ = ["DIVERGED_COST", "MEAN_FIELD", "EpisodeCosts", "Plant"]
+__all__ = ["DIVERGED_COST", "MEAN_FIELD", "EpisodeCosts", "Machine", "Plant"]
 
 DIVERGED_COST = 1e9
 """Mean stage cost of an environment that diverged: very bad, and finite."""
@@ -38,6 +39,17 @@ class EpisodeCosts:
     mean: NDArray[np.float64]
     total: NDArray[np.float64]
     diverged_step: NDArray[np.int64]
+
+
+class Machine(NamedTuple):
+    """A step in machine code, as addresses: see `kernel.environments` for what it is called with."""
+
+    code: int
+    plan: int
+    states: int
+    actions: int
+    totals: int
+    diverged_step: int
 
 
 class Plant:
@@ -244,6 +256,23 @@ class Plant:
         self._actions[:] = actions
         if not all_finite(self._actions):
             raise ValueError("actions must be finite, got NaN or infinity")
+
+    @property
+    def machine(self) -> Machine | None:
+        """What it takes to do `step` in compiled functions, until the next `reset`; tell it afterwards
+        with `credit`. None where a step is more than that, or better done by several threads.
+        """
+        if type(self).step is not Plant.step:
+            return None
+        code = self._integrator.lone(self.batch)
+        if code is None:
+            return None
+        arrays = self.states, self._actions, self._total, self._diverged_step
+        return Machine(*code, *(array.ctypes.data for array in arrays))
+
+    def credit(self, steps: int) -> None:
+        """So many steps were done by the `machine`."""
+        self.step_index += steps
 
     def evaluate(
         self, states: NDArray[np.float64], actions: NDArray[np.float64]

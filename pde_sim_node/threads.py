@@ -26,6 +26,9 @@ POINTS_PER_PIECE = 15_000
 """Grid points, in all stages, of a piece of work for a thread: 30 to 40 microseconds."""
 WORTHWHILE_PIECES = 6
 """Below this many pieces, waking another thread takes longer than it helps."""
+LONE_PIECES = 7
+"""Up to this many pieces of a step a thread does best that has everything else to do, too: with
+helpers the interpreter is between two steps."""
 LOOKS = 1_000_000
 """Looks for the end of what other threads have begun before the caller sleeps: longer than a piece."""
 NAP = 50e-6
@@ -97,6 +100,12 @@ class PlanTeam:
         while not done(address, pieces):
             time.sleep(NAP)
         self._crew.dismiss()
+
+    def lone(self, batch: int) -> tuple[int, int] | None:
+        """Addresses of code and plan that do a step of a batch alone; None where helpers are better."""
+        if self.pieces(batch) > LONE_PIECES and len(self._addresses) > 1:
+            return None
+        return self._code, self._addresses[0]
 
     def pieces(self, batch: int) -> int:
         """How many pieces of work for a thread a step is."""

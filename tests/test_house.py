@@ -14,6 +14,7 @@ NODES = ("pde_sim_node", "controller_node", "tuner_node", "recorder_node", "view
 WITH_ROS = {
     "node.py",
     "node_loop.py",
+    "line.py",
     "watching.py",
     "looking.py",
     "peers.py",
