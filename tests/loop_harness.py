@@ -86,14 +86,13 @@ class Processes:
 
     def left_behind(self) -> list[int]:
         """Processes of this test that still run, also those its children started."""
-        mark = f"ROS_LOG_DIR={self.environment['ROS_LOG_DIR']}".encode()
         inside = f"ROS_LOG_DIR={self.folder}".encode()
         found = []
         for entry in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):
                 environment = (entry / "environ").read_bytes()
                 zombie = (entry / "stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
-                if (mark in environment or inside in environment) and not zombie:
+                if inside in environment and not zombie:
                     found.append(int(entry.name))
         return found
 

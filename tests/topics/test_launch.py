@@ -57,7 +57,8 @@ def installed(loop: Processes, compiled: Workspace) -> Processes:
     """Processes that run the installed code, not the sources."""
     path = compiled.environment["PYTHONPATH"]
     given = os.environ.get("PYTHONPATH", "")  # where launch may come from
-    loop.environment |= compiled.environment | {"PYTHONPATH": f"{path}{os.pathsep}{given}"}
+    own = {"ROS_LOG_DIR": loop.environment["ROS_LOG_DIR"]}  # whose processes these are
+    loop.environment |= compiled.environment | own | {"PYTHONPATH": f"{path}{os.pathsep}{given}"}
     return loop
 
 
