@@ -195,14 +195,14 @@ class PlantNode:
         for send in sends:
             if send.topic is STATE and send.frame.step == 0:
                 self._bundler.begin(self._loop.now())
-            elif send.topic is COST:
-                self._bundler.flush()  # who waits for the cost has the episode by then
-                if self._lockstep.contradiction:
-                    self._node.get_logger().error(
-                        f"episode is void: {self._lockstep.contradiction}",
-                        throttle_duration_sec=1.0,
-                    )
+            elif send.topic is COST and self._lockstep.contradiction:
+                self._node.get_logger().error(
+                    f"episode is void: {self._lockstep.contradiction}",
+                    throttle_duration_sec=1.0,
+                )
             self._senders[send.topic].send(send.frame)
+            if send.topic is COST:
+                self._bundler.flush()  # after it: most who wait for the cost need no samples
             if self._clock_wanted and send.topic is STATE:
                 self._tell_time(send.frame.time)
 

@@ -91,6 +91,34 @@ def test_answers_of_other_runs_episodes_and_shapes_change_nothing():
     assert sum(served.tally.values()) == 2
 
 
+@pytest.mark.parametrize("cost_first", [True, False])
+def test_trajectories_are_complete_with_the_last_sample_or_the_cost(cost_first):
+    served = dispatcher()
+    ((_, start),) = starts(served.assign(replace(batch(2), trajectories=True), 0.0))
+    cost = costs_of(start)
+    served.target(0, Frame(0, 0, 0, 0.0, np.zeros(3)), 0.0)
+
+    def samples() -> list[bool]:
+        told = []
+        for k in range(cost.step + 1):
+            told.append(served.state(0, replace(start, step=k, values=np.full((2, 3), k))))
+            if k < cost.step:
+                told.append(served.action(0, replace(start, step=k, values=np.zeros((2, 2)))))
+        return told
+
+    if cost_first:
+        served.cost(0, cost, 0.0)
+        assert served.result() is None
+        assert samples() == [False] * 2 * cost.step + [True]
+        served.tick(0.0)
+    else:
+        assert not any(samples())
+        served.cost(0, cost, 0.0)
+    result = served.result()
+    assert result is not None and result.trajectories is not None
+    assert [t.states[:, 0].tolist() for t in result.trajectories] == [list(range(31))] * 2
+
+
 def test_two_different_costs_of_one_episode_end_the_run():
     served = dispatcher()
     ((_, first),) = starts(served.assign(batch(1), 0.0))

@@ -218,15 +218,18 @@ class Dispatcher:
             self._targets[frame.plant] = frame.values.copy()
         return []
 
-    def state(self, pair: int, frame: Frame, now: float) -> list[Order]:
-        """Take a sample z_k of a pair's episode."""
-        self.pairs[pair].observer.state(frame)
-        return []
+    def state(self, pair: int, frame: Frame) -> bool:
+        """Take a sample z_k of a pair's episode; whether it is the last one, and the cost is there:
+        then `tick`, they come in their order.
+        """
+        known = self.pairs[pair]
+        known.observer.state(frame)
+        return known.held is not None and frame.step == known.held.step
 
-    def action(self, pair: int, frame: Frame, now: float) -> list[Order]:
-        """Take a sample a_k of a pair's episode."""
+    def action(self, pair: int, frame: Frame) -> bool:
+        """Take a sample a_k of a pair's episode; never the last one."""
         self.pairs[pair].observer.action(frame)
-        return []
+        return False
 
     def model(self, pair: int, frame: Frame, now: float) -> list[Order]:
         """Take the reduced models of an exploratory episode."""

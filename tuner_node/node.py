@@ -166,8 +166,12 @@ class TunerNode:
             if session.training.settings.trajectories:
                 # Before the costs: what has come in with one is then taken before it.
                 loop.receive(TARGET, self._handler(session.target, number), namespace)
-                loop.observe(STATE, partial(self._observe, session.state, number), namespace)
-                loop.observe(ACTION, partial(self._observe, session.action, number), namespace)
+                loop.observe(
+                    STATE, partial(self._observe, session.dispatcher.state, number), namespace
+                )
+                loop.observe(
+                    ACTION, partial(self._observe, session.dispatcher.action, number), namespace
+                )
             cost = loop.receive(COST, self._handler(session.cost, number), namespace)
             model = loop.receive(MODEL_IDENTIFIED, self._handler(session.model, number), namespace)
             self._cost_topics.append(cost.name)
@@ -210,10 +214,9 @@ class TunerNode:
         for name, value in values.items():
             setattr(self._session.dispatcher, name, value)
 
-    def _observe(
-        self, take: Callable[[int, Frame, float], list[Order]], pair: int, frame: Frame
-    ) -> None:
-        take(pair, frame, self._loop.now())
+    def _observe(self, take: Callable[[int, Frame], bool], pair: int, frame: Frame) -> None:
+        if take(pair, frame):
+            self._guarded(self._session.tick)
 
     def _handler(
         self, handle: Callable[[int, Frame, float], list[Order]], pair: int

@@ -80,12 +80,6 @@ class Session:
     def target(self, pair: int, frame: Frame, now: float) -> list[Order]:
         return self.dispatcher.target(pair, frame, now)
 
-    def state(self, pair: int, frame: Frame, now: float) -> list[Order]:
-        return self.dispatcher.state(pair, frame, now)
-
-    def action(self, pair: int, frame: Frame, now: float) -> list[Order]:
-        return self.dispatcher.action(pair, frame, now)
-
     def failure(self, pair: int, failure: ModelFailure, now: float) -> list[Order]:
         return self._advance(self.dispatcher.failure(pair, failure, now), now)
 
