@@ -34,6 +34,7 @@ LINE = np.dtype(
         # Addresses of functions of rcl,
         ("clear", np.int64),  # rcl_wait_set_clear
         ("add", np.int64),  # rcl_wait_set_add_subscription
+        ("add_guard", np.int64),  # rcl_wait_set_add_guard_condition
         ("wait", np.int64),  # rcl_wait
         ("take", np.int64),  # rcl_take_serialized_message
         ("publish", np.int64),  # rcl_publish_serialized_message
@@ -44,6 +45,7 @@ LINE = np.dtype(
         ("wait_set", np.int64),
         ("subscription", np.int64),
         ("publisher", np.int64),
+        ("guard", np.int64),
         # and of our own.
         ("incoming", np.int64),  # an rcl_serialized_message_t
         ("outgoing", np.int64),
@@ -76,6 +78,7 @@ def wait(line: Any, patience: int) -> bool:
             call_c(line.give_way, (0,))
     call_c(line.clear, (line.wait_set,))
     call_c(line.add, (line.wait_set, line.subscription, 0))
+    call_c(line.add_guard, (line.wait_set, line.guard, 0))
     call_c(line.wait, (line.wait_set, patience))
     return bool(call_c(line.take, take) == 0)
 
@@ -113,7 +116,8 @@ class _Message(ctypes.Structure):
 
 
 class Line:
-    """Reads with one subscription and writes with one publisher of rclpy.
+    """Reads with one subscription and writes with one publisher of rclpy; a guard condition ends its
+    waits.
 
     record: what the compiled functions want, an entry of LINE; valid as long as this object and the
     node are. Only one thread may use it, and nobody else that subscription and publisher meanwhile.
@@ -121,7 +125,9 @@ class Line:
     Raises OSError or AttributeError where rcl is not to be had.
     """
 
-    def __init__(self, node: Node, subscription: Any, publisher: Any, *, poll: float = 0.0) -> None:
+    def __init__(
+        self, node: Node, subscription: Any, publisher: Any, guard: Any, *, poll: float = 0.0
+    ) -> None:
         rcl, rcutils = ctypes.CDLL("librcl.so"), ctypes.CDLL("librcutils.so")
         rcutils.rcutils_get_default_allocator.restype = _Allocator
         allocator = rcutils.rcutils_get_default_allocator()
@@ -129,13 +135,14 @@ class Line:
         self._incoming, self._outgoing = (_Message(None, 0, 0, allocator) for _ in range(2))
         self._free = rcutils.rcutils_uint8_array_fini
         self._moment = np.zeros(2, np.int64)
-        self._wait_set = _rclpy.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
-        self._held = subscription, publisher
+        self._wait_set = _rclpy.WaitSet(1, 1, 0, 0, 0, 0, node.context.handle)
+        self._held = subscription, publisher, guard
         self.records = np.zeros(1, LINE)
         record = self.records[0]
         for field, name in (
             ("clear", "rcl_wait_set_clear"),
             ("add", "rcl_wait_set_add_subscription"),
+            ("add_guard", "rcl_wait_set_add_guard_condition"),
             ("wait", "rcl_wait"),
             ("take", "rcl_take_serialized_message"),
             ("publish", "rcl_publish_serialized_message"),
@@ -145,6 +152,7 @@ class Line:
         record["give_way"] = address_of(ctypes.CDLL(None).sched_yield)
         record["wait_set"] = self._wait_set.pointer
         record["subscription"], record["publisher"] = subscription.pointer, publisher.pointer
+        record["guard"] = guard.pointer
         record["incoming"] = ctypes.addressof(self._incoming)
         record["outgoing"] = ctypes.addressof(self._outgoing)
         record["moment"] = self._moment.ctypes.data

@@ -54,6 +54,8 @@ than a round of a fast plant, shorter than what anyone would notice."""
 STREAM = 0.002
 """Seconds without a message after which a stream of them has ended. Until then nothing else is
 waited for: every further subscription in a WaitSet costs, and within an episode nothing comes there."""
+STUCK = 0.5
+"""Seconds in which the loop goes round at least once, unless it computes."""
 ROUNDS = 50
 """Messages of a stream that compiled functions deal with before the node looks around."""
 SUSPENDED = 2.0
@@ -90,6 +92,10 @@ class NodeLoop:
         self._poll = 0.0
         self._stream: Receiver | None = None
         """The one whose messages stream in, as long as they do: the only one to wait for."""
+        self._guard = _rclpy.GuardCondition(node.context.handle)
+        """Ends a wait: see `_look_after`."""
+        self._turned = time.monotonic()
+        """When the loop last went round."""
         self.suspended = False
         """Whether `run` ended because the process had been suspended (SIGSTOP, a frozen machine)."""
         self._executor = SingleThreadedExecutor(context=node.context)
@@ -132,7 +138,13 @@ class NodeLoop:
         from loop_interfaces.line import Line  # not every node needs the compiler
 
         try:
-            line = Line(self.node, receiver.handle, sender.publisher.handle, poll=self._poll)
+            line = Line(
+                self.node,
+                receiver.handle,
+                sender.publisher.handle,
+                self._guard,
+                poll=self._poll,
+            )
         except (OSError, AttributeError) as error:
             self.node.get_logger().warning(f"the loop is slower than it could be: {error}")
             return
@@ -212,7 +224,8 @@ class NodeLoop:
         tick(now) is called when `deadline()` (monotonic s, or None) has passed; housekeeping(now)
         every HOUSEKEEPING seconds, or BUSY_HOUSEKEEPING.
         """
-        with Pulse() as pulse:
+        self._turned = self.now()
+        with Pulse(self._look_after) as pulse:
             return self._handle_events(pulse, tick, deadline, housekeeping)
 
     def _handle_events(
@@ -227,14 +240,14 @@ class NodeLoop:
         handles, take_from = self._sources()
         self._stream = None
         wait_set = _rclpy.WaitSet(
-            len(handles) + 2 * len(self._watched), 0, 0, 0, 0, 0, context.handle
+            len(handles) + 2 * len(self._watched), 1, 0, 0, 0, 0, context.handle
         )
         clear, add = wait_set.clear_entities, wait_set.add_subscription
         wait, ready = wait_set.wait, wait_set.get_ready_entities
         next_round = clock()
         poll_until, handled = 0.0, 0
         while self._stop_reason is None:
-            now = clock()
+            self._turned = now = clock()
             if now >= next_round:
                 if not context.ok():
                     break
@@ -274,6 +287,7 @@ class NodeLoop:
             if due is not None:
                 wake = min(wake, due)
             clear()
+            wait_set.add_guard_condition(self._guard)
             if stream is not None:
                 add(stream.handle)
                 wait(int((min(wake, now + STREAM) - now) * 1e9))
@@ -287,6 +301,15 @@ class NodeLoop:
             if taken and self._poll:
                 poll_until = clock() + self._poll
         return self._stop_reason or "shutdown"
+
+    def _look_after(self) -> None:
+        """In another thread: end a wait that takes too long.
+
+        Fast DDS waits until a point of the machine's clock where it was built with an old C++
+        library, as the wheels are; when that clock is set back meanwhile, until it gets there again.
+        """
+        if self.now() - self._turned > STUCK:
+            self._guard.trigger_guard_condition()
 
     def _sources(self) -> tuple[list[Any], dict[int, Callable[[], int]]]:
         """What to wait for, and what takes from it; the watched ones first: a cost comes after

@@ -1,4 +1,4 @@
-"""Tells a process that was suspended (SIGSTOP, a frozen machine) from one that is only busy."""
+"""A second look at a process: was it suspended (SIGSTOP, a frozen machine), is its loop stuck?"""
 
 from __future__ import annotations
 
@@ -26,10 +26,16 @@ class Pulse:
 
     The loop itself is no measure: it may compute for seconds. A thread that sleeps is scheduled
     promptly even on a busy machine, and NumPy and Numba let it in between.
+
+    each_beat: called from that thread, about every BEAT seconds.
     """
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
+    def __init__(
+        self,
+        each_beat: Callable[[], None] | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._clock, self._each_beat = clock, each_beat
         self._lock = threading.Lock()
         self._longest = 0.0
         self._last, self._cpu = clock(), time.process_time()
@@ -53,6 +59,8 @@ class Pulse:
         while not self._stopped:
             nap(BEAT)
             self._beat()
+            if self._each_beat and not self._stopped:
+                self._each_beat()
 
     def _beat(self) -> None:
         with self._lock:

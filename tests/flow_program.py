@@ -64,8 +64,8 @@ class Peer:
         return [s for raw in self.heard(1, self._bundles) for s in unpack(raw)[1]]
 
 
-def line_of(node: Any, receiver: Any, sender: Any, poll: float = 0.0) -> Line:
-    return Line(node, receiver.handle, sender.publisher.handle, poll=poll)
+def line_of(node: Any, loop: NodeLoop, receiver: Any, sender: Any, poll: float = 0.0) -> Line:
+    return Line(node, receiver.handle, sender.publisher.handle, loop._guard, poll=poll)
 
 
 def plant_flows(*, poll: float = 0.0, timed: bool = False, **overrides: object) -> None:
@@ -74,7 +74,7 @@ def plant_flows(*, poll: float = 0.0, timed: bool = False, **overrides: object) 
     loop.bundler.timed = timed
     receiver = loop.receive(ACTION, lambda frame: None, bundled=True)
     sender = loop.sender(STATE, bundled=True)
-    line = line_of(node, receiver, sender, poll)
+    line = line_of(node, loop, receiver, sender, poll)
     flow = partial(plant.reflex.flow, loop.bundler, line)
     peer.meet("state")
 
@@ -173,7 +173,7 @@ def plant_flows(*, poll: float = 0.0, timed: bool = False, **overrides: object) 
 def plant_with_instruments_does_not() -> None:
     node = rclpy.create_node("instruments")
     loop, plant = NodeLoop(node), Plant(measurement_noise=0.1)
-    line = line_of(node, loop.receive(ACTION, lambda frame: None), loop.sender(STATE))
+    line = line_of(node, loop, loop.receive(ACTION, lambda frame: None), loop.sender(STATE))
     plant.long_way(plant.action(plant.begin(1, (3, 4))))
     assert plant.lockstep.flowing >= 0
     assert plant.reflex.flow(loop.bundler, line, 1, SHORT) == (0, UNABLE)
@@ -183,7 +183,7 @@ def plant_with_instruments_does_not() -> None:
 def controller_flows() -> None:
     node = rclpy.create_node("controller")
     loop, controller, peer = NodeLoop(node), Controller(3), Peer("state", "action")
-    line = line_of(node, loop.receive(STATE, lambda frame: None), loop.sender(ACTION))
+    line = line_of(node, loop, loop.receive(STATE, lambda frame: None), loop.sender(ACTION))
     flow = partial(controller.reflex.flow, line)
     peer.meet("action")
     controller.begin(4)

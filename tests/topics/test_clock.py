@@ -19,6 +19,37 @@ from tests.topics.test_loop import (
 pytestmark = pytest.mark.topics
 
 
+STUCK = """
+import rclpy, threading, time
+from loop_interfaces import node_loop
+from loop_interfaces.endpoints import QUIET
+from loop_interfaces.line import Line
+from loop_interfaces.topics import ACTION, STATE
+from tests.test_reflexes import Controller
+node_loop.HOUSEKEEPING = 60.0  # as long as a wait until a moment that was set back
+rclpy.init()
+loop = node_loop.NodeLoop(rclpy.create_node("stuck"))
+turns = []
+threading.Timer(3.0, loop.stop, ["enough"]).start()
+loop.run(tick=print, deadline=lambda: turns.append(time.monotonic()), housekeeping=lambda now: None)
+print("turns", len(turns) >= 4, max(b - a for a, b in zip(turns, turns[1:])) < 1.5)
+
+controller = Controller(2)
+controller.begin(4)
+controller.long_way(controller.state(4, 0))
+receiver, sender = loop.receive(STATE, lambda frame: None), loop.sender(ACTION)
+line = Line(loop.node, receiver.handle, sender.publisher.handle, loop._guard)
+threading.Timer(0.5, loop._look_after).start()
+began = time.monotonic()
+print("flow", controller.reflex.flow(line, 50, 60 * 10**9) == (0, QUIET), time.monotonic() - began < 2.0)
+"""
+
+
+def test_a_wait_that_would_last_until_the_clock_is_there_again_is_ended(loop: Processes):
+    lines = loop.wait(loop.start("-c", STUCK, name="stuck"), LIMIT).splitlines()
+    assert lines == ["turns True True", "flow True True"]
+
+
 def test_a_clock_that_jumps_forth_and_back_changes_nothing(loop: Processes, tmp_path: Path):
     found = list(Path("/usr/lib").glob("*/faketime/libfaketime.so.1"))
     assert found, "libfaketime is not installed; `make packages` installs Debian's faketime"
