@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from loop_interfaces import compiled, simd
 from loop_interfaces.compiled import fingerprint, jit, kept
-from loop_interfaces.simd import load, peek, read, read_word, splat, store, whole_lanes, write
+from loop_interfaces.simd import fma, load, peek, read, read_word, splat, store, whole_lanes, write
 
 __all__ = ["LAW", "act", "control", "padded"]
 
@@ -65,10 +65,10 @@ def reduce(law: Any, states: int, first: int, batch: int) -> None:
         a0, a1, a2, a3 = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
         k = block
         for i in range(n_z):
-            a0 = a0 + load(u0, k) * splat(peek(z0, i))
-            a1 = a1 + load(u1, k) * splat(peek(z1, i))
-            a2 = a2 + load(u2, k) * splat(peek(z2, i))
-            a3 = a3 + load(u3, k) * splat(peek(z3, i))
+            a0 = fma(load(u0, k), splat(peek(z0, i)), a0)
+            a1 = fma(load(u1, k), splat(peek(z1, i)), a1)
+            a2 = fma(load(u2, k), splat(peek(z2, i)), a2)
+            a3 = fma(load(u3, k), splat(peek(z3, i)), a3)
             k += width
         store(s, block, a0)
         store(s, width + block, a1)
@@ -86,13 +86,13 @@ def answer(law: Any, m: int, s: int, action: int) -> None:
     for block in range(0, wide, 8):
         a = load(law.constant, m * wide + block)
         for j in range(n_s):
-            a = a + load(law.feedback, (m * n_s + j) * wide + block) * splat(read(s, j))
+            a = fma(load(law.feedback, (m * n_s + j) * wide + block), splat(read(s, j)), a)
         if pairs > 0:
             row = m * pairs
             for i in range(n_s):
                 for j in range(i, n_s):
                     e_i, e_j = read(s, i) - read(centre, i), read(s, j) - read(centre, j)
-                    a = a + load(law.quadratic, row * wide + block) * splat(e_i * e_j)
+                    a = fma(load(law.quadratic, row * wide + block), splat(e_i * e_j), a)
                     row += 1
         store(sums, block, a)
     for k in range(n_a):

@@ -3,8 +3,8 @@
 Numba leaves vectorisation to the compiler, which gives up on the butterflies of an FFT. A value of
 type `lanes` states it: eight numbers that are added, subtracted and multiplied at once. LLVM maps
 it to the vector registers there are (one of AVX-512, two of AVX2, four of SSE2 or NEON). Each lane
-is plain IEEE arithmetic, neither contracted nor reordered, so a result does not depend on the width
-of the registers.
+is plain IEEE arithmetic as it is written, neither contracted nor reordered, so a result does not
+depend on the width of the registers. A product that is added with one rounding is written so (`fma`).
 
 Memory is an address and an offset in float64 from it, unchecked: a Numba array is seven numbers to
 pass, and a dozen calls for every stage of an internal step cost as much as the arithmetic.
@@ -16,6 +16,7 @@ from typing import Any
 
 from llvmlite import ir
 from numba import types
+from numba.core.cgutils import get_or_insert_function
 from numba.core.datamodel import models
 from numba.extending import intrinsic as numba_intrinsic
 from numba.extending import overload, register_model
@@ -24,8 +25,10 @@ __all__ = [
     "WIDTH",
     "backwards",
     "call",
+    "fma",
     "lane_sum",
     "load",
+    "minus_product",
     "peek",
     "peek_lanes",
     "peek_word",
@@ -195,6 +198,36 @@ def call(typing_context: Any, function: Any, address: Any, offset: Any, count: A
         return context.get_dummy_value()
 
     return types.void(types.intp, types.intp, types.intp, types.intp), build
+
+
+def fused(builder: Any, a: Any, b: Any, c: Any) -> Any:
+    kind = ir.FunctionType(VECTOR, [VECTOR] * 3)
+    name = f"llvm.fma.v{WIDTH}f64"
+    function = get_or_insert_function(builder.module, kind, name)  # type: ignore[no-untyped-call]
+    return builder.call(function, [a, b, c])
+
+
+@intrinsic
+def fma(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
+    """a * b + c with one rounding, by an instruction of its own or, slowly, by the C library: never
+    two roundings, so that all machines agree.
+    """
+
+    def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return fused(builder, *args)
+
+    return lanes(lanes, lanes, lanes), build
+
+
+@intrinsic
+def minus_product(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
+    """c - a * b with one rounding."""
+
+    def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        a, b, c = args
+        return fused(builder, builder.fneg(a), b, c)
+
+    return lanes(lanes, lanes, lanes), build
 
 
 def define(operation: Callable[[Any, Any], Any], instruction: str) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.compiled import jit
-from loop_interfaces.simd import WIDTH, load, read, splat, store, transpose
+from loop_interfaces.simd import WIDTH, fma, load, minus_product, read, splat, store, transpose
 
 __all__ = ["fft", "is_transform_length", "plane_size", "radices_of", "twiddles_of"]
 
@@ -77,7 +77,7 @@ def root(power: NDArray[np.int64], n: int) -> NDArray[np.complex128]:
 
 @jit
 def times(ar: Any, ai: Any, br: Any, bi: Any) -> Any:
-    return ar * br - ai * bi, ar * bi + ai * br
+    return minus_product(ai, bi, ar * br), fma(ai, br, ar * bi)
 
 
 @jit
@@ -197,7 +197,7 @@ def pass3(w: int, x: int, y: int, d: int, m: int, s: int, c: int, v: int, e: int
             a2r, a2i = load(w, i + 2 * t), load(w, i + 2 * t + d)
             b1r, b1i = a1r + a2r, a1i + a2i
             b2r, b2i = sine * (a1r - a2r), sine * (a1i - a2i)
-            b0r, b0i = a0r - half * b1r, a0i - half * b1i
+            b0r, b0i = minus_product(half, b1r, a0r), minus_product(half, b1i, a0i)
             o = y + q + 3 * s * p
             store(w, o, a0r + b1r)
             store(w, o + d, a0i + b1i)

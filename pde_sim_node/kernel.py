@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from loop_interfaces import simd
 from loop_interfaces.compiled import fingerprint, jit, kept
 from loop_interfaces.native import MachineCode
-from loop_interfaces.simd import call, load, read, read_word, splat, store, write, write_word
+from loop_interfaces.simd import call, fma, load, read, read_word, splat, store, write, write_word
 
 from . import fft, spectra
 from .spectra import (
@@ -37,6 +37,7 @@ from .spectra import (
     joined,
     minus,
     plus,
+    plus_product,
     product,
     put,
     split,
@@ -117,28 +118,28 @@ def integrate(w: int, d: int, plan: Any, c: int, e: int) -> None:
     z = nonlinear(w, d, plan, c, e)
     for k in range(0, modes, 8):
         g, v, qf = joined(w, z, d, m, factors, k, c, e), get(w, x + k, d), get(w, qfs + k, d)
-        half, qg = plus(product(c, e2 + k, e, v), qf), product(c, qm + k, e, g)
+        half, qg = plus_product(qf, c, e2 + k, e, v), product(c, qm + k, e, g)
         a = plus(half, qg)
         put(w, x + k, d, a)
         put(w, to_b + k, d, half)
-        put(w, to_c + k, d, minus(plus(product(c, e2 + k, e, a), qf), qg))
-        whole = plus(product(c, e1 + k, e, v), get(w, ffs + k, d))
-        put(w, next_x + k, d, plus(whole, product(c, f1m + k, e, g)))
+        put(w, to_c + k, d, minus(plus_product(qf, c, e2 + k, e, a), qg))
+        whole = plus_product(get(w, ffs + k, d), c, e1 + k, e, v)
+        put(w, next_x + k, d, plus_product(whole, c, f1m + k, e, g))
     z = nonlinear(w, d, plan, c, e)
     for k in range(0, modes, 8):
         g = joined(w, z, d, m, factors, k, c, e)
-        put(w, x + k, d, plus(get(w, to_b + k, d), product(c, qm + k, e, g)))
-        put(w, next_x + k, d, plus(get(w, next_x + k, d), product(c, f2m + k, e, g)))
+        put(w, x + k, d, plus_product(get(w, to_b + k, d), c, qm + k, e, g))
+        put(w, next_x + k, d, plus_product(get(w, next_x + k, d), c, f2m + k, e, g))
     z = nonlinear(w, d, plan, c, e)
     for k in range(0, modes, 8):
         g = joined(w, z, d, m, factors, k, c, e)
         qg = product(c, qm + k, e, g)
         put(w, x + k, d, plus(get(w, to_c + k, d), plus(qg, qg)))
-        put(w, next_x + k, d, plus(get(w, next_x + k, d), product(c, f2m + k, e, g)))
+        put(w, next_x + k, d, plus_product(get(w, next_x + k, d), c, f2m + k, e, g))
     z = nonlinear(w, d, plan, c, e)
     for k in range(0, modes, 8):
         g = joined(w, z, d, m, factors, k, c, e)
-        put(w, x + k, d, plus(get(w, next_x + k, d), product(c, f3m + k, e, g)))
+        put(w, x + k, d, plus_product(get(w, next_x + k, d), c, f3m + k, e, g))
 
 
 @jit
@@ -149,7 +150,7 @@ def force(action: int, w: int, d: int, plan: Any, c: int, e: int) -> None:
         for j in range(plan.n_a):
             a = splat(read(action, j))
             support = get(c, plan.supports + j * plan.modes + k, e)
-            total = plus(total, (a * support[0], a * support[1]))
+            total = fma(a, support[0], total[0]), fma(a, support[1], total[1])
         put(w, plan.qf + k, d, product(c, plan.q + k, e, total))
         put(w, plan.ff + k, d, product(c, plan.f + k, e, total))
 
@@ -160,7 +161,7 @@ def stage_cost(state: int, action: int, w: int, plan: Any, c: int) -> float:
     whole = plan.n_z // 8 * 8
     for i in range(0, whole, 8):
         error = load(state, i) - load(c, plan.target + i)
-        lanes = lanes + error * error
+        lanes = fma(error, error, lanes)
     store(w, plan.next, lanes)
     state_part, action_part = 0.0, 0.0
     for i in range(8):

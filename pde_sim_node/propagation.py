@@ -17,11 +17,11 @@ from numba import carray  # type: ignore[attr-defined, unused-ignore]
 from loop_interfaces import simd
 from loop_interfaces.compiled import fingerprint, jit
 from loop_interfaces.native import MachineCode
-from loop_interfaces.simd import read, read_word, splat, write, write_word
+from loop_interfaces.simd import fma, read, read_word, splat, write, write_word
 
 from . import fft, kernel, spectra
 from .kernel import accept, stage_cost, step_signature
-from .spectra import TRANSFORM, analyse, get, plus, product, put, synthesise
+from .spectra import TRANSFORM, analyse, get, plus_product, put, synthesise
 
 __all__ = ["LINEAR_PLAN", "propagate"]
 
@@ -64,11 +64,11 @@ def advance(component: int, action: int, w: int, d: int, plan: Any, c: int, e: i
         total = splat(0.0), splat(0.0)
         for g in range(plan.components):
             at = plan.e + (component * plan.components + g) * plan.modes + k
-            total = plus(total, product(c, at, e, get(w, plan.spectra + g * plan.modes + k, d)))
+            total = plus_product(total, c, at, e, get(w, plan.spectra + g * plan.modes + k, d))
         for j in range(plan.n_a):
             a, at = splat(read(action, j)), plan.b + (component * plan.n_a + j) * plan.modes + k
             b = get(c, at, e)
-            total = plus(total, (a * b[0], a * b[1]))
+            total = fma(a, b[0], total[0]), fma(a, b[1], total[1])
         put(w, plan.x + k, d, total)
 
 

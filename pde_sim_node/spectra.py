@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from loop_interfaces.compiled import jit
-from loop_interfaces.simd import backwards, load, read, splat, store, write
+from loop_interfaces.simd import backwards, fma, load, minus_product, read, splat, store, write
 
 from .fft import fft, times
 
@@ -30,6 +30,7 @@ __all__ = [
     "joined",
     "minus",
     "plus",
+    "plus_product",
     "product",
     "put",
     "split",
@@ -76,6 +77,13 @@ def product(c: int, at: int, e: int, value: Complex) -> Complex:
 
 
 @jit
+def plus_product(total: Complex, c: int, at: int, e: int, value: Complex) -> Complex:
+    """A number and constants times a value."""
+    ar, ai, (br, bi) = load(c, at), load(c, at + e), value
+    return minus_product(ai, bi, fma(ar, br, total[0])), fma(ai, br, fma(ar, bi, total[1]))
+
+
+@jit
 def with_mirror(w: int, x: int, d: int, m: int, k: int) -> tuple[Complex, Complex]:
     """Eight numbers x_k + x*_{m-k} and x_k - x*_{m-k}, from k on."""
     a, at = get(w, x + k, d), x + m - k - 7
@@ -88,14 +96,22 @@ def split(w: int, x: int, z: int, d: int, t: Any, c: int, e: int) -> None:
     m, factors = t.m, t.split
     for k in range(0, m, 8):
         (s, r), v = with_mirror(w, x, d, m, k), get(c, factors + k, e)
-        put(w, z + k, d, (s[0] + (r[0] * v[0] + r[1] * v[1]), s[1] + (r[1] * v[0] - r[0] * v[1])))
+        put(
+            w,
+            z + k,
+            d,
+            (
+                fma(r[1], v[1], fma(r[0], v[0], s[0])),
+                minus_product(r[0], v[1], fma(r[1], v[0], s[1])),
+            ),
+        )
 
 
 @jit
 def joined(w: int, z: int, d: int, m: int, factors: int, k: int, c: int, e: int) -> Complex:
     """Eight modes of the spectrum, from k on, times 4m."""
     s, r = with_mirror(w, z, d, m, k)
-    return plus(s, product(c, factors + k, e, r))
+    return plus_product(s, c, factors + k, e, r)
 
 
 @jit
@@ -131,7 +147,7 @@ def analyse(state: int, w: int, d: int, plan: Any, c: int, e: int) -> None:
             for j in range(plan.n_x):
                 u = splat(read(state, j))
                 row = get(c, plan.analysis + j * plan.modes + k, e)
-                x = plus(x, (u * row[0], u * row[1]))
+                x = fma(u, row[0], x[0]), fma(u, row[1], x[1])
             put(w, plan.x + k, d, x)
     # Lanes beyond the last mode hold whatever was beside the transform.
     for k in range(plan.n_x // 2 + 1, plan.modes):

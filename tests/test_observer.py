@@ -26,9 +26,9 @@ def samples(start: Frame, plant: int = 0):
 def feed(served, pair: int, start: Frame, lose_state: int = -1, lose_action: int = -1) -> None:
     for frame, actions in samples(start):
         if frame.step != lose_state:
-            served.state(pair, frame, 0.0)
+            served.state(pair, frame)
         if frame.step != lose_action:
-            served.action(pair, replace(frame, values=actions), 0.0)
+            served.action(pair, replace(frame, values=actions))
 
 
 def observed(count: int) -> Batch:
@@ -59,7 +59,7 @@ def test_a_late_sample_is_waited_for_and_a_lost_one_repeats_the_episode():
     assert served.cost(0, costs_of(start), 1.0) == []
     assert served.result() is None
     late = list(samples(start))[STEPS - 1]
-    served.action(0, replace(late[0], values=late[1]), 1.1)
+    served.action(0, replace(late[0], values=late[1]))
     served.tick(1.2)
     assert served.result() is not None
 
