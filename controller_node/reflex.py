@@ -18,9 +18,9 @@ from controller_node.law import LAW, act
 from controller_node.responder import Responder
 from loop_interfaces import compiled, line, native, simd, wire
 from loop_interfaces.compiled import fingerprint, jit, kept
-from loop_interfaces.endpoints import MORE, OTHER, QUIET, UNABLE
 from loop_interfaces.frames import MAX_ID, ArrayCodec, Frame
 from loop_interfaces.line import LINE, Line, received, send, wait
+from loop_interfaces.protocol import MORE, OTHER, QUIET, UNABLE
 from loop_interfaces.simd import peek, poke, read
 from loop_interfaces.topics import ACTION
 from loop_interfaces.wire import (

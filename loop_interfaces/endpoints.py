@@ -235,10 +235,7 @@ class Sender:
 
 Flow = Callable[["Line", int, int], tuple[int, int]]
 """Deals with messages as they come in on a line, so many, the next within so many ns; how many it
-were, and why it ends."""
-MORE, QUIET, OTHER, UNABLE = range(4)
-"""Why a flow ends: it has done enough for once, nothing came in for long, something came that is not
-its business (`Line.message`), or there is nothing that it could deal with."""
+were, and why it ends (protocol.MORE, ...)."""
 
 
 class Receiver:

@@ -9,16 +9,16 @@ goes back to rclpy: the message that was taken last is in `Line.message`.
 from __future__ import annotations
 
 import ctypes
-import ctypes.util
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
-from rclpy.node import Node
 
 from loop_interfaces.compiled import jit
 from loop_interfaces.native import call_c
 from loop_interfaces.simd import read_word, write_word
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
 
 __all__ = [
     "LINE",
@@ -119,7 +119,7 @@ class Line:
     """Reads with one subscription and writes with one publisher of rclpy; a guard condition ends its
     waits.
 
-    record: what the compiled functions want, an entry of LINE; valid as long as this object and the
+    records: what the compiled functions want, one entry of LINE; valid as long as this object and the
     node are. Only one thread may use it, and nobody else that subscription and publisher meanwhile.
 
     Raises OSError or AttributeError where rcl is not to be had.
@@ -128,6 +128,9 @@ class Line:
     def __init__(
         self, node: Node, subscription: Any, publisher: Any, guard: Any, *, poll: float = 0.0
     ) -> None:
+        # Here, so that what only compares and fills in needs no ROS.
+        from rclpy.impl.implementation_singleton import rclpy_implementation
+
         rcl, rcutils = ctypes.CDLL("librcl.so"), ctypes.CDLL("librcutils.so")
         rcutils.rcutils_get_default_allocator.restype = _Allocator
         allocator = rcutils.rcutils_get_default_allocator()
@@ -135,7 +138,7 @@ class Line:
         self._incoming, self._outgoing = (_Message(None, 0, 0, allocator) for _ in range(2))
         self._free = rcutils.rcutils_uint8_array_fini
         self._moment = np.zeros(2, np.int64)
-        self._wait_set = _rclpy.WaitSet(1, 1, 0, 0, 0, 0, node.context.handle)
+        self._wait_set = rclpy_implementation.WaitSet(1, 1, 0, 0, 0, 0, node.context.handle)
         self._held = subscription, publisher, guard
         self.records = np.zeros(1, LINE)
         record = self.records[0]

@@ -24,9 +24,6 @@ from std_msgs.msg import Float64MultiArray
 
 from loop_interfaces.affinity import pin_process
 from loop_interfaces.endpoints import (
-    MORE,
-    OTHER,
-    UNABLE,
     Bundler,
     Flow,
     Receiver,
@@ -37,6 +34,7 @@ from loop_interfaces.endpoints import (
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.health import Health
 from loop_interfaces.introspection import Introspection
+from loop_interfaces.protocol import MORE, OTHER, UNABLE
 from loop_interfaces.pulse import Pulse
 from loop_interfaces.samples import ACTION_KIND, STATE_KIND
 from loop_interfaces.topics import ACTION, SAMPLES, STATE, Topic

@@ -17,7 +17,6 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
 from loop_interfaces.affinity import core_list
-from loop_interfaces.endpoints import UNABLE
 from loop_interfaces.frames import Frame
 from loop_interfaces.introspection import offer
 from loop_interfaces.isolation import keep_on_this_machine
@@ -25,7 +24,7 @@ from loop_interfaces.line import Line
 from loop_interfaces.node_loop import NodeLoop
 from loop_interfaces.node_main import node_main
 from loop_interfaces.parameters import EXECUTION, PLANT, PROBLEM
-from loop_interfaces.protocol import Send
+from loop_interfaces.protocol import UNABLE, Send
 from loop_interfaces.ros_parameters import declare, given_parameters, on_change
 from loop_interfaces.samples import clock_message
 from loop_interfaces.spec import Spec

@@ -9,17 +9,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from time import monotonic
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces import compiled, line, native, simd, wire
 from loop_interfaces.compiled import fingerprint, jit, kept
-from loop_interfaces.endpoints import MORE, OTHER, QUIET, UNABLE, Bundler
 from loop_interfaces.frames import HEADER, ArrayCodec, Frame
 from loop_interfaces.line import LINE, Line, monotonic_ns, received, send, wait
 from loop_interfaces.native import call_c
+from loop_interfaces.protocol import MORE, OTHER, QUIET, UNABLE
 from loop_interfaces.samples import ACTION_KIND, NO_TIME, SAMPLE_HEADER, STATE_KIND
 from loop_interfaces.simd import WIDTH, load, peek, poke, poke_lanes, read, write
 from loop_interfaces.topics import STATE
@@ -36,6 +36,9 @@ from loop_interfaces.wire import (
 )
 from pde_sim_node.lockstep import Lockstep
 from pde_sim_node.plant import Machine
+
+if TYPE_CHECKING:
+    from loop_interfaces.endpoints import Bundler
 
 __all__ = ["Reflex"]
 

@@ -10,10 +10,11 @@ import numpy as np
 import rclpy
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
-from loop_interfaces.endpoints import MORE, OTHER, QUIET, UNABLE, raw_subscription, samples_qos
+from loop_interfaces.endpoints import raw_subscription, samples_qos
 from loop_interfaces.frames import HEADER
 from loop_interfaces.line import Line
 from loop_interfaces.node_loop import NodeLoop
+from loop_interfaces.protocol import MORE, OTHER, QUIET, UNABLE
 from loop_interfaces.samples import ACTION_KIND, NO_TIME, STATE_KIND, unpack
 from loop_interfaces.topics import ACTION, COST, STATE, VOID, CostColumn
 from loop_interfaces.watching import Intake

@@ -24,7 +24,7 @@ pytestmark = pytest.mark.topics
 STUCK = """
 import rclpy, threading, time
 from loop_interfaces import node_loop
-from loop_interfaces.endpoints import QUIET
+from loop_interfaces.protocol import QUIET
 from loop_interfaces.line import Line
 from loop_interfaces.topics import ACTION, STATE
 from tests.test_reflexes import Controller
