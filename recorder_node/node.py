@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import sys
 import time
@@ -49,6 +50,9 @@ DRAIN = 0.02
 """Seconds between two batches: often enough for the depth below, seldom enough to cost little."""
 FLUSH = 0.3
 """Seconds of recording that a SIGKILL may lose at the most."""
+HELD_UP, CATCH_UP = 0.15, 0.5
+"""Seconds between two rounds after which this process was held up, and in which it then takes what has
+come in meanwhile, before it says of an episode that something is missing."""
 DEPTH = 1000
 """Messages of a latched topic that wait here: of seconds of the fastest loop, should this process
 be held up."""
@@ -93,7 +97,8 @@ class RecorderNode:
         )
         self._what = what
         self._health = RecorderHealth(self._recording)
-        self._flush_at = self._report_at = 0.0
+        self._flush_at = self._report_at = self._caught_up_at = 0.0
+        self._ticked = math.inf
         self._wire(node, loop)
         self._log.info(f"recording to {self._recording.path} ({values['bag_storage']})")
 
@@ -156,9 +161,15 @@ class RecorderNode:
     def _tick(self, now: float) -> None:
         time.sleep(DRAIN)
         self._drain()
+        now = self._loop.now()
+        if now - self._ticked > HELD_UP:
+            self._caught_up_at = now + CATCH_UP
+        self._ticked = now
         if now >= self._flush_at:
             self._flush_at = now + FLUSH
-            self._recording.flush(time.time_ns())
+            self._recording.flush()
+            if now >= self._caught_up_at:
+                self._recording.index(time.time_ns())
 
     def _drain(self) -> int:
         """Record what has come in by now, in the order of arrival.

@@ -131,11 +131,14 @@ class Recording:
         except OSError as error:
             raise BagError(f"cannot write to {self.path}: {error.strerror}") from error
 
-    def flush(self, now: int) -> None:
-        """Make everything up to now (ns) survive a crash, and index the episodes that are over."""
+    def flush(self) -> None:
+        """Make everything so far survive a crash."""
         for bag in (self._bag, *self._bags.values()):
             if bag is not None:
                 bag.flush()
+
+    def index(self, now: int) -> None:
+        """Index the episodes that are over at time `now` (ns): nothing more is expected of them."""
         self._finish_episodes(now)
 
     def close(self) -> None:

@@ -144,7 +144,8 @@ def test_what_was_flushed_is_readable_without_an_end_and_can_be_recovered(tmp_pa
     path = tmp_path / "bag"
     recording = Recording(path, WHAT, storage=storage, bag_per_episode=False)
     recorded_episode(recording, 7)
-    recording.flush(7 * SECOND)
+    recording.flush()
+    recording.index(7 * SECOND)
     recorded_episode(recording, 8)  # never flushed: as if killed now
     if storage == "sqlite3":
         copy = tmp_path / "killed"
@@ -168,7 +169,8 @@ def test_a_file_that_ends_within_a_record_is_read_up_to_there(tmp_path, cut):
     recording = Recording(path, WHAT, storage="mcap", bag_per_episode=False)
     for episode in (7, 8):
         recorded_episode(recording, episode)
-        recording.flush(episode * SECOND)
+        recording.flush()
+        recording.index(episode * SECOND)
     file = path / "bag.mcap"
     os.truncate(file, file.stat().st_size - 2000 - cut)
     assert next(Bag(path).episodes()).number == 7
@@ -200,7 +202,8 @@ def test_a_full_disk_stops_the_recording_and_keeps_what_was_written(tmp_path, st
         def fill() -> None:
             for episode in range(1000):
                 recorded_episode(recording, episode, steps=50)
-                recording.flush(episode * SECOND)
+                recording.flush()
+                recording.index(episode * SECOND)
 
         with pytest.raises(BagError, match=r"(No space left|disk is full).*; recording stopped"):
             fill()
