@@ -18,6 +18,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import controller_node.reflex
+import pde_sim_node.reflex
 from bringup.display import Display, ProgressFile, summary_text
 from bringup.domain import own_domain
 from bringup.in_process import LocalPair, train
@@ -46,13 +48,13 @@ def resolve(problem: str, options: Mapping[str, Any]) -> dict[str, Any]:
     """The parameters of a new run; ValueError if the problem's plant cannot be built from them."""
     values = load_parameters(problem, options)
     # Compiled code is kept on disk, so that this is slow once only, and not for the nodes.
-    notice = threading.Timer(
-        4.0, print, ["compiling the plant's kernel, once ..."], {"file": sys.stderr}
-    )
+    notice = threading.Timer(4.0, print, ["compiling, once ..."], {"file": sys.stderr})
     notice.daemon = True
     notice.start()
     try:
         build_plant(values)
+        controller_node.reflex.load_compiled()
+        pde_sim_node.reflex.load_compiled()
     finally:
         notice.cancel()
     physical = asdict(build_equation(values))

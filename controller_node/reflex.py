@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller_node import law
-from controller_node.law import LAW, act
+from controller_node.law import LAW, act, control
 from controller_node.responder import Responder
 from loop_interfaces import compiled, line, native, simd, wire
 from loop_interfaces.compiled import fingerprint, jit, kept
@@ -33,7 +33,7 @@ from loop_interfaces.wire import (
     expected_header,
 )
 
-__all__ = ["Reflex"]
+__all__ = ["Reflex", "load_compiled"]
 
 PLAN = np.dtype(
     [
@@ -98,6 +98,14 @@ def compile_answers(sources: str) -> tuple[Any, Any]:
 answer, answer_all = compile_answers(fingerprint(compiled, simd, native, line, wire, law))
 
 
+def load_compiled() -> None:
+    """Load all that the controller has compiled, or compile it."""
+    plans, nothing = np.zeros(1, PLAN), np.zeros((0, 1))
+    answer(b"", plans)
+    answer_all(np.zeros(1, LINE), plans, 0, 0)
+    control(np.zeros(1, LAW), nothing, nothing)
+
+
 class Reflex:
     """Answers what a responder has answered before in the episode.
 
@@ -121,8 +129,7 @@ class Reflex:
         self._message = OwnMessage(self._actions, Frame(0, 0, 0, 0.0, np.zeros((0, 0))))
         self._room = np.zeros(0)
         self._law: Any = None
-        answer(b"", self._plans)  # load them, or compile them
-        answer_all(np.zeros(1, LINE), self._plans, 0, 0)
+        load_compiled()
 
     def __call__(self, raw: bytes) -> bytearray | None:
         """The message that answers a state, valid until the next call; None: take the long way."""

@@ -40,7 +40,7 @@ from pde_sim_node.plant import Machine
 if TYPE_CHECKING:
     from loop_interfaces.endpoints import Bundler
 
-__all__ = ["Reflex"]
+__all__ = ["Reflex", "load_compiled"]
 
 PLAN = np.dtype(
     [
@@ -147,6 +147,15 @@ def compile_reflexes(sources: str) -> tuple[Any, Any, Any]:
 awaited, answer, advance = compile_reflexes(fingerprint(compiled, simd, native, line, wire))
 
 
+def load_compiled() -> None:
+    """Load what is compiled, or compile it."""
+    plans = np.zeros(1, PLAN)
+    plans[0]["message"] = (room := np.zeros(FIRST + 1)).ctypes.data
+    awaited(b"", plans, 0)
+    answer(plans, 0, 0.0, room[:1].reshape(1, 1))
+    advance(np.zeros(1, LINE), plans, 0, 0)
+
+
 class Reflex:
     """Advances a lock-step that has taken an action of the episode before.
 
@@ -171,9 +180,7 @@ class Reflex:
         self._log = np.zeros((0, 0))
         self._advances = False
         self._plan["message"] = self._message.address
-        awaited(b"", self._plans, 0)  # load them, or compile them
-        answer(self._plans, 0, 0.0, np.zeros((1, 1)))
-        advance(np.zeros(1, LINE), self._plans, 0, 0)
+        load_compiled()
 
     def __call__(self, raw: bytes, now: float) -> bytearray | None:
         """The message of the next state, valid until the next call; None: take the long way."""

@@ -20,7 +20,7 @@ def error_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     captured = capsys.readouterr()
     # On a slow or busy machine the first use of a kernel announces its compilation.
     said = captured.err.strip().splitlines()
-    (line,) = [text for text in said if not text.startswith("compiling the plant's kernel")]
+    (line,) = [text for text in said if not text.startswith("compiling, once")]
     assert line.startswith("pdeloop: ")
     return line
 
