@@ -71,7 +71,7 @@ LOOP_ARGUMENTS = (
     ),
     Argument(Spec("namespace", "", "namespace of all nodes; empty: none")),
     Argument(Spec("pairs", 1, "plants with a controller each", 1, MAX_PAIRS)),
-    Argument(Spec("pin", False, "a core for each plant and controller, and polling")),
+    Argument(Spec("pin", False, "keep each pair on a core, helpers look for work all the time")),
     Argument(
         Spec(
             "equation",

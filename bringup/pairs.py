@@ -71,26 +71,26 @@ def pair_nodes(
     *,
     shared: bool = False,
 ) -> list[LoopNode]:
-    """The nodes of `pairs` pairs; with `pin` each has a core of its own.
+    """The nodes of `pairs` pairs; with `pin` each pair stays on a core of its own.
 
     remaps: by package; shared: each pair will be kept on one core (bringup.shared_core), but the
     plant's solver has all of them. ParameterError when there are too many for this machine.
     """
     if not 1 <= pairs <= MAX_PAIRS:
         raise ParameterError(f"--pairs is {pairs}; expected a whole number from 1 to {MAX_PAIRS}")
-    cores = free_cores(2 * pairs)
-    if pin and len(set(cores)) < 2 * pairs:
+    cores = free_cores(pairs)
+    if pin and len(set(cores)) < pairs:
         raise ParameterError(
-            f"--pin gives each of the {2 * pairs} plants and controllers a core of its own, but "
+            f"--pin gives each of the {pairs} pairs of plant and controller a core of its own, but "
             f"there are {len(set(cores))}; leave out --pin, or use fewer pairs"
         )
     nodes = []
     for number, namespace in enumerate(namespaces(pairs)):
-        for place, package in enumerate(PAIR):
-            parameters = [f"pin:={cores[2 * number + place]}"] if pin else []
+        for package in PAIR:
+            parameters = [f"pin:={cores[number]}"] if pin else []
             if number and package == "pde_sim_node":  # /clock is one topic for all
                 parameters.append("publish_clock:=false")
-            if shared and package == "pde_sim_node":
+            if (shared or pin) and package == "pde_sim_node":
                 parameters.append(f"solver_cores:={quoted(core_text(usable_cores()))}")
             name = f"{package}-{namespace}" if namespace else package
             more = (remaps or {}).get(package, ())

@@ -97,7 +97,7 @@ class Transport:
             )
         if self.pin and self.spread:
             raise ParameterError(
-                "--pin gives each node a core, --spread none; leave out one of them"
+                "--pin keeps each pair on a core, --spread on none; leave out one of them"
             )
         if self.pairs > 1 and self.faulty_line:
             raise ParameterError("--faulty-line is the line of one pair; leave out --pairs")

@@ -39,8 +39,10 @@ LAW = np.dtype(
 
 def padded(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """A copy whose last axis is filled up to whole lanes."""
-    missing = whole_lanes(values.shape[-1]) - values.shape[-1]
-    return np.ascontiguousarray(np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, missing)]))
+    *others, last = values.shape
+    copy = np.zeros((*others, whole_lanes(last)))  # np.pad takes ten times as long
+    copy[..., :last] = values
+    return copy
 
 
 @jit

@@ -99,7 +99,7 @@ class ControllerNode:
         states = loop.receive(STATE, self._on_state)
         states.swift = self._swiftly
         self._reflex = Reflex(responder, states.codec)
-        loop.stream(states, self._senders[ACTION], self._reflex.flow)
+        loop.stream(states, self._senders[ACTION], self._reflex.flow, self._reflex.ear)
         for topic, handler in handlers.items():
             loop.receive(topic, partial(self._on_other, handler))
         loop.listen(PAUSED, self._on_paused)

@@ -10,17 +10,20 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numba
 import numpy as np
+from numba import carray  # type: ignore[attr-defined, unused-ignore]
 from numpy.typing import NDArray
 
 from controller_node import law
 from controller_node.law import LAW, act, control
 from controller_node.responder import Responder
-from loop_interfaces import compiled, line, native, simd, wire
+from loop_interfaces import atomics, compiled, line, native, simd, wire
 from loop_interfaces.compiled import fingerprint, jit, kept
 from loop_interfaces.frames import MAX_ID, ArrayCodec, Frame
-from loop_interfaces.line import LINE, Line, received, send, wait
-from loop_interfaces.protocol import MORE, OTHER, QUIET, UNABLE
+from loop_interfaces.line import GOING, LINE, Ear, announcement, attendance, received, send
+from loop_interfaces.native import MachineCode
+from loop_interfaces.protocol import MORE, OTHER, UNABLE
 from loop_interfaces.simd import peek, poke, read
 from loop_interfaces.topics import ACTION
 from loop_interfaces.wire import (
@@ -37,6 +40,7 @@ __all__ = ["Reflex", "load_compiled"]
 
 PLAN = np.dtype(
     [
+        ("line", LINE),
         ("expected", EXPECTED),
         ("law", LAW),
         ("batch", np.int64),
@@ -45,6 +49,7 @@ PLAN = np.dtype(
         ("begin", np.int64),  # address of the message, and its length
         ("length", np.int64),
         ("answered", np.int64),
+        ("limit", np.int64),  # how many may be
         ("step", np.int64),  # that was answered last
     ]
 )
@@ -69,6 +74,19 @@ def fill_in(raw: int, length: int, plan: Any) -> bool:
     return True
 
 
+@jit
+def deal(line: Any, plan: Any) -> int:
+    """Answer the message that has come in; GOING, or why no more are wanted."""
+    raw, length = received(line)
+    if not fill_in(raw, length, plan):
+        return OTHER
+    send(line, plan.begin, plan.length)
+    return MORE if plan.answered == plan.limit else GOING
+
+
+attend, announced = attendance(deal)
+
+
 def compile_answers(sources: str) -> tuple[Any, Any]:
     @kept
     def answer(raw: bytes, plans: NDArray[np.void]) -> bool:
@@ -77,32 +95,36 @@ def compile_answers(sources: str) -> tuple[Any, Any]:
         return bool(fill_in(data.ctypes.data, len(data), plans[0]))
 
     @kept
-    def answer_all(
-        lines: NDArray[np.void], plans: NDArray[np.void], rounds: int, patience: int
-    ) -> int:
-        """Answer so many messages on the line; why it returns."""
+    def answer_all(plans: NDArray[np.void], until: int) -> int:
+        """Answer messages on the line, as many as may be; why it returns."""
         sources  # noqa: B018
-        line, plan = lines[0], plans[0]
-        for _ in range(rounds):
-            if not wait(line, patience):
-                return QUIET
-            raw, length = received(line)
-            if not fill_in(raw, length, plan):
-                return OTHER
-            send(line, plan.begin, plan.length)
-        return MORE
+        plan = plans[0]
+        return attend(plan.line, plan, until) if plan.answered < plan.limit else MORE
 
     return answer, answer_all
 
 
-answer, answer_all = compile_answers(fingerprint(compiled, simd, native, line, wire, law))
+def compile_answer_soon() -> Any:
+    @numba.cfunc(announcement(PLAN), cache=True)
+    def answer_soon(plans: Any, count: int) -> None:
+        SOURCES  # noqa: B018  # part of the key on disk
+        plan = carray(plans, 1)[0]
+        announced(plan.line, plan)
+
+    return answer_soon
+
+
+SOURCES = fingerprint(compiled, simd, atomics, native, line, wire, law)
+answer, answer_all = compile_answers(SOURCES)
+answer_soon = MachineCode(compile_answer_soon)
 
 
 def load_compiled() -> None:
     """Load all that the controller has compiled, or compile it."""
     plans, nothing = np.zeros(1, PLAN), np.zeros((0, 1))
     answer(b"", plans)
-    answer_all(np.zeros(1, LINE), plans, 0, 0)
+    answer_all(plans, 0)
+    answer_soon()
     control(np.zeros(1, LAW), nothing, nothing)
 
 
@@ -137,15 +159,22 @@ class Reflex:
             return self._message.raw
         return None
 
-    def flow(self, line: Line, rounds: int, patience: int) -> tuple[int, int]:
-        """Answer states on the line, so many and as long as they come within `patience` ns.
+    @property
+    def ear(self) -> Ear:
+        """What a line to the plant is for."""
+        code, _ = answer_soon()
+        return Ear(self._plan["line"], code, self._plans.ctypes.data)
 
-        How many were answered, and why it ends; OTHER: `line.message` waits to be handled.
+    def flow(self, rounds: int, until: int) -> tuple[int, int]:
+        """Answer states on the line, so many, until a time (monotonic ns).
+
+        How many were answered, and why it ends; OTHER: the line's message waits to be handled.
         """
         if not self._ready:
             return 0, UNABLE
         before = self._plan["answered"]
-        ended = answer_all(line.records, self._plans, rounds, patience)
+        self._plan["limit"] = before + rounds
+        ended = answer_all(self._plans, until)
         return int(self._plan["answered"] - before), ended
 
     def forget(self) -> None:

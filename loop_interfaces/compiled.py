@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 import numba
 
-__all__ = ["cache_misses", "fingerprint", "jit", "kept"]
+__all__ = ["cache_misses", "fingerprint", "jit", "kept", "part"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -22,6 +22,12 @@ F = TypeVar("F", bound=Callable[..., Any])
 def jit(function: F) -> F:
     """Compile as a part of a function that is `kept`."""
     compiled: F = numba.njit(function)
+    return compiled
+
+
+def part(function: F) -> F:
+    """Compile into every function that calls it, for the constants that it is called with."""
+    compiled: F = numba.njit(function, forceinline=True)
     return compiled
 
 

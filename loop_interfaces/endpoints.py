@@ -233,9 +233,9 @@ class Sender:
             bundler.add(STATE_KIND, bytes(raw), time if bundler.timed else NO_TIME)
 
 
-Flow = Callable[["Line", int, int], tuple[int, int]]
-"""Deals with messages as they come in on a line, so many, the next within so many ns; how many it
-were, and why it ends (protocol.MORE, ...)."""
+Flow = Callable[[int, int], tuple[int, int]]
+"""Deals with messages as they come in on a line, so many, until a point of time (monotonic ns); how
+many it were, and why it ends (protocol.MORE, ...)."""
 
 
 class Receiver:

@@ -12,10 +12,11 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
@@ -40,21 +41,22 @@ from loop_interfaces.samples import ACTION_KIND, STATE_KIND
 from loop_interfaces.topics import ACTION, SAMPLES, STATE, Topic
 from loop_interfaces.watching import Watcher
 
+if TYPE_CHECKING:  # not every node needs the compiler
+    from loop_interfaces.line import Ear
+
 HOUSEKEEPING = 0.05
 """Seconds between two rounds of the executor and of the node's slow duties."""
 BUSY_HOUSEKEEPING = 0.2
 """The same while messages stream through: a round of the executor costs as much as ten of them."""
 BUSY = 20
 """Messages since the last round that make a stream."""
-POLL = 200e-6
-"""Seconds that a node with a core of its own polls for the next message before it waits: longer
-than a round of a fast plant, shorter than what anyone would notice."""
 STREAM = 0.002
-"""Seconds without a message after which a stream of them has ended. Until then nothing else is
-waited for: every further subscription in a WaitSet costs, and within an episode nothing comes there."""
+"""Seconds without a message after which a stream of them has ended, where no `Doorbell` tells that
+something else has come. Until then nothing else is waited for: every further subscription in a WaitSet
+costs, and within an episode nothing comes there."""
 STUCK = 0.5
 """Seconds in which the loop goes round at least once, unless it computes."""
-ROUNDS = 50
+ROUNDS = 1000
 """Messages of a stream that compiled functions deal with before the node looks around."""
 SUSPENDED = 2.0
 """Seconds without being scheduled after which a process takes its peers to have dropped it.
@@ -87,7 +89,6 @@ class NodeLoop:
         self._bundler: Bundler | None = None
         self._watched: dict[str, _Watched] = {}
         self._stop_reason: str | None = None
-        self._poll = 0.0
         self._stream: Receiver | None = None
         """The one whose messages stream in, as long as they do: the only one to wait for."""
         self._guard = _rclpy.GuardCondition(node.context.handle)
@@ -128,8 +129,10 @@ class NodeLoop:
         self._receivers.append(receiver)
         return receiver
 
-    def stream(self, receiver: Receiver, sender: Sender, flow: Flow) -> None:
+    def stream(self, receiver: Receiver, sender: Sender, flow: Flow, ear: Ear) -> None:
         """Let `flow` deal with the messages of `receiver` while they stream in; it answers on `sender`.
+
+        ear: what it wants of a line to both.
 
         Where rcl is not to be had, `receiver.swift` goes on alone.
         """
@@ -141,7 +144,7 @@ class NodeLoop:
                 receiver.handle,
                 sender.publisher.handle,
                 self._guard,
-                poll=self._poll,
+                ear,
             )
         except (OSError, AttributeError) as error:
             self.node.get_logger().warning(f"the loop is slower than it could be: {error}")
@@ -196,10 +199,9 @@ class NodeLoop:
         self._stop_reason = reason
 
     def pin(self, core: int) -> None:
-        """Stay on one core and poll before waiting; -1: neither. ValueError for a core not allowed."""
+        """Stay on one core; -1: on any. ValueError for a core not allowed."""
         if core >= 0:
             pin_process(core)
-            self._poll = POLL
 
     def resume(self) -> None:
         """Make `run` possible again after `stop`."""
@@ -223,18 +225,40 @@ class NodeLoop:
         every HOUSEKEEPING seconds, or BUSY_HOUSEKEEPING.
         """
         self._turned = self.now()
-        with Pulse(self._look_after) as pulse:
-            return self._handle_events(pulse, tick, deadline, housekeeping)
+        with Pulse(self._look_after) as pulse, self._doorbell() as told:
+            patience = HOUSEKEEPING if told else STREAM
+            return self._handle_events(pulse, patience, tick, deadline, housekeeping)
+
+    @contextmanager
+    def _doorbell(self) -> Iterator[bool]:
+        """Whether the waits of a stream end with a message of any other subscription."""
+        lines = [receiver.line for receiver in self._receivers if receiver.line]
+        if not lines:
+            yield False
+            return
+        from loop_interfaces.line import Doorbell
+
+        others = [receiver.handle for receiver in self._receivers if not receiver.line]
+        doorbell = Doorbell(others, self._guard)
+        for line in lines:
+            line.open()
+        try:
+            yield doorbell.works
+        finally:
+            for line in lines:
+                line.close()
+            doorbell.close()
 
     def _handle_events(
         self,
         pulse: Pulse,
+        patience: float,
         tick: Callable[[float], None],
         deadline: Callable[[], float | None],
         housekeeping: Callable[[float], None],
     ) -> str:
         context = self.node.context
-        receivers, clock = self._receivers, time.monotonic
+        clock = time.monotonic
         handles, take_from = self._sources()
         self._stream = None
         wait_set = _rclpy.WaitSet(
@@ -243,7 +267,7 @@ class NodeLoop:
         clear, add = wait_set.clear_entities, wait_set.add_subscription
         wait, ready = wait_set.wait, wait_set.get_ready_entities
         next_round = clock()
-        poll_until, handled = 0.0, 0
+        handled = 0
         while self._stop_reason is None:
             self._turned = now = clock()
             if now >= next_round:
@@ -269,26 +293,22 @@ class NodeLoop:
             if due is not None and now >= due:
                 tick(now)
                 continue
-            stream, self._stream = self._stream, None
-            if stream is not None and (dealt_with := self._flow(stream)) is not None:
-                handled += dealt_with
-                continue
-            if now < poll_until:
-                self._stream = stream
-                for receiver in (stream,) if stream else receivers:
-                    if self._take(receiver):
-                        handled += 1
-                        poll_until = clock() + self._poll
-                continue
             # Never longer than HOUSEKEEPING: a wait does not end by a signal.
             wake = min(next_round, now + HOUSEKEEPING)
             if due is not None:
                 wake = min(wake, due)
+            stream, self._stream = self._stream, None
+            if stream is not None:
+                wake = min(wake, now + patience)
+                dealt_with = self._flow(stream, wake)
+                if dealt_with is not None:
+                    handled += dealt_with
+                    continue
             clear()
             wait_set.add_guard_condition(self._guard)
             if stream is not None:
                 add(stream.handle)
-                wait(int((min(wake, now + STREAM) - now) * 1e9))
+                wait(int((wake - now) * 1e9))
                 taken = self._take(stream)
             else:
                 for handle in handles:
@@ -296,8 +316,6 @@ class NodeLoop:
                 wait(int((wake - now) * 1e9))
                 taken = sum(take_from[pointer]() for pointer in ready("subscription"))
             handled += taken
-            if taken and self._poll:
-                poll_until = clock() + self._poll
         return self._stop_reason or "shutdown"
 
     def _look_after(self) -> None:
@@ -322,18 +340,21 @@ class NodeLoop:
         handles = [handle for handle, _ in found.values()]
         return handles, {pointer: take for pointer, (_, take) in found.items()}
 
-    def _flow(self, stream: Receiver) -> int | None:
+    def _flow(self, stream: Receiver, until: float) -> int | None:
         """Let a stream flow: how many messages that were; None where it cannot."""
         if stream.line is None or stream.flow is None:
             return None
-        count, ended = stream.flow(stream.line, ROUNDS, int(STREAM * 1e9))
+        count, ended = stream.flow(ROUNDS, int(until * 1e9))
         if ended == UNABLE:
             return None
         if ended == MORE:
             self._stream = stream
-        elif ended == OTHER:
+            return count
+        if ended == OTHER:
             count += self._handle(stream, stream.line.message())
-        return count
+        # Where the middleware's thread has taken a message, it believes that one is there until
+        # somebody looks for the next.
+        return count + self._take(stream)
 
     def _take(self, receiver: Receiver) -> int:
         """Handle the next message of `receiver`; how many there were."""

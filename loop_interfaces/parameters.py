@@ -158,8 +158,8 @@ EXECUTION = (
     Spec(
         "pin",
         -1,
-        "core on which every thread of the node stays, polling for 200 microseconds before it "
-        "waits; -1: all cores, no polling",
+        "core on which every thread of the node stays, but a plant's helpers if it has "
+        "solver_cores, which then look for work all the time within an episode; -1: any core",
         -1,
         4095,
     ),

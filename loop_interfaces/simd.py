@@ -24,7 +24,6 @@ from numba.extending import overload, register_model
 __all__ = [
     "WIDTH",
     "backwards",
-    "call",
     "fma",
     "lane_sum",
     "load",
@@ -153,13 +152,13 @@ def splat(typing_context: Any, number: Any) -> Any:
 
 
 @intrinsic
-def backwards(typing_context: Any, value: Any) -> Any:
-    """The lanes in reverse order."""
+def backwards(typing_context: Any, below: Any, above: Any) -> Any:
+    """Of sixteen numbers in a row the ninth, the eighth, ..., the second."""
 
     def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return shuffle(builder, args[0], args[0], range(WIDTH - 1, -1, -1))
+        return shuffle(builder, args[0], args[1], range(WIDTH, 0, -1))
 
-    return lanes(lanes), build
+    return lanes(lanes, lanes), build
 
 
 @intrinsic
@@ -182,22 +181,6 @@ def transpose(typing_context: Any, rows: Any) -> Any:
         return context.make_tuple(builder, signature.return_type, columns)
 
     return eight_lanes(eight_lanes), build
-
-
-@intrinsic
-def call(typing_context: Any, function: Any, address: Any, offset: Any, count: Any) -> Any:
-    """Call machine code, a void (*)(double *, intp), on the numbers from an offset on."""
-
-    def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        function, address, offset, count = args
-        kind = ir.FunctionType(ir.VoidType(), [NUMBER.as_pointer(), count.type])
-        builder.call(
-            builder.inttoptr(function, kind.as_pointer()),
-            [pointer(builder, address, offset), count],
-        )
-        return context.get_dummy_value()
-
-    return types.void(types.intp, types.intp, types.intp, types.intp), build
 
 
 def fused(builder: Any, a: Any, b: Any, c: Any) -> Any:

@@ -35,9 +35,10 @@ from numba.core.errors import NumbaError
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from loop_interfaces import compiled, simd
+from loop_interfaces import compiled, native, simd
 from loop_interfaces.compiled import fingerprint, jit, kept
-from loop_interfaces.simd import call, load, read, splat, write
+from loop_interfaces.native import call_c
+from loop_interfaces.simd import load, read, splat, write
 
 from . import fft, kernel, spectra
 from .equations import Equation
@@ -88,10 +89,10 @@ def taped(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> int:
     z = inverse(w, plan.z1, plan.z2, d, t, c, e)
     for j in range(0, t.m, 8):
         put(w, tape + j, d, get(w, z + j, d))
-    call(plan.derivative, w, tape, t.m)
-    call(plan.derivative, w, tape + d, t.m)
-    call(plan.pointwise, w, z, t.m)
-    call(plan.pointwise, w, z + d, t.m)
+    call_c(plan.derivative, (w + 8 * tape, t.m))
+    call_c(plan.derivative, (w + 8 * (tape + d), t.m))
+    call_c(plan.pointwise, (w + 8 * z, t.m))
+    call_c(plan.pointwise, (w + 8 * (z + d), t.m))
     return forward(w, z, plan.z1 + plan.z2 - z, d, t, c, e)
 
 
@@ -236,7 +237,7 @@ def compile_pull_back(sources: str) -> Any:
     return pull_back
 
 
-_pull_back = compile_pull_back(fingerprint(compiled, simd, fft, spectra, kernel))
+_pull_back = compile_pull_back(fingerprint(compiled, native, simd, fft, spectra, kernel))
 
 
 class Adjoint:

@@ -5,67 +5,18 @@ only change in one instruction each, and a ticket of another turn is no ticket: 
 late, when the next step has been put up already, takes nothing of it.
 """
 
-from typing import Any
-
-from llvmlite import ir
-from numba import types
-
+from loop_interfaces.atomics import add, exchange, look, set_word
 from loop_interfaces.compiled import jit
-from loop_interfaces.simd import intrinsic
 
-__all__ = ["BOARD", "MAX_TURN", "claim", "next_piece", "put_up", "wait"]
+__all__ = ["BOARD", "MAX_TURN", "claim", "close", "look_up", "next_piece", "put_up", "wait"]
 
 BOARD = 16
 """Words of a board: the two that are used, each on a cache line of its own."""
 MAX_TURN = 2**31
 PIECES = 32
+CLOSED = 2**31
 FINISHED = 64
 """Bytes from the ticket to the count."""
-WORD = ir.IntType(64)
-
-
-def place(builder: Any, address: Any) -> Any:
-    return builder.inttoptr(address, WORD.as_pointer())
-
-
-@intrinsic
-def look(typing_context: Any, address: Any) -> Any:
-    """The word at an address; what was written before it was is seen, too."""
-
-    def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.load_atomic(place(builder, args[0]), "acquire", 8)
-
-    return types.intp(types.intp), build
-
-
-@intrinsic
-def set_word(typing_context: Any, address: Any, word: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        builder.store_atomic(args[1], place(builder, args[0]), "release", 8)
-        return context.get_dummy_value()
-
-    return types.void(types.intp, types.intp), build
-
-
-@intrinsic
-def exchange(typing_context: Any, address: Any, old: Any, new: Any) -> Any:
-    """Write `new` if the word is `old`; whether it was."""
-
-    def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        address, old, new = args
-        found = builder.cmpxchg(place(builder, address), old, new, "acq_rel", "acquire")
-        return builder.extract_value(found, 1)
-
-    return types.boolean(types.intp, types.intp, types.intp), build
-
-
-@intrinsic
-def count_up(typing_context: Any, address: Any) -> Any:
-    def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        builder.atomic_rmw("add", place(builder, args[0]), WORD(1), "acq_rel")
-        return context.get_dummy_value()
-
-    return types.void(types.intp), build
 
 
 @jit
@@ -73,6 +24,19 @@ def put_up(board: int, turn: int) -> None:
     """All pieces of a turn, none of them finished. Only when those of the turn before are."""
     set_word(board + FINISHED, 0)
     set_word(board, turn << PIECES)
+
+
+@jit
+def close(board: int, turn: int) -> None:
+    """No pieces until the next turn. Only when those of this one are finished."""
+    set_word(board, (turn << PIECES) | CLOSED)
+
+
+@jit
+def look_up(board: int) -> int:
+    """The turn."""
+    turn: int = look(board) >> PIECES
+    return turn
 
 
 @jit
@@ -97,7 +61,7 @@ def next_piece(board: int, turn: int, pieces: int) -> int:
     """The piece after one that is done, and what was written for which is there."""
     if board == 0:
         return -1
-    count_up(board + FINISHED)
+    add(board + FINISHED, 1)
     return claim(board, turn, pieces)
 
 

@@ -105,8 +105,7 @@ class Integrator:
 
         functions = all_finite, *TEAMWORK
         began, misses = time.perf_counter(), cache_misses(*functions)
-        self._loop, loop_is_new = pointwise_loop(equation.nonlinearity)
-        plan["pointwise"] = self._loop.address
+        plan["pointwise"], loop_is_new = pointwise_loop(equation.nonlinearity)
         code, code_is_new = environments()
         self._team = PlanTeam(code, plan, constants, size, points_per_step=8 * steps * fine)
 
@@ -127,9 +126,10 @@ class Integrator:
         """Advance all environments in place, see `kernel`; arrays are contiguous and writable."""
         self._team.step(states, actions, totals, diverged_step, k)
 
-    def lone(self, batch: int) -> tuple[int, int] | None:
-        """Addresses of code and plan that do a step of a batch alone; None where helpers are better."""
-        return self._team.lone(batch)
+    @property
+    def team(self) -> PlanTeam:
+        """The threads that do it."""
+        return self._team
 
 
 def fine_length(n_z: int) -> int:

@@ -1,8 +1,5 @@
 """The compiled step of the plant: ETDRK4 for one environment after the other.
 
-An environment is computed alone and by the same instructions whatever stands beside it, so its
-result does not depend on the batch, nor on which thread computes it.
-
 With N = m F[g(u)] + F_a the nonlinear part and the forcing of a held action, one internal step is
 
     a = E2 v + Q N(v)
@@ -17,17 +14,17 @@ the multiplier m is contained in the coefficients (names with an m).
 import math
 from typing import Any
 
-import numba
 import numpy as np
-from numba import carray, types  # type: ignore[attr-defined, unused-ignore]
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from loop_interfaces import simd
-from loop_interfaces.compiled import fingerprint, jit, kept
-from loop_interfaces.native import MachineCode
-from loop_interfaces.simd import call, fma, load, read, read_word, splat, store, write, write_word
+from loop_interfaces import native, simd
+from loop_interfaces.compiled import jit, kept
+from loop_interfaces.native import call_c
+from loop_interfaces.simd import fma, read, splat
 
 from . import fft, spectra
+from .environments import environments_of
 from .spectra import (
     TRANSFORM,
     analyse,
@@ -44,7 +41,7 @@ from .spectra import (
     synthesise,
 )
 
-__all__ = ["PLAN", "accept", "all_finite", "environments", "stage_cost", "step_signature"]
+__all__ = ["PLAN", "all_finite", "environments"]
 
 PLAN = np.dtype(
     [
@@ -90,20 +87,14 @@ PLAN = np.dtype(
 )
 
 
-def step_signature(plan: Any) -> Any:
-    """Of the machine code that advances environments: its plan, and seven addresses and numbers."""
-    plans = types.CPointer(numba.from_dtype(plan))  # type: ignore[no-untyped-call]
-    return types.void(plans, *[types.intp] * 7)
-
-
 @jit
 def nonlinear(w: int, d: int, plan: Any, c: int, e: int) -> int:
     """Where the transform of g(u) stands, u being the field of the spectrum x on the fine grid."""
     t = plan.fine
     split(w, plan.x, plan.z1, d, t, c, e)
     z = inverse(w, plan.z1, plan.z2, d, t, c, e)
-    call(plan.pointwise, w, z, t.m)
-    call(plan.pointwise, w, z + d, t.m)
+    call_c(plan.pointwise, (w + 8 * z, t.m))
+    call_c(plan.pointwise, (w + 8 * (z + d), t.m))
     return forward(w, z, plan.z1 + plan.z2 - z, d, t, c, e)
 
 
@@ -155,77 +146,17 @@ def force(action: int, w: int, d: int, plan: Any, c: int, e: int) -> None:
         put(w, plan.ff + k, d, product(c, plan.f + k, e, total))
 
 
-@jit
-def stage_cost(state: int, action: int, w: int, plan: Any, c: int) -> float:
-    lanes = splat(0.0)
-    whole = plan.n_z // 8 * 8
-    for i in range(0, whole, 8):
-        error = load(state, i) - load(c, plan.target + i)
-        lanes = fma(error, error, lanes)
-    store(w, plan.next, lanes)
-    state_part, action_part = 0.0, 0.0
-    for i in range(8):
-        state_part += read(w, plan.next + i)
-    for i in range(whole, plan.n_z):
-        state_part += (read(state, i) - read(c, plan.target + i)) ** 2
-    for j in range(plan.n_a):
-        action_part += read(action, j) ** 2
-    cost: float = plan.state_weight * state_part + plan.action_weight * action_part
-    return cost
+@register_jitable  # type: ignore[untyped-decorator, unused-ignore]
+def advance(state: int, action: int, w: int, d: int, plan: Any, c: int, e: int) -> None:
+    """The state a sampling time later, in the scratch."""
+    force(action, w, d, plan, c, e)
+    analyse(state, w, d, plan, c, e)
+    for _ in range(plan.steps):
+        integrate(w, d, plan, c, e)
+    synthesise(w + 8 * plan.state, w, d, plan, c, e)
 
 
-@jit
-def accept(total: float, state: int, w: int, plan: Any) -> bool:
-    """Take over the new state, if it and the costs so far are within bounds."""
-    valid = math.isfinite(total)
-    for j in range(plan.n_z):
-        valid &= abs(read(w, plan.state + j)) <= plan.bound
-    if valid:
-        for j in range(plan.n_z):
-            write(state, j, read(w, plan.state + j))
-    return valid
-
-
-def compile_environments() -> Any:
-    sources = fingerprint(simd, fft, spectra)
-
-    @numba.cfunc(step_signature(PLAN), cache=True)
-    def environments(
-        plans: Any,
-        states: int,
-        actions: int,
-        totals: int,
-        diverged_step: int,
-        first: int,
-        last: int,
-        k: int,
-    ) -> None:
-        """Advance the environments first, ..., last - 1 in place; all but the plan are addresses.
-
-        Adds the stage cost to `totals`. An environment whose new state is not within the bound
-        keeps its state and gets k in `diverged_step`; one that has an entry there is left alone.
-        """
-        sources  # noqa: B018  # closed over to be part of the key on disk
-        plan = carray(plans, 1)[0]
-        w, d, c, e = plan.scratch, plan.scratch_apart, plan.constants, plan.constants_apart
-        for i in range(first, last):
-            if read_word(diverged_step, i) >= 0:
-                continue
-            state, action = states + 8 * plan.n_z * i, actions + 8 * plan.n_a * i
-            total = read(totals, i) + stage_cost(state, action, w, plan, c)
-            write(totals, i, total)
-            force(action, w, d, plan, c, e)
-            analyse(state, w, d, plan, c, e)
-            for _ in range(plan.steps):
-                integrate(w, d, plan, c, e)
-            synthesise(w + 8 * plan.state, w, d, plan, c, e)
-            if not accept(total, state, w, plan):
-                write_word(diverged_step, i, k)
-
-    return environments
-
-
-environments = MachineCode(compile_environments)
+environments = environments_of(PLAN, advance, native, simd, fft, spectra)
 
 
 @kept

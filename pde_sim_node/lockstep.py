@@ -16,6 +16,8 @@ nothing is given up meanwhile; `episode/paused` tells everybody who waits for th
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
+
 import numpy as np
 
 from loop_interfaces.frames import MAX_VALUES, Frame, FrameError
@@ -33,8 +35,9 @@ from loop_interfaces.topics import (
     Topic,
     noise_seeds,
 )
+from pde_sim_node.machine import Machine
 from pde_sim_node.pace import Pace
-from pde_sim_node.plant import Machine, Plant
+from pde_sim_node.plant import Plant
 
 PAUSED_REPORT = 1.0
 """Seconds between two messages on `episode/paused` while the plant is paused."""
@@ -321,37 +324,38 @@ class Lockstep:
 
         digest: of the action, see Frame.digest.
         """
-        plant = self._plant
-        self._tuner_heard = now
-        self._taken.append(digest)
-        self._state = plant.step(action)
-        self.steps_total += plant.batch
-        self.rounds_total += 1
+        self._state = self._plant.step(action)
         self.time += self._sample_time
+        self._count([digest], now)
+        return self._state
+
+    def _count(self, digests: list[int], now: float) -> None:
+        """Actions were applied, the last one right now."""
+        self._tuner_heard = now
+        self._taken += digests
+        self.steps_total += len(digests) * self._plant.batch
+        self.rounds_total += len(digests)
         self._repeats = 0
         self._deadline = now + self._action_timeout
-        return self._state
 
     @property
     def machine(self) -> Machine | None:
         """What it takes to advance in compiled functions while it is `flowing`; then `credit`."""
         return self._plant.machine
 
+    def helping(self, machines: np.ndarray) -> AbstractContextManager[None]:
+        """While the machine, one entry of MACHINE, does steps: let other threads help it."""
+        return self._plant.helping(machines)
+
     def credit(self, actions: np.ndarray, time: float, now: float) -> None:
         """So many actions, one in each row, were applied by the `machine`, the last one right now.
 
         time: simulated time in s, which has gone on with every one.
         """
-        plant, count = self._plant, len(actions)
-        plant.credit(count)
-        self._tuner_heard = now
-        self._taken += [hash(action.tobytes()) for action in actions]
-        self._state = plant.states
-        self.steps_total += count * plant.batch
-        self.rounds_total += count
+        self._plant.credit(len(actions))
+        self._state = self._plant.states
         self.time = time
-        self._repeats = 0
-        self._deadline = now + self._action_timeout
+        self._count([hash(action.tobytes()) for action in actions], now)
 
     def tick(self, now: float) -> list[Send]:
         """Send the state again when its answer is overdue; give the episode up after max_repeats.

@@ -20,7 +20,6 @@ from loop_interfaces.affinity import core_list
 from loop_interfaces.frames import Frame
 from loop_interfaces.introspection import offer
 from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.line import Line
 from loop_interfaces.node_loop import NodeLoop
 from loop_interfaces.node_main import node_main
 from loop_interfaces.parameters import EXECUTION, PLANT, PROBLEM
@@ -76,7 +75,7 @@ class PlantNode:
         values = declare_parameters(node)
         loop.pin(values["pin"])  # before the plant counts the cores it has
         if values["solver_cores"]:
-            use_cores(core_list(values["solver_cores"]))
+            use_cores(core_list(values["solver_cores"]), attentive=values["pin"] >= 0)
         plant = build_plant(values)
         if plant.compiled_in_seconds > 0.0:
             node.get_logger().info(f"compiled the kernel in {plant.compiled_in_seconds:.1f} s")
@@ -118,7 +117,7 @@ class PlantNode:
         actions = loop.receive(ACTION, self._on_action, bundled=True)
         actions.swift = self._swiftly
         self._reflex = Reflex(self._lockstep, actions.codec)
-        loop.stream(actions, self._senders[STATE], self._flow)
+        loop.stream(actions, self._senders[STATE], self._flow, self._reflex.ear)
         loop.diagnose("lock-step", self._health.report)
         offer(node, "~/pause", self._pause)
         offer(node, "~/resume", self._resume)
@@ -172,10 +171,10 @@ class PlantNode:
             self._tell_time(self._lockstep.time)
         return True
 
-    def _flow(self, line: Line, rounds: int, patience: int) -> tuple[int, int]:
+    def _flow(self, rounds: int, until: int) -> tuple[int, int]:
         if self._clock_wanted:
             return 0, UNABLE
-        return self._reflex.flow(self._bundler, line, rounds, patience)
+        return self._reflex.flow(self._bundler, rounds, until)
 
     def _on_action(self, frame: Frame) -> None:
         self._send(self._lockstep.action(frame, self._loop.now()))

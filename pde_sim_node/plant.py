@@ -2,8 +2,8 @@
 
 import math
 import operator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,10 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 from .equations import Equation, LinearEquation
 from .integrator import Integrator
 from .kernel import all_finite
+from .machine import Machine
 from .propagator import Propagator
 from .supports import indicator_supports
 
-__all__ = ["DIVERGED_COST", "MEAN_FIELD", "EpisodeCosts", "Machine", "Plant"]
+__all__ = ["DIVERGED_COST", "MEAN_FIELD", "EpisodeCosts", "Plant"]
 
 DIVERGED_COST = 1e9
 """Mean stage cost of an environment that diverged: very bad, and finite."""
@@ -39,17 +40,6 @@ class EpisodeCosts:
     mean: NDArray[np.float64]
     total: NDArray[np.float64]
     diverged_step: NDArray[np.int64]
-
-
-class Machine(NamedTuple):
-    """A step in machine code, as addresses: see `kernel.environments` for what it is called with."""
-
-    code: int
-    plan: int
-    states: int
-    actions: int
-    totals: int
-    diverged_step: int
 
 
 class Plant:
@@ -191,14 +181,14 @@ class Plant:
             raise ValueError(
                 f"seeds must be 0 or more, or -1 for the mean field, got {seeds.min()}"
             )
-        drawn = [self._initial_field(int(seed)) for seed in seeds]
+        fields = {seed: self._initial_field(seed) for seed in set(seeds.tolist())}
         if self.batch != seeds.size:
             self._allocate(seeds.size)
         self.step_index = 0
         self._total.fill(0.0)
         self._diverged_step.fill(-1)
-        for state, initial in zip(self.states, drawn, strict=True):
-            state[:] = initial
+        for state, seed in zip(self.states, seeds.tolist(), strict=True):
+            state[:] = fields[seed]
         return self.states
 
     def _initial_field(self, seed: int) -> NDArray[np.float64]:
@@ -264,11 +254,21 @@ class Plant:
         """
         if type(self).step is not Plant.step:
             return None
-        code = self._integrator.lone(self.batch)
+        code = self._integrator.team.in_machine_code(self.batch)
         if code is None:
             return None
-        arrays = self.states, self._actions, self._total, self._diverged_step
-        return Machine(*code, *(array.ctypes.data for array in arrays))
+        return Machine(
+            *code,
+            states=self.states.ctypes.data,
+            actions=self._actions.ctypes.data,
+            totals=self._total.ctypes.data,
+            diverged_step=self._diverged_step.ctypes.data,
+            batch=self.batch,
+        )
+
+    def helping(self, machines: NDArray[np.void]) -> AbstractContextManager[None]:
+        """While the machine, one entry of MACHINE, does steps: let other threads help it."""
+        return self._integrator.team.helping(machines)
 
     def credit(self, steps: int) -> None:
         """So many steps were done by the `machine`."""

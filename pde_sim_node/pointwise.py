@@ -9,39 +9,37 @@ from numba.core.errors import NumbaError
 from numba.extending import register_jitable
 
 from loop_interfaces.compiled import fingerprint
+from loop_interfaces.native import MachineCode
 
 __all__ = ["pointwise_loop"]
 
-LOOPS: dict[Callable[[float], float], Any] = {}
+LOOPS: dict[Callable[[float], float], MachineCode] = {}
 
 
-def pointwise_loop(function: Callable[[float], float]) -> tuple[Any, bool]:
-    """Machine code of u[i] = function(u[i]) over an array, as Numba's cfunc of (double *, intp).
+def pointwise_loop(function: Callable[[float], float]) -> tuple[int, bool]:
+    """Machine code of u[i] = function(u[i]) over an array, a void (*)(double *, intp).
 
     Returns
     -------
-    The cfunc, the same one for the same function, and whether it was compiled by this call.
+    Its address, the same one for the same function, and whether it was compiled by this call.
 
     Raises
     ------
     ValueError
         Numba cannot compile the function for a float64, or it returns something else.
     """
-    if function in LOOPS:
-        return LOOPS[function], False
     # A plain function in the closure keeps the key on disk the same in every process; a dispatcher
     # would not.
     scalar = register_jitable(error_model="numpy")(function)
+    code = MachineCode(lambda: compile_loop(scalar, fingerprint(function)))
     try:
-        loop = compile_loop(scalar, fingerprint(function))
+        return LOOPS.setdefault(function, code)()
     except NumbaError as error:
         reason = str(error).strip().splitlines()[-1]
         raise ValueError(
             f"the nonlinearity {function.__qualname__} must be a scalar function u -> g(u) "
             f"that Numba can compile for a float64: {reason}"
         ) from error
-    LOOPS[function] = loop
-    return loop, not loop.cache_hits
 
 
 def compile_loop(scalar: Callable[[float], float], sources: str) -> Any:

@@ -10,17 +10,15 @@ alone and by the same instructions whatever stands beside it.
 
 from typing import Any
 
-import numba
 import numpy as np
-from numba import carray  # type: ignore[attr-defined, unused-ignore]
+from numba.extending import register_jitable
 
-from loop_interfaces import simd
-from loop_interfaces.compiled import fingerprint, jit
-from loop_interfaces.native import MachineCode
-from loop_interfaces.simd import fma, read, read_word, splat, write, write_word
+from loop_interfaces import native, simd
+from loop_interfaces.compiled import jit
+from loop_interfaces.simd import fma, read, splat
 
-from . import fft, kernel, spectra
-from .kernel import accept, stage_cost, step_signature
+from . import fft, spectra
+from .environments import environments_of
 from .spectra import TRANSFORM, analyse, get, plus_product, put, synthesise
 
 __all__ = ["LINEAR_PLAN", "propagate"]
@@ -58,7 +56,9 @@ LINEAR_PLAN = np.dtype(
 
 
 @jit
-def advance(component: int, action: int, w: int, d: int, plan: Any, c: int, e: int) -> None:
+def advance_component(
+    component: int, action: int, w: int, d: int, plan: Any, c: int, e: int
+) -> None:
     """The spectrum x of a component a sampling time later."""
     for k in range(0, plan.modes, 8):
         total = splat(0.0), splat(0.0)
@@ -72,41 +72,16 @@ def advance(component: int, action: int, w: int, d: int, plan: Any, c: int, e: i
         put(w, plan.x + k, d, total)
 
 
-def compile_propagation() -> Any:
-    sources = fingerprint(simd, fft, spectra, kernel)
-
-    @numba.cfunc(step_signature(LINEAR_PLAN), cache=True)
-    def propagate(
-        plans: Any,
-        states: int,
-        actions: int,
-        totals: int,
-        diverged_step: int,
-        first: int,
-        last: int,
-        k: int,
-    ) -> None:
-        """Advance environments as those of `kernel`."""
-        sources  # noqa: B018  # closed over to be part of the key on disk
-        plan = carray(plans, 1)[0]
-        w, d, c, e = plan.scratch, plan.scratch_apart, plan.constants, plan.constants_apart
-        for i in range(first, last):
-            if read_word(diverged_step, i) >= 0:
-                continue
-            state, action = states + 8 * plan.n_z * i, actions + 8 * plan.n_a * i
-            total = read(totals, i) + stage_cost(state, action, w, plan, c)
-            write(totals, i, total)
-            for f in range(plan.components):
-                analyse(state + 8 * plan.n_x * f, w, d, plan, c, e)
-                for m in range(0, plan.modes, 8):
-                    put(w, plan.spectra + f * plan.modes + m, d, get(w, plan.x + m, d))
-            for f in range(plan.components):
-                advance(f, action, w, d, plan, c, e)
-                synthesise(w + 8 * (plan.state + f * plan.n_x), w, d, plan, c, e)
-            if not accept(total, state, w, plan):
-                write_word(diverged_step, i, k)
-
-    return propagate
+@register_jitable  # type: ignore[untyped-decorator, unused-ignore]
+def advance(state: int, action: int, w: int, d: int, plan: Any, c: int, e: int) -> None:
+    """The state a sampling time later, in the scratch."""
+    for f in range(plan.components):
+        analyse(state + 8 * plan.n_x * f, w, d, plan, c, e)
+        for k in range(0, plan.modes, 8):
+            put(w, plan.spectra + f * plan.modes + k, d, get(w, plan.x + k, d))
+    for f in range(plan.components):
+        advance_component(f, action, w, d, plan, c, e)
+        synthesise(w + 8 * (plan.state + f * plan.n_x), w, d, plan, c, e)
 
 
-propagate = MachineCode(compile_propagation)
+propagate = environments_of(LINEAR_PLAN, advance, native, simd, fft, spectra)

@@ -152,6 +152,7 @@ class Propagator:
         """Advance all environments in place, see `kernel`; arrays are contiguous and writable."""
         self._team.step(states, actions, totals, diverged_step, k)
 
-    def lone(self, batch: int) -> tuple[int, int] | None:
-        """Addresses of code and plan that do a step of a batch alone; None where helpers are better."""
-        return self._team.lone(batch)
+    @property
+    def team(self) -> PlanTeam:
+        """The threads that do it."""
+        return self._team

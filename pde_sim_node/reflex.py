@@ -11,15 +11,26 @@ from dataclasses import replace
 from time import monotonic
 from typing import TYPE_CHECKING, Any
 
+import numba
 import numpy as np
+from numba import carray  # type: ignore[attr-defined, unused-ignore]
 from numpy.typing import NDArray
 
-from loop_interfaces import compiled, line, native, simd, wire
+from loop_interfaces import atomics, compiled, line, native, simd, wire
 from loop_interfaces.compiled import fingerprint, jit, kept
 from loop_interfaces.frames import HEADER, ArrayCodec, Frame
-from loop_interfaces.line import LINE, Line, monotonic_ns, received, send, wait
-from loop_interfaces.native import call_c
-from loop_interfaces.protocol import MORE, OTHER, QUIET, UNABLE
+from loop_interfaces.line import (
+    GOING,
+    LINE,
+    Ear,
+    announcement,
+    attendance,
+    monotonic_ns,
+    received,
+    send,
+)
+from loop_interfaces.native import MachineCode
+from loop_interfaces.protocol import MORE, OTHER, UNABLE
 from loop_interfaces.samples import ACTION_KIND, NO_TIME, SAMPLE_HEADER, STATE_KIND
 from loop_interfaces.simd import WIDTH, load, peek, poke, poke_lanes, read, write
 from loop_interfaces.topics import STATE
@@ -34,8 +45,9 @@ from loop_interfaces.wire import (
     append,
     expected_header,
 )
+from pde_sim_node import board, machine
 from pde_sim_node.lockstep import Lockstep
-from pde_sim_node.plant import Machine
+from pde_sim_node.machine import MACHINE, step_together
 
 if TYPE_CHECKING:
     from loop_interfaces.endpoints import Bundler
@@ -44,17 +56,17 @@ __all__ = ["Reflex", "load_compiled"]
 
 PLAN = np.dtype(
     [
+        ("line", LINE),
         ("expected", EXPECTED),
         ("message", np.int64),  # address of the header of the message to be sent
         # The following are of a plant that advances in machine code.
         ("begin", np.int64),  # address of the message to be sent, and its length
         ("length", np.int64),
-        *((name, np.int64) for name in Machine._fields),
-        ("batch", np.int64),
+        ("machine", MACHINE),
         ("values", np.int64),  # numbers of all states
         ("log", np.int64),  # address of room for the actions that were applied
-        ("step", np.int64),
         ("rounds", np.int64),  # done since the log was read
+        ("limit", np.int64),  # how many may be
         ("time", np.float64),  # simulated, in s
         ("sample_time", np.float64),
         ("timed", np.int64),  # whether samples of states tell it
@@ -62,6 +74,8 @@ PLAN = np.dtype(
     ]
 )
 IDS = ("run", "episode", "step", "plant")
+LOG = 50_000
+"""Numbers in actions that are applied before the lock-step hears of it."""
 NONE = -2
 """Number of no episode, nor of a lock-step that does not flow."""
 
@@ -92,6 +106,34 @@ def full(bundle: Any) -> bool:
     return bool(bundle.open and bundle.end >= bundle.limit)
 
 
+@jit
+def deal(line: Any, plan: Any) -> int:
+    """Take the action that has come in, and send the state; GOING, or why no more are wanted."""
+    raw, length = received(line)
+    head = expected_header(raw, length, plan.expected)
+    machine = plan.machine
+    if head == 0 or peek(head, STEP) != machine.step:
+        return OTHER
+    keep(line, plan, ACTION_KIND, NO_TIME, raw, length)
+    numbers = plan.expected.values
+    for i in range(numbers):
+        number = peek(head, FIRST + i)
+        write(machine.actions, i, number)
+        write(plan.log, plan.rounds * numbers + i, number)
+    step_together(machine)
+    plan.rounds += 1
+    plan.time += plan.sample_time
+    fill_in(plan.message, machine.step, plan.time, machine.states, plan.values)
+    send(line, plan.begin, plan.length)
+    told = plan.time if plan.timed else NO_TIME
+    keep(line, plan, STATE_KIND, told, plan.begin, plan.length)
+    done = plan.rounds == plan.limit or full(plan.bundles[0]) or full(plan.bundles[1])
+    return MORE if done else GOING
+
+
+attend, announced = attendance(deal)
+
+
 def compile_reflexes(sources: str) -> tuple[Any, Any, Any]:
     @kept
     def awaited(raw: bytes, plans: NDArray[np.void], step: int) -> bool:
@@ -109,42 +151,28 @@ def compile_reflexes(sources: str) -> tuple[Any, Any, Any]:
         fill_in(plans[0].message, step, time, states.ctypes.data, states.size)
 
     @kept
-    def advance(
-        lines: NDArray[np.void], plans: NDArray[np.void], rounds: int, patience: int
-    ) -> int:
-        """Take so many actions on the line, and send the states; why it returns."""
+    def advance(plans: NDArray[np.void], until: int) -> int:
+        """Take actions on the line, as many as may be, and send the states; why it returns."""
         sources  # noqa: B018
-        line, plan = lines[0], plans[0]
-        for _ in range(rounds):
-            if full(plan.bundles[0]) or full(plan.bundles[1]):
-                return MORE
-            if not wait(line, patience):
-                return QUIET
-            raw, length = received(line)
-            head = expected_header(raw, length, plan.expected)
-            if head == 0 or peek(head, STEP) != plan.step:
-                return OTHER
-            keep(line, plan, ACTION_KIND, NO_TIME, raw, length)
-            numbers = plan.expected.values
-            for i in range(numbers):
-                number = peek(head, FIRST + i)
-                write(plan.actions, i, number)
-                write(plan.log, plan.rounds * numbers + i, number)
-            arrays = plan.states, plan.actions, plan.totals, plan.diverged_step
-            call_c(plan.code, (plan.plan, *arrays, 0, plan.batch, plan.step))
-            plan.rounds += 1
-            plan.step += 1
-            plan.time += plan.sample_time
-            fill_in(plan.message, plan.step, plan.time, plan.states, plan.values)
-            send(line, plan.begin, plan.length)
-            told = plan.time if plan.timed else NO_TIME
-            keep(line, plan, STATE_KIND, told, plan.begin, plan.length)
-        return MORE
+        plan = plans[0]
+        return attend(plan.line, plan, until) if plan.rounds < plan.limit else MORE
 
     return awaited, answer, advance
 
 
-awaited, answer, advance = compile_reflexes(fingerprint(compiled, simd, native, line, wire))
+def compile_advance_soon() -> Any:
+    @numba.cfunc(announcement(PLAN), cache=True)
+    def advance_soon(plans: Any, count: int) -> None:
+        SOURCES  # noqa: B018  # part of the key on disk
+        plan = carray(plans, 1)[0]
+        announced(plan.line, plan)
+
+    return advance_soon
+
+
+SOURCES = fingerprint(compiled, simd, atomics, native, line, wire, board, machine)
+awaited, answer, advance = compile_reflexes(SOURCES)
+advance_soon = MachineCode(compile_advance_soon)
 
 
 def load_compiled() -> None:
@@ -153,7 +181,8 @@ def load_compiled() -> None:
     plans[0]["message"] = (room := np.zeros(FIRST + 1)).ctypes.data
     awaited(b"", plans, 0)
     answer(plans, 0, 0.0, room[:1].reshape(1, 1))
-    advance(np.zeros(1, LINE), plans, 0, 0)
+    advance(plans, 0)
+    advance_soon()
 
 
 class Reflex:
@@ -194,23 +223,28 @@ class Reflex:
         answer(self._plans, lockstep.step, lockstep.time, states)
         return self._message.raw
 
-    def flow(self, bundler: Bundler, line: Line, rounds: int, patience: int) -> tuple[int, int]:
-        """Advance with the actions on the line, so many and as long as they come within `patience` ns.
+    @property
+    def ear(self) -> Ear:
+        """What a line to the controller is for."""
+        code, _ = advance_soon()
+        return Ear(self._plan["line"], code, self._plans.ctypes.data)
 
-        How many were taken, and why it ends; OTHER: `line.message` waits to be handled.
+    def flow(self, bundler: Bundler, rounds: int, until: int) -> tuple[int, int]:
+        """Advance with the actions on the line, so many, until a time (monotonic ns).
+
+        How many were taken, and why it ends; OTHER: the line's message waits to be handled.
         """
         lockstep, plan = self._lockstep, self._plan
         if not self._advances or lockstep.flowing != self._serial:
             return 0, UNABLE
-        rounds = min(rounds, lockstep.horizon - lockstep.step)
-        if len(self._log) < rounds:
-            self._log = np.zeros((rounds, plan["expected"]["values"]))
-            plan["log"] = self._log.ctypes.data
-        plan["step"], plan["time"], plan["rounds"] = lockstep.step, lockstep.time, 0
+        rounds = min(rounds, lockstep.horizon - lockstep.step, len(self._log))
+        plan["machine"]["step"], plan["time"], plan["rounds"] = lockstep.step, lockstep.time, 0
+        plan["limit"] = rounds
         plan["timed"] = bundler.timed
         lengths = len(self._message.raw), self._values + self._log.itemsize * self._log.shape[1]
         bundler.lend(plan["bundles"], 2 * SAMPLE_HEADER + sum(lengths))
-        ended = advance(line.records, self._plans, rounds, patience)
+        with lockstep.helping(self._plans["machine"]):
+            ended = advance(self._plans, until)
         count = int(plan["rounds"])
         if count:
             lockstep.credit(self._log[:count], float(plan["time"]), monotonic())
@@ -240,9 +274,11 @@ class Reflex:
         self._advances = machine is not None
         if machine is None:
             return
-        for name, address in machine._asdict().items():
-            plan[name] = address
+        for name, value in machine._asdict().items():
+            plan["machine"][name] = value
         plan["begin"], plan["length"] = self._message.begin, len(self._message.raw)
-        plan["batch"], plan["values"] = len(state.values), state.values.size
+        plan["values"] = state.values.size
         plan["sample_time"] = self._lockstep.sample_time
-        self._log = np.zeros((0, frame.values.size))
+        if self._log.shape[1] != frame.values.size:
+            self._log = np.zeros((max(LOG // frame.values.size, 1), frame.values.size))
+            plan["log"] = self._log.ctypes.data

@@ -86,8 +86,9 @@ def plus_product(total: Complex, c: int, at: int, e: int, value: Complex) -> Com
 @jit
 def with_mirror(w: int, x: int, d: int, m: int, k: int) -> tuple[Complex, Complex]:
     """Eight numbers x_k + x*_{m-k} and x_k - x*_{m-k}, from k on."""
-    a, at = get(w, x + k, d), x + m - k - 7
-    br, bi = backwards(load(w, at)), backwards(load(w, at + d))
+    # A load of just these would cross what was stored as a whole, and wait for the cache.
+    a, below, above = get(w, x + k, d), get(w, x + m - k - 8, d), get(w, x + m - k, d)
+    br, bi = backwards(below[0], above[0]), backwards(below[1], above[1])
     return (a[0] + br, a[1] - bi), (a[0] - br, a[1] + bi)
 
 
@@ -116,10 +117,9 @@ def joined(w: int, z: int, d: int, m: int, factors: int, k: int, c: int, e: int)
 
 @jit
 def forward(w: int, z: int, other: int, d: int, t: Any, c: int, e: int) -> int:
-    """Transform the numbers at z; returns where the result is, its first number repeated behind."""
+    """Transform the numbers at z; returns where the result is, its first numbers repeated behind."""
     z = fft(w, z, other, d, t, c, e)
-    write(w, z + t.m, read(w, z))
-    write(w, z + t.m + d, read(w, z + d))
+    put(w, z + t.m, d, get(w, z, d))
     return z
 
 

@@ -3,22 +3,22 @@
 import os
 import time
 from _thread import LockType
-from collections.abc import Callable, Collection
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager, suppress
 from threading import Lock, Thread
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces import native
+from loop_interfaces import atomics, native
 from loop_interfaces.affinity import join_solver, usable_cores
 from loop_interfaces.compiled import fingerprint, kept
-from loop_interfaces.native import call_c
 
-from . import board
-from .board import BOARD, MAX_TURN, claim, next_piece, put_up, wait
+from . import board, machine
+from .board import BOARD, MAX_TURN, close, put_up, wait
 from .layout import Constants, aligned
+from .machine import LOOKS, MACHINE, help_out, work
 
 __all__ = ["TEAMWORK", "PlanTeam", "use_cores"]
 
@@ -29,8 +29,6 @@ WORTHWHILE_PIECES = 6
 LONE_PIECES = 7
 """Up to this many pieces of a step a thread does best that has everything else to do, too: with
 helpers the interpreter is between two steps."""
-LOOKS = 1_000_000
-"""Looks for the end of what other threads have begun before the caller sleeps: longer than a piece."""
 NAP = 50e-6
 """Seconds that it sleeps then: the thread it waits for has lost its core to somebody else."""
 
@@ -41,7 +39,7 @@ class PlanTeam:
     Parameters
     ----------
     code
-        Its address, see `kernel.environments`.
+        Its address, see `environments`.
     plan
         Its plan; the addresses of constants and scratch are filled in here.
     constants, scratch
@@ -69,7 +67,9 @@ class PlanTeam:
         self._turn = 0
         if threads > 1:  # load or compile what the first large batch would wait for
             start(self._board.ctypes.data, 0)
+            shut(self._board.ctypes.data, 0)
             done(self._board.ctypes.data, 0)
+            stand_by(np.ones(1, MACHINE), 0)  # it is over
 
     def step(
         self,
@@ -88,24 +88,51 @@ class PlanTeam:
         self._turn = turn = (self._turn + 1) % MAX_TURN
         address = self._board.ctypes.data
 
-        def help_out(thread: int) -> None:
+        def take_pieces(thread: int) -> None:
             work_off(
                 code, plans[thread], states, actions, totals, diverged_step, k,
                 address, turn, pieces,
             )  # fmt: skip
 
         start(address, turn)
-        self._crew.call(help_out, pieces - 1)
-        help_out(0)
+        self._crew.call(take_pieces, pieces - 1)
+        take_pieces(0)
         while not done(address, pieces):
             time.sleep(NAP)
         self._crew.dismiss()
 
-    def lone(self, batch: int) -> tuple[int, int] | None:
-        """Addresses of code and plan that do a step of a batch alone; None where helpers are better."""
-        if self.pieces(batch) > LONE_PIECES and len(self._addresses) > 1:
+    def in_machine_code(self, batch: int) -> tuple[int, int, int, int] | None:
+        """Code, plan, board and pieces of a `Machine` that does a step of a batch; None where helpers
+        are better, who are called from Python.
+        """
+        pieces, helpers = self.pieces(batch), len(self._addresses) - 1
+        if helpers and self._crew.attentive and pieces > 1:
+            return self._code, self._addresses[0], self._board.ctypes.data, pieces
+        if helpers and pieces > LONE_PIECES:
             return None
-        return self._code, self._addresses[0]
+        return self._code, self._addresses[0], 0, 1
+
+    @contextmanager
+    def helping(self, machines: NDArray[np.void]) -> Iterator[None]:
+        """Let helpers take pieces of what `machine.step_together` does meanwhile.
+
+        machines: one entry of MACHINE.
+        """
+        record = machines[0]
+        if not record["board"]:
+            yield
+            return
+        record["turn"], record["over"] = self._turn, 0
+        shut(self._board.ctypes.data, self._turn)
+        self._crew.call(
+            lambda thread: stand_by(machines, self._addresses[thread]), record["pieces"] - 1
+        )
+        try:
+            yield
+        finally:
+            record["over"] = 1
+            self._crew.dismiss()
+            self._turn = int(record["turn"])
 
     def pieces(self, batch: int) -> int:
         """How many pieces of work for a thread a step is."""
@@ -115,11 +142,13 @@ class PlanTeam:
 class Crew:
     """Threads that lend a hand to whoever calls. They exist from the first call on, for ever.
 
-    Nobody waits for one that has not begun, so a busy machine costs little.
+    Nobody waits for one that has not begun, so a busy machine costs little. attentive: whether they
+    may look for work all the time while they are called.
     """
 
-    def __init__(self, cores: Collection[int]) -> None:
+    def __init__(self, cores: Collection[int], attentive: bool = False) -> None:
         self.size = len(cores) - 1
+        self.attentive = attentive
         self._cores = cores
         self._process = 0
         self._gates: list[LockType] = []
@@ -164,14 +193,17 @@ def crew() -> Crew:
     return _CREW[0]
 
 
-def use_cores(cores: Collection[int]) -> None:
-    """Where the threads of the plants that are made from now on may be."""
-    _CREW[:] = [Crew(cores)]
+def use_cores(cores: Collection[int], *, attentive: bool = False) -> None:
+    """Where the threads of the plants that are made from now on may be.
+
+    attentive: they look for work all the time within an episode, where a step is worth it.
+    """
+    _CREW[:] = [Crew(cores, attentive)]
 
 
-def compile_board() -> tuple[Any, Any, Any]:
+def compile_board() -> tuple[Any, ...]:
     """What the threads call."""
-    sources = fingerprint(board, native)
+    sources = fingerprint(board, machine, atomics, native)
 
     @kept
     def work_off(
@@ -193,11 +225,12 @@ def compile_board() -> tuple[Any, Any, Any]:
         batch = len(totals)
         z, a = states.ctypes.data, actions.ctypes.data
         c, ended = totals.ctypes.data, diverged_step.ctypes.data
-        piece = claim(at, turn, pieces)
-        while piece >= 0:
-            first, last = batch * piece // pieces, batch * (piece + 1) // pieces
-            call_c(code, (plan, z, a, c, ended, first, last, k))
-            piece = next_piece(at, turn, pieces)
+        work(code, plan, z, a, c, ended, k, batch, at, turn, pieces)
+
+    @kept
+    def stand_by(machines: NDArray[np.void], plan: int) -> None:
+        sources  # noqa: B018
+        help_out(machines[0], plan)
 
     @kept
     def start(address: int, turn: int) -> None:
@@ -205,11 +238,16 @@ def compile_board() -> tuple[Any, Any, Any]:
         put_up(address, turn)
 
     @kept
+    def shut(address: int, turn: int) -> None:
+        sources  # noqa: B018
+        close(address, turn)
+
+    @kept
     def done(address: int, pieces: int) -> bool:
         sources  # noqa: B018
         return wait(address, pieces, LOOKS)
 
-    return work_off, start, done
+    return work_off, stand_by, start, shut, done
 
 
-TEAMWORK = work_off, start, done = compile_board()
+TEAMWORK = work_off, stand_by, start, shut, done = compile_board()

@@ -158,7 +158,7 @@ class RecorderNode:
         kind, qos = _TYPES[source.channel.type], reader_qos(START, DEPTH)
         return Intake(raw_subscription(self._node, kind, source.channel.topic, qos), kind, DEPTH)
 
-    def _tick(self, now: float) -> None:
+    def _tick(self, _: float) -> None:
         time.sleep(DRAIN)
         self._drain()
         now = self._loop.now()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from functools import partial
+from threading import Timer
 from typing import Any
 
 import numpy as np
@@ -12,12 +12,13 @@ from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
 from loop_interfaces.endpoints import raw_subscription, samples_qos
 from loop_interfaces.frames import HEADER
-from loop_interfaces.line import Line
+from loop_interfaces.line import Doorbell, Ear, Line
 from loop_interfaces.node_loop import NodeLoop
 from loop_interfaces.protocol import MORE, OTHER, QUIET, UNABLE
 from loop_interfaces.samples import ACTION_KIND, NO_TIME, STATE_KIND, unpack
 from loop_interfaces.topics import ACTION, COST, STATE, VOID, CostColumn
 from loop_interfaces.watching import Intake
+from pde_sim_node import threads
 from tests.test_reflexes import Controller, Plant, with_number
 
 LONG, SHORT = 10**9, 5 * 10**7  # ns
@@ -27,7 +28,7 @@ class Peer:
     """Publishes messages of one kind, and reads those of the other."""
 
     def __init__(self, sends: str, reads: str) -> None:
-        self.node = rclpy.create_node(f"sender_of_{sends}")
+        self.node = rclpy.create_node("peer")
         self._publisher = self.node.create_publisher(Float64MultiArray, sends, 10)
         self._intake = self._reader(Float64MultiArray, reads, 10)
 
@@ -65,21 +66,30 @@ class Peer:
         return [s for raw in self.heard(1, self._bundles) for s in unpack(raw)[1]]
 
 
-def line_of(node: Any, loop: NodeLoop, receiver: Any, sender: Any, poll: float = 0.0) -> Line:
-    return Line(node, receiver.handle, sender.publisher.handle, loop._guard, poll=poll)
+def line_of(loop: NodeLoop, receiver: Any, sender: Any, ear: Ear, opened: bool = True) -> Line:
+    line = Line(loop.node, receiver.handle, sender.publisher.handle, loop._guard, ear)
+    if opened:  # else the thread that attends deals with everything itself
+        line.open()
+    return line
 
 
-def plant_flows(*, poll: float = 0.0, timed: bool = False, **overrides: object) -> None:
+def plant_flows(
+    *, opened: bool = True, timed: bool = False, helped: bool = False, **overrides: object
+) -> None:
     node = rclpy.create_node("plant")
     loop, plant, peer = NodeLoop(node), Plant(horizon=12, **overrides), Peer("action", "state")
     loop.bundler.timed = timed
     receiver = loop.receive(ACTION, lambda frame: None, bundled=True)
     sender = loop.sender(STATE, bundled=True)
-    line = line_of(node, loop, receiver, sender, poll)
-    flow = partial(plant.reflex.flow, loop.bundler, line)
+    line = line_of(loop, receiver, sender, plant.reflex.ear, opened)
+
+    def flow(rounds: int, patience: int) -> tuple[int, int]:
+        return plant.reflex.flow(loop.bundler, rounds, time.monotonic_ns() + patience)
+
     peer.meet("state")
 
     state = plant.begin(1, (3, 4))
+    assert bool(plant.lockstep.machine.board) == helped
     assert flow(1, SHORT) == (0, UNABLE)  # nothing was learnt yet
     plant.expected(first := plant.action(state))
     state = plant.long_way(first)
@@ -103,9 +113,19 @@ def plant_flows(*, poll: float = 0.0, timed: bool = False, **overrides: object) 
     assert peer.heard(5) == states
     assert plant.lockstep.step == plant.judge.step == 6
 
+    # While it waits.
+    raw = plant.action(state)
+    _, state = plant.expected(raw)
+    Timer(0.2, peer.say, [raw]).start()
+    assert flow(50, LONG) == (1, QUIET)
+    Timer(0.2, peer.say, [raw]).start()
+    assert flow(50, LONG) == (0, OTHER)
+    assert line.message() == raw
+    assert peer.heard(1) == [plant.sent.encode(state)]
+
     # Nothing else is taken, and everything else is left to be handled.
     good = plant.action(state)
-    for place, number in ((0, 1.0), (1, 2.0), (2, 5.0), (4, 78.0), (HEADER, np.nan), (-1, np.inf)):
+    for place, number in ((0, 1.0), (1, 2.0), (2, 6.0), (4, 78.0), (HEADER, np.nan), (-1, np.inf)):
         peer.say(bad := with_number(good, 8, place, number))
         assert flow(50, LONG) == (0, OTHER), (place, number)
         assert line.message() == bad
@@ -113,7 +133,7 @@ def plant_flows(*, poll: float = 0.0, timed: bool = False, **overrides: object) 
         peer.say(bad)
         assert flow(50, LONG) == (0, OTHER)
         assert line.message()[: len(bad)] == bad
-    assert plant.lockstep.step == 6
+    assert plant.lockstep.step == 7
     peer.say(good, actions[-1])  # the next one, and an old one again
     assert flow(50, LONG) == (1, OTHER)
     assert line.message() == actions[-1]
@@ -167,6 +187,7 @@ def plant_flows(*, poll: float = 0.0, timed: bool = False, **overrides: object) 
     other = with_number(raw, 8, -1, 0.123)
     (void,) = plant.lockstep.action(plant.own.decode(other), 0.0)
     assert (void.frame.values[:, CostColumn.ENDED] == VOID).all()
+    line.close()
     node.destroy_node()
     peer.node.destroy_node()
 
@@ -174,18 +195,24 @@ def plant_flows(*, poll: float = 0.0, timed: bool = False, **overrides: object) 
 def plant_with_instruments_does_not() -> None:
     node = rclpy.create_node("instruments")
     loop, plant = NodeLoop(node), Plant(measurement_noise=0.1)
-    line = line_of(node, loop, loop.receive(ACTION, lambda frame: None), loop.sender(STATE))
+    actions = loop.receive(ACTION, lambda frame: None)
+    line = line_of(loop, actions, loop.sender(STATE), plant.reflex.ear)
     plant.long_way(plant.action(plant.begin(1, (3, 4))))
     assert plant.lockstep.flowing >= 0
-    assert plant.reflex.flow(loop.bundler, line, 1, SHORT) == (0, UNABLE)
+    assert plant.reflex.flow(loop.bundler, 1, SHORT) == (0, UNABLE)
+    line.close()
     node.destroy_node()
 
 
 def controller_flows() -> None:
     node = rclpy.create_node("controller")
     loop, controller, peer = NodeLoop(node), Controller(3), Peer("state", "action")
-    line = line_of(node, loop, loop.receive(STATE, lambda frame: None), loop.sender(ACTION))
-    flow = partial(controller.reflex.flow, line)
+    states = loop.receive(STATE, lambda frame: None)
+    line = line_of(loop, states, loop.sender(ACTION), controller.reflex.ear)
+
+    def flow(rounds: int, patience: int) -> tuple[int, int]:
+        return controller.reflex.flow(rounds, time.monotonic_ns() + patience)
+
     peer.meet("action")
     controller.begin(4)
     assert flow(1, SHORT) == (0, UNABLE)
@@ -203,15 +230,51 @@ def controller_flows() -> None:
     assert (controller.responder.answered, controller.responder.step) == (7, 3)
     controller.reflex.forget()
     assert flow(1, SHORT) == (0, UNABLE)
+    line.close()
+    node.destroy_node()
+    peer.node.destroy_node()
+
+
+def other_messages_end_a_wait() -> None:
+    node = rclpy.create_node("interrupted")
+    loop, controller, peer = NodeLoop(node), Controller(3), Peer("action", "state")
+    states = loop.receive(STATE, lambda frame: None)
+    line = line_of(loop, states, loop.sender(ACTION), controller.reflex.ear)
+    other = loop.receive(ACTION, lambda frame: None)
+    peer.meet("action")
+    controller.begin(4)
+    controller.long_way(controller.state(4, 0))
+
+    def waits(seconds: float) -> bool:
+        began = time.monotonic()
+        until = time.monotonic_ns() + int(1e9 * seconds)
+        assert controller.reflex.flow(1, until) == (0, QUIET)
+        return time.monotonic() - began >= seconds
+
+    doorbell = Doorbell([other.handle], loop._guard)
+    assert doorbell.works
+    assert waits(0.3)
+    peer.say(raw := controller.state(4, 1))
+    assert not waits(5.0)
+    assert waits(0.3)  # once a message
+    Timer(0.3, peer.say, [raw]).start()  # while it waits
+    assert not waits(5.0)
+    doorbell.close()
+    peer.say(raw)
+    assert waits(0.3)
+    line.close()
     node.destroy_node()
     peer.node.destroy_node()
 
 
 if __name__ == "__main__":
     rclpy.init()
+    other_messages_end_a_wait()
     controller_flows()
     plant_flows()
-    plant_flows(timed=True, poll=200e-6)
+    plant_flows(timed=True, opened=False)
     plant_with_instruments_does_not()
+    threads.use_cores(range(2), attentive=True)
+    plant_flows(helped=True, integration_time=0.0005)
     rclpy.shutdown()
     print("done")

@@ -33,12 +33,15 @@ def test_one_pair_has_no_namespace_and_several_share_one_clock() -> None:
     assert pairs.tuner_parameter(3) == ["pairs:=[pair0, pair1, pair2]"]
 
 
-def test_pinning_gives_every_node_its_own_core_or_refuses(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pinning_gives_every_pair_its_own_core_or_refuses(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {3, 5, 6, 7})
-    pins = [word for node in pairs.pair_nodes(2, pin=True) for word in node.parameters]
-    assert [p for p in pins if p.startswith("pin")] == [f"pin:={core}" for core in (3, 5, 6, 7)]
+    nodes = pairs.pair_nodes(2, pin=True)
+    pins = [word for node in nodes for word in node.parameters if word.startswith("pin")]
+    assert pins == [f"pin:={core}" for core in (3, 3, 5, 5)]
+    helpers = [node.name for node in nodes if "solver_cores:='3,5,6,7'" in node.parameters]
+    assert helpers == ["pde_sim_node-pair0", "pde_sim_node-pair1"]
     with pytest.raises(ParameterError, match="a core of its own, but there are 4"):
-        pairs.pair_nodes(3, pin=True)
+        pairs.pair_nodes(5, pin=True)
     with pytest.raises(ParameterError, match="--pairs is 0; expected a whole number from 1 to 64"):
         pairs.pair_nodes(0, pin=False)
     with pytest.raises(ValueError, match=r"'pin' is 4; expected -1 or one of the cores \[3, 5"):

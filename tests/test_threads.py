@@ -58,7 +58,7 @@ def test_who_comes_late_takes_nothing_of_the_next_step() -> None:
     team = plant._integrator._team
     plant.reset(np.arange(4))
     before = plant.states.copy()
-    board, (work_off, start, done) = team._board.ctypes.data, TEAMWORK
+    board, (work_off, _, start, _, done) = team._board.ctypes.data, TEAMWORK
     costs, diverged = np.zeros(4), np.full(4, -1)
     code, plan = team._code, team._addresses[0]
     what = code, plan, plant.states, np.zeros((4, 6)), costs, diverged, 0

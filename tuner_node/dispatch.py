@@ -226,10 +226,9 @@ class Dispatcher:
         known.observer.state(frame)
         return known.held is not None and frame.step == known.held.step
 
-    def action(self, pair: int, frame: Frame) -> bool:
-        """Take a sample a_k of a pair's episode; never the last one."""
+    def action(self, pair: int, frame: Frame) -> None:
+        """Take a sample a_k of a pair's episode."""
         self.pairs[pair].observer.action(frame)
-        return False
 
     def model(self, pair: int, frame: Frame, now: float) -> list[Order]:
         """Take the reduced models of an exploratory episode."""

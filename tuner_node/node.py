@@ -166,12 +166,8 @@ class TunerNode:
             if session.training.settings.trajectories:
                 # Before the costs: what has come in with one is then taken before it.
                 loop.receive(TARGET, self._handler(session.target, number), namespace)
-                loop.observe(
-                    STATE, partial(self._observe, session.dispatcher.state, number), namespace
-                )
-                loop.observe(
-                    ACTION, partial(self._observe, session.dispatcher.action, number), namespace
-                )
+                loop.observe(STATE, partial(self._on_state, number), namespace)
+                loop.observe(ACTION, partial(session.dispatcher.action, number), namespace)
             cost = loop.receive(COST, self._handler(session.cost, number), namespace)
             model = loop.receive(MODEL_IDENTIFIED, self._handler(session.model, number), namespace)
             self._cost_topics.append(cost.name)
@@ -214,8 +210,8 @@ class TunerNode:
         for name, value in values.items():
             setattr(self._session.dispatcher, name, value)
 
-    def _observe(self, take: Callable[[int, Frame], bool], pair: int, frame: Frame) -> None:
-        if take(pair, frame):
+    def _on_state(self, pair: int, frame: Frame) -> None:
+        if self._session.dispatcher.state(pair, frame):
             self._guarded(self._session.tick)
 
     def _handler(

@@ -29,16 +29,16 @@ def run(seconds: float = 10.0, pin: bool = False, rates: tuple[float, ...] = RAT
     for rate in rates:
         factor = rate * sample_time
         horizon = f"horizon:={max(1, round(seconds * rate))}"
-        cores = free_cores(2) if pin else [-1, -1]
+        core = free_cores(1)[0] if pin else -1
         with bench() as running:
             plant = running.start(
                 "pde_sim_node",
                 horizon,
                 f"real_time_factor:={factor}",
-                f"pin:={cores[0]}",
+                f"pin:={core}",
                 problem=PROBLEM,
             )
-            running.start("controller_node", f"pin:={cores[1]}", problem=PROBLEM)
+            running.start("controller_node", f"pin:={core}", problem=PROBLEM)
             limit = f"give_up:={seconds + 60}"
             driver = running.start("bringup.bench.driver", horizon, limit, problem=PROBLEM)
             driver.ask(do="begin", batch=1, seconds=3.0)  # until all have found each other

@@ -23,8 +23,8 @@ PROBLEM = "allen-cahn"
 BATCHES = (2, 64)
 CORES = ("any", "shared", "pinned")
 """Where plant and controller are: wherever the scheduler puts them (nodes started by hand), on one
-core for both (as `pdeloop train` does it), on one each (`--pin`). The
-ping-pong is on any two, and pinned with `pinned`."""
+core for both (as `pdeloop train` does it), on one for good, the plant's helpers looking for work on
+the others (`--pin`). The ping-pong is on any two, and with `pinned` on one each, polling."""
 PAYLOAD = 256
 """Numbers in a request of the bare ping-pong."""
 
@@ -44,10 +44,10 @@ def _measure(
     ping = running.start("bringup.bench.ping", f"pin:={one}")
     running.start("bringup.bench.ping", "end:=pong", f"pin:={two}")
     horizon = "horizon:=1000"
-    solver = [f"solver_cores:='{core_text(usable_cores())}'"] if cores == "shared" else []
+    solver = [] if cores == "any" else [f"solver_cores:='{core_text(usable_cores())}'"]
     pair = (
         running.start("pde_sim_node", horizon, f"pin:={one}", *solver, problem=PROBLEM),
-        running.start("controller_node", f"pin:={two}", problem=PROBLEM),
+        running.start("controller_node", f"pin:={one}", problem=PROBLEM),
     )
     if cores == "shared":
         placement = SharedCores(1)

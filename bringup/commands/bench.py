@@ -58,7 +58,7 @@ def add(commands: Commands) -> None:
         "--seconds 30 --pin",
     )
     real.add_argument("--seconds", type=float, default=10.0, metavar="S", help="of each rate [10]")
-    real.add_argument("--pin", action="store_true", help="with cores of their own")
+    real.add_argument("--pin", action="store_true", help="both kept on one core")
     pairs = _add(
         programs,
         "pairs",

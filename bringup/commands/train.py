@@ -113,7 +113,8 @@ def add(commands: Commands) -> None:
     train.add_argument(
         "--pin",
         action="store_true",
-        help="a core for each plant and controller, and polling: less time per step, more power",
+        help="keep each plant and its controller on one core, and let the plant's helpers on the "
+        "others look for work all the time: less time per step, more power",
     )
     train.add_argument(
         "--spread",

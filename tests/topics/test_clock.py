@@ -40,10 +40,10 @@ controller = Controller(2)
 controller.begin(4)
 controller.long_way(controller.state(4, 0))
 receiver, sender = loop.receive(STATE, lambda frame: None), loop.sender(ACTION)
-line = Line(loop.node, receiver.handle, sender.publisher.handle, loop._guard)
+line = Line(loop.node, receiver.handle, sender.publisher.handle, loop._guard, controller.reflex.ear)
 threading.Timer(0.5, loop._look_after).start()
 began = time.monotonic()
-ended = controller.reflex.flow(line, 50, 60 * 10**9)
+ended = controller.reflex.flow(50, time.monotonic_ns() + 60 * 10**9)
 print("flow", ended == (0, QUIET), time.monotonic() - began < 2.0)
 """
 
