@@ -102,9 +102,13 @@ class Introspection:
                 )
 
     def _namesakes(self, now: float) -> int:
-        """How many other nodes have had this one's full name for a while; says so."""
-        own = (self._node.get_name(), self._node.get_namespace())
-        others = self._node.get_node_names_and_namespaces().count(own) - 1
+        """How many other nodes have had this one's full name for a while; says so.
+
+        A node is there as long as its services are: the graph's list of names can keep a node that has
+        left, for good, when what it said last is read only after it has gone.
+        """
+        own = f"{self._node.get_fully_qualified_name()}/get_parameters"
+        others = self._node.count_services(own) - 1
         if others < 1:
             self._namesake_since = None
             return 0
