@@ -5,6 +5,7 @@ All are read-only but the live ones, which no result depends on.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -21,6 +22,8 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 from loop_interfaces.parameters import table
 from loop_interfaces.spec import ParameterError, Spec, check_names
 
+UNANSWERED = 1.0
+"""Seconds after which a request that got no answer is made again."""
 _LARGEST = 1.7976931348623157e308
 
 
@@ -96,7 +99,8 @@ def descriptor(spec: Spec) -> ParameterDescriptor:
 class RemoteParameters:
     """Asks another node for its parameters, through the services that every ROS node has.
 
-    name: the node's full name; values: what it said, None before. Call `poll` from time to time.
+    name: the node's full name; values: what it said, None before. Call `poll` from time to time. An
+    answer can be lost, if the other process has not heard yet of who reads it: it is asked again.
 
     The answer also proves that the other process knows every endpoint this node had before: its
     discovery hears of our endpoints in their order, and it cannot answer before it has heard of the
@@ -110,6 +114,8 @@ class RemoteParameters:
         self._get = node.create_client(GetParameters, f"{name}/get_parameters")
         self._clients = [self._list, self._get]
         self._future: Any = None
+        self._asked: Any = None
+        self._again_at = 0.0
         self._names: list[str] | None = None
 
     def poll(self) -> None:
@@ -117,10 +123,10 @@ class RemoteParameters:
         if self.values is not None:
             return
         if self._future is None:
-            if self._names is None and self._list.service_is_ready():
-                self._future = self._list.call_async(ListParameters.Request())
-            elif self._names is not None and self._get.service_is_ready():
-                self._future = self._get.call_async(GetParameters.Request(names=self._names))
+            if self._names is None:
+                self._ask(self._list, ListParameters.Request())
+            else:
+                self._ask(self._get, GetParameters.Request(names=self._names))
         elif self._future.done():
             answer, self._future = self._future.result(), None
             if self._names is None:
@@ -129,6 +135,14 @@ class RemoteParameters:
             values = [parameter_value_to_python(value) for value in answer.values]
             self.values = dict(zip(self._names, values, strict=True))
             self.close()
+        elif time.monotonic() > self._again_at:
+            self._asked.remove_pending_request(self._future)
+            self._future = None
+
+    def _ask(self, client: Any, request: Any) -> None:
+        if client.service_is_ready():
+            self._future, self._asked = client.call_async(request), client
+            self._again_at = time.monotonic() + UNANSWERED
 
     def close(self) -> None:
         """Drop the clients."""

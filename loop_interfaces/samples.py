@@ -47,8 +47,10 @@ SAMPLE_HEADER = _SAMPLE.size
 """Bytes in front of a sample's own."""
 _CLOCK = struct.Struct("<BBHiI")
 """CDR of a rosgraph_msgs/Clock."""
-_TYPICAL_OFFSET = 100_000_000
-"""Nanoseconds by which the delay of a bundle may vary before its clock is taken to be another one."""
+_STEP = 100_000_000
+"""Nanoseconds by which the sender's two clocks may part before one of them was set, or is another."""
+_WINDOW = 10_000_000_000
+"""Nanoseconds of which the smallest delay counts: clocks of two hosts drift apart."""
 
 
 class Allowance:
@@ -159,17 +161,28 @@ def clock_message(time: float) -> bytes | None:
 
 
 class ClockOffset:
-    """Puts the plant's stamps on the reader's clock: the smallest delay seen counts as none.
+    """Puts the plant's stamps on the reader's clock: the smallest delay of late counts as none.
 
-    So the times of samples do not depend on how many came together, nor on the clocks of hosts.
+    So the times of samples do not depend on how many came together, nor on the clocks of hosts, nor
+    on how long the reader was held up.
     """
 
     def __init__(self) -> None:
-        self._offset: int | None = None
+        self._smallest: list[int] = []
+        """In the window before, and in this one."""
+        self._began = self._clocks = 0
 
-    def update(self, sent: int, received: int) -> int:
-        """The offset in ns to add to a stamp, after a bundle sent and received at these times."""
-        new = received - sent
-        if self._offset is None or not 0 <= new - self._offset <= _TYPICAL_OFFSET:
-            self._offset = new
-        return self._offset
+    def update(self, sent: int, source: int, received: int) -> int:
+        """The offset in ns to add to a stamp, after a bundle.
+
+        sent: when, on the clock of the stamps; source: the same on the sender's clock of day, as the
+        middleware tells it; received: when, on the reader's.
+        """
+        offset, clocks = received - sent, source - sent
+        if not self._smallest or abs(clocks - self._clocks) > _STEP:
+            self._smallest, self._began = [offset, offset], received
+        elif received - self._began > _WINDOW:
+            self._smallest, self._began = [self._smallest[1], offset], received
+        self._clocks = clocks
+        self._smallest[1] = min(self._smallest[1], offset)
+        return min(self._smallest)

@@ -122,7 +122,7 @@ class Watcher:
         """
         for bundle, info in self._bundles.take(until):
             sent, samples = unpack(bundle)
-            offset = self._offset.update(sent, info["received_timestamp"])
+            offset = self._offset.update(sent, info["source_timestamp"], info["received_timestamp"])
             for sample in samples:
                 yield sample.kind, sample.stamp + offset, sample.raw
                 if self._clock and (told := clock_message(sample.time)) is not None:

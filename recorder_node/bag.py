@@ -33,6 +33,8 @@ from rosbags.typesys import Stores, get_typestore
 STORAGES = ("mcap", "sqlite3")
 _MESSAGE = struct.Struct("<BQHIQQ")
 """An MCAP message record up to its data: opcode, length, channel, sequence, log and publish time."""
+LARGE, LARGEST = 2**20, 2**26
+"""Bytes of an MCAP chunk that is closed at the next pause, and of one that is closed at once."""
 
 
 class BagError(RuntimeError):
@@ -82,6 +84,15 @@ class BagWriter:
         except (OSError, sqlite3.Error) as error:
             raise self._stopped(error) from error
         self.messages += 1
+
+    def pause(self) -> None:
+        """Between two batches of messages, each of which is kept as a whole or not at all: write what
+        has become large.
+        """
+        try:
+            self._storage.pause()
+        except OSError as error:
+            raise self._stopped(error) from error
 
     def flush(self) -> None:
         """Hand everything to the operating system, in a form that can be read back."""
@@ -173,7 +184,7 @@ class _Mcap(McapWriter):
         chunk.msgs[channel].append((timestamp, chunk.bio.tell()))
         chunk.bio.write(_MESSAGE.pack(5, 22 + len(data), channel, 0, timestamp, timestamp))
         chunk.bio.write(data)
-        if chunk.bio.tell() > 2**20:
+        if chunk.bio.tell() > LARGEST:
             self.close_chunk()
 
     def close_chunk(self) -> None:
@@ -183,6 +194,10 @@ class _Mcap(McapWriter):
         except OSError:
             self.bio.truncate(begin)
             raise
+
+    def pause(self) -> None:
+        if self.chunk.bio.tell() > LARGE:
+            self.close_chunk()
 
     def flush(self) -> None:
         if self.chunk.msgs:
@@ -195,6 +210,9 @@ class _Sqlite3(Sqlite3Writer):
     def __init__(self, path: Path, compression: CompressionMode) -> None:
         super().__init__(path, compression)
         self.conn.execute("PRAGMA synchronous=NORMAL")
+
+    def pause(self) -> None:
+        pass
 
     def flush(self) -> None:
         self.conn.commit()

@@ -59,6 +59,11 @@ class Episode:
         lacking += [f"{actions} of {self.horizon} actions"] if actions else []
         return lacking
 
+    @property
+    def sampled(self) -> bool:
+        """Whether no more samples are awaited of it, now that its cost is there."""
+        return self.void or (len(self.states) > self.horizon and len(self.actions) >= self.horizon)
+
     def settled(self, now: int) -> bool:
         """Whether nothing more is expected of it at time `now` (ns)."""
         if self.cost_at is None:
@@ -88,6 +93,10 @@ class EpisodeIndex:
             found = self._open[key] = Episode(*key, first=when, last=when)
         found.first, found.last = min(found.first, when), max(found.last, when)
         return found
+
+    def find(self, key: Key) -> Episode | None:
+        """An episode that is not over."""
+        return self._open.get(key)
 
     def start(self, key: Key, when: int, frame: Frame) -> Episode:
         """Note an episode's start."""

@@ -58,6 +58,9 @@ DEPTH = 1000
 be held up."""
 REPORT = 1.0
 """Seconds between two messages on recorder/status."""
+SLICE, PAST = 200_000_000, 10_000_000_000
+"""Nanoseconds of arrivals that are recorded in one batch, so that a recorder that is behind writes what
+it has, too; and by how much it can be behind, beyond which the clock was set."""
 QUIET = 0.1
 """At the end: seconds without a message after which nothing more is on its way."""
 _TYPES = {ARRAY_TYPE: Float64MultiArray, TEXT_TYPE: String}
@@ -99,6 +102,7 @@ class RecorderNode:
         self._health = RecorderHealth(self._recording)
         self._flush_at = self._report_at = self._caught_up_at = 0.0
         self._ticked = math.inf
+        self._until, self._behind = 0, False
         self._wire(node, loop)
         self._log.info(f"recording to {self._recording.path} ({values['bag_storage']})")
 
@@ -142,7 +146,7 @@ class RecorderNode:
             quiet_at = time.monotonic() + QUIET
             while time.monotonic() < min(quiet_at, deadline):
                 time.sleep(DRAIN)
-                if self._drain():
+                if self._drain(PAST):
                     quiet_at = time.monotonic() + QUIET
             recording.close()
         except BagError as error:
@@ -159,10 +163,11 @@ class RecorderNode:
         return Intake(raw_subscription(self._node, kind, source.channel.topic, qos), kind, DEPTH)
 
     def _tick(self, _: float) -> None:
-        time.sleep(DRAIN)
-        self._drain()
+        if not self._behind:
+            time.sleep(DRAIN)
+        self._drain(SLICE)
         now = self._loop.now()
-        if now - self._ticked > HELD_UP:
+        if self._behind or now - self._ticked > HELD_UP:
             self._caught_up_at = now + CATCH_UP
         self._ticked = now
         if now >= self._flush_at:
@@ -171,13 +176,15 @@ class RecorderNode:
             if now >= self._caught_up_at:
                 self._recording.index(time.time_ns())
 
-    def _drain(self) -> int:
-        """Record what has come in by now, in the order of arrival.
+    def _drain(self, longest: int) -> int:
+        """Record what has come in since the last time, in the order of arrival, of `longest` ns.
 
         Of all topics up to the same moment: what is written next to each other then belongs
         together, even if this process is held up between two of them and killed after it.
         """
-        until = time.time_ns()
+        now = time.time_ns()
+        self._behind = longest < now - self._until < PAST
+        self._until = until = self._until + longest if self._behind else now
         taken: list[tuple[int, int, Source, bytes]] = []
         for watcher, by_kind in self._watchers:
             try:
@@ -192,6 +199,7 @@ class RecorderNode:
         taken.sort(key=lambda item: item[:2])
         for when, _, source, raw in taken:
             self._recording.take(source, when, raw)
+        self._recording.pause()
         return len(taken)
 
     def _housekeeping(self, now: float) -> None:

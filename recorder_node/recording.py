@@ -8,10 +8,11 @@ bag/parameters.json                the nodes' parameters by run, as far as the n
 from __future__ import annotations
 
 import json
+from collections import defaultdict, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from loop_interfaces.protocol import ModelFailure
 from loop_interfaces.topics import (
@@ -28,7 +29,7 @@ from loop_interfaces.topics import (
     Topic,
 )
 from recorder_node.bag import BagError, BagWriter, Channel
-from recorder_node.episodes import EpisodeIndex, Key
+from recorder_node.episodes import SETTLING, Episode, EpisodeIndex, Key
 from recorder_node.headers import HeaderReader
 
 INDEX = "episodes.jsonl"
@@ -68,8 +69,35 @@ def clock() -> Source:
     return Source(Channel(CLOCK, CLOCK_TYPE, False), None, "")
 
 
+class _Taken(NamedTuple):
+    """A message to be written.
+
+    key: of the episode whose bag it is for; episode: the one it is about, if that is not over.
+    """
+
+    source: Source
+    when: int
+    raw: bytes
+    key: Key | None
+    episode: Episode | None
+
+    @property
+    def early(self) -> bool:
+        """Whether something should stand before it in the bag that has not come yet."""
+        if self.episode is None:
+            return False
+        if self.source.array is POLICY:
+            return not self.episode.started
+        return self.source.array is COST and not self.episode.sampled
+
+
 class Recording:
     """Writes what `take` is given.
+
+    A plant sends its samples after the cost they make up, and a tuner the policies of an episode as
+    soon as it has them. In the bag a cost stands behind its samples and policies behind the start:
+    they wait, and what the pair says next waits behind them. So whenever this process may be killed,
+    all episodes of a pair but the last are whole.
 
     path: a new folder; storage: 'mcap' or 'sqlite3'. Raises BagError when it cannot be written.
     """
@@ -90,6 +118,8 @@ class Recording:
         self._bags: dict[Key, BagWriter] = {}
         self._latched: dict[str, bytes] = {}
         self._newest: Key | None = None
+        self._waiting: defaultdict[str, deque[_Taken]] = defaultdict(deque)
+        """By namespace: one that came early, and what came after it."""
         if path.exists():
             raise BagError(f"{path} already exists; choose another folder for the bag")
         try:
@@ -105,6 +135,26 @@ class Recording:
         """Record one message that arrived at `when` (ns since the epoch)."""
         key = self._attribute(source, when, raw)
         self.messages += 1
+        episode = self._index.find(key) if key else None
+        taken = _Taken(source, when, raw, key or self._newest, episode)
+        waiting = self._waiting[source.namespace]
+        if source.array in (STATE, ACTION) or not (waiting or taken.early):
+            self._write(taken)
+        else:
+            waiting.append(taken)
+        if waiting:
+            self._let_go(waiting, when)
+
+    def _let_go(self, waiting: deque[_Taken], now: int | None) -> None:
+        """Write what need not wait at time `now` (ns); None: all."""
+        while waiting:
+            first = waiting[0]
+            if now is not None and first.early and now - first.when <= SETTLING * 1e9:
+                return
+            self._write(waiting.popleft())
+
+    def _write(self, taken: _Taken) -> None:
+        source, when, raw, key, _ = taken
         if self._bag is not None:
             self._bag.write(source.channel.topic, when, raw)
             return
@@ -112,7 +162,6 @@ class Recording:
             self._latched[source.channel.topic] = raw
             for bag in self._bags.values():
                 bag.write(source.channel.topic, when, raw)
-        key = key or self._newest
         if key is not None:
             self._bag_of(key, when).write(source.channel.topic, when, raw)
 
@@ -131,18 +180,29 @@ class Recording:
         except OSError as error:
             raise BagError(f"cannot write to {self.path}: {error.strerror}") from error
 
+    def pause(self) -> None:
+        """All that arrived up to some moment was taken."""
+        for bag in self._open_bags():
+            bag.pause()
+
     def flush(self) -> None:
         """Make everything so far survive a crash."""
-        for bag in (self._bag, *self._bags.values()):
-            if bag is not None:
-                bag.flush()
+        for bag in self._open_bags():
+            bag.flush()
+
+    def _open_bags(self) -> list[BagWriter]:
+        return [*self._bags.values()] if self._bag is None else [self._bag]
 
     def index(self, now: int) -> None:
         """Index the episodes that are over at time `now` (ns): nothing more is expected of them."""
+        for waiting in self._waiting.values():
+            self._let_go(waiting, now)
         self._finish_episodes(now)
 
     def close(self) -> None:
         """Finish the bag or bags."""
+        for waiting in self._waiting.values():
+            self._let_go(waiting, None)
         self._finish_episodes(None)
         for bag in self._bags.values():
             bag.close(self._custom())

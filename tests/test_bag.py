@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sqlite3
 import subprocess
 import sys
@@ -17,7 +18,7 @@ from rosbags.highlevel import AnyReader
 from bringup.bags.reader import Bag
 from bringup.bags.tools import recover
 from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.topics import ACTION, COST, START, STATE
+from loop_interfaces.topics import ACTION, COST, POLICY, START, STATE
 from recorder_node.bag import STORAGES, BagError
 from recorder_node.headers import HeaderReader
 from recorder_node.recording import Recording, Source, clock, sources
@@ -161,6 +162,64 @@ def test_what_was_flushed_is_readable_without_an_end_and_can_be_recovered(tmp_pa
     with AnyReader([target]) as reader:
         assert reader.message_count == 14
     assert Bag(target).finished
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_cost_waits_for_the_samples_that_it_is_about(tmp_path, storage, lost):
+    recording = Recording(tmp_path / "bag", WHAT, storage=storage, bag_per_episode=False)
+    early, samples = [], []
+
+    def take(topic, content: Frame, when: int) -> None:
+        recording.take(BY_TOPIC[topic], when, encode(topic, content))
+
+    for episode in (7, 8):
+        rows = np.array([(3.0, 4.0, 0.1, 0.0)])
+        early.append((POLICY, Frame(RUN, episode, 0, 0.0, np.ones((1, 2, 3)))))
+        early.append((START, Frame(RUN, episode, 0, 0.0, rows)))
+        early.append((COST, Frame(RUN, episode, 5, 0.0, np.array([(1.0, 5.0, -1.0)]), 99)))
+        for step in range(6):
+            samples.append((STATE, frame(step, 1, 16, episode=episode)))
+            samples.append((ACTION, frame(step, 1, 4, episode=episode)))
+    for topic, content in early:
+        take(topic, content, SECOND)
+        recording.flush()
+        began = (topic, content.episode) != (POLICY, 7)
+        assert len(list(Bag(tmp_path / "bag").episodes())) == began
+    for topic, content in samples:
+        recording.flush()  # as if it were killed now
+        whole = [not episode.missing for episode in Bag(tmp_path / "bag").episodes()]
+        assert lost or all(whole[:-1]), (topic, content.episode, content.step)
+        if not (lost and topic is STATE and content.step == 3):
+            take(topic, content, SECOND)
+    recording.index(SECOND + SECOND // 2)  # nothing more is waited for
+    recording.flush()
+    assert [not e.missing for e in Bag(tmp_path / "bag").episodes()] == [not lost] * 2
+    recording.close()
+    assert recording.messages == 6 + 24 - 2 * lost
+    with AnyReader([tmp_path / "bag"]) as reader:
+        assert reader.message_count == recording.messages
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_of_a_batch_all_survives_or_nothing(tmp_path, storage):
+    recording = Recording(tmp_path / "bag", WHAT, storage=storage, bag_per_episode=False)
+    raw = encode(STATE, frame(0, 8, 1024))  # 64 kB
+
+    def survivors() -> int:
+        shutil.rmtree(tmp_path / "killed", ignore_errors=True)
+        shutil.copytree(tmp_path / "bag", tmp_path / "killed")
+        return sum(1 for _ in Bag(tmp_path / "killed").messages())
+
+    for batch in range(3):
+        for when in range(40):
+            recording.take(BY_TOPIC[STATE], SECOND + 40 * batch + when, raw)
+            assert survivors() % 40 == 0
+        recording.pause()
+        assert survivors() % 40 == 0
+    recording.flush()
+    assert survivors() == 3 * 40
+    recording.close()
 
 
 @pytest.mark.parametrize("cut", [1, 50, 333])

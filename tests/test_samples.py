@@ -129,8 +129,19 @@ def test_a_time_that_the_clock_cannot_tell_is_none(seconds: float):
 
 def test_stamps_are_put_on_the_readers_clock():
     clock = ClockOffset()
-    assert clock.update(sent=1_000, received=5_000) == 4_000
-    assert clock.update(sent=2_000, received=9_000) == 4_000  # a bundle that took longer
-    assert clock.update(sent=3_000, received=6_500) == 3_500  # one that was faster
-    another = 10**12
-    assert clock.update(sent=4_000, received=another) == another - 4_000  # another plant's clock
+    day, second = 7_000, 10**9  # the sender's other clock is ahead by 7 us
+    assert clock.update(1_000, day + 1_000, received=5_000) == 4_000
+    assert clock.update(2_000, day + 2_000, received=9_000) == 4_000  # a bundle that took longer
+    assert clock.update(3_000, day + 3_000, received=6_500) == 3_500  # one that was faster
+    assert clock.update(4_000, day + 4_000, received=second) == 3_500  # the reader was held up
+    later = 3_600 * second
+    assert clock.update(5_000, later, received=later + 2_000) == later - 3_000  # it was set
+    assert clock.update(6_000, later + 1_000, received=later + 2_000) == later - 4_000
+
+
+def test_stamps_follow_a_clock_that_drifts():
+    clock = ClockOffset()
+    second = 10**9
+    for sent in range(0, 100 * second, second):  # another host's, slow by 20 us a second
+        drift = 20_000 * sent // second
+        assert 0 <= drift - clock.update(sent, sent, received=sent + drift) <= 20 * 20_000

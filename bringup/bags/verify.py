@@ -22,7 +22,7 @@ from controller_node.identification import DesignSettings, design
 from controller_node.policy import ProjectedLaw, excitation
 from loop_interfaces import model_rows
 from loop_interfaces.frames import Frame
-from loop_interfaces.parameters import table
+from loop_interfaces.parameters import PLANT, table
 from loop_interfaces.spec import check, read_yaml
 from loop_interfaces.topics import COMPLETED, VOID, CostColumn, StartColumn, noise_seeds
 from pde_sim_node.build import build_plant, fingerprint
@@ -108,14 +108,19 @@ def verify(*paths: Path, parameters: Path | None = None) -> Report:
             report.episodes += 1
             number = episode.key[1]
             if number not in runs:
-                values = given if given is not None else known.get(number)
-                runs[number] = _Run(number, values, report)
+                runs[number] = _Run(number, given or _complete(known.get(number)), report)
             runs[number].episode(episode)
     for run in runs.values():
         run.finish()
     if not report.episodes:
         report.notes.append("no episode of the loop is in this bag")
     return report
+
+
+def _complete(values: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
+    """The parameters of a run, None without those that only its plant can tell."""
+    told = values is not None and any(spec.name in values for spec in PLANT)
+    return values if told else None
 
 
 class _Run:
