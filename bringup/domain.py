@@ -15,6 +15,7 @@ DOMAINS = range(1, 101)
 """Domains whose ports lie outside the ephemeral range on Linux; 0 is everybody's default."""
 DOMAINS_FOLDER = Path(tempfile.gettempdir()) / f"pdeloop-domains-{os.getuid()}"
 """Locks of the domains in use, and who uses them (bringup.live)."""
+FIRST_PARTICIPANTS = 16
 
 
 class DomainError(RuntimeError):
@@ -35,8 +36,8 @@ def given_domain() -> int | None:
 def own_domain() -> Iterator[int]:
     """ROS_DOMAIN_ID if the user set it, else a free domain, held until the end of the block.
 
-    A domain is free when no other run holds its lock and nobody is bound to its first participant's
-    discovery port (7410 + 250 d on loopback).
+    A domain is free when no other run holds its lock and nobody is bound to a discovery port of its
+    first participants (7410 + 250 d + 2 i on loopback): the first of them may have left.
     """
     chosen = given_domain()
     if chosen is not None:
@@ -56,9 +57,10 @@ def own_domain() -> Iterator[int]:
 
 
 def _unused(domain: int) -> bool:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.bind(("127.0.0.1", 7410 + 250 * domain))
-        except OSError:
-            return False
+    for participant in range(FIRST_PARTICIPANTS):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(("127.0.0.1", 7410 + 250 * domain + 2 * participant))
+            except OSError:
+                return False
     return True

@@ -85,15 +85,24 @@ def test_the_user_opens_the_network_on_purpose(monkeypatch):
 def test_every_run_has_a_domain_of_its_own_unless_the_user_sets_one(monkeypatch):
     with own_domain() as first, own_domain() as second:
         assert first != second
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as busy:
-            taken = next(d for d in range(1, 101) if d not in (first, second))
-            busy.bind(("127.0.0.1", 7410 + 250 * taken))
-            for _ in range(5):
-                with own_domain() as third:
-                    assert third not in (first, second, taken)
+        monkeypatch.setattr("bringup.domain.DOMAINS", (first, second))
+        with pytest.raises(DomainError, match="are in use"), own_domain():
+            pass
     monkeypatch.setenv("ROS_DOMAIN_ID", "7")
     with own_domain() as chosen:
         assert chosen == 7
     monkeypatch.setenv("ROS_DOMAIN_ID", "many")
     with pytest.raises(DomainError, match="'many'; expected a whole number"), own_domain():
         pass
+
+
+@pytest.mark.parametrize("participant", [0, 3])
+def test_a_domain_in_which_somebody_is_left_is_not_given_out(monkeypatch, participant):
+    with own_domain() as first, own_domain() as second:
+        pass
+    monkeypatch.setattr("bringup.domain.DOMAINS", (first, second))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as busy:
+        busy.bind(("127.0.0.1", 7410 + 250 * first + 2 * participant))
+        for _ in range(10):
+            with own_domain() as chosen:
+                assert chosen == second
