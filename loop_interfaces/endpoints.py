@@ -19,6 +19,7 @@ from rclpy.subscription import Subscription
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
 from loop_interfaces.frames import ArrayCodec, Frame
+from loop_interfaces.rcl import publishes_where_it_is
 from loop_interfaces.samples import AGE, NO_TIME, STATE_KIND, Allowance, Bundle
 from loop_interfaces.topics import (
     READER_DEPTH,
@@ -107,13 +108,14 @@ class _Outlet:
 
     def __init__(self, node: Node, name: str) -> None:
         self._publisher = node.create_publisher(UInt8MultiArray, name, samples_qos(KEPT))
-        self._publish = self._publisher.handle.publish_raw
+        self._publish = publishes_where_it_is(self._publisher)
         self.bundle = Bundle()
         self._began = 0.0
 
     def flush(self) -> None:
         if self.bundle.size:
-            self._publish(self.bundle.take(time.monotonic_ns()))
+            with self.bundle.take(time.monotonic_ns()) as message:
+                self._publish(message)
         self._began = time.monotonic()
 
     def look(self, now: float) -> bool:

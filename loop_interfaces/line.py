@@ -215,24 +215,6 @@ class Doorbell:
         self._subscriptions = ()
 
 
-class _Allocator(ctypes.Structure):
-    _fields_ = [
-        (name, ctypes.c_void_p)
-        for name in ("allocate", "deallocate", "reallocate", "zero_allocate", "state")
-    ]
-
-
-class _Message(ctypes.Structure):
-    """rcl_serialized_message_t."""
-
-    _fields_ = [
-        ("buffer", ctypes.c_void_p),
-        ("length", ctypes.c_size_t),
-        ("capacity", ctypes.c_size_t),
-        ("allocator", _Allocator),
-    ]
-
-
 class Ear(NamedTuple):
     """What a line is for.
 
@@ -266,11 +248,15 @@ class Line:
         # Here, so that what only compares and fills in needs no ROS.
         from rclpy.impl.implementation_singleton import rclpy_implementation
 
+        from loop_interfaces.rcl import Allocator, SerializedMessage
+
         rcl, rcutils = ctypes.CDLL("librcl.so"), ctypes.CDLL("librcutils.so")
-        rcutils.rcutils_get_default_allocator.restype = _Allocator
+        rcutils.rcutils_get_default_allocator.restype = Allocator
         allocator = rcutils.rcutils_get_default_allocator()
         # rcl makes room in the one, and only reads the other.
-        self._incoming, self._outgoing = (_Message(None, 0, 0, allocator) for _ in range(2))
+        self._incoming, self._outgoing = (
+            SerializedMessage(None, 0, 0, allocator) for _ in range(2)
+        )
         self._free = rcutils.rcutils_uint8_array_fini
         self._moment = np.zeros(2, np.int64)
         self._turns = np.array([1, GOING, 0, 1])  # the node's own

@@ -102,10 +102,13 @@ class Bundle:
         self.size = int(record["end"] - record["limit"]) + LIMIT
         return self.size >= LIMIT
 
-    def take(self, sent: int) -> bytes:
-        """CDR bytes of the message that holds them all; the bundle is empty afterwards."""
+    def take(self, sent: int) -> memoryview:
+        """CDR bytes of the message that holds them all, to be released before anything is added.
+
+        The bundle is empty afterwards.
+        """
         _MESSAGE.pack_into(self._memory, 0, _ENCODING, 0, 0, 8 + self.size, sent)
-        whole = bytes(memoryview(self._memory)[: _MESSAGE.size + self.size])
+        whole = memoryview(self._memory)[: _MESSAGE.size + self.size]
         self.size = 0
         return whole
 

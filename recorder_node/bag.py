@@ -176,15 +176,19 @@ class _Mcap(McapWriter):
     def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
         # As in the parent class, with one struct instead of seven writes.
         chunk, channel = self.chunk, connection.id
-        self.message_start_time = min(timestamp, self.message_start_time)
-        self.message_end_time = max(timestamp, self.message_end_time)
-        chunk.message_start_time = min(timestamp, chunk.message_start_time)
-        chunk.message_end_time = max(timestamp, chunk.message_end_time)
+        if timestamp < chunk.message_start_time:
+            chunk.message_start_time = timestamp
+            self.message_start_time = min(timestamp, self.message_start_time)
+        if timestamp > chunk.message_end_time:
+            chunk.message_end_time = timestamp
+            self.message_end_time = max(timestamp, self.message_end_time)
         self.channel_stats[channel] += 1
-        chunk.msgs[channel].append((timestamp, chunk.bio.tell()))
-        chunk.bio.write(_MESSAGE.pack(5, 22 + len(data), channel, 0, timestamp, timestamp))
-        chunk.bio.write(data)
-        if chunk.bio.tell() > LARGEST:
+        content = chunk.bio
+        position = content.tell()
+        chunk.msgs[channel].append((timestamp, position))
+        content.write(_MESSAGE.pack(5, 22 + len(data), channel, 0, timestamp, timestamp))
+        content.write(data)
+        if position > LARGEST:
             self.close_chunk()
 
     def close_chunk(self) -> None:
@@ -219,6 +223,17 @@ class _Sqlite3(Sqlite3Writer):
 
 
 class _Writer(Writer):
+    """The parent class compares the connection with every one it has, for every message."""
+
+    def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
+        assert self.storage is not None
+        self.storage.write(connection, timestamp, data)
+        self.counts[connection.id] += 1
+        if timestamp < self.min_timestamp:
+            self.min_timestamp = timestamp
+        if timestamp > self.max_timestamp:
+            self.max_timestamp = timestamp
+
     STORAGE_PLUGINS: Mapping[StoragePlugin, Any] = {  # as in the parent class
         StoragePlugin.MCAP: _Mcap,
         StoragePlugin.SQLITE3: _Sqlite3,

@@ -91,7 +91,10 @@ class EpisodeIndex:
         found = self._open.get(key)
         if found is None:
             found = self._open[key] = Episode(*key, first=when, last=when)
-        found.first, found.last = min(found.first, when), max(found.last, when)
+        elif when < found.first:
+            found.first = when
+        elif when > found.last:
+            found.last = when
         return found
 
     def find(self, key: Key) -> Episode | None:

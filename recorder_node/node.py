@@ -196,7 +196,7 @@ class RecorderNode:
         for source, intake in self._intakes:
             for raw, info in intake.take(until):
                 taken.append((info["received_timestamp"], len(taken), source, raw))
-        taken.sort(key=lambda item: item[:2])
+        taken.sort()  # no two have the same number
         for when, _, source, raw in taken:
             self._recording.take(source, when, raw)
         self._recording.pause()

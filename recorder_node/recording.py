@@ -11,6 +11,7 @@ import json
 from collections import defaultdict, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -50,6 +51,11 @@ class Source:
     channel: Channel
     array: Topic | None
     namespace: str
+
+    @cached_property
+    def sampled(self) -> bool:
+        """Whether it is what comes by the hundred: states or actions."""
+        return self.array in (STATE, ACTION)
 
 
 def sources(namespace: str) -> list[Source]:
@@ -133,15 +139,18 @@ class Recording:
 
     def take(self, source: Source, when: int, raw: bytes) -> None:
         """Record one message that arrived at `when` (ns since the epoch)."""
-        key = self._attribute(source, when, raw)
+        key = self._attribute(source, when, raw) or self._newest
         self.messages += 1
-        episode = self._index.find(key) if key else None
-        taken = _Taken(source, when, raw, key or self._newest, episode)
         waiting = self._waiting[source.namespace]
-        if source.array in (STATE, ACTION) or not (waiting or taken.early):
-            self._write(taken)
+        if source.sampled:
+            self._write(source, when, raw, key)
         else:
-            waiting.append(taken)
+            episode = self._index.find(key) if key else None
+            taken = _Taken(source, when, raw, key, episode)
+            if waiting or taken.early:
+                waiting.append(taken)
+            else:
+                self._write(source, when, raw, key)
         if waiting:
             self._let_go(waiting, when)
 
@@ -151,10 +160,10 @@ class Recording:
             first = waiting[0]
             if now is not None and first.early and now - first.when <= SETTLING * 1e9:
                 return
-            self._write(waiting.popleft())
+            waiting.popleft()
+            self._write(first.source, first.when, first.raw, first.key)
 
-    def _write(self, taken: _Taken) -> None:
-        source, when, raw, key, _ = taken
+    def _write(self, source: Source, when: int, raw: bytes, key: Key | None) -> None:
         if self._bag is not None:
             self._bag.write(source.channel.topic, when, raw)
             return
@@ -219,12 +228,14 @@ class Recording:
             return self._failed(source, when, raw) if source.channel.type == TEXT_TYPE else None
         headers = self._headers[source.channel.topic]
         ids = headers.ids(raw)
-        if ids is None or source.array in (MODEL, TARGET):
+        if ids is None:
             return None
         run, number, step = ids
         key = (source.namespace, run, number)
-        if source.array in (STATE, ACTION):
+        if source.sampled:
             self._index.sample(key, when, step, is_state=source.array is STATE)
+        elif source.array in (MODEL, TARGET):
+            return None
         elif source.array in (START, COST):
             frame = headers.frame(raw)
             if frame is None or not len(frame.values):
