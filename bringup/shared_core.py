@@ -59,6 +59,7 @@ class SharedCores:
         self._busy = self._total = dict.fromkeys(self._cores, 0)
         self._next = float("-inf")
         self._starting: deque[tuple[float, int, _Pair]] = deque()
+        self._away: dict[str, int] = {}
 
     def place(self, pair: int, name: str, process: int, started: float | None = None) -> None:
         """A process of a pair is there, perhaps in place of one of the same name.
@@ -71,6 +72,19 @@ class SharedCores:
             _move(process, place.core, self._cores)
         else:
             self._starting.append((started + START_UP, process, place))
+
+    def keep_away(self, name: str, process: int) -> None:
+        """Keep a process, perhaps in place of one of the same name, off the cores of the pairs, if
+        there are others: the scheduler would have it wait for its turn on any of them.
+        """
+        self._away[name] = process
+        self._move_away(process)
+
+    def _move_away(self, process: int) -> None:
+        others = set(self._cores) - {pair.core for pair in self._pairs} or set(self._cores)
+        for thread in _threads(process):
+            with contextlib.suppress(ProcessLookupError):
+                os.sched_setaffinity(thread, others)
 
     def look(self, now: float) -> None:
         """Call it often; now: monotonic s."""
@@ -98,17 +112,25 @@ class SharedCores:
                 pair.core = core
                 for process in pair.processes.values():
                     _move(process, core, self._cores)
+                for process in self._away.values():
+                    self._move_away(process)
         self._busy, self._total = busy, total
 
 
 def _move(process: int, core: int, cores: Collection[int]) -> None:
     """Every thread but those that help the solver, which go to the others of `cores`."""
     others = set(cores) - {core} or {core}
-    with contextlib.suppress(OSError):  # it has ended meanwhile
-        threads = [int(thread.name) for thread in Path(f"/proc/{process}/task").iterdir()]
-        for thread in threads:
-            with contextlib.suppress(ProcessLookupError):
-                os.sched_setaffinity(thread, others if helps_solver(process, thread) else {core})
+    for thread in _threads(process):
+        with contextlib.suppress(ProcessLookupError):
+            os.sched_setaffinity(thread, others if helps_solver(process, thread) else {core})
+
+
+def _threads(process: int) -> list[int]:
+    """Of a process; none of one that has ended."""
+    try:
+        return [int(thread.name) for thread in Path(f"/proc/{process}/task").iterdir()]
+    except OSError:
+        return []
 
 
 def _ticks(cores: list[int]) -> tuple[dict[int, int], dict[int, int]]:

@@ -155,6 +155,8 @@ class Supervisor:
             )
         if self.shared is not None and child.pair is not None:
             self.shared.place(child.pair, child.name, child.process.pid, now)
+        elif self.shared is not None and child.optional:
+            self.shared.keep_away(child.name, child.process.pid)
         child.started, child.due = now, None
 
     def _bury(self, child: Child, code: int, now: float) -> None:

@@ -41,10 +41,12 @@ def test_processes_share_a_core_and_leave_it_to_who_needs_it(monkeypatch, tmp_pa
 
     monkeypatch.setattr(shared_core, "_STAT", counts)
     cores = SharedCores(1)
-    started = [subprocess.Popen(["sleep", "60"]) for _ in range(2)]
+    started = [subprocess.Popen(["sleep", "60"]) for _ in range(3)]
     try:
         cores.place(0, PAIR[0], started[0].pid)
         (first,) = os.sched_getaffinity(started[0].pid)
+        cores.keep_away("recorder_node", started[2].pid)
+        assert os.sched_getaffinity(started[2].pid) == os.sched_getaffinity(0) - {first}
         cores.place(0, PAIR[1], started[1].pid, started=0.0)  # loads what it needs on all cores
         taken(0.0, set())
         cores.look(0.9 * shared_core.START_UP)
@@ -61,6 +63,7 @@ def test_processes_share_a_core_and_leave_it_to_who_needs_it(monkeypatch, tmp_pa
         (second,) = os.sched_getaffinity(started[0].pid)
         assert second != first
         assert os.sched_getaffinity(started[1].pid) == {second}
+        assert os.sched_getaffinity(started[2].pid) == os.sched_getaffinity(0) - {second}
     finally:
         for process in started:
             process.kill()
@@ -73,5 +76,6 @@ def test_a_process_that_has_ended_is_nothing_to_move():
     assert not Path(f"/proc/{ended.pid}").exists()
     cores = SharedCores(1)
     cores.place(0, "controller_node", ended.pid)
+    cores.keep_away("recorder_node", ended.pid)
     cores.look(0.0)
     cores.look(10.0)

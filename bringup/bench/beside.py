@@ -33,6 +33,8 @@ class Setting:
 
     folder: Path
     environment: dict[str, str]
+    cores: SharedCores | None = None
+    """Which of them the pair is on, as `pdeloop train` does it."""
     processes: list[subprocess.Popen[bytes]] = field(default_factory=list)
 
     def start(self, command: Sequence[str], name: str) -> subprocess.Popen[bytes]:
@@ -42,6 +44,13 @@ class Setting:
                 command, env=self.environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log
             )
         self.processes.append(process)
+        return process
+
+    def start_child(self, command: Sequence[str], name: str) -> subprocess.Popen[bytes]:
+        """The same, where `pdeloop train` starts such a process itself."""
+        process = self.start(command, name)
+        if self.cores is not None:
+            self.cores.keep_away(name, process.pid)
         return process
 
     def log(self, name: str) -> str:
@@ -74,11 +83,13 @@ def measure(
 
         try:
             nodes = [start(name) for name in PAIR]
-            if possible():  # as `pdeloop train` does it
+            cores = None
+            if possible():
                 cores = SharedCores(1)
                 for name, node in zip(PAIR, nodes, strict=True):
                     cores.place(0, name, node.pid)
             start("tuner_node", f"out:={run}", "iterations:=100000", "optimizer:=two_point", *tuner)
+            setting.cores = cores
             progress = run / "progress.jsonl"
 
             def observe(beside: int) -> None:
@@ -113,7 +124,8 @@ def text(result: dict[str, Any], what: str) -> str:
     count_off, count_on = result["iterations"]
     return (
         f"{result['problem']}: median iteration {1e3 * off:.2f} ms without {what} "
-        f"({count_off} iterations), {1e3 * on:.2f} ms with one ({count_on}), ratio {on / off:.3f}\n"
+        f"({count_off} iterations), {1e3 * on:.2f} ms with one ({count_on}), ratio {on / off:.3f}, "
+        f"of the means {count_off / max(count_on, 1):.3f}\n"
         f"  processor time of plant and controller {1e3 * cpu_off:.2f} ms without, "
         f"{1e3 * cpu_on:.2f} ms with one, ratio {cpu_on / cpu_off:.3f}"
     )

@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def recorder(setting: Setting, window: int) -> Iterator[None]:
         bag = setting.folder / f"bag{window}"
         given = [word for p in (f"bag:={bag}", *options.set) for word in ("-p", p)]
-        process = setting.start(node_command("recorder_node", *given), "recorder_node")
+        process = setting.start_child(node_command("recorder_node", *given), "recorder_node")
         while not (bag / "parameters.json").exists():  # matched, and start-up is over
             time.sleep(0.05)
         yield

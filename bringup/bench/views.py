@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         name = f"looker{window}"
         command = [sys.executable, "-m", "bringup.bench.looker.node"]
         children = [
-            setting.start(node_command("viewer_node", *given), "viewer_node"),
+            setting.start_child(node_command("viewer_node", *given), "viewer_node"),
             setting.start(command, name),
         ]
         deadline = time.monotonic() + PATIENCE
