@@ -63,6 +63,16 @@ class Child:
             return ""
         return lines[-1] if lines else ""
 
+    def refusal(self) -> str:
+        """Why the process refused to run, in its one sentence; what ends after it may say more."""
+        try:
+            lines = self.log.read_text(errors="replace").splitlines()
+        except OSError:
+            return ""
+        node = self.name.partition("-")[0]  # of one in a namespace, that is behind a hyphen
+        said = [line for line in lines if line.startswith(f"{node}: ")]
+        return said[-1].strip() if said else self.last_words()
+
 
 @dataclass
 class Supervisor:
@@ -165,7 +175,7 @@ class Supervisor:
         )
         child.process = None
         if code == REFUSED:
-            raise NodeError(child.last_words() or f"{child.name} {how}; see {child.log}")
+            raise NodeError(child.refusal() or f"{child.name} {how}; see {child.log}")
         child.deaths = 1 if now - child.started > STEADY else child.deaths + 1
         often = child.deaths > len(BACK_OFF)
         if child.optional and (often or code not in (CRASHED, *_KILLED)):

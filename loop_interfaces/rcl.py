@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from rclpy.publisher import Publisher
 
 __all__ = ["Allocator", "SerializedMessage", "publishes_where_it_is"]
 
@@ -32,8 +31,9 @@ class SerializedMessage(ctypes.Structure):
     ]
 
 
-def publishes_where_it_is(publisher: Publisher) -> Callable[[memoryview], None]:
-    """A function that publishes the serialised message in a writable piece of memory.
+def publishes_where_it_is(publisher: Any) -> Callable[[memoryview], None]:
+    """A function that publishes, with a publisher of rclpy, the serialised message in a writable
+    piece of memory.
 
     rclpy would copy it twice first, which takes as long as everything else for a large one. Where rcl
     is not to be had, it is rclpy that publishes.

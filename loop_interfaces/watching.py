@@ -47,22 +47,27 @@ class Intake:
         self._take = subscription.handle.take_message
         self._type, self._depth = message_type, depth
         self._left: tuple[bytes, dict[str, Any]] | None = None
+        self._until = 0
+        """Of the call that has left it."""
 
     def take(self, until: int | None = None) -> Iterator[tuple[bytes, dict[str, Any]]]:
         """What has come in. until: only what arrived by then (ns since the epoch).
 
-        The first message that arrived later is kept for the next call, which gives it in any case:
-        the clock may have been set back.
+        The first message that arrived later is kept for a call with a later time; or an earlier one,
+        for then the clock has been set back.
         """
-        left, self._left = self._left, None
+        left = self._left
         if left is not None:
+            if until is not None and self._until <= until < left[1]["received_timestamp"]:
+                return
+            self._left = None
             yield left
         for _ in range(self._depth):
             taken = self._take(self._type, True)
             if taken is None:
                 return
             if until is not None and taken[1]["received_timestamp"] > until:
-                self._left = taken
+                self._left, self._until = taken, until
                 return
             yield taken
 

@@ -12,6 +12,7 @@ from bringup import pairs
 from bringup.bench import batch as bench_batch
 from bringup.bench import train as bench_train
 from bringup.cli import main
+from bringup.supervisor import Child
 from loop_interfaces import affinity
 from loop_interfaces.spec import ParameterError
 
@@ -94,3 +95,12 @@ def test_bench_lists_its_programs(capsys) -> None:
     said = capsys.readouterr().out
     for program in ("rtt", "batch", "train", "realtime", "pairs", "kernel"):
         assert program in said
+
+
+def test_a_refusal_is_the_sentence_of_the_node_whatever_its_end_says(tmp_path) -> None:
+    child = Child("tuner_node", [], tmp_path / "tuner_node.log")
+    assert child.refusal() == ""
+    child.log.write_text("Exception ignored in: <function f>\nInvalidHandle: it is gone\n")
+    assert child.refusal() == "InvalidHandle: it is gone"
+    child.log.write_text(f"[INFO] tuner_node: no\ntuner_node: 'a' is 9\n{child.log.read_text()}")
+    assert child.refusal() == "tuner_node: 'a' is 9"

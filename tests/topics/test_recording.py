@@ -275,7 +275,8 @@ tell("a", "b")
 moment = time.time_ns()
 tell("c", "d")
 print("until the moment", taken(moment))
-print("again", taken(moment))  # as if the clock had been set back: no message waits for ever
+print("again", taken(moment))
+print("before", taken(moment - 1))  # as if the clock had been set back: no message waits for ever
 tell("e")
 print("rest", taken())
 """
@@ -283,7 +284,7 @@ print("rest", taken())
 
 def test_what_came_after_a_moment_is_left_for_the_next_time(loop):
     lines = loop.wait(loop.start("-c", INTAKE, name="intake"), LIMIT).splitlines()
-    assert lines == ["until the moment ['a', 'b']", "again ['c']", "rest ['d', 'e']"]
+    assert lines == ["until the moment ['a', 'b']", "again []", "before ['c']", "rest ['d', 'e']"]
 
 
 def test_a_training_that_must_be_recorded_stops_when_the_recorder_does(loop, tmp_path):
