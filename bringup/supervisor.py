@@ -57,21 +57,20 @@ class Child:
 
     def last_words(self) -> str:
         """The last line of the node's log."""
-        try:
-            lines = self.log.read_text(errors="replace").strip().splitlines()
-        except OSError:
-            return ""
+        lines = self._logged()
         return lines[-1] if lines else ""
 
     def refusal(self) -> str:
         """Why the process refused to run, in its one sentence; what ends after it may say more."""
+        node = self.name.partition("-")[0]  # behind a hyphen stands its namespace
+        said = [line for line in self._logged() if line.startswith(f"{node}: ")]
+        return said[-1] if said else self.last_words()
+
+    def _logged(self) -> list[str]:
         try:
-            lines = self.log.read_text(errors="replace").splitlines()
+            return self.log.read_text(errors="replace").strip().splitlines()
         except OSError:
-            return ""
-        node = self.name.partition("-")[0]  # of one in a namespace, that is behind a hyphen
-        said = [line for line in lines if line.startswith(f"{node}: ")]
-        return said[-1].strip() if said else self.last_words()
+            return []
 
 
 @dataclass

@@ -223,9 +223,8 @@ class _Sqlite3(Sqlite3Writer):
 
 
 class _Writer(Writer):
-    """The parent class compares the connection with every one it has, for every message."""
-
     def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
+        # The parent class compares the connection with every one it has.
         assert self.storage is not None
         self.storage.write(connection, timestamp, data)
         self.counts[connection.id] += 1

@@ -146,11 +146,7 @@ class Recording:
             self._write(source, when, raw, key)
         else:
             episode = self._index.find(key) if key else None
-            taken = _Taken(source, when, raw, key, episode)
-            if waiting or taken.early:
-                waiting.append(taken)
-            else:
-                self._write(source, when, raw, key)
+            waiting.append(_Taken(source, when, raw, key, episode))
         if waiting:
             self._let_go(waiting, when)
 

@@ -108,7 +108,8 @@ def verify(*paths: Path, parameters: Path | None = None) -> Report:
             report.episodes += 1
             number = episode.key[1]
             if number not in runs:
-                runs[number] = _Run(number, given or _complete(known.get(number)), report)
+                values = _complete(known.get(number)) if given is None else given
+                runs[number] = _Run(number, values, report)
             runs[number].episode(episode)
     for run in runs.values():
         run.finish()
