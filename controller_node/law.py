@@ -12,9 +12,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces import compiled, simd
-from loop_interfaces.compiled import fingerprint, jit, kept
-from loop_interfaces.simd import fma, load, peek, read, read_word, splat, store, whole_lanes, write
+from loop_interfaces.jit import cache, simd
+from loop_interfaces.jit.cache import fingerprint, jit, kept
+from loop_interfaces.jit.simd import (
+    fma,
+    load,
+    peek,
+    read,
+    read_word,
+    splat,
+    store,
+    whole_lanes,
+    write,
+)
 
 __all__ = ["LAW", "act", "control", "padded"]
 
@@ -128,4 +138,4 @@ def compile_control(sources: str) -> Any:
     return control
 
 
-control = compile_control(fingerprint(compiled, simd))
+control = compile_control(fingerprint(cache, simd))

@@ -15,19 +15,19 @@ from functools import partial
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from controller_node.health import ControllerHealth
+from controller_node.diagnostics import ControllerHealth
 from controller_node.identification import DesignSettings
 from controller_node.reflex import Reflex
 from controller_node.responder import Responder
-from loop_interfaces.endpoints import writer_qos
+from loop_interfaces.diagnostics import Health
 from loop_interfaces.frames import Frame
-from loop_interfaces.health import Health
 from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.node_loop import NodeLoop
-from loop_interfaces.node_main import node_main
 from loop_interfaces.parameters import EXECUTION, PROBLEM
 from loop_interfaces.protocol import ModelFailure, Send
-from loop_interfaces.ros_parameters import declare, given_parameters
+from loop_interfaces.ros.endpoints import writer_qos
+from loop_interfaces.ros.node_loop import NodeLoop
+from loop_interfaces.ros.node_main import node_main
+from loop_interfaces.ros.parameters import declare, given_parameters
 from loop_interfaces.topics import (
     ACTION,
     COST,

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from controller_node.law import LAW, control, padded
+from loop_interfaces.jit.simd import whole_lanes
 from loop_interfaces.policy_columns import quadratic_columns
-from loop_interfaces.simd import whole_lanes
 
 __all__ = ["ProjectedLaw", "excitation"]
 

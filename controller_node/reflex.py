@@ -18,15 +18,17 @@ from numpy.typing import NDArray
 from controller_node import law
 from controller_node.law import LAW, act, control
 from controller_node.responder import Responder
-from loop_interfaces import atomics, compiled, line, native, simd, wire
-from loop_interfaces.compiled import fingerprint, jit, kept
-from loop_interfaces.frames import MAX_ID, ArrayCodec, Frame
-from loop_interfaces.line import GOING, LINE, Ear, announcement, attendance, received, send
-from loop_interfaces.native import MachineCode
-from loop_interfaces.protocol import MORE, OTHER, UNABLE
-from loop_interfaces.simd import peek, poke, read
-from loop_interfaces.topics import ACTION
-from loop_interfaces.wire import (
+from loop_interfaces.fast_path import line, wire
+from loop_interfaces.fast_path.line import (
+    GOING,
+    LINE,
+    Ear,
+    announcement,
+    attendance,
+    received,
+    send,
+)
+from loop_interfaces.fast_path.wire import (
     EXPECTED,
     FIRST,
     STEP,
@@ -35,6 +37,13 @@ from loop_interfaces.wire import (
     OwnMessage,
     expected_header,
 )
+from loop_interfaces.frames import MAX_ID, ArrayCodec, Frame
+from loop_interfaces.jit import atomics, cache, native, simd
+from loop_interfaces.jit.cache import fingerprint, jit, kept
+from loop_interfaces.jit.native import MachineCode
+from loop_interfaces.jit.simd import peek, poke, read
+from loop_interfaces.protocol import MORE, OTHER, UNABLE
+from loop_interfaces.topics import ACTION
 
 __all__ = ["Reflex", "load_compiled"]
 
@@ -114,7 +123,7 @@ def compile_answer_soon() -> Any:
     return answer_soon
 
 
-SOURCES = fingerprint(compiled, simd, atomics, native, line, wire, law)
+SOURCES = fingerprint(cache, simd, atomics, native, line, wire, law)
 answer, answer_all = compile_answers(SOURCES)
 answer_soon = MachineCode(compile_answer_soon)
 

@@ -6,8 +6,8 @@ ros2 launch pdeloop train.launch.py --show-args
 
 from launch import LaunchDescription
 
-from bringup.launch_actions import description
-from bringup.launch_plan import TRAIN_ARGUMENTS, train_plan
+from pdeloop.launch_actions import description
+from pdeloop.launch_plan import TRAIN_ARGUMENTS, train_plan
 
 
 def generate_launch_description() -> LaunchDescription:

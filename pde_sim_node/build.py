@@ -12,7 +12,7 @@ from typing import Any
 from loop_interfaces.frames import MAX_ID
 from loop_interfaces.parameters import INSTRUMENTS
 from pde_sim_node.equations import Equation, configured_equation
-from pde_sim_node.instruments import InstrumentedPlant, Instruments
+from pde_sim_node.measurement import InstrumentedPlant, Instruments
 from pde_sim_node.plant import Plant
 
 

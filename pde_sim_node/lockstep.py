@@ -35,9 +35,9 @@ from loop_interfaces.topics import (
     Topic,
     noise_seeds,
 )
-from pde_sim_node.machine import Machine
-from pde_sim_node.pace import Pace
 from pde_sim_node.plant import Plant
+from pde_sim_node.real_time import Pace
+from pde_sim_node.solver.step_context import Machine
 
 PAUSED_REPORT = 1.0
 """Seconds between two messages on `episode/paused` while the plant is paused."""

@@ -18,22 +18,22 @@ from rosgraph_msgs.msg import Clock
 
 from loop_interfaces.affinity import core_list
 from loop_interfaces.frames import Frame
-from loop_interfaces.introspection import offer
 from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.node_loop import NodeLoop
-from loop_interfaces.node_main import node_main
 from loop_interfaces.parameters import EXECUTION, PLANT, PROBLEM
 from loop_interfaces.protocol import UNABLE, Send
-from loop_interfaces.ros_parameters import declare, given_parameters, on_change
+from loop_interfaces.ros.introspection import offer
+from loop_interfaces.ros.node_loop import NodeLoop
+from loop_interfaces.ros.node_main import node_main
+from loop_interfaces.ros.parameters import declare, given_parameters, on_change
 from loop_interfaces.samples import clock_message
 from loop_interfaces.spec import Spec
 from loop_interfaces.topics import ACTION, COST, PAUSED, START, STATE, TARGET
 from pde_sim_node.build import build_plant, fingerprint
+from pde_sim_node.diagnostics import PlantHealth
 from pde_sim_node.equations import configured_equation
-from pde_sim_node.health import PlantHealth
 from pde_sim_node.lockstep import Lockstep
 from pde_sim_node.reflex import Reflex
-from pde_sim_node.threads import use_cores
+from pde_sim_node.solver.workers import use_cores
 
 
 def declare_parameters(node: Node, changed: Mapping[str, Any] | None = None) -> dict[str, Any]:

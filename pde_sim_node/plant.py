@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .equations import Equation, LinearEquation
-from .integrator import Integrator
-from .kernel import all_finite
-from .machine import Machine
-from .propagator import Propagator
-from .supports import indicator_supports
+from pde_sim_node.equations import Equation, LinearEquation
+from pde_sim_node.solver.exact import Propagator
+from pde_sim_node.solver.integrator import Integrator
+from pde_sim_node.solver.kernel import all_finite
+from pde_sim_node.solver.step_context import Machine
+from pde_sim_node.supports import indicator_supports
 
 __all__ = ["DIVERGED_COST", "MEAN_FIELD", "EpisodeCosts", "Plant"]
 

@@ -16,10 +16,8 @@ import numpy as np
 from numba import carray  # type: ignore[attr-defined, unused-ignore]
 from numpy.typing import NDArray
 
-from loop_interfaces import atomics, compiled, line, native, simd, wire
-from loop_interfaces.compiled import fingerprint, jit, kept
-from loop_interfaces.frames import HEADER, ArrayCodec, Frame
-from loop_interfaces.line import (
+from loop_interfaces.fast_path import line, wire
+from loop_interfaces.fast_path.line import (
     GOING,
     LINE,
     Ear,
@@ -29,12 +27,7 @@ from loop_interfaces.line import (
     received,
     send,
 )
-from loop_interfaces.native import MachineCode
-from loop_interfaces.protocol import MORE, OTHER, UNABLE
-from loop_interfaces.samples import ACTION_KIND, NO_TIME, SAMPLE_HEADER, STATE_KIND
-from loop_interfaces.simd import WIDTH, load, peek, poke, poke_lanes, read, write
-from loop_interfaces.topics import STATE
-from loop_interfaces.wire import (
+from loop_interfaces.fast_path.wire import (
     BUNDLE,
     EXPECTED,
     FIRST,
@@ -45,12 +38,20 @@ from loop_interfaces.wire import (
     append,
     expected_header,
 )
-from pde_sim_node import board, machine
+from loop_interfaces.frames import HEADER, ArrayCodec, Frame
+from loop_interfaces.jit import atomics, cache, native, simd
+from loop_interfaces.jit.cache import fingerprint, jit, kept
+from loop_interfaces.jit.native import MachineCode
+from loop_interfaces.jit.simd import WIDTH, load, peek, poke, poke_lanes, read, write
+from loop_interfaces.protocol import MORE, OTHER, UNABLE
+from loop_interfaces.samples import ACTION_KIND, NO_TIME, SAMPLE_HEADER, STATE_KIND
+from loop_interfaces.topics import STATE
 from pde_sim_node.lockstep import Lockstep
-from pde_sim_node.machine import MACHINE, step_together
+from pde_sim_node.solver import step_context, work_queue
+from pde_sim_node.solver.step_context import MACHINE, step_together
 
 if TYPE_CHECKING:
-    from loop_interfaces.endpoints import Bundler
+    from loop_interfaces.ros.endpoints import Bundler
 
 __all__ = ["Reflex", "load_compiled"]
 
@@ -170,7 +171,7 @@ def compile_advance_soon() -> Any:
     return advance_soon
 
 
-SOURCES = fingerprint(compiled, simd, atomics, native, line, wire, board, machine)
+SOURCES = fingerprint(cache, simd, atomics, native, line, wire, work_queue, step_context)
 awaited, answer, advance = compile_reflexes(SOURCES)
 advance_soon = MachineCode(compile_advance_soon)
 

@@ -21,18 +21,18 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Float64MultiArray, String
 
-from loop_interfaces.endpoints import raw_subscription, reader_qos, scoped
 from loop_interfaces.frames import FrameError
 from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.node_loop import NodeLoop
-from loop_interfaces.node_main import ConfigurationError, node_main
 from loop_interfaces.parameters import RECORDER, TUNER
-from loop_interfaces.ros_parameters import declare, given_parameters
+from loop_interfaces.ros.endpoints import raw_subscription, reader_qos, scoped
+from loop_interfaces.ros.node_loop import NodeLoop
+from loop_interfaces.ros.node_main import ConfigurationError, node_main
+from loop_interfaces.ros.parameters import declare, given_parameters
+from loop_interfaces.ros.sample_subscription import Intake, Watcher
 from loop_interfaces.samples import ACTION_KIND, CLOCK_KIND, STATE_KIND
 from loop_interfaces.topics import ACTION, RECORDER_STATUS, START, STATE
-from loop_interfaces.watching import Intake, Watcher
 from recorder_node.bag import BagError
-from recorder_node.health import RecorderHealth
+from recorder_node.diagnostics import RecorderHealth
 from recorder_node.peers import Peers
 from recorder_node.recording import (
     ARRAY_TYPE,

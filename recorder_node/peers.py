@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 from rclpy.node import Node
 
-from loop_interfaces.introspection import NAMELESS
 from loop_interfaces.parameters import table
-from loop_interfaces.ros_parameters import RemoteParameters
+from loop_interfaces.ros.introspection import NAMELESS
+from loop_interfaces.ros.parameters import RemoteParameters
 
 PATIENCE = 3.0
 """Seconds in which a node is expected to answer a request for its parameters."""

@@ -16,7 +16,7 @@ from typing import Any
 
 import aiohttp
 
-from bringup.supervisor import die_with_parent
+from pdeloop.supervisor import die_with_parent
 
 COMMAND = [
     "chromium",

@@ -10,15 +10,15 @@ import numpy as np
 import rclpy
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
-from loop_interfaces.endpoints import raw_subscription, samples_qos
+from loop_interfaces.fast_path.line import Doorbell, Ear, Line
 from loop_interfaces.frames import HEADER
-from loop_interfaces.line import Doorbell, Ear, Line
-from loop_interfaces.node_loop import NodeLoop
 from loop_interfaces.protocol import MORE, OTHER, QUIET, UNABLE
+from loop_interfaces.ros.endpoints import raw_subscription, samples_qos
+from loop_interfaces.ros.node_loop import NodeLoop
+from loop_interfaces.ros.sample_subscription import Intake
 from loop_interfaces.samples import ACTION_KIND, NO_TIME, STATE_KIND, unpack
 from loop_interfaces.topics import ACTION, COST, STATE, VOID, CostColumn
-from loop_interfaces.watching import Intake
-from pde_sim_node import threads
+from pde_sim_node.solver import workers
 from tests.test_reflexes import Controller, Plant, with_number
 
 LONG, SHORT = 10**9, 5 * 10**7  # ns
@@ -274,7 +274,7 @@ if __name__ == "__main__":
     plant_flows()
     plant_flows(timed=True, opened=False)
     plant_with_instruments_does_not()
-    threads.use_cores(range(2), attentive=True)
+    workers.use_cores(range(2), attentive=True)
     plant_flows(helped=True, integration_time=0.0005)
     rclpy.shutdown()
     print("done")

@@ -12,8 +12,8 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from bringup.domain import DOMAINS, DOMAINS_FOLDER, own_domain
 from loop_interfaces.isolation import loopback_environment
+from pdeloop.domain import DOMAINS, DOMAINS_FOLDER, own_domain
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -65,7 +65,7 @@ class Processes:
 
     def pdeloop(self, *arguments: str) -> subprocess.Popen[bytes]:
         """Start the command line."""
-        return self.start("-m", "bringup.cli", *arguments, name="pdeloop")
+        return self.start("-m", "pdeloop.cli", *arguments, name="pdeloop")
 
     def output(self, process: subprocess.Popen[bytes]) -> str:
         text: str = process.log.read_text(errors="replace")  # type: ignore[attr-defined]

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from bringup.in_process import LocalPair, train
-from bringup.training_run import resolve
+from pdeloop.in_process import LocalPair, train
+from pdeloop.training_run import resolve
 from tuner_node.build import build_training
 from tuner_node.training import Training
 

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from bringup.bench.gradients import Gradients
+from benchmarks.gradients import Gradients
 from loop_interfaces.problem import load_parameters
-from pde_sim_node.adjoint import Adjoint
 from pde_sim_node.build import build_plant
 from pde_sim_node.equations import Burgers
 from pde_sim_node.plant import Plant
+from pde_sim_node.solver.adjoint import Adjoint
 
 PROBLEMS = ("burgers", "allen-cahn", "kdv")
 
@@ -157,7 +157,7 @@ def test_gradients_of_whole_episodes_agree_with_finite_differences(problem):
 
 def test_the_law_of_a_policy_costs_what_the_controller_makes_it_cost():
     """theta = [K_a, K_b s_r] is the projected law that runs in the loop."""
-    from bringup.bench.optimizers import run_rollouts
+    from benchmarks.optimizers import run_rollouts
     from tuner_node.optimizers import Rollout
 
     plant = plant_of("burgers", horizon=40)

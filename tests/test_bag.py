@@ -15,10 +15,10 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from bringup.bags.reader import Bag
-from bringup.bags.tools import recover
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.topics import ACTION, COST, POLICY, START, STATE
+from pdeloop.bags.reader import Bag
+from pdeloop.bags.tools import recover
 from recorder_node.bag import STORAGES, BagError
 from recorder_node.headers import HeaderReader
 from recorder_node.recording import Recording, Source, clock, sources

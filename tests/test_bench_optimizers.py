@@ -1,4 +1,4 @@
-"""`pdeloop bench optimizers`: the same training as everywhere else, and its table."""
+"""`python -m benchmarks optimizers`: the same training as everywhere else, and its table."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from bringup.bench import beyond
-from bringup.bench.optimizers import Job, run, table, train
+from benchmarks import robustness
+from benchmarks.optimizers import Job, run, table, train
 from pde_sim_node.plant import DIVERGED_COST
 from tests.small import SMALL, parameters, train_here
 
@@ -65,7 +65,7 @@ def test_the_table_of_other_settings_says_what_diverged_and_where_there_was_no_m
         {**noisy, "optimizer": "gauss_newton", "adapted": [1.0, 2.0]},
         {"problem": "p", "options": {"sensors": 2}, "optimizer": "two_point", "failed": "why"},
     ]
-    lines = beyond.text(rows).splitlines()
+    lines = robustness.text(rows).splitlines()
     assert lines[0] == "**p**"
     assert lines[-2:] == [
         "| measurement_noise 0.1 | 1/5 | 4 | 2.5 (3) | diverges (1 of 2) | 1.5 (2) | 3/7 |",

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bringup.cli import main
+from pdeloop.cli import main
 from tests.small import SMALL, parameters, same_bits, train_here
 from tuner_node import checkpoint
 from tuner_node.results import RunFolder

@@ -25,17 +25,17 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from bringup import cli
-from bringup.cli import main
-from bringup.commands import problems
-from bringup.display import Display
-from bringup.output import print_json
-from bringup.progress import Share, duration
 from loop_interfaces.spec import read_yaml
+from pdeloop import cli
+from pdeloop.cli import main
+from pdeloop.commands import problems
+from pdeloop.display import Display
+from pdeloop.output import print_json
+from pdeloop.progress import Share, duration
 from tests.loop_harness import ROOT
 from tests.small import SMALL
 
-PDELOOP = [sys.executable, "-m", "bringup.cli"]
+PDELOOP = [sys.executable, "-m", "pdeloop.cli"]
 CONTROL = re.compile(r"\x1b\[[0-9;?]*[a-zA-Z]")
 COLOUR = re.compile(r"\x1b\[(?:\d+;)*(?:3[0-8]|4[0-8]|9[0-7]|10[0-7])(?:;\d+)*m")
 LIMIT = 240.0
@@ -67,7 +67,7 @@ def run(*words: str, environment: Mapping[str, str] | None = None, cwd: Path | N
 
 
 def test_there_are_commands() -> None:
-    assert {"pdeloop train", "pdeloop bag verify", "pdeloop bench soak"} <= set(ALL)
+    assert {"pdeloop train", "pdeloop bag verify", "pdeloop identify"} <= set(ALL)
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -161,7 +161,7 @@ def test_exit_codes(words: list[str], code: int, said: str) -> None:
 
 
 def test_ctrl_c_finds_little_to_interrupt_before_it_is_caught() -> None:
-    code = "import sys, bringup.cli; print([m for m in ('numpy', 'yaml', 'email') if m in sys.modules])"
+    code = "import sys, pdeloop.cli; print([m for m in ('numpy', 'yaml', 'email') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
@@ -380,7 +380,7 @@ def test_a_real_shell_completes(shell: str, tmp_path: Path) -> None:
             # fish only sorts YAML files before others; bash and zsh leave the others out.
             ("pdeloop train zzz" + "-ow" * (shell == "fish"), "pdeloop train zzz-own.yaml "),
             ("pdeloop bag ver", "pdeloop bag verify "),
-            ("pdeloop bench so", "pdeloop bench soak "),
+            ("pdeloop bag ver", "pdeloop bag verify "),
             ("pdeloop train --optimizer gauss", "--optimizer gauss_newton "),
             ("pdeloop evaluate ru", "pdeloop evaluate runs/"),
         ):

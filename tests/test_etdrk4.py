@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pde_sim_node.equations import AllenCahn, Burgers, Equation, KortewegDeVries
-from pde_sim_node.etdrk4 import etdrk4_coefficients
 from pde_sim_node.plant import Plant
+from pde_sim_node.solver.etdrk4 import etdrk4_coefficients
 
 MAGNITUDES = np.array([0.0, 1e-12, 1e-6, 1e-3, 0.1, 0.5, 0.99, 1.0, 1.01, 1.5, 2.0, 5.0, 30.0])
 

@@ -15,13 +15,13 @@ WITH_ROS = {
     "node.py",
     "node_loop.py",
     "line.py",
-    "watching.py",
-    "looking.py",
+    "sample_subscription.py",
+    "polling.py",
     "peers.py",
     "node_main.py",
     "endpoints.py",
     "introspection.py",
-    "ros_parameters.py",
+    "parameters.py",
     "launch_actions.py",
 }
 """Files that may import rclpy or messages."""
@@ -60,20 +60,25 @@ def tops(path: Path) -> set[str]:
 
 @pytest.mark.parametrize("node", NODES)
 def test_no_node_imports_another_node_or_what_starts_it(node):
-    others = {"bringup", *NODES} - {node}
+    others = {"pdeloop", *NODES} - {node}
     for path in sources(node):
         assert not tops(path) & others, path
 
 
 def test_what_is_shared_imports_no_node():
     for path in sources("loop_interfaces"):
-        assert not tops(path) & {"bringup", *NODES}, path
+        assert not tops(path) & {"pdeloop", *NODES}, path
 
 
 def test_only_the_named_files_import_ros():
-    for path in sources("loop_interfaces", *NODES, "bringup"):
+    for path in sources("loop_interfaces", *NODES, "pdeloop"):
         if path.name not in WITH_ROS:
             assert not tops(path) & set(ROS), path
+
+
+def test_nothing_installed_imports_benchmarks_or_tests():
+    for path in sources("loop_interfaces", *NODES, "pdeloop"):
+        assert not tops(path) & {"benchmarks", "tests"}, path
 
 
 def test_the_loop_runs_in_one_process_without_ros():

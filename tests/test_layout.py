@@ -1,4 +1,4 @@
-"""Pairs, cores and the fitted models: the pure parts of scaling out and of `pdeloop bench`."""
+"""Pairs, cores and the fitted models: the pure parts of scaling out and of `python -m benchmarks`."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bringup import pairs
-from bringup.bench import batch as bench_batch
-from bringup.bench import train as bench_train
-from bringup.cli import main
-from bringup.supervisor import Child
+from benchmarks import batch as bench_batch
+from benchmarks import train as bench_train
+from benchmarks.__main__ import parser as benchmarks_parser
 from loop_interfaces import affinity
 from loop_interfaces.spec import ParameterError
+from pdeloop import pairs
+from pdeloop.cli import main
+from pdeloop.supervisor import Child
 
 
 def test_one_pair_has_no_namespace_and_several_share_one_clock() -> None:
@@ -90,7 +91,7 @@ def test_the_memory_of_children_that_are_no_nodes_is_not_counted() -> None:
 
 def test_bench_lists_its_programs(capsys) -> None:
     with pytest.raises(SystemExit) as left:
-        main(["bench", "--help"])
+        benchmarks_parser().parse_args(["--help"])
     assert left.value.code == 0
     said = capsys.readouterr().out
     for program in ("rtt", "batch", "train", "realtime", "pairs", "kernel"):

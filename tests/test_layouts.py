@@ -9,8 +9,8 @@ from typing import Any
 
 import yaml
 
-from bringup.secure import ROLES
 from loop_interfaces.problem import config_folder
+from pdeloop.secure import ROLES
 from viewer_node.view import SCALARS
 
 VIEWS = config_folder() / "views"

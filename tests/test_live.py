@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from bringup.live import Live, announced, running
-from bringup.monitor.finder import Finder
+from pdeloop.live import Live, announced, running
+from pdeloop.monitor.finder import Finder
 
 
 def test_a_loop_is_found_as_long_as_it_runs(tmp_path, monkeypatch):
-    monkeypatch.setattr("bringup.live.DOMAINS_FOLDER", tmp_path / "domains")
+    monkeypatch.setattr("pdeloop.live.DOMAINS_FOLDER", tmp_path / "domains")
     assert running() == []
     with announced(17, tmp_path / "first"):
         (live,) = running()
@@ -22,7 +22,7 @@ def test_a_loop_is_found_as_long_as_it_runs(tmp_path, monkeypatch):
 
 
 def test_what_a_killed_loop_left_behind_is_not_found_and_goes_away(tmp_path, monkeypatch):
-    monkeypatch.setattr("bringup.live.DOMAINS_FOLDER", tmp_path)
+    monkeypatch.setattr("pdeloop.live.DOMAINS_FOLDER", tmp_path)
     left = tmp_path / "live-1-17"
     left.write_text(json.dumps({"domain": 17, "folder": "x", "started": 1, "network": False}))
     assert running() == [] and not left.exists()

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bringup.monitor.attention import Attention
-from bringup.monitor.curve import MOST, Curve
-from bringup.monitor.episode import COLUMNS, COMPONENTS, ROWS, Episode, rows_of
-from bringup.monitor.health import Endpoint, Health, Rate
-from bringup.monitor.messages import Cursor
-from bringup.monitor.view import View
-from bringup.monitor.watched import Watched
 from loop_interfaces.frames import Frame
 from loop_interfaces.topics import COMPLETED, VOID
+from pdeloop.monitor.attention import Attention
+from pdeloop.monitor.curve import MOST, Curve
+from pdeloop.monitor.diagnostics import Endpoint, Health, Rate
+from pdeloop.monitor.episode import COLUMNS, COMPONENTS, ROWS, Episode, rows_of
+from pdeloop.monitor.messages import Cursor
+from pdeloop.monitor.view import View
+from pdeloop.monitor.watched import Watched
 
 PLANT = 7
 

@@ -11,9 +11,9 @@ import aiohttp
 import numpy as np
 import pytest
 
-from bringup.monitor.commands import Call, Commands, Watch
-from bringup.monitor.server import PAGE, TOKEN, TYPES, Server
-from bringup.monitor.view import View
+from pdeloop.monitor.commands import Call, Commands, Watch
+from pdeloop.monitor.server import PAGE, TOKEN, TYPES, Server
+from pdeloop.monitor.view import View
 
 
 @contextlib.contextmanager
@@ -149,7 +149,7 @@ def test_the_headers_allow_nothing_from_elsewhere_and_no_inline_script():
 def test_the_colour_map_is_that_of_the_report():
     from matplotlib import colormaps
 
-    from bringup.report.figures import FIELD_MAP
+    from pdeloop.report.figures import FIELD_MAP
 
     text = "".join((PAGE / "cividis.js").read_text().split('"')[1::2])
     ours = np.frombuffer(bytes.fromhex(text), np.uint8).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""The limits of `pdeloop bench optimum`: against known optima, and what reports make of them."""
+"""The limits of `python -m benchmarks optimum`: against known optima, and what reports make of them."""
 
 import json
 from dataclasses import dataclass
@@ -7,15 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bringup import reference
-from bringup.bench import optimum
-from bringup.bench.descent import descend
-from bringup.bench.gradients import Gradients
-from bringup.cli import main
+from benchmarks import optimum
+from benchmarks.__main__ import parser
+from benchmarks.descent import descend
+from benchmarks.gradients import Gradients
 from loop_interfaces.problem import config_folder, load_parameters
 from pde_sim_node.build import build_plant
 from pde_sim_node.equations import Burgers
 from pde_sim_node.plant import DIVERGED_COST, Plant
+from pdeloop import reference
+from pdeloop.cli import run
 from tests.small import SMALL
 from tuner_node.results import RunFolderError
 
@@ -162,7 +163,7 @@ def test_a_reference_holds_for_its_plant_only(limits):
 @pytest.mark.parametrize("content", ["", "{}", '{"format": 1, "parameters": 3}', "[" * 5000])
 def test_a_broken_reference_is_an_error_that_says_what_to_do(tmp_path, content):
     (tmp_path / "small.json").write_text(content)
-    with pytest.raises(RunFolderError, match="pdeloop bench optimum --save"):
+    with pytest.raises(RunFolderError, match="python -m benchmarks optimum --save"):
         reference.find(values_of(), folder=tmp_path)
 
 
@@ -190,19 +191,21 @@ def test_the_shipped_limits_hold_for_the_shipped_problems():
     assert names
     for name in names:
         found = reference.find(load_parameters(name, {}))
-        assert found is not None, f"{name}: pdeloop bench optimum {name} --save config/optimum"
+        assert found is not None, (
+            f"{name}: python -m benchmarks optimum {name} --save config/optimum"
+        )
         for seed, best in found.optimum.items():
             assert found.open_loop.mean() < best.mean() < found.lqt[seed].mean()
 
 
 def test_the_command_line_prints_the_limits_and_refuses_nonsense(capsys, tmp_path):
     options = ["--seeds", "1", "--fields", "2", "--evaluation-fields", "1", "--no-checks"]
-    given = ["bench", "optimum", str(SMALL), *options, "--tolerance", "0.01", "--jobs", "1"]
-    assert main([*given, "--save", str(tmp_path / "x")]) == 0
+    given = ["optimum", str(SMALL), *options, "--tolerance", "0.01", "--jobs", "1"]
+    assert run(parser, [*given, "--save", str(tmp_path / "x")]) == 0
     shown = capsys.readouterr()
     assert "small" in shown.out and "optimum of class" in shown.out
     assert "law of seed 0" in shown.err
     assert (tmp_path / "x" / "small.json").is_file()
     for words in (["--seeds", "0"], ["--tolerance", "2"], ["--fields", "0"]):
-        assert main(["bench", "optimum", str(SMALL), *words]) == 1
+        assert run(parser, ["optimum", str(SMALL), *words]) == 1
         assert words[0].lstrip("-") in capsys.readouterr().err

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from bringup import cli, launch_plan
-from bringup.launch_plan import LOOP_ARGUMENTS, TRAIN_ARGUMENTS, loop_plan, train_plan
-from bringup.pairs import LoopNode
 from loop_interfaces.parameters import table
 from loop_interfaces.spec import ParameterError, read_yaml
 from pde_sim_node.equations import ALLOWED
+from pdeloop import cli, launch_plan
+from pdeloop.launch_plan import LOOP_ARGUMENTS, TRAIN_ARGUMENTS, loop_plan, train_plan
+from pdeloop.pairs import LoopNode
 from tests.colcon_workspace import ROOT, Workspace, build
 from tests.small import SMALL
 from tuner_node.results import RunFolderError

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bringup.bench.kernel import Grid, NumpyPlant
-from pde_sim_node import threads
+from benchmarks.kernel import Grid, NumpyPlant
 from pde_sim_node.equations import (
     AllenCahn,
     Burgers,
@@ -21,8 +20,9 @@ from pde_sim_node.equations import (
     Schrodinger,
     load_equation,
 )
-from pde_sim_node.integrator import fine_length
 from pde_sim_node.plant import DIVERGED_COST, Plant
+from pde_sim_node.solver import workers
+from pde_sim_node.solver.integrator import fine_length
 
 DATA = Path(__file__).parent / "data"
 
@@ -192,8 +192,8 @@ def test_batch_place_and_threads_change_no_bit(
         assert all(alone[s] == bits for s, bits in rollout(plant, seeds[:batch]).items())
     shuffled = [int(s) for s in np.random.default_rng(0).permutation(seeds)]
     assert rollout(plant, shuffled) == alone
-    monkeypatch.setattr(threads, "_CREW", [threads.Crew(range(3))])
-    monkeypatch.setattr(threads, "POINTS_PER_PIECE", 1)
+    monkeypatch.setattr(workers, "_CREW", [workers.Crew(range(3))])
+    monkeypatch.setattr(workers, "POINTS_PER_PIECE", 1)
     threaded = make(equation, **grid)
     for batch in (3, 7, 64):
         assert all(alone[s] == bits for s, bits in rollout(threaded, shuffled[:batch]).items())
@@ -424,7 +424,7 @@ def test_a_users_equation_is_compiled_once_for_all_processes(tmp_path: Path) -> 
     path = tmp_path / "fisher.py"
     program = (
         "import sys; from pde_sim_node.equations import load_equation;"
-        "from pde_sim_node.pointwise import pointwise_loop;"
+        "from pde_sim_node.solver.pointwise import pointwise_loop;"
         "print(pointwise_loop(load_equation(sys.argv[1]).nonlinearity)[1])"
     )
     root = str(Path(__file__).parent.parent)

@@ -42,13 +42,15 @@ def folder(request, tmp_path_factory) -> Path:
     if request.param == "run":
         command = ("train", str(SMALL), "--in-process", "--iterations", "12")
         command += ("--optimizer", "gauss_newton")
-        limits = ("bench", "optimum", str(SMALL), "--seeds", "2", "--fields", "2", "--no-checks")
+        limits = ("optimum", str(SMALL), "--seeds", "2", "--fields", "2", "--no-checks")
         report = ("--limits", str(base / "limits"))
     with processes(base) as running:
         running.wait(running.pdeloop(*command, *options), LIMIT)
         if report:
             words = ("--jobs", "1", "--tolerance", "0.01", "--save", str(base / "limits"))
-            running.wait(running.pdeloop(*limits, *words), LIMIT)
+            running.wait(
+                running.start("-m", "benchmarks", *limits, *words, name="benchmarks"), LIMIT
+            )
         running.wait(running.pdeloop("report", str(base / "out"), *report), LIMIT)
     return base / "out"
 
@@ -95,7 +97,7 @@ def test_axes_are_labelled_with_units_and_controllers_named(folder):
 
 
 def test_a_controller_has_the_same_colour_in_every_figure(folder):
-    from bringup.report.style import COLOURS
+    from pdeloop.report.style import COLOURS
 
     for name in ("costs", "small-behaviour", "small-spectrum"):
         svg = (folder / "report" / f"{name}.svg").read_text().lower()
@@ -109,7 +111,7 @@ def test_a_controller_has_the_same_colour_in_every_figure(folder):
 
 def test_steps_damping_and_model_error_are_those_of_the_history(folder):
     """The figure's data against result.json; the paper's optimiser has none."""
-    from bringup.report.data import gather
+    from pdeloop.report.data import gather
 
     base = folder if (folder / "result.json").exists() else folder / "small" / "lqt"
     history = json.loads((base / "result.json").read_text())["history"]
@@ -138,7 +140,7 @@ def test_the_page_says_which_share_of_the_possible_gain_was_reached(folder):
     if (folder / "reproduction.json").exists():
         assert "possible gain" not in page and "open-loop limit" not in page
         return
-    from bringup.report.data import gather
+    from pdeloop.report.data import gather
 
     limits = folder.parent / "limits"
     share = gather(folder, limits).problems[0].share("lqt_po")
@@ -180,7 +182,7 @@ def test_a_real_browser_shows_the_page_without_a_console_message(folder, tmp_pat
 
 
 def test_a_plant_of_two_fields_shows_both(tmp_path):
-    from bringup.cli import main
+    from pdeloop.cli import main
 
     out = str(tmp_path / "run")
     command = ["train", "wave", "--iterations", "1", "--optimizer", "two_point", "--in-process"]

@@ -9,9 +9,9 @@ import time
 import numpy as np
 import pytest
 
-from bringup.in_process import LocalPair
-from bringup.reproduce import experiment as reproduce
 from loop_interfaces.topics import CostColumn
+from pdeloop.in_process import LocalPair
+from pdeloop.reproduce import experiment as reproduce
 from tests.loop_harness import Processes, until
 from tests.small import SMALL, parameters, same_bits, train_here
 from tuner_node.batch import Batch

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bringup.in_process import LocalPair
 from controller_node.identification import DesignSettings
 from controller_node.policy import excitation
 from controller_node.responder import Responder
@@ -14,6 +13,7 @@ from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import ModelFailure
 from loop_interfaces.topics import ACTION, COMPLETED, MODEL_IDENTIFIED
 from pde_sim_node.build import build_plant
+from pdeloop.in_process import LocalPair
 from tests.small import parameters, same_bits
 from tuner_node.batch import Batch
 

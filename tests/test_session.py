@@ -6,9 +6,9 @@ from functools import cache
 
 import pytest
 
-from bringup.in_process import LocalPair
 from loop_interfaces.frames import Frame
 from loop_interfaces.topics import MODEL, POLICY, START, StartColumn
+from pdeloop.in_process import LocalPair
 from tests.small import parameters, same_bits, train_here
 from tuner_node.batch import Batch
 from tuner_node.build import build_training

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parent.parent
 PROGRAM = """
 import sys
 import numpy as np, numba
-from loop_interfaces.simd import fma, load, minus_product, store
+from loop_interfaces.jit.simd import fma, load, minus_product, store
 
 @numba.njit
 def both(x, y, z, plus, minus):

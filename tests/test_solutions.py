@@ -18,7 +18,7 @@ from pde_sim_node.equations import (
     Wave,
 )
 from pde_sim_node.plant import Plant
-from pde_sim_node.propagator import exact_propagator
+from pde_sim_node.solver.exact import exact_propagator
 
 
 def make(equation: Equation, **values: Any) -> Plant:

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bringup.in_process import LocalPair, train
 from loop_interfaces import model_rows
 from loop_interfaces.model_rows import unpack
 from loop_interfaces.topics import COMPLETED, StartColumn
+from pdeloop.in_process import LocalPair, train
 from tests.small import parameters, same_bits, train_here
 from tuner_node import checkpoint
 from tuner_node.batch import BatchResult

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from loop_interfaces.diagnostics import Level
 from loop_interfaces.frames import Frame
-from loop_interfaces.health import Level
 from loop_interfaces.model_rows import ModelRows, pack
-from viewer_node.health import ViewerHealth
+from viewer_node.diagnostics import ViewerHealth
 from viewer_node.spacetime import MAX_ROWS, UNSEEN, SpaceTime
 from viewer_node.view import SCALARS, LoopView
 

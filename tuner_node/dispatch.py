@@ -31,7 +31,7 @@ from loop_interfaces.topics import (
     Topic,
 )
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult
-from tuner_node.work import Chunk, Pair
+from tuner_node.dispatch_state import Chunk, Pair
 
 Array = NDArray[np.float64]
 Order = tuple[int, Send]

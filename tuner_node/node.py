@@ -21,16 +21,16 @@ from typing import Any
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from loop_interfaces.endpoints import Sender, reader_qos, scoped
 from loop_interfaces.frames import MAX_ID, Frame
-from loop_interfaces.introspection import offer
 from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.node_loop import NodeLoop
-from loop_interfaces.node_main import ConfigurationError, node_main
 from loop_interfaces.parameters import PROBLEM, TUNER
 from loop_interfaces.protocol import STOPPED, ModelFailure
-from loop_interfaces.pulse import nap
-from loop_interfaces.ros_parameters import declare, given_parameters, on_change
+from loop_interfaces.ros.endpoints import Sender, reader_qos, scoped
+from loop_interfaces.ros.introspection import offer
+from loop_interfaces.ros.node_loop import NodeLoop
+from loop_interfaces.ros.node_main import ConfigurationError, node_main
+from loop_interfaces.ros.parameters import declare, given_parameters, on_change
+from loop_interfaces.ros.suspend_watchdog import nap
 from loop_interfaces.topics import (
     ACTION,
     COST,
@@ -45,10 +45,10 @@ from loop_interfaces.topics import (
     TARGET,
 )
 from tuner_node.build import build_training
+from tuner_node.diagnostics import TunerHealth
 from tuner_node.dispatch import Dispatcher, DispatchError, Order
-from tuner_node.health import TunerHealth
-from tuner_node.record import Recorder
 from tuner_node.results import RunFolder, RunIdentity, summarise
+from tuner_node.run_store import Recorder
 from tuner_node.session import Session
 
 RIVAL_GRACE = 6.0

@@ -26,13 +26,13 @@ from visualization_msgs.msg import Marker
 
 from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.looking import DRAIN, Handler, Reader, Samples, drain
-from loop_interfaces.node_loop import NodeLoop
-from loop_interfaces.node_main import node_main
 from loop_interfaces.parameters import PROBLEM, VIEWER
-from loop_interfaces.ros_parameters import declare, given_parameters, on_change
+from loop_interfaces.ros.node_loop import NodeLoop
+from loop_interfaces.ros.node_main import node_main
+from loop_interfaces.ros.parameters import declare, given_parameters, on_change
+from loop_interfaces.ros.polling import DRAIN, Handler, Reader, Samples, drain
 from loop_interfaces.topics import COST, MODEL, POLICY, START, TARGET
-from viewer_node.health import ViewerHealth
+from viewer_node.diagnostics import ViewerHealth
 from viewer_node.view import SCALARS, LoopView
 
 FRAME_ID = "field"

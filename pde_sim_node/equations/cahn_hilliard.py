@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from .base import Equation, Field, Spectrum, draw, parameter
+from pde_sim_node.equations.base import Equation, Field, Spectrum, draw, parameter
 
 
 @dataclass(frozen=True, kw_only=True)

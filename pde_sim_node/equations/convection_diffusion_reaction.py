@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from .base import Field, LinearEquation, Spectrum, draw, parameter, sech
+from pde_sim_node.equations.base import Field, LinearEquation, Spectrum, draw, parameter, sech
 
 
 @dataclass(frozen=True, kw_only=True)

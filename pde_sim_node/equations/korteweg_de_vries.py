@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from .base import Equation, Field, Spectrum, draw, parameter, sech
+from pde_sim_node.equations.base import Equation, Field, Spectrum, draw, parameter, sech
 
 
 @dataclass(frozen=True, kw_only=True)

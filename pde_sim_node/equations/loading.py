@@ -17,8 +17,8 @@ from pathlib import Path
 from types import CodeType, ModuleType
 from typing import Any
 
-from .base import Equation
-from .registry import EQUATIONS
+from pde_sim_node.equations.base import Equation
+from pde_sim_node.equations.registry import EQUATIONS
 
 __all__ = ["ALLOWED", "GROUP", "allow", "configured_equation", "load_equation"]
 

@@ -3,17 +3,17 @@
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from .allen_cahn import AllenCahn
-from .base import Equation
-from .burgers import Burgers
-from .cahn_hilliard import CahnHilliard
-from .convection_diffusion_reaction import ConvectionDiffusionReaction
-from .fisher import Fisher
-from .ginzburg_landau import GinzburgLandau
-from .korteweg_de_vries import KortewegDeVries
-from .kuramoto_sivashinsky import KuramotoSivashinsky
-from .schrodinger import Schrodinger
-from .wave import Wave
+from pde_sim_node.equations.allen_cahn import AllenCahn
+from pde_sim_node.equations.base import Equation
+from pde_sim_node.equations.burgers import Burgers
+from pde_sim_node.equations.cahn_hilliard import CahnHilliard
+from pde_sim_node.equations.convection_diffusion_reaction import ConvectionDiffusionReaction
+from pde_sim_node.equations.fisher import Fisher
+from pde_sim_node.equations.ginzburg_landau import GinzburgLandau
+from pde_sim_node.equations.korteweg_de_vries import KortewegDeVries
+from pde_sim_node.equations.kuramoto_sivashinsky import KuramotoSivashinsky
+from pde_sim_node.equations.schrodinger import Schrodinger
+from pde_sim_node.equations.wave import Wave
 
 __all__ = ["EQUATIONS"]
 

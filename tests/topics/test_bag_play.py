@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from bringup.bags.playback import Playback, channels
-from bringup.bags.reader import Bag, Message
+from pdeloop.bags.playback import Playback, channels
+from pdeloop.bags.reader import Bag, Message
 from tests.browser import browser
 from tests.loop_harness import Processes, processes, until, without_domain
 from tests.small import SMALL

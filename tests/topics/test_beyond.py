@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from bringup.bags.verify import verify
+from pdeloop.bags.verify import verify
 from tests.loop_harness import Processes, until
 from tests.small import SMALL, parameters, train_here
 from tests.topics.test_loop import LIMIT, assert_same_training, iterations_done, tuner_arguments
@@ -31,7 +31,7 @@ def test_a_faulty_line_and_killed_nodes_change_no_noise(loop: Processes, tmp_pat
     lines = {"pde_sim_node": "state:=state_sent", "controller_node": "action:=action_sent"}
     running = {name: loop.node(name, *start, "-r", line) for name, line in lines.items()}
     line = ("-p", "loss:=0.002", "-p", "duplicate:=0.2", "-p", "delay:=0.002")
-    loop.start("-m", "bringup.relay.node", "--ros-args", *line, name="relay")
+    loop.start("-m", "pdeloop.relay.node", "--ros-args", *line, name="relay")
     options = {"iterations": ITERATIONS, "optimizer": optimizer, "seeds": 2}
     tuner = loop.node("tuner_node", *start, *tuner_arguments(out, **options, max_attempts=50))
     for iteration, victim in ((4, "controller_node"), (8, "pde_sim_node")):

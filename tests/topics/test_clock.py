@@ -25,7 +25,7 @@ STUCK = """
 import rclpy, threading, time
 from loop_interfaces import node_loop
 from loop_interfaces.protocol import QUIET
-from loop_interfaces.line import Line
+from loop_interfaces.fast_path.line import Line
 from loop_interfaces.topics import ACTION, STATE
 from tests.test_reflexes import Controller
 node_loop.HOUSEKEEPING = 60.0  # as long as a wait until a moment that was set back

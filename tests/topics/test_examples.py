@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bringup.cli import main
 from loop_interfaces.model_rows import unpack
 from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from pde_sim_node.equations import ALLOWED
+from pdeloop.cli import main
 from tests.loop_harness import ROOT, Processes, until
 from tests.topics.test_foreign import INTERFACES, code_block, documented_command
 from tests.topics.test_loop import LIMIT
@@ -58,7 +58,7 @@ def example(name: str) -> Any:
 
 def test_a_controller_of_ones_own_is_tuned(loop: Processes, tmp_path: Path) -> None:
     source = (EXAMPLES / "saturated_controller.py").read_text()
-    assert not re.search(r"import (loop_interfaces|pde_sim_node|controller_node|bringup)", source)
+    assert not re.search(r"import (loop_interfaces|pde_sim_node|controller_node|pdeloop)", source)
     mark = "examples/saturated_controller.py"
     loop.node("pde_sim_node", *ros_arguments(mark, "pde_sim_node"))
     controller = ros_arguments(mark, "python examples/saturated_controller.py")
@@ -132,7 +132,7 @@ def test_a_pde_of_ones_own_is_offered_by_its_package(tmp_path: Path, monkeypatch
     options = ["--in-process", "--iterations", "1", "--optimizer", "two_point"]
     options += ["--out", str(tmp_path / "run")]
     done = subprocess.run(
-        [sys.executable, "-m", "bringup.cli", "train", str(problem), *options],
+        [sys.executable, "-m", "pdeloop.cli", "train", str(problem), *options],
         env={**os.environ, "PYTHONPATH": f"{ROOT}:{tmp_path}"},
         capture_output=True,
         text=True,

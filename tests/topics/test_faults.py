@@ -56,7 +56,7 @@ def test_lost_repeated_delayed_and_reordered_messages_change_nothing(loop, tmp_p
     loop.node("pde_sim_node", *PARAMETERS, "-r", "state:=state_sent", "-p", "action_timeout:=0.02")
     loop.node("controller_node", *PARAMETERS, "-r", "action:=action_sent")
     arguments = [word for name, value in faults.items() for word in ("-p", f"{name}:={value}")]
-    relay = loop.start("-m", "bringup.relay.node", "--ros-args", *arguments, name="relay")
+    relay = loop.start("-m", "pdeloop.relay.node", "--ros-args", *arguments, name="relay")
     tuner = start_tuner(loop, tmp_path / "run", iterations=8)
     loop.wait(tuner, LIMIT)
     assert_same_training(tmp_path / "run", in_process(iterations=8))
@@ -269,7 +269,7 @@ import sys, time
 import numpy as np, rclpy
 from std_msgs.msg import Float64MultiArray
 from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.endpoints import writer_qos
+from loop_interfaces.ros.endpoints import writer_qos
 from loop_interfaces.topics import ARRAYS
 from tests.topics.test_faults import garbage
 rclpy.init()
@@ -307,7 +307,7 @@ import time
 import numpy as np, rclpy
 from std_msgs.msg import Float64MultiArray
 from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.endpoints import writer_qos
+from loop_interfaces.ros.endpoints import writer_qos
 from loop_interfaces.topics import ACTION
 rclpy.init()
 node = rclpy.create_node("stranger")
@@ -344,7 +344,7 @@ from dataclasses import replace
 import numpy as np, rclpy
 from std_msgs.msg import Float64MultiArray
 from loop_interfaces.frames import ArrayCodec
-from loop_interfaces.endpoints import reader_qos, writer_qos
+from loop_interfaces.ros.endpoints import reader_qos, writer_qos
 from loop_interfaces.topics import ACTION, STATE
 rclpy.init()
 node = rclpy.create_node("second_controller")

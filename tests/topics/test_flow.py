@@ -22,7 +22,7 @@ def test_plant_and_controller_flow_with_the_bytes_of_the_long_way(loop: Processe
 
 RESTLESS = """
 import gc, sys, time
-from loop_interfaces.node_loop import NodeLoop
+from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.protocol import QUIET, Tally
 from {0}.node import main
 from {0}.reflex import Reflex

@@ -38,7 +38,7 @@ def test_a_linear_plant_written_from_the_interface_page_is_identified_and_tuned(
 ) -> None:
     source = code_block(INTERFACES, "python", "class LinearPlant")
     assert "pdeloop" not in re.sub(r'"""[^"]*"""', "", source)
-    assert not re.search(r"import (loop_interfaces|pde_sim_node|controller_node|bringup)", source)
+    assert not re.search(r"import (loop_interfaces|pde_sim_node|controller_node|pdeloop)", source)
     (tmp_path / "linear_plant.py").write_text(source)
     space: dict[str, np.ndarray] = {"__name__": "linear_plant"}
     exec(compile(source.split("VOLATILE =")[0], "linear_plant", "exec"), space)

@@ -115,7 +115,7 @@ import time
 import numpy as np, rclpy
 from std_msgs.msg import Float64MultiArray
 from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.endpoints import writer_qos
+from loop_interfaces.ros.endpoints import writer_qos
 from loop_interfaces.topics import START
 rclpy.init()
 node = rclpy.create_node("stranger")

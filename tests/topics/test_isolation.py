@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from bringup.domain import DomainError, own_domain
 from loop_interfaces.isolation import NETWORK, PROFILE, loopback_environment, outside_sockets
 from loop_interfaces.problem import config_folder
+from pdeloop.domain import DomainError, own_domain
 from tests.loop_harness import ROOT, Processes, until
 
 pytestmark = pytest.mark.topics
@@ -85,7 +85,7 @@ def test_the_user_opens_the_network_on_purpose(monkeypatch):
 def test_every_run_has_a_domain_of_its_own_unless_the_user_sets_one(monkeypatch):
     with own_domain() as first, own_domain() as second:
         assert first != second
-        monkeypatch.setattr("bringup.domain.DOMAINS", (first, second))
+        monkeypatch.setattr("pdeloop.domain.DOMAINS", (first, second))
         with pytest.raises(DomainError, match="are in use"), own_domain():
             pass
     monkeypatch.setenv("ROS_DOMAIN_ID", "7")
@@ -100,7 +100,7 @@ def test_every_run_has_a_domain_of_its_own_unless_the_user_sets_one(monkeypatch)
 def test_a_domain_in_which_somebody_is_left_is_not_given_out(monkeypatch, participant):
     with own_domain() as first, own_domain() as second:
         pass
-    monkeypatch.setattr("bringup.domain.DOMAINS", (first, second))
+    monkeypatch.setattr("pdeloop.domain.DOMAINS", (first, second))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as busy:
         busy.bind(("127.0.0.1", 7410 + 250 * first + 2 * participant))
         for _ in range(10):

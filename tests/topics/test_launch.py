@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from bringup.launch_plan import train_plan
+from pdeloop.launch_plan import train_plan
 from tests.colcon_workspace import Workspace
 from tests.loop_harness import Processes, until
 from tests.small import SMALL

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bringup.bags.verify import verify
+from pdeloop.bags.verify import verify
 from tests.loop_harness import Processes
 from tests.small import SMALL, parameters, train_here
 from tests.topics.test_loop import LIMIT, assert_same_training

@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bringup.bench import pairs as bench_pairs
-from bringup.bench import realtime as bench_realtime
-from bringup.bench.hosts import can_make_hosts, hosts
-from bringup.bench.processes import bench
-from bringup.in_process import LocalPair, train
-from bringup.shared_core import START_UP
-from bringup.training_run import resolve
+from benchmarks import pairs as bench_pairs
+from benchmarks import realtime as bench_realtime
+from benchmarks.hosts import can_make_hosts, hosts
+from benchmarks.processes import bench
 from loop_interfaces.affinity import helps_solver
+from pdeloop.core_affinity import START_UP
+from pdeloop.in_process import LocalPair, train
+from pdeloop.training_run import resolve
 from tests.loop_harness import Processes, until
 from tests.small import SMALL, same_bits
 from tests.topics.test_loop import LIMIT, assert_same_training, in_process, iterations_done
@@ -115,5 +115,5 @@ def test_a_paced_plant_takes_as_long_as_the_wall_clock_says() -> None:
 
 def test_the_processes_of_a_measurement_end_with_it() -> None:
     with bench() as running:
-        node = running.start("bringup.bench.ping", "end:=pong")
+        node = running.start("benchmarks.ping", "end:=pong")
     assert node.process.poll() is not None

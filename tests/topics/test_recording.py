@@ -16,11 +16,11 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from bringup.bags.identification import identify
-from bringup.bags.reader import Bag
-from bringup.bags.tools import describe, recover
-from bringup.bags.verify import verify
 from loop_interfaces.model_rows import pack
+from pdeloop.bags.identification import identify
+from pdeloop.bags.reader import Bag
+from pdeloop.bags.tools import describe, recover
+from pdeloop.bags.verify import verify
 from tests.loop_harness import Processes, until
 from tests.small import SMALL, same_bits
 from tests.small_disk import read_only_folder, small_disk
@@ -254,8 +254,8 @@ def test_a_recorder_that_is_held_up_for_a_second_misses_nothing(loop, tmp_path):
 INTAKE = """
 import rclpy, time
 from std_msgs.msg import String
-from loop_interfaces.endpoints import raw_subscription
-from loop_interfaces.watching import Intake
+from loop_interfaces.ros.endpoints import raw_subscription
+from loop_interfaces.ros.sample_subscription import Intake
 rclpy.init()
 node = rclpy.create_node("intake")
 intake = Intake(raw_subscription(node, String, "words", 50), String, 50)

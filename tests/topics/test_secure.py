@@ -6,7 +6,7 @@ import xml.etree.ElementTree as ET
 
 import pytest
 
-from bringup.secure import EVERY_NODE_ANSWERS, EVERY_NODE_PUBLISHES, ROLES, policy
+from pdeloop.secure import EVERY_NODE_ANSWERS, EVERY_NODE_PUBLISHES, ROLES, policy
 from tests.loop_harness import Processes
 
 pytestmark = pytest.mark.topics

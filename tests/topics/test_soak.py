@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from bringup.bench.soak import as_dict, soak, text
 from tests.small import SMALL
+from tests.soak import as_dict, soak, text
 
 pytestmark = pytest.mark.topics
 

@@ -1,0 +1,333 @@
+"""How long one sampling time of one environment takes: this plant against other implementations.
+
+All of them integrate the same equation with the same ETDRK4 and the same dealiasing. NumPy stands
+for what one writes first, vectorised over the environments with SciPy's FFT; JAX for the same,
+jitted; controlgym for the library that the paper used. The last two run in Python environments of
+their own, named by the path of their interpreter.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pde_sim_node.equations import EQUATIONS, Equation, Field
+from pde_sim_node.solver.etdrk4 import etdrk4_coefficients
+from pde_sim_node.supports import indicator_supports
+
+__all__ = ["BATCHES", "GRIDS", "Grid", "NumpyPlant", "Row", "run"]
+
+BATCHES = (1, 2, 12, 64)
+SECONDS = 0.25
+"""How long each figure is measured for."""
+KEEP_MEMORY = {"MALLOC_MMAP_THRESHOLD_": str(2**24), "MALLOC_TRIM_THRESHOLD_": str(2**28)}
+"""For the references: glibc may return their temporaries to the system at every step, and the page
+faults then cost up to ten times the arithmetic."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The discretisation of one of the paper's problems."""
+
+    n_z: int
+    n_a: int
+    width: float
+    sample_time: float
+    integration_time: float
+
+    @property
+    def steps(self) -> int:
+        return round(self.sample_time / self.integration_time)
+
+
+GRIDS = {
+    "burgers": Grid(128, 6, 0.15, 0.05, 0.0025),
+    "allen-cahn": Grid(256, 12, 0.05, 0.01, 0.01),
+    "kdv": Grid(256, 10, 0.05, 0.01, 0.001),
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """Least time that a sampling time of one environment took."""
+
+    problem: str
+    batch: int
+    method: str
+    microseconds: float
+
+
+class NumpyPlant:
+    """ETDRK4 over all environments at once, in plain NumPy with SciPy's real FFT.
+
+    Parameters
+    ----------
+    equation, grid
+        The problem.
+    fine
+        Points of the dealiased grid; 3/2 n_z if not given.
+    """
+
+    def __init__(self, equation: Equation, grid: Grid, fine: int | None = None) -> None:
+        self.n_z, self.steps = grid.n_z, grid.steps
+        self.fine = fine or 3 * grid.n_z // 2
+        modes = np.arange(grid.n_z // 2 + 1, dtype=np.float64)
+        k: Field = 2 * np.pi / equation.length * modes
+        self.c = etdrk4_coefficients(equation.linear_operator(k), grid.integration_time)
+        self.multiplier = equation.multiplier(k) * grid.n_z / self.fine
+        self.nonlinearity: Any = equation.nonlinearity
+        supports = indicator_supports(grid.n_z, grid.n_a, grid.width)
+        self.forcing = np.fft.rfft(supports, axis=0).T
+
+    def step(
+        self, states: NDArray[np.float64], actions: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """The states (M, n_z) one sampling time later, under the actions (M, n_a)."""
+        from scipy.fft import irfft, rfft
+
+        c, forcing = self.c, actions @ self.forcing
+        scale, modes = self.fine / self.n_z, self.n_z // 2 + 1
+
+        def nonlinear(v: Any) -> Any:
+            u = scale * irfft(v, self.fine)
+            return self.multiplier * rfft(self.nonlinearity(u))[:, :modes] + forcing
+
+        v = rfft(states)
+        for _ in range(self.steps):
+            n_v, half = nonlinear(v), c.e2 * v
+            a = half + c.q * n_v
+            n_a = nonlinear(a)
+            n_b = nonlinear(half + c.q * n_a)
+            n_c = nonlinear(c.e2 * a + c.q * (2 * n_b - n_v))
+            v = c.e * v + c.f1 * n_v + 2 * c.f2 * (n_a + n_b) + c.f3 * n_c
+        new: NDArray[np.float64] = irfft(v, self.n_z)
+        return new
+
+
+def least_microseconds(step: Callable[[], object], batch: int) -> float:
+    """Of many repeats the fastest: what makes the others slower is other programs, not the method."""
+    step()
+    times: list[float] = []
+    end = time.perf_counter() + SECONDS
+    while time.perf_counter() < end or len(times) < 5:
+        began = time.perf_counter()
+        step()
+        times.append(time.perf_counter() - began)
+    return min(times) / batch * 1e6
+
+
+def start(problem: str, batch: int) -> tuple[Equation, NDArray[np.float64], NDArray[np.float64]]:
+    """An equation, initial fields and actions."""
+    equation, grid = EQUATIONS[problem](), GRIDS[problem]
+    x = equation.length * np.arange(grid.n_z) / grid.n_z
+    fields = [equation.initial_field(x, np.random.default_rng(seed)) for seed in range(batch)]
+    actions = np.random.default_rng(0).normal(0, 0.3, (batch, grid.n_a))
+    return equation, np.array(fields), actions
+
+
+def time_pdeloop(problem: str, batch: int) -> float:
+    from pde_sim_node.plant import Plant
+
+    equation, _, actions = start(problem, batch)
+    grid = GRIDS[problem]
+    plant = Plant(
+        equation,
+        n_z=grid.n_z,
+        n_a=grid.n_a,
+        width=grid.width,
+        sample_time=grid.sample_time,
+        integration_time=grid.integration_time,
+        horizon=10**9,
+        state_weight=1.0,
+        action_weight=1.0,
+    )
+    plant.reset(np.arange(batch))
+
+    def step() -> None:
+        if plant.step_index >= 80:
+            plant.reset(np.arange(batch))
+        plant.step(actions)
+
+    return least_microseconds(step, batch)
+
+
+def time_numpy(problem: str, batch: int) -> float:
+    equation, states, actions = start(problem, batch)
+    plant = NumpyPlant(equation, GRIDS[problem])
+    return least_microseconds(lambda: plant.step(states, actions), batch)
+
+
+def time_jax(problem: str, batch: int) -> float:
+    import jax  # type: ignore[import-not-found, unused-ignore]
+
+    jax.config.update("jax_enable_x64", True)
+    from jax import numpy as jnp
+
+    equation, states, actions = start(problem, batch)
+    plant = NumpyPlant(equation, GRIDS[problem])
+    c, modes = plant.c, plant.n_z // 2 + 1
+
+    @jax.jit  # type: ignore[untyped-decorator, unused-ignore]
+    def step(states: Any, actions: Any) -> Any:
+        forcing = actions @ plant.forcing
+
+        def nonlinear(v: Any) -> Any:
+            u = plant.fine / plant.n_z * jnp.fft.irfft(v, plant.fine)
+            return plant.multiplier * jnp.fft.rfft(plant.nonlinearity(u))[:, :modes] + forcing
+
+        def integrate(_: int, v: Any) -> Any:
+            n_v, half = nonlinear(v), c.e2 * v
+            a = half + c.q * n_v
+            n_a = nonlinear(a)
+            n_b = nonlinear(half + c.q * n_a)
+            n_c = nonlinear(c.e2 * a + c.q * (2 * n_b - n_v))
+            return c.e * v + c.f1 * n_v + 2 * c.f2 * (n_a + n_b) + c.f3 * n_c
+
+        v = jnp.fft.rfft(states)
+        v = integrate(0, v) if plant.steps == 1 else jax.lax.fori_loop(0, plant.steps, integrate, v)
+        return jnp.fft.irfft(v, plant.n_z)
+
+    z, a = jnp.asarray(states), jnp.asarray(actions)
+    return least_microseconds(lambda: step(z, a).block_until_ready(), batch)
+
+
+def time_controlgym(problem: str, batch: int) -> float:
+    import controlgym  # type: ignore[import-not-found, unused-ignore]
+
+    grid, equation = GRIDS[problem], EQUATIONS[problem]()
+    names = {"burgers": "burgers", "allen-cahn": "allen_cahn", "kdv": "korteweg_de_vries"}
+    environments = [
+        controlgym.make(
+            names[problem],
+            n_steps=10**9,
+            domain_length=equation.length,
+            integration_time=grid.integration_time,
+            # It counts steps by a floor division, which must not come out one short.
+            sample_time=grid.sample_time * (1 + 1e-12),
+            n_state=grid.n_z,
+            n_action=grid.n_a,
+            control_sup_width=grid.width,
+            sensor_noise_cov=0.0,
+        )
+        for _ in range(batch)
+    ]
+    actions = np.random.default_rng(0).normal(0, 0.3, (batch, grid.n_a))
+    for environment in environments:
+        environment.reset(seed=0)
+    fields = [environment.state.copy() for environment in environments]
+
+    def step() -> None:
+        for environment, field, action in zip(environments, fields, actions, strict=True):
+            environment.state = field
+            environment.step(action)
+
+    return least_microseconds(step, batch)
+
+
+METHODS = {
+    "pdeloop": time_pdeloop,
+    "numpy": time_numpy,
+    "jax": time_jax,
+    "controlgym": time_controlgym,
+}
+
+
+def measure(method: str, batches: Sequence[int]) -> list[Row]:
+    time_one = METHODS[method]
+    return [
+        Row(problem, batch, method, time_one(problem, batch))
+        for problem in GRIDS
+        for batch in batches
+    ]
+
+
+def measure_with(python: str, method: str, batches: Sequence[int]) -> list[Row]:
+    """`measure` by another interpreter; CalledProcessError if it fails, its words on stderr."""
+    root = Path(__file__).resolve().parent.parent.parent
+    command = [
+        python,
+        "-m",
+        "benchmarks.kernel",
+        "--only",
+        method,
+        "--batches",
+        *map(str, batches),
+    ]
+    done = subprocess.run(
+        command,
+        check=True,
+        stdout=subprocess.PIPE,
+        text=True,
+        timeout=600,
+        env={**os.environ, **KEEP_MEMORY, "PYTHONPATH": str(root)},
+    )
+    return [Row(**row) for row in json.loads(done.stdout.splitlines()[-1])]
+
+
+def run(
+    batches: Sequence[int] = BATCHES,
+    *,
+    jax_python: str | None = None,
+    controlgym_python: str | None = None,
+) -> list[Row]:
+    """Measure the plant and its references, one after the other.
+
+    Parameters
+    ----------
+    batches
+        Numbers of environments.
+    jax_python, controlgym_python
+        Interpreters that can import JAX, and controlgym 1.0.0; left out where not given.
+    """
+    rows = measure("pdeloop", batches) + measure_with(sys.executable, "numpy", batches)
+    if jax_python:
+        rows += measure_with(jax_python, "jax", batches)
+    if controlgym_python:
+        rows += measure_with(controlgym_python, "controlgym", batches)
+    return rows
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Times, and in brackets how many times slower than the plant, as Markdown."""
+    methods = list(dict.fromkeys(row.method for row in rows))
+    times = {(row.problem, row.batch, row.method): row.microseconds for row in rows}
+    lines = ["| problem | batch | " + " | ".join(methods) + " |", "|---" * (2 + len(methods)) + "|"]
+    for problem, batch in dict.fromkeys((row.problem, row.batch) for row in rows):
+        own = times[problem, batch, methods[0]]
+        cells = [
+            f"{times[problem, batch, method]:.1f} ({times[problem, batch, method] / own:.1f})"
+            for method in methods
+        ]
+        lines.append(f"| {problem} | {batch} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Print the table, in microseconds for a sampling time of one environment."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("--batches", type=int, nargs="+", default=BATCHES)
+    parser.add_argument("--jax", metavar="PYTHON", help="interpreter that can import JAX")
+    parser.add_argument("--controlgym", metavar="PYTHON", help="interpreter with controlgym 1.0.0")
+    parser.add_argument("--only", choices=METHODS, help="measure one, print its rows as JSON")
+    options = parser.parse_args()
+    if options.only:
+        json.dump([asdict(row) for row in measure(options.only, options.batches)], sys.stdout)
+    else:
+        print(
+            table(
+                run(options.batches, jax_python=options.jax, controlgym_python=options.controlgym)
+            )
+        )
+
+
+if __name__ == "__main__":
+    main()

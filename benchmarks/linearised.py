@@ -1,0 +1,88 @@
+"""How far linear theory gets: LQR of the exact linearisation about 0, with the full state.
+
+For the linear problems it is the optimum over an infinite horizon; for the others it is what a perfect
+model of small fields gives. Costs are those of `pdeloop train`'s closing evaluation.
+
+    python -m benchmarks.linearised wave cahn-hilliard
+    python -m benchmarks.linearised ginzburg-landau --n-a 20 --width 0.05
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loop_interfaces.problem import load_parameters, shipped_problems
+from pde_sim_node.build import build_plant
+from pde_sim_node.plant import Plant
+from tuner_node.seeds import Purpose, derive
+
+SMALL = 1e-6
+"""Size of the fields and actions whose answers are differenced."""
+FIELDS = 10
+
+
+def linearisation(plant: Plant) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """A (n_z, n_z) and B (n_z, n_a) of z+ = A z + B a near z = 0, by central differences."""
+    n, n_a = plant.n_z, plant.n_a
+    columns = []
+    for states, actions in (
+        (np.eye(n), np.zeros((n, n_a))),
+        (np.zeros((n_a, n)), np.eye(n_a)),
+    ):
+        plus, _ = plant.evaluate(SMALL * states, SMALL * actions)
+        minus, _ = plant.evaluate(-SMALL * states, -SMALL * actions)
+        columns.append((plus - minus).T / (2 * SMALL))
+    return columns[0], columns[1]
+
+
+def costs(problem: str, changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Mean stage costs without control and with that law; None where no law stabilises A."""
+    from scipy.linalg import solve_discrete_are
+
+    plant = build_plant(load_parameters(problem, changes))
+    A, B = linearisation(plant)
+    R = plant.action_weight * np.eye(plant.n_a)
+    laws: dict[str, NDArray[np.float64]] = {"none": np.zeros((plant.n_a, plant.n_z))}
+    closed = np.inf
+    try:
+        P = solve_discrete_are(A, B, plant.state_weight * np.eye(plant.n_z), R)
+        laws["lqr"] = -np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+        closed = np.abs(np.linalg.eigvals(A + B @ laws["lqr"])).max()
+    except np.linalg.LinAlgError:
+        pass
+    if closed > 1 + 1e-9:  # nothing that it says about an unstable loop means anything
+        laws.pop("lqr", None)
+    seeds = [derive(0, Purpose.EVALUATION_FIELD, i) for i in range(FIELDS)]
+    found: dict[str, Any] = {"radius": float(np.abs(np.linalg.eigvals(A)).max()), "lqr": None}
+    for name, gain in laws.items():
+        z = plant.reset(seeds)
+        for _ in range(plant.horizon):
+            z = plant.step(z @ gain.T)
+        found[name] = float(plant.episode_costs().mean.mean())
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("problem", nargs="+", choices=shipped_problems(), metavar="PROBLEM")
+    parser.add_argument("--n-a", type=int, help="actuators [those of the problem]")
+    parser.add_argument("--width", type=float, help="width of one as a share of L")
+    options = parser.parse_args()
+    given = {"n_a": options.n_a, "actuator_width": options.width}
+    for problem in options.problem:
+        found = costs(problem, {k: v for k, v in given.items() if v is not None})
+        lqr = "no stabilising law" if found["lqr"] is None else f"{found['lqr']:.4g}"
+        print(
+            f"{problem}: {found['none']:.4g} without control, {lqr} with the LQR of the exact "
+            f"linearisation (spectral radius {found['radius']:.4f})",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,161 @@
+"""The processes of a measurement: nodes in a domain of their own, spoken to through pipes."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import platform
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from loop_interfaces.isolation import loopback_environment
+from loop_interfaces.problem import find_problem
+from pdeloop.domain import own_domain
+from pdeloop.supervisor import die_with_parent, node_command
+
+ANSWER = 300.0
+"""Longest silence of a process that was asked something, in s."""
+
+
+class BenchError(RuntimeError):
+    """A process of a measurement ended; the text has its last words."""
+
+
+class BenchProcess:
+    """A node whose stdin and stdout carry one JSON object a line."""
+
+    def __init__(self, process: subprocess.Popen[str], log: Path) -> None:
+        self.process, self._log = process, log
+
+    def ask(self, **request: Any) -> dict[str, Any]:
+        """The answer to one request. BenchError when the process has ended instead."""
+        assert self.process.stdin is not None and self.process.stdout is not None
+        with contextlib.suppress(BrokenPipeError):
+            self.process.stdin.write(json.dumps(request) + "\n")
+            self.process.stdin.flush()
+        line = self.process.stdout.readline()
+        if not line:
+            words = self.log().strip().splitlines()[-1:]
+            raise BenchError(f"a process of the measurement ended: {' '.join(words)}")
+        answer: dict[str, Any] = json.loads(line)
+        return answer
+
+    def log(self) -> str:
+        """What the node has logged."""
+        return self._log.read_text(errors="replace")
+
+    def processor_times(self) -> dict[str, float]:
+        """Seconds of processor time so far: `own`, of the node's threads, and `middleware` (Linux)."""
+        times = {"own": 0.0, "middleware": 0.0}
+        for thread in Path(f"/proc/{self.process.pid}/task").iterdir():
+            with contextlib.suppress(OSError):  # it has ended meanwhile
+                whose = (thread / "comm").read_text().startswith("dds.")
+                nanoseconds = int((thread / "schedstat").read_text().split()[0])
+                times["middleware" if whose else "own"] += 1e-9 * nanoseconds
+        return times
+
+    def end(self) -> None:
+        """Ask the node to end, and wait for it."""
+        self.process.terminate()
+        try:
+            self.process.wait(5.0)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
+
+class Bench:
+    """Starts nodes; all of them end with the block that made it."""
+
+    def __init__(self, folder: Path, domain: int) -> None:
+        self.folder = folder
+        self._environment = {
+            **os.environ,
+            **loopback_environment(),
+            "ROS_DOMAIN_ID": str(domain),
+            "ROS_LOG_DIR": str(folder),
+        }
+        self._started: list[subprocess.Popen[str]] = []
+
+    def start(
+        self,
+        name: str,
+        *parameters: str,
+        problem: str | None = None,
+        namespace: str = "",
+        remaps: Sequence[str] = (),
+        prefix: Sequence[str] = (),
+        environment: Mapping[str, str] | None = None,
+    ) -> BenchProcess:
+        """Start the node of package `name` with parameters written NAME:=VALUE.
+
+        prefix: words in front of the command, such as `ip netns exec`; environment: in addition.
+        """
+        words = ["--params-file", str(find_problem(problem))] if problem else []
+        words += ["-r", f"__ns:=/{namespace}"] if namespace else []
+        words += [word for parameter in parameters for word in ("-p", parameter)]
+        words += [word for remap in remaps for word in ("-r", remap)]
+        log = self.folder / f"{len(self._started)}-{name}.log"
+        with log.open("wb") as stderr:
+            process = subprocess.Popen(
+                [*prefix, *node_command(name, *words)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=stderr,
+                text=True,
+                env={**self._environment, **(environment or {})},
+                process_group=0,  # Ctrl-C in the terminal reaches the measuring program only
+                preexec_fn=die_with_parent,
+            )
+        self._started.append(process)
+        return BenchProcess(process, log)
+
+    def stop(self) -> None:
+        """End every process."""
+        for process in self._started:
+            process.terminate()
+        deadline = time.monotonic() + 2.0
+        for process in self._started:
+            try:
+                process.wait(max(0.0, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+            for pipe in (process.stdin, process.stdout):
+                if pipe is not None:
+                    with contextlib.suppress(BrokenPipeError):
+                        pipe.close()
+
+
+@contextlib.contextmanager
+def bench() -> Iterator[Bench]:
+    """Processes in a domain and a temporary folder of their own."""
+    with tempfile.TemporaryDirectory() as folder, own_domain() as domain:
+        running = Bench(Path(folder), domain)
+        try:
+            yield running
+        finally:
+            running.stop()
+
+
+def machine() -> dict[str, Any]:
+    """What a figure was measured on, without names."""
+    return {
+        "cores": os.cpu_count(),
+        "architecture": platform.machine(),
+        "system": platform.system(),
+        "python": platform.python_version(),
+        "load": os.getloadavg()[0],
+    }
+
+
+def markdown(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """A Markdown table."""
+    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    lines += ["| " + " | ".join(map(str, row)) + " |" for row in rows]
+    return "\n".join(lines)

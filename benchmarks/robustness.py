@@ -1,0 +1,127 @@
+"""`python -m benchmarks beyond`: trainings with noise, with action limits and with few sensors.
+
+Every line of the tables is a training of `--seeds` seeds side by side in this process, as
+`pdeloop train --in-process` does it, 80 rollouts a seed, judged on the same ten sampled fields.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from loop_interfaces.topics import COMPLETED
+from pde_sim_node.plant import DIVERGED_COST
+from pdeloop.in_process import LocalPair, train
+from pdeloop.training_run import resolve
+from tuner_node.build import build_training
+from tuner_node.training import Training
+
+PROBLEMS = ("burgers", "allen-cahn", "kdv")
+OPTIMIZERS = ("two_point", "gauss_newton")
+LOST = 1e-3 * DIVERGED_COST
+"""A mean cost in which rollouts that diverged count."""
+LEVELS: dict[str, list[dict[str, Any]]] = {
+    "ideal": [{}],
+    "measurement": [{"measurement_noise": level} for level in (0.01, 0.03, 0.1)],
+    "process": [{"process_noise": level} for level in (0.003, 0.01, 0.03)],
+    "limit": [{"action_limit": level} for level in (2.0, 1.0, 0.5)],
+    "sensors": [
+        {"sensors": sensors, "sensor_delays": delays}
+        for sensors in (32, 16, 8)
+        for delays in (1, 4)
+    ],
+    "both": [
+        {"measurement_noise": level, "sensors": 64, "sensor_delays": delays}
+        for level in (0.03, 0.1)
+        for delays in (1, 4)
+    ],
+}
+"""What is tried, by part."""
+
+
+def run(
+    problems: Sequence[str] = PROBLEMS, parts: Sequence[str] = tuple(LEVELS), seeds: int = 3
+) -> list[dict[str, Any]]:
+    """One row for each problem, level and optimiser."""
+    rows = []
+    for problem in problems:
+        for part in parts:
+            for options in LEVELS[part]:
+                for optimizer in OPTIMIZERS:
+                    row = measure(problem, options, optimizer, seeds)
+                    rows.append({"part": part, **row})
+                    print(json.dumps(row), file=sys.stderr, flush=True)
+    return rows
+
+
+def measure(problem: str, options: Mapping[str, Any], optimizer: str, seeds: int) -> dict[str, Any]:
+    """Costs of one setting: mean over the fields, one number a seed."""
+    values = resolve(problem, {**options, "optimizer": optimizer, "seeds": seeds})
+    training = build_training(values)
+    row: dict[str, Any] = {"problem": problem, "options": dict(options), "optimizer": optimizer}
+    try:
+        train(training, LocalPair(values), lambda _: None)
+    except ValueError as error:  # no reduced model
+        return row | {"failed": str(error)}
+    return row | outcome(training)
+
+
+def outcome(training: Training) -> dict[str, Any]:
+    """What a finished training says: costs a seed, attempts at a model, diverged rollouts."""
+    assert training.evaluation is not None and training.ended is not None
+    none, lqt, adapted = training.evaluation.mean(axis=2).T
+    steps = [bool(row["accepted"]) for row in training.history if "accepted" in row]
+    return {
+        "none": none.tolist(),
+        "lqt": lqt.tolist(),
+        "adapted": adapted.tolist(),
+        "attempts": [attempt + 1 for attempt in training.attempts],
+        "accepted": [sum(steps), len(steps)],
+        "diverged_rollouts": sum(int(row["diverged"]) for row in training.history),
+        "diverged_final": int((training.ended[:, 2] != COMPLETED).sum()),
+    }
+
+
+def text(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The rows as a Markdown table for each problem: mean over the seeds (worst seed).
+
+    explorations: episodes a seed until a warm start beat no control; accepted: steps of Gauss-Newton.
+    """
+    lines: list[str] = []
+    for problem in dict.fromkeys(row["problem"] for row in rows):
+        own = [row for row in rows if row["problem"] == problem]
+        lines += ["", f"**{problem}**", ""]
+        lines.append(
+            "| setting | explorations | no control | LQT | two-point | Gauss-Newton | accepted |"
+        )
+        lines.append("|---|---|---|---|---|---|---|")
+        settings = list(dict.fromkeys(str(row["options"]) for row in own))
+        for setting in settings:
+            pair = {row["optimizer"]: row for row in own if str(row["options"]) == setting}
+            lines.append(_line(next(iter(pair.values()))["options"], pair))
+    return "\n".join(lines[1:])
+
+
+def _line(options: Mapping[str, Any], rows: Mapping[str, Mapping[str, Any]]) -> str:
+    first = next(iter(rows.values()))
+    name = ", ".join(f"{key} {value:g}" for key, value in options.items()) or "none of them"
+    if "failed" in first:
+        return f"| {name} | no reduced model | | | | | |"
+    cells = [name, "/".join(str(n) for n in first["attempts"])]
+    cells += [f"{np.mean(first['none']):.4g}", _cell(first["lqt"])]
+    cells += [
+        _cell(rows[optimizer]["adapted"]) if optimizer in rows else "" for optimizer in OPTIMIZERS
+    ]
+    cells.append("/".join(map(str, rows[OPTIMIZERS[-1]]["accepted"])) if len(rows) > 1 else "")
+    return f"| {' | '.join(cells)} |"
+
+
+def _cell(costs: Sequence[float]) -> str:
+    lost = sum(cost >= LOST for cost in costs)
+    if lost:
+        return f"diverges ({lost} of {len(costs)})"
+    return f"{np.mean(costs):.4g} ({max(costs):.4g})"

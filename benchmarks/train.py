@@ -1,0 +1,166 @@
+"""`python -m benchmarks train`: a whole training over topics against the same one in one process.
+
+The two take turns. Without start-up means: from the first reduced model to the end. The start-up
+given for topics is from the command to the first reduced model, so it contains, besides the start
+of all nodes, one exploratory episode.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import suppress
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from benchmarks.processes import BenchError, machine, markdown
+from loop_interfaces.affinity import free_cores
+
+LIMIT = 600.0
+"""Seconds after which a training is given up."""
+
+
+def run(
+    problem: str = "burgers", turns: int = 3, iterations: int = 40, pin: bool = False
+) -> dict[str, Any]:
+    """One row for each way to train."""
+    ways: dict[str, list[str]] = {"in-process": ["--in-process"], "topics": []}
+    if pin:
+        free_cores(2)
+        ways["topics --spread"] = ["--spread"]
+        ways["topics --pin"] = ["--pin"]
+    runs: dict[str, list[dict[str, Any]]] = {way: [] for way in ways}
+    with tempfile.TemporaryDirectory() as folder:
+        for turn in range(turns):
+            for way, words in ways.items():
+                out = Path(folder) / f"{turn}-{way.replace(' ', '')}"
+                runs[way].append(_train(problem, iterations, out, words))
+    ratios = {
+        way: median(
+            r["seconds"] / i["seconds"] for r, i in zip(own, runs["in-process"], strict=True)
+        )
+        for way, own in runs.items()
+    }
+    rows = [
+        {
+            "way": way,
+            "seconds": median(r["seconds"] for r in own),
+            "ratio": ratios[way],
+            "startup_seconds": median(r["startup"] for r in own),
+            "megabytes": {
+                k: max(r["megabytes"].get(k, 0.0) for r in own) for k in own[0]["megabytes"]
+            },
+            "running_megabytes": {
+                k: max(r["running"].get(k, 0.0) for r in own) for k in own[0]["running"]
+            },
+            "growth_megabytes": {
+                k: max(r["growth"].get(k, 0.0) for r in own) for k in own[0]["growth"]
+            },
+        }
+        for way, own in runs.items()
+    ]
+    same = len({r["policy"] for own in runs.values() for r in own}) == 1
+    return {
+        "problem": problem,
+        "iterations": iterations,
+        "identical": same,
+        "machine": machine(),
+        "rows": rows,
+    }
+
+
+def _train(problem: str, iterations: int, out: Path, words: list[str]) -> dict[str, Any]:
+    command = [sys.executable, "-m", "pdeloop.cli", "train", problem, "--out", str(out)]
+    command += ["--optimizer", "two_point"]  # always the same number of rollouts
+    began = time.time()
+    process = subprocess.Popen(
+        [*command, "--iterations", str(iterations), *words],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    memory: dict[str, list[float]] = {}
+    try:
+        while process.poll() is None:
+            if time.time() - began > LIMIT:
+                raise BenchError(f"a training took more than {LIMIT:g} s")
+            for name, size in _memory(process.pid).items():
+                memory.setdefault(name, []).append(size)
+            time.sleep(0.2)
+    finally:
+        process.terminate()
+        said, _ = process.communicate()
+    if process.returncode != 0:
+        raise BenchError(f"a training failed: {said.strip().splitlines()[-1:]}")
+    rows = [json.loads(line) for line in (out / "progress.jsonl").read_text().splitlines()]
+    first, last = (
+        next(row["time"] for row in ordered if row["event"] == event)
+        for ordered, event in ((rows, "designed"), (rows[::-1], "evaluated"))
+    )
+    # In the middle of its life a node has all it needs: what comes on top from there is growth.
+    middle = {name: sizes[len(sizes) // 2] for name, sizes in memory.items()}
+    return {
+        "seconds": last - first,
+        "startup": first - began,
+        "megabytes": {name: max(sizes) for name, sizes in memory.items()},
+        "running": middle,
+        "growth": {name: sizes[-1] - middle[name] for name, sizes in memory.items()},
+        "policy": _policy(out),
+    }
+
+
+def _policy(out: Path) -> str:
+    import numpy as np
+
+    with np.load(out / "policy.npz") as arrays:
+        return bytes(arrays["policy"].tobytes()).hex()
+
+
+def _memory(pid: int) -> dict[str, float]:
+    """Resident megabytes of the nodes that process `pid` started."""
+    found = {}
+    with suppress(OSError):
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+        for child in children:
+            with suppress(OSError):
+                words = Path(f"/proc/{child}/cmdline").read_text().split("\0")
+                name = next((w.removesuffix(".node") for w in words if w.endswith(".node")), "")
+                pages = int(Path(f"/proc/{child}/statm").read_text().split()[1])
+                if name:
+                    found[name] = pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+    return found
+
+
+def text(result: dict[str, Any]) -> str:
+    """A table of `result`."""
+    head = (
+        "way", "s without start-up", "ratio", "s to the first model",
+        "MB at most", "MB in the middle", "growth MB",
+    )  # fmt: skip
+
+    def sizes(values: dict[str, float]) -> str:
+        return ", ".join(f"{k.removesuffix('_node')} {v:.0f}" for k, v in values.items())
+
+    rows = [
+        (
+            row["way"],
+            f"{row['seconds']:.2f}",
+            f"{row['ratio']:.2f}",
+            f"{row['startup_seconds']:.2f}",
+            sizes(row["megabytes"]),
+            sizes(row["running_megabytes"]),
+            sizes(row["growth_megabytes"]),
+        )
+        for row in result["rows"]
+    ]
+    same = "the same to the bit" if result["identical"] else "NOT the same"
+    return (
+        f"{result['problem']}, {result['iterations']} iterations; policies are {same}\n"
+        + markdown(head, rows)
+    )

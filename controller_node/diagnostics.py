@@ -1,0 +1,80 @@
+"""How the controller is, as its /diagnostics show it. Pure."""
+
+from __future__ import annotations
+
+from controller_node.responder import Responder
+from loop_interfaces.diagnostics import Health, Level, Rate
+
+SILENT = 5.0
+"""Seconds without a state, within an episode, after which what is known of the plant is old."""
+WAITING = 2.0
+"""Seconds that a state may wait for what its answer needs, before somebody should look."""
+
+
+class ControllerHealth:
+    """Reports on a responder, from one call to the next."""
+
+    def __init__(self, responder: Responder) -> None:
+        self._responder = responder
+        self._answers = Rate()
+        self._answered = 0
+        self._heard = float("-inf")
+        self._waiting_since: float | None = None
+        self.plant_paused = False
+        """What the plant said on `episode/paused`."""
+        self.plants: int | None = None
+        """How many publish `state`; None: not known."""
+
+    def waiting(self, now: float) -> list[str]:
+        """What a state has waited for, for longer than WAITING; to be called in every round."""
+        lacking = self._responder.waits_for()
+        if not lacking:
+            self._waiting_since = None
+        elif self._waiting_since is None:
+            self._waiting_since = now
+        waited = self._waiting_since is not None and now - self._waiting_since > WAITING
+        return lacking if waited else []
+
+    def report(self, now: float) -> Health:
+        """Level, sentence and values at time `now` (monotonic s)."""
+        responder = self._responder
+        if responder.answered != self._answered or self._heard == float("-inf"):
+            self._answered, self._heard = responder.answered, now
+        level, message = self._state(now)
+        return Health(
+            level,
+            message,
+            {
+                "run": responder.run,
+                "episode": responder.episode if responder.episode >= 0 else None,
+                "step": responder.step if responder.episode >= 0 else None,
+                "exploring": responder.exploring,
+                "answers/s": self._answers.per_second(responder.answered, now),
+                "answers": responder.answered,
+                "states that had to wait": responder.tally["states that had to wait"],
+                "models identified": responder.tally["models identified"],
+                "identifications failed": responder.tally["identifications failed"],
+                "last cost": responder.last_cost,
+                "plant paused": self.plant_paused,
+            },
+        )
+
+    def _state(self, now: float) -> tuple[Level, str]:
+        responder = self._responder
+        if lacking := self.waiting(now):
+            return (
+                Level.WARN,
+                f"a state waits for its action until there is: {', '.join(lacking)}",
+            )
+        if responder.failure:
+            return Level.ERROR, f"no reduced model: {responder.failure}"
+        where = f"step {responder.step} of episode {responder.episode}"
+        gone = self.plants == 0 and responder.answered > 0
+        if not responder.under_way and not gone:
+            return Level.OK, "no episode under way"
+        if self.plant_paused:
+            return Level.OK, f"the plant is paused at {where}"
+        if now - self._heard > SILENT:
+            reason = ", and no plant any more" if gone else ""
+            return Level.STALE, f"no state for {now - self._heard:.0f} s, after {where}{reason}"
+        return Level.OK, where

@@ -1,0 +1,1 @@
+"""The compiled path from a received message to the published answer."""

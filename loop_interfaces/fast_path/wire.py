@@ -1,0 +1,157 @@
+"""Messages of the loop as bytes, inside compiled functions (see `frames` for what is in them).
+
+Within an episode a peer sends the same prefix and the same run, episode and plant in every message.
+Who knows them can take such a message with a few comparisons, and leaves everything else to
+`frames.ArrayCodec`.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loop_interfaces.frames import HEADER, ArrayCodec, Frame
+from loop_interfaces.jit.cache import jit
+from loop_interfaces.jit.simd import (
+    WIDTH,
+    lane_sum,
+    peek,
+    peek_lanes,
+    peek_word,
+    poke,
+    poke_word,
+    splat,
+)
+from loop_interfaces.samples import SAMPLE_HEADER
+
+__all__ = [
+    "BUNDLE",
+    "EXPECTED",
+    "FIRST",
+    "STEP",
+    "TIME",
+    "Expectation",
+    "OwnMessage",
+    "append",
+    "expected_header",
+]
+
+RUN, EPISODE, STEP, TIME, PLANT, FIRST = range(HEADER + 1)
+"""Places of the numbers of the header, and of the first value behind it."""
+EXPECTED = np.dtype(
+    [
+        ("prefix", np.int64),  # address of the bytes in front of the header
+        ("start", np.int64),  # how many they are
+        ("values", np.int64),  # how many numbers follow the header
+        ("run", np.float64),
+        ("episode", np.float64),
+        ("plant", np.float64),
+    ]
+)
+
+
+@jit
+def expected_header(raw: int, length: int, expected: Any) -> int:
+    """Address of the header of a message of the expected kind, all of it finite; 0 of any other.
+
+    raw, length: where the message is.
+    """
+    start, values = expected.start, expected.values
+    if length != start + 8 * (FIRST + values):
+        return 0
+    for at in range(0, start - 7, 8):
+        if peek_word(raw + at, 0) != peek_word(expected.prefix + at, 0):
+            return 0
+    if peek_word(raw + start - 8, 0) != peek_word(expected.prefix + start - 8, 0):
+        return 0
+    head = raw + start
+    if peek(head, RUN) != expected.run or peek(head, EPISODE) != expected.episode:
+        return 0
+    if peek(head, PLANT) != expected.plant:
+        return 0
+    step, time = peek(head, STEP), peek(head, TIME)
+    # x - x is 0, and NaN if x is NaN or infinite.
+    lanes, last = splat(0.0), values % WIDTH
+    for i in range(0, values - last, WIDTH):
+        x = peek_lanes(head, FIRST + i)
+        lanes = lanes + (x - x)
+    total = lane_sum(lanes) + (step - step) + (time - time)
+    for i in range(values - last, values):
+        total += peek(head, FIRST + i) - peek(head, FIRST + i)
+    return head if total == 0.0 else 0
+
+
+BUNDLE = np.dtype(
+    [
+        ("end", np.int64),  # address behind the last sample
+        ("limit", np.int64),  # the address from which on the bundle should be sent
+        ("open", np.int64),  # whether it takes samples
+    ]
+)
+"""A bundle (samples.Bundle) inside compiled functions."""
+
+
+@jit
+def append(bundle: Any, kind: int, stamp: int, time: float, raw: int, length: int) -> None:
+    """Keep the serialised message at an address, if the bundle is open; there must be room."""
+    if not bundle.open:
+        return
+    at = bundle.end
+    poke_word(at, 0, kind | (length << 32))
+    poke_word(at, 1, stamp)
+    poke(at, 2, time)
+    at += SAMPLE_HEADER
+    whole = length // 8
+    for i in range(whole):
+        poke_word(at, i, peek_word(raw, i))
+    if length > 8 * whole:  # bytes up to the last one, some of them again
+        poke_word(at + length - 8, 0, peek_word(raw + length - 8, 0))
+    bundle.end = at + length
+
+
+class Expectation:
+    """What is expected, learnt from a message that was decoded.
+
+    expected: the record that `expected_header` wants, filled in by `learn`.
+    """
+
+    def __init__(self, expected: np.void) -> None:
+        self._expected = expected
+        self._prefix: NDArray[np.uint8] | None = None
+
+    def learn(self, codec: ArrayCodec, frame: Frame) -> bool:
+        """Expect more of the messages of which `codec` has decoded `frame`; False if it cannot."""
+        prefix = codec.prefix
+        if prefix is None or len(prefix) < 8:
+            return False
+        self._prefix = np.frombuffer(prefix, np.uint8)
+        expected = self._expected
+        expected["prefix"], expected["start"] = self._prefix.ctypes.data, len(prefix)
+        expected["values"] = frame.values.size
+        expected["run"], expected["episode"] = frame.run, frame.episode
+        expected["plant"] = frame.plant
+        return True
+
+
+class OwnMessage:
+    """A message in memory of its own, to be filled in by compiled code and sent again and again.
+
+    raw: its bytes; begin: their address; address: of its header.
+    """
+
+    def __init__(self, codec: ArrayCodec, frame: Frame) -> None:
+        self.raw = bytearray(codec.encode(frame))
+        start = len(self.raw) - 8 * (HEADER + math.prod(frame.values.shape))
+        self._held = np.frombuffer(self.raw, np.uint8)
+        self.begin = self._held.ctypes.data
+        self.address = self.begin + start
+        self._start, self.shape = start, frame.values.shape
+
+    def address_to(self, frame: Frame) -> None:
+        """Take over run, episode and plant."""
+        struct.pack_into("<2d", self.raw, self._start, frame.run, frame.episode)
+        struct.pack_into("<d", self.raw, self._start + 8 * PLANT, frame.plant)

@@ -1,0 +1,1 @@
+"""Compiled helpers: vector lanes, atomic words, calls by address, the cache."""

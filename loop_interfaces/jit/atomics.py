@@ -1,0 +1,59 @@
+"""Words of memory that several threads change, inside compiled functions."""
+
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+
+from loop_interfaces.jit.simd import intrinsic
+
+__all__ = ["add", "exchange", "look", "set_word"]
+
+WORD = ir.IntType(64)
+
+
+def place(builder: Any, address: Any) -> Any:
+    return builder.inttoptr(address, WORD.as_pointer())
+
+
+@intrinsic
+def look(typing_context: Any, address: Any) -> Any:
+    """The word at an address; what was written before it was is seen, too."""
+
+    def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.load_atomic(place(builder, args[0]), "acquire", 8)
+
+    return types.intp(types.intp), build
+
+
+@intrinsic
+def set_word(typing_context: Any, address: Any, word: Any) -> Any:
+    """Write the word at an address; who sees it sees what was written before."""
+
+    def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        builder.store_atomic(args[1], place(builder, args[0]), "release", 8)
+        return context.get_dummy_value()
+
+    return types.void(types.intp, types.intp), build
+
+
+@intrinsic
+def exchange(typing_context: Any, address: Any, old: Any, new: Any) -> Any:
+    """Write `new` if the word is `old`; whether it was."""
+
+    def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        address, old, new = args
+        found = builder.cmpxchg(place(builder, address), old, new, "acq_rel", "acquire")
+        return builder.extract_value(found, 1)
+
+    return types.boolean(types.intp, types.intp, types.intp), build
+
+
+@intrinsic
+def add(typing_context: Any, address: Any, number: Any) -> Any:
+    """Add to the word at an address; what it was before."""
+
+    def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.atomic_rmw("add", place(builder, args[0]), args[1], "seq_cst")
+
+    return types.intp(types.intp, types.intp), build

@@ -1,0 +1,1 @@
+"""What the nodes share of ROS: event loop, endpoints, introspection, parameters."""

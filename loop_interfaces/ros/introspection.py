@@ -1,0 +1,139 @@
+"""What every node of the loop offers to ROS tools: /diagnostics, trigger services, a look around.
+
+All of it runs in the node's housekeeping, off the hot path: nothing here is called for a message of
+the loop.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable, Sequence
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from std_srvs.srv import Trigger
+
+from loop_interfaces.diagnostics import Health, Level
+
+NAMELESS = "_NODE_NAME_UNKNOWN_"
+"""What the graph says of an endpoint whose node it has not heard of yet."""
+DIAGNOSTICS = "/diagnostics"
+PERIOD = 1.0
+"""Seconds between two reports, and between two looks at the graph."""
+NAMESAKE_GRACE = 6.0
+"""Seconds a second node of our name may be seen before it counts: a killed one is seen for 3 s."""
+
+
+class Introspection:
+    """Tells how a node is, and who else is there who should not be.
+
+    refused() counts the messages that were refused so far, and tells why the last one was; topics()
+    names the topics that one node should publish for this one.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        refused: Callable[[], tuple[int, str]],
+        topics: Callable[[], Sequence[str]],
+    ) -> None:
+        self._node, self._refused, self._topics = node, refused, topics
+        self._publisher: Publisher | None = None
+        self._health: Callable[[float], Health] = lambda now: Health(Level.OK, "")
+        self._status = DiagnosticStatus(hardware_id=socket.gethostname())
+        self._due = 0.0
+        self._began: float | None = None
+        self._refused_before = 0
+        self._namesake_since: float | None = None
+
+    def report(self, task: str, health: Callable[[float], Health]) -> None:
+        """Publish what `health(now)` says once a second, under the node's name and `task`."""
+        self._publisher = self._node.create_publisher(DiagnosticArray, DIAGNOSTICS, 1)
+        name = self._node.get_fully_qualified_name().removeprefix("/")
+        self._status.name = f"{name}: {task}"
+        self._health = health
+
+    def round(self, now: float) -> None:
+        """To be called at every housekeeping; works once a second."""
+        if now < self._due:
+            return
+        # A steady beat, though the housekeeping comes a little late each time.
+        self._due = max(self._due + PERIOD, now + PERIOD / 2)
+        if self._began is None:
+            self._began = now
+        self._look_for_strangers()
+        namesakes = self._namesakes(now)
+        if self._publisher is not None:
+            self._publish(self._publisher, namesakes, now - self._began, now)
+
+    def _publish(self, publisher: Publisher, namesakes: int, uptime: float, now: float) -> None:
+        health = self._health(now)
+        total, reason = self._refused()
+        if total > self._refused_before:
+            health = health.worsened(
+                Level.WARN, f"refused {total - self._refused_before} message(s): {reason}"
+            )
+            self._refused_before = total
+        if namesakes:
+            health = health.worsened(Level.WARN, "another node has this name")
+        health.values = {**health.values, "refused messages": total, "uptime": round(uptime, 1)}
+        status = self._status
+        status.level, status.message = bytes([health.level]), health.message
+        status.values = [KeyValue(key=key, value=value) for key, value in health.texts()]
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        publisher.publish(message)
+
+    def _look_for_strangers(self) -> None:
+        """Say who else publishes what one node of the loop should publish."""
+        for topic in self._topics():
+            if self._node.count_publishers(topic) < 2:
+                continue
+            found = {
+                f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
+                for endpoint in self._node.get_publishers_info_by_topic(topic)
+            }
+            if len(found) > 1:
+                self._node.get_logger().warning(
+                    f"{len(found)} nodes publish {topic}: {', '.join(sorted(found))}; "
+                    "only messages of this run, episode, step and plant count",
+                    throttle_duration_sec=10.0,
+                )
+
+    def _namesakes(self, now: float) -> int:
+        """How many other nodes have had this one's full name for a while; says so.
+
+        A node is there as long as its services are: the graph's list of names can keep a node that has
+        left, for good, when what it said last is read only after it has gone.
+        """
+        own = f"{self._node.get_fully_qualified_name()}/get_parameters"
+        others = self._node.count_services(own) - 1
+        if others < 1:
+            self._namesake_since = None
+            return 0
+        if self._namesake_since is None:
+            self._namesake_since = now
+        if now - self._namesake_since <= NAMESAKE_GRACE:
+            return 0
+        self._node.get_logger().warning(
+            f"{others} other node(s) called {self._node.get_fully_qualified_name()} in this ROS "
+            "domain: services and parameters reach any of them; stop one, or give it another name "
+            "(-r __node:=NAME) or namespace (-r __ns:=/NAME)",
+            throttle_duration_sec=10.0,
+        )
+        return others
+
+
+def offer(node: Node, name: str, act: Callable[[], str]) -> None:
+    """A std_srvs/Trigger service. act() does it and says what it did; a ValueError says why not."""
+
+    def answer(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        try:
+            response.success, response.message = True, act()
+        except ValueError as error:
+            response.success, response.message = False, str(error)
+        node.get_logger().info(f"{name}: {response.message}")
+        return response
+
+    node.create_service(Trigger, name, answer)

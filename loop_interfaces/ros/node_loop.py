@@ -1,0 +1,403 @@
+"""The event loop of a node: raw array topics on a WaitSet, everything else on an executor.
+
+The hot path takes serialised bytes from the middleware, decodes them with one `frombuffer`, and
+publishes bytes; it is driven by a WaitSet of the node's array subscriptions alone. Within an episode
+compiled functions do that for many messages in a row (`stream`). Parameter
+services, timers and whatever else the node has are served by an ordinary executor now and then
+(`HOUSEKEEPING`), off the critical path. Array subscriptions sit in a callback group that the
+executor never runs, so both can share one node and ROS tools see one node.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
+from rclpy.node import Node
+from std_msgs.msg import Float64MultiArray
+
+from loop_interfaces.affinity import pin_process
+from loop_interfaces.diagnostics import Health
+from loop_interfaces.frames import ArrayCodec, Frame
+from loop_interfaces.protocol import MORE, OTHER, UNABLE
+from loop_interfaces.ros.endpoints import Bundler, Flow, Receiver, Sender, reader_qos, scoped
+from loop_interfaces.ros.introspection import Introspection
+from loop_interfaces.ros.sample_subscription import Watcher
+from loop_interfaces.ros.suspend_watchdog import Pulse
+from loop_interfaces.samples import ACTION_KIND, STATE_KIND
+from loop_interfaces.topics import ACTION, SAMPLES, STATE, Topic
+
+if TYPE_CHECKING:  # not every node needs the compiler
+    from loop_interfaces.fast_path.line import Ear
+
+HOUSEKEEPING = 0.05
+"""Seconds between two rounds of the executor and of the node's slow duties."""
+BUSY_HOUSEKEEPING = 0.2
+"""The same while messages stream through: a round of the executor costs as much as ten of them."""
+BUSY = 20
+"""Messages since the last round that make a stream."""
+STREAM = 0.002
+"""Seconds without a message after which a stream of them has ended, where no `Doorbell` tells that
+something else has come. Until then nothing else is waited for: every further subscription in a WaitSet
+costs, and within an episode nothing comes there."""
+STUCK = 0.5
+"""Seconds in which the loop goes round at least once, unless it computes."""
+ROUNDS = 1000
+"""Messages of a stream that compiled functions deal with before the node looks around."""
+SUSPENDED = 2.0
+"""Seconds without being scheduled after which a process takes its peers to have dropped it.
+
+The DDS lease is 3 s: peers that stop hearing a participant forget it, while it does not know and
+does not introduce itself again. Joining as a new participant is the way back."""
+
+
+@dataclass
+class _Watched:
+    """A pair that is watched: how its messages are decoded, and who is called with them."""
+
+    watcher: Watcher
+    callbacks: dict[int, tuple[Callable[[bytes], Frame], Callable[[Frame], None]]] = field(
+        default_factory=dict
+    )
+
+
+class NodeLoop:
+    """Runs one node until it is told to stop.
+
+    refused counts the messages that were refused, by reason; new ones are reported through the
+    node's logger at most once a second.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self.node = node
+        self.refused: Counter[str] = Counter()
+        self._receivers: list[Receiver] = []
+        self._bundler: Bundler | None = None
+        self._watched: dict[str, _Watched] = {}
+        self._stop_reason: str | None = None
+        self._stream: Receiver | None = None
+        """The one whose messages stream in, as long as they do: the only one to wait for."""
+        self._guard = _rclpy.GuardCondition(node.context.handle)
+        """Ends a wait: see `_look_after`."""
+        self._turned = time.monotonic()
+        """When the loop last went round."""
+        self.suspended = False
+        """Whether `run` ended because the process had been suspended (SIGSTOP, a frozen machine)."""
+        self._executor = SingleThreadedExecutor(context=node.context)
+        self._executor.add_node(node)
+        self._last_reason = ""
+        self._reported = 0
+        self._report_at = 0.0
+        self._introspection = Introspection(
+            node,
+            refused=lambda: (sum(self.refused.values()), self._last_reason),
+            topics=lambda: [receiver.name for receiver in self._receivers],
+        )
+
+    def sender(self, topic: Topic, namespace: str = "", *, bundled: bool = False) -> Sender:
+        """A publisher of frames on `topic`; bundled: they go out on `samples`, too."""
+        return Sender(self.node, topic, namespace, self.bundler if bundled else None)
+
+    def receive(
+        self,
+        topic: Topic,
+        callback: Callable[[Frame], None],
+        namespace: str = "",
+        *,
+        bundled: bool = False,
+    ) -> Receiver:
+        """Call `callback` with every frame of `topic`; a ValueError it raises refuses the message.
+
+        bundled: what has come in goes out on `samples`, too.
+        """
+        bundler = self.bundler if bundled else None
+        receiver = Receiver(self.node, topic, callback, namespace, bundler)
+        self._receivers.append(receiver)
+        return receiver
+
+    def stream(self, receiver: Receiver, sender: Sender, flow: Flow, ear: Ear) -> None:
+        """Let `flow` deal with the messages of `receiver` while they stream in; it answers on `sender`.
+
+        ear: what it wants of a line to both.
+
+        Where rcl is not to be had, `receiver.swift` goes on alone.
+        """
+        from loop_interfaces.fast_path.line import Line  # not every node needs the compiler
+
+        try:
+            line = Line(
+                self.node,
+                receiver.handle,
+                sender.publisher.handle,
+                self._guard,
+                ear,
+            )
+        except (OSError, AttributeError) as error:
+            self.node.get_logger().warning(f"the loop is slower than it could be: {error}")
+            return
+        receiver.line, receiver.flow = line, flow
+
+    def observe(self, topic: Topic, callback: Callable[[Frame], None], namespace: str = "") -> None:
+        """Call `callback` with every state or action, without taking part in the loop.
+
+        The loop neither waits for an observer nor repeats for it
+        (loop_interfaces.ros.sample_subscription).
+        """
+        watched = self._watched.get(namespace)
+        if watched is None:
+            watched = self._watched[namespace] = _Watched(Watcher(self.node, namespace))
+        kind = {STATE: STATE_KIND, ACTION: ACTION_KIND}[topic]
+        watched.callbacks[kind] = (ArrayCodec(topic.labels).decode, callback)
+
+    @property
+    def bundler(self) -> Bundler:
+        """Publishes `samples`; made when it is first asked for."""
+        if self._bundler is None:
+            self._bundler = Bundler(self.node)
+        return self._bundler
+
+    def listen(self, topic: Topic, callback: Callable[[Frame], None], namespace: str = "") -> None:
+        """Like `receive`, for what is rare and not urgent: served with the housekeeping.
+
+        It costs the hot path nothing, not even a place in its WaitSet.
+        """
+        decode = ArrayCodec(topic.labels).decode
+        name = scoped(namespace, topic.name)
+
+        def take(raw: bytes) -> None:
+            try:
+                callback(decode(raw))
+            except ValueError as error:
+                self._refuse(name, error)
+
+        self.node.create_subscription(Float64MultiArray, name, take, reader_qos(topic), raw=True)
+
+    def diagnose(self, task: str, health: Callable[[float], Health]) -> None:
+        """Publish what `health(now)` says on /diagnostics, once a second."""
+        self._introspection.report(task, health)
+
+    @staticmethod
+    def now() -> float:
+        """Monotonic time in s, as handed to `tick` and `housekeeping`."""
+        return time.monotonic()
+
+    def stop(self, reason: str) -> None:
+        """Leave `run` after the present event."""
+        self._stop_reason = reason
+
+    def pin(self, core: int) -> None:
+        """Stay on one core; -1: on any. ValueError for a core not allowed."""
+        if core >= 0:
+            pin_process(core)
+
+    def resume(self) -> None:
+        """Make `run` possible again after `stop`."""
+        self._stop_reason = None
+
+    @property
+    def stopped(self) -> bool:
+        """Whether `stop` was called or ROS was shut down."""
+        return self._stop_reason is not None or not self.node.context.ok()
+
+    def run(
+        self,
+        *,
+        tick: Callable[[float], None],
+        deadline: Callable[[], float | None],
+        housekeeping: Callable[[float], None],
+    ) -> str:
+        """Handle events until `stop` or a signal; returns the reason.
+
+        tick(now) is called when `deadline()` (monotonic s, or None) has passed; housekeeping(now)
+        every HOUSEKEEPING seconds, or BUSY_HOUSEKEEPING.
+        """
+        self._turned = self.now()
+        with Pulse(self._look_after) as pulse, self._doorbell() as told:
+            patience = HOUSEKEEPING if told else STREAM
+            return self._handle_events(pulse, patience, tick, deadline, housekeeping)
+
+    @contextmanager
+    def _doorbell(self) -> Iterator[bool]:
+        """Whether the waits of a stream end with a message of any other subscription."""
+        lines = [receiver.line for receiver in self._receivers if receiver.line]
+        if not lines:
+            yield False
+            return
+        from loop_interfaces.fast_path.line import Doorbell
+
+        others = [receiver.handle for receiver in self._receivers if not receiver.line]
+        doorbell = Doorbell(others, self._guard)
+        for line in lines:
+            line.open()
+        try:
+            yield doorbell.works
+        finally:
+            for line in lines:
+                line.close()
+            doorbell.close()
+
+    def _handle_events(
+        self,
+        pulse: Pulse,
+        patience: float,
+        tick: Callable[[float], None],
+        deadline: Callable[[], float | None],
+        housekeeping: Callable[[float], None],
+    ) -> str:
+        context = self.node.context
+        clock = time.monotonic
+        handles, take_from = self._sources()
+        self._stream = None
+        wait_set = _rclpy.WaitSet(
+            len(handles) + 2 * len(self._watched), 1, 0, 0, 0, 0, context.handle
+        )
+        clear, add = wait_set.clear_entities, wait_set.add_subscription
+        wait, ready = wait_set.wait, wait_set.get_ready_entities
+        next_round = clock()
+        handled = 0
+        while self._stop_reason is None:
+            self._turned = now = clock()
+            if now >= next_round:
+                if not context.ok():
+                    break
+                if pulse.longest() > SUSPENDED:
+                    self.suspended = True
+                    return "suspended"
+                self._stream = None
+                self._executor.spin_once(timeout_sec=0)
+                if self._bundler is not None:
+                    self._bundler.look(now)
+                changed = [watched.watcher.look() for watched in self._watched.values()]
+                if any(changed):
+                    handles, take_from = self._sources()
+                housekeeping(now)
+                self._report(now)
+                self._introspection.round(now)
+                next_round = now + (BUSY_HOUSEKEEPING if handled > BUSY else HOUSEKEEPING)
+                handled = 0
+                continue
+            due = deadline()
+            if due is not None and now >= due:
+                tick(now)
+                continue
+            # Never longer than HOUSEKEEPING: a wait does not end by a signal.
+            wake = min(next_round, now + HOUSEKEEPING)
+            if due is not None:
+                wake = min(wake, due)
+            stream, self._stream = self._stream, None
+            if stream is not None:
+                wake = min(wake, now + patience)
+                dealt_with = self._flow(stream, wake)
+                if dealt_with is not None:
+                    handled += dealt_with
+                    continue
+            clear()
+            wait_set.add_guard_condition(self._guard)
+            if stream is not None:
+                add(stream.handle)
+                wait(int((wake - now) * 1e9))
+                taken = self._take(stream)
+            else:
+                for handle in handles:
+                    add(handle)
+                wait(int((wake - now) * 1e9))
+                taken = sum(take_from[pointer]() for pointer in ready("subscription"))
+            handled += taken
+        return self._stop_reason or "shutdown"
+
+    def _look_after(self) -> None:
+        """In another thread: end a wait that takes too long.
+
+        Fast DDS waits until a point of the machine's clock where it was built with an old C++
+        library, as the wheels are; when that clock is set back meanwhile, until it gets there again.
+        """
+        if self.now() - self._turned > STUCK:
+            self._guard.trigger_guard_condition()
+
+    def _sources(self) -> tuple[list[Any], dict[int, Callable[[], int]]]:
+        """What to wait for, and what takes from it; the watched ones first: a cost comes after
+        the samples of its episode, and is to be handled after them.
+        """
+        found: dict[int, tuple[Any, Callable[[], int]]] = {}
+        for watched in self._watched.values():
+            for handle in watched.watcher.handles:
+                found[handle.pointer] = (handle, partial(self._drain, watched))
+        for receiver in self._receivers:
+            found[receiver.handle.pointer] = (receiver.handle, partial(self._take, receiver))
+        handles = [handle for handle, _ in found.values()]
+        return handles, {pointer: take for pointer, (_, take) in found.items()}
+
+    def _flow(self, stream: Receiver, until: float) -> int | None:
+        """Let a stream flow: how many messages that were; None where it cannot."""
+        if stream.line is None or stream.flow is None:
+            return None
+        count, ended = stream.flow(ROUNDS, int(until * 1e9))
+        if ended == UNABLE:
+            return None
+        if ended == MORE:
+            self._stream = stream
+            return count
+        if ended == OTHER:
+            count += self._handle(stream, stream.line.message())
+        # Where the middleware's thread has taken a message, it believes that one is there until
+        # somebody looks for the next.
+        return count + self._take(stream)
+
+    def _take(self, receiver: Receiver) -> int:
+        """Handle the next message of `receiver`; how many there were."""
+        taken = receiver.take(Float64MultiArray, True)
+        return 0 if taken is None else self._handle(receiver, taken[0])
+
+    def _handle(self, receiver: Receiver, raw: bytes) -> int:
+        """Handle a message of `receiver`; 1."""
+        bundler = receiver.bundler
+        if bundler is not None and bundler.wanted:
+            bundler.add(ACTION_KIND, raw)
+        if receiver.swift is not None and receiver.swift(raw):
+            self._stream = receiver
+            return 1
+        self._stream = None
+        try:
+            receiver.callback(receiver.decode(raw))
+        except ValueError as error:
+            self._refuse(receiver.name, error)
+        return 1
+
+    def _drain(self, watched: _Watched) -> int:
+        """Handle all samples that have come in; how many."""
+        count = 0
+        try:
+            for kind, _, raw in watched.watcher.drain():
+                count += 1
+                if kind in watched.callbacks:
+                    decode, callback = watched.callbacks[kind]
+                    try:
+                        callback(decode(raw))
+                    except ValueError as error:
+                        self._refuse("state" if kind == STATE_KIND else "action", error)
+        except ValueError as error:
+            self._refuse(SAMPLES, error)
+        return count
+
+    def _refuse(self, topic: str, error: ValueError) -> None:
+        self._last_reason = f"{topic}: {error}"[:300]
+        self.refused[self._last_reason] += 1
+        if len(self.refused) > 1000:  # a flood with ever new reasons must not grow memory
+            self.refused = Counter({"others": sum(self.refused.values())})
+
+    def _report(self, now: float) -> None:
+        total = sum(self.refused.values())
+        if total > self._reported and now >= self._report_at:
+            self.node.get_logger().warning(
+                f"refused {total - self._reported} message(s), the last one because: "
+                f"{self._last_reason}"
+            )
+            self._reported = total
+            self._report_at = now + 1.0

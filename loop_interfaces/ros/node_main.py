@@ -1,0 +1,126 @@
+"""The `main` of a node: its ROS context, its signals, its exit code."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Callable, Iterator
+from types import FrameType
+from typing import Protocol
+
+import rclpy
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args, try_shutdown
+
+from loop_interfaces.isolation import PROFILE, is_confined, outside_sockets
+from loop_interfaces.memory import release_compiler
+from loop_interfaces.ros.node_loop import NodeLoop
+
+CRASHED = 70
+"""Exit code after a bug; 1 means that the node was asked for something it cannot do."""
+
+
+class ConfigurationError(Exception):
+    """A node cannot start as it was asked to; the text is one sentence for the user."""
+
+
+@contextlib.contextmanager
+def ros_node(name: str, args: list[str] | None) -> Iterator[tuple[Node, NodeLoop]]:
+    """A node with its loop: initialises ROS, handles SIGINT and SIGTERM, and leaves nothing behind."""
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # rcl raises bare RuntimeErrors and its own types
+        raise ConfigurationError(_first_line(error)) from error
+    node = None
+    try:
+        try:
+            node = Node(name, start_parameter_services=True)
+        except Exception as error:
+            raise ConfigurationError(_first_line(error)) from error
+        if is_confined() and (outside := outside_sockets()):
+            raise ConfigurationError(
+                f"the Fast DDS profile {os.environ[PROFILE]} did not take effect (UDP sockets at "
+                f"{', '.join(outside)}); expected the loopback interface only, or PDELOOP_NETWORK=1"
+            )
+        loop = NodeLoop(node)
+
+        def stop(number: int, frame: FrameType | None) -> None:
+            loop.stop(signal.Signals(number).name)
+
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, stop)
+        yield node, loop
+    finally:
+        if node is not None:
+            node.destroy_node()
+        try_shutdown()
+
+
+class NodeBody(Protocol):
+    """What a node does: made with its parameters and topics, then run."""
+
+    def join(self, node: Node, loop: NodeLoop) -> None:
+        """Declare the parameters and wire the topics on a new `node`; what was learnt stays."""
+
+    def run(self) -> int:
+        """Work until the loop stops; returns the exit code, of no meaning if it was suspended."""
+
+
+def node_main(name: str, args: list[str] | None, make: Callable[[Node, NodeLoop], NodeBody]) -> int:
+    """The `main` of a node: makes its body, runs it and returns the exit code.
+
+    A process that was suspended for long joins again, as a new participant. 1 with one line on
+    stderr when the node cannot start as it was asked to: a ConfigurationError,
+    or a ValueError while it is made (a parameter out of range, a plant that cannot be built).
+    """
+    try:
+        _refuse_other_words(name, args)
+        release_compiler()  # of what importing it has touched; loading needs little of that
+        body: NodeBody | None = None
+        while True:
+            with ros_node(name, args) as (node, loop):
+                try:
+                    if body is None:
+                        body = make(node, loop)
+                    else:
+                        body.join(node, loop)
+                        node.get_logger().warning("was suspended; joined the network again")
+                except ValueError as error:
+                    raise ConfigurationError(str(error)) from error
+                release_compiler()
+                code = body.run()
+                if not loop.suspended:
+                    return code
+    except ConfigurationError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return 1
+    except Exception:  # a bug: say where, and let a supervisor start the node again
+        traceback.print_exc()
+        return CRASHED
+
+
+def _refuse_other_words(name: str, args: list[str] | None) -> None:
+    """Words that are not ROS arguments would be ignored in silence; `--help` among them."""
+    try:
+        words = remove_ros_args(args)[1:] if args is None else remove_ros_args(args)
+    except Exception as error:  # a parameter file that is not there, a rule that cannot be read
+        raise ConfigurationError(_first_line(error)) from error
+    if any(word in ("-h", "--help") for word in words):
+        print(
+            f"usage: {name} [--ros-args -p PARAMETER:=VALUE ... --params-file FILE -r __ns:=/NAME]"
+            "\n\nParameters, topics and what the node does: docs/interfaces.md;"
+            " with ROS tools: ros2 param describe."
+        )
+        raise SystemExit(0)
+    if words:
+        raise ConfigurationError(
+            f"unexpected argument '{words[0]}'; parameters are given as --ros-args -p NAME:=VALUE"
+        )
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

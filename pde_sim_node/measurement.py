@@ -1,0 +1,192 @@
+"""What stands between a field and its controller: noise, actuators that saturate, few sensors.
+
+    y_k = C z_k + v_k,                      v_k ~ N(0, measurement_noise^2 I)
+    z_{k+1} = f(z_k, sat(a_k)) + w_k,       w_k ~ N(0, process_noise^2 dt / dx I)
+
+with sat(a)_i = min(max(a_i, -action_limit), action_limit). C picks the grid points of the n_y
+sensors, or all. The stage cost is that of the true z_k and of sat(a_k), which a real plant could
+only estimate.
+
+With sensors the plant publishes the last d measurements, scaled,
+
+    o_k = sqrt(n_x / (n_y d)) [y_k, y_{k-1}, ..., y_{k-d+1}]        (y_0 in place of y_{-1}, ...),
+
+and as its target that of them, o_r. By this delay embedding the dynamics can be read off a state
+that is measured (Takens; for linear systems d is to reach the observability index), and who answers
+needs no memory. The scale makes q |o_k - o_r|^2, summed over an episode, the part of the stage cost
+that the sensors see: every measurement is in d of the o_k, and stands for n_x / n_y grid points.
+
+w_k is space-time white noise on the grid: du = F(u) dt + sigma dW(x, t) has increments of
+covariance sigma^2 dt delta(x - x'), and on cells of width dx = L / n_x the delta is 1 / dx. So the
+statistics of a mode of the field depend neither on the sampling time dt nor on n_x. The flow and
+the increment are applied one after the other (Lie splitting), once a sample. A
+field of several components is forced in the one that is actuated, and measured in all.
+
+All noise is a pure function of (noise seed, field seed, step): a counter-based generator (Philox) is
+keyed with the two seeds and its counter set from the step. So an episode that is repeated, in
+another batch or by another process, has the same noise, to the bit.
+
+References
+----------
+Lord, Powell, Shardlow, "An Introduction to Computational Stochastic PDEs", Cambridge 2014, chapter 10.
+Takens, "Detecting strange attractors in turbulence", LNM 898, 1981. Arbabi, Mezic, "Ergodic theory,
+dynamic mode decomposition, and computation of spectral properties of the Koopman operator", SIAM J.
+Appl. Dyn. Syst. 16(4), 2017 (Hankel DMD).
+Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011 (Philox).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pde_sim_node.equations import Equation
+from pde_sim_node.plant import Plant
+
+__all__ = ["InstrumentedPlant", "Instruments", "Noise", "standard_normal"]
+
+
+class Noise(IntEnum):
+    """What a draw is for; the numbers are part of the results' reproducibility."""
+
+    MEASUREMENT = 0
+    PROCESS = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Instruments:
+    """Noise of the measurement, forcing of the field, limit of the actions, sensors and delays.
+
+    See loop_interfaces.parameters.INSTRUMENTS; 0 is none of it.
+    """
+
+    measurement_noise: float = 0.0
+    process_noise: float = 0.0
+    action_limit: float = 0.0
+    sensors: int = 0
+    sensor_delays: int = 4
+
+    @property
+    def ideal(self) -> bool:
+        """Whether there is nothing between the field and the controller."""
+        return self == Instruments(sensor_delays=self.sensor_delays)
+
+
+def standard_normal(
+    noise_seed: int, field_seed: int, step: int, kind: Noise, size: int
+) -> NDArray[np.float64]:
+    """Independent numbers from N(0, 1): a pure function of the arguments.
+
+    noise_seed, step : not negative; field_seed : at least -1.
+    """
+    key = np.array([noise_seed, field_seed + 1], dtype=np.uint64)
+    # The draws of one call count in the low words: no two calls ever share a counter.
+    counter = np.array([0, 0, step, int(kind)], dtype=np.uint64)
+    generator = np.random.Generator(np.random.Philox(key=key, counter=counter))
+    draw: NDArray[np.float64] = generator.standard_normal(size)
+    return draw
+
+
+class InstrumentedPlant(Plant):
+    """A plant behind its instruments.
+
+    As `Plant`, but `reset` and `step` return what is measured, `target` is the target of that, and
+    actions saturate. `states` are the true fields. An environment is forced only after a step that
+    did not diverge, and it has diverged, too, if the forcing takes it beyond the bound.
+
+    Parameters
+    ----------
+    equation
+        The PDE.
+    instruments
+        What stands between the field and the controller.
+    grid
+        The other parameters of `Plant`.
+
+    Raises
+    ------
+    ValueError
+        More sensors than grid points, or what `Plant` raises.
+    """
+
+    def __init__(self, equation: Equation, *, instruments: Instruments, **grid: Any) -> None:
+        self.instruments = instruments
+        super().__init__(equation, **grid)
+        n_x = self.x.size
+        points = sensor_positions(n_x, instruments.sensors)
+        # A sensor measures every component at its point.
+        first = n_x * np.arange(len(equation.components))
+        self.positions = (first[:, None] + points).ravel()
+        self._delays = instruments.sensor_delays if instruments.sensors else 1
+        self._scale = math.sqrt(n_x / (points.size * self._delays))
+        self._forcing = instruments.process_noise * math.sqrt(
+            self.sample_time * n_x / equation.length
+        )
+        self._forced = slice(equation.actuated * n_x, (equation.actuated + 1) * n_x)
+        self.target = self._scale * np.tile(self.target[self.positions], self._delays)
+        self._seeds: list[tuple[int, int]] = []
+        self._published = np.zeros((0, self.state_size))
+
+    @property
+    def state_size(self) -> int:
+        return self._delays * self.positions.size
+
+    def reset(
+        self, seeds: ArrayLike, noise: NDArray[np.int64] | None = None
+    ) -> NDArray[np.float64]:
+        """Begin an episode; without seeds of the noise they are 0."""
+        super().reset(seeds)
+        if noise is None:
+            noise = np.zeros(self.batch, dtype=np.int64)
+        self._seeds = [(int(n), int(s)) for n, s in zip(noise, np.asarray(seeds), strict=True)]
+        self._published = np.tile(self._measure(), (1, self._delays))
+        return self._published
+
+    def step(self, actions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Hold the saturated actions for one sampling time; returns what is measured then."""
+        limit = self.instruments.action_limit
+        super().step(np.clip(actions, -limit, limit) if limit else actions)
+        if self._forcing:
+            self._force()
+        newest = self._measure()
+        if self._delays > 1:
+            newest = np.hstack([newest, self._published[:, : -self.positions.size]])
+        self._published = newest
+        return newest
+
+    def _force(self) -> None:
+        step = self.step_index
+        for m, (noise_seed, field_seed) in enumerate(self._seeds):
+            if self._diverged_step[m] >= 0:
+                continue
+            draw = standard_normal(noise_seed, field_seed, step, Noise.PROCESS, self.x.size)
+            forced = self.states[m, self._forced] + self._forcing * draw
+            if np.abs(forced).max() <= self.divergence_bound:
+                self.states[m, self._forced] = forced
+            else:
+                self._diverged_step[m] = step - 1
+
+    def _measure(self) -> NDArray[np.float64]:
+        """The scaled readings of the sensors now, (M, n_y)."""
+        y = self.states[:, self.positions]
+        sigma = self.instruments.measurement_noise
+        if sigma:
+            for m, (noise_seed, field_seed) in enumerate(self._seeds):
+                y[m] += sigma * standard_normal(
+                    noise_seed, field_seed, self.step_index, Noise.MEASUREMENT, len(y[m])
+                )
+        y *= self._scale
+        return y
+
+
+def sensor_positions(n_x: int, sensors: int) -> NDArray[np.int64]:
+    """Grid indices of equally spaced sensors, int((j + 0.5) n_x / sensors); all if there are 0."""
+    if sensors > n_x:
+        raise ValueError(f"sensors must be at most the {n_x} grid points, got {sensors}")
+    count = sensors or n_x
+    return (2 * np.arange(count) + 1) * n_x // (2 * count)

@@ -1,0 +1,77 @@
+"""When each state is due on the wall clock, and how well that was kept. Pure: no clock.
+
+State 0 goes out at once and sets the grid; every further one is due a period after the one before.
+A state that is not ready at its instant is a missed deadline: it goes out as soon as it is ready and
+moves the grid, so that the plant never hurries to make up for lost time.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+_EDGES = np.geomspace(1e-7, 100.0, 1801)
+"""Classes of lateness in s, 1.2 % wide, so that a long life needs no more memory than a short one."""
+
+
+class Pace:
+    """The instants of the states of one episode after the other.
+
+    period (s): wall time from one state to the next. `now` is any monotonic time in s.
+    """
+
+    def __init__(self, period: float) -> None:
+        self.period = period
+        self.clear()
+        self._due = 0.0
+        self._late = False
+        self._asked = False
+
+    def clear(self) -> None:
+        """Forget what was counted."""
+        self.count = 0
+        self.missed = 0
+        self.largest = 0.0
+        self._classes = np.zeros(len(_EDGES) + 1, dtype=np.int64)
+
+    def begin(self, now: float) -> None:
+        """State 0 goes out now."""
+        self._due = now
+
+    def next(self, now: float) -> float:
+        """The instant at which the next state is due; its step is about to be, or just was, made."""
+        self._due += self.period
+        self._asked, self._late = False, now > self._due
+        return self._due
+
+    def ready(self, now: float) -> bool:
+        """Whether the state, which is ready now, is to go out; then it is counted."""
+        if now < self._due:
+            self._asked = True
+            return False
+        missed = self._late or not self._asked
+        lateness = now - self._due
+        self.count += 1
+        self.missed += missed
+        self.largest = max(self.largest, lateness)
+        self._classes[np.searchsorted(_EDGES, lateness)] += 1
+        if missed:
+            self._due = now
+        return True
+
+    def quantile(self, share: float) -> float:
+        """Lateness in s that this share of the states did not exceed; 0 before the first."""
+        if not self.count:
+            return 0.0
+        rank = math.ceil(share * self.count)
+        place = int(np.searchsorted(np.cumsum(self._classes), rank))
+        return min(float(_EDGES[min(place, len(_EDGES) - 1)]), self.largest)
+
+    def summary(self) -> str:
+        """What was counted, for people and for `python -m benchmarks realtime`."""
+        p50, p99 = (1e6 * self.quantile(share) for share in (0.5, 0.99))
+        return (
+            f"{self.count} states every {1e3 * self.period:g} ms, {self.missed} missed deadlines, "
+            f"jitter p50 {p50:.0f} us, p99 {p99:.0f} us, max {1e6 * self.largest:.0f} us"
+        )

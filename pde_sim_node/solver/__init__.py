@@ -1,0 +1,1 @@
+"""How a PDE is stepped: coefficients, compiled kernels, threads, exact solutions, adjoint."""

@@ -1,0 +1,358 @@
+"""The transpose of the plant's derivative: exact gradients of whatever depends on a trajectory.
+
+For z' = f(z, a), the compiled step of `kernel`, `Adjoint.pull_back` gives
+
+    (df/dz)^T y    and    (df/da)^T y
+
+for any y: the discrete adjoint of the ETDRK4 step itself, not a discretised adjoint equation. A
+sampling time is integrated again from its state, g'(u) of every stage is kept, and the stages are
+walked through backwards. With A(x) = F[g'(u) S x], S the field of a spectrum on the fine grid and F
+the transform back (real modes of weight 2 against the first of weight 1 make F S^T and S F^T equal
+up to a factor, so A is its own transpose), one internal step turns the covector x of v' into
+
+    x_c = A_c(f3* x)
+    x_b = A_b(2 f2* x + 2 Q* x_c)
+    x_a = A_a(2 f2* x + Q* x_b) + E2* x_c
+    x_v = A_v(f1* x + Q* (x_a - x_c)) + E2* (x_a + x_b) + E* x
+    x_F = Q* (x_a + x_b + x_c) + (f1 + 4 f2 + f3)* x
+
+with * the complex conjugate and the multiplier m inside the coefficients, as in `kernel`.
+
+Source: Griewank & Walther, Evaluating Derivatives, SIAM 2008, chapter 3 (reverse mode); Squire &
+Trapp, SIAM Review 40 (1998) (the complex step for g').
+"""
+
+from __future__ import annotations
+
+import ctypes
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numba
+import numpy as np
+from numba import carray, types  # type: ignore[attr-defined, unused-ignore]
+from numba.core.errors import NumbaError
+from numba.extending import register_jitable
+from numpy.typing import NDArray
+
+from loop_interfaces.jit import cache, native, simd
+from loop_interfaces.jit.cache import fingerprint, jit, kept
+from loop_interfaces.jit.native import call_c
+from loop_interfaces.jit.simd import load, read, splat, write
+from pde_sim_node.equations import Equation
+from pde_sim_node.plant import Plant
+from pde_sim_node.solver import fft, kernel, spectra
+from pde_sim_node.solver.integrator import Integrator
+from pde_sim_node.solver.kernel import PLAN, force
+from pde_sim_node.solver.kernel_memory import aligned
+from pde_sim_node.solver.spectra import (
+    analyse,
+    forward,
+    get,
+    inverse,
+    joined,
+    minus,
+    plus,
+    product,
+    put,
+    split,
+    synthesise,
+)
+
+__all__ = ["Adjoint"]
+
+Array = NDArray[np.float64]
+COMPLEX_STEP = 1e-30
+"""g'(u) = Im g(u + i h)/h, without cancellation: h can be far below the rounding of u."""
+
+PLAN_AND_TAPE = np.dtype(
+    [
+        ("derivative", np.int64),  # address of the compiled g'
+        # Offsets in w.
+        ("tape", np.int64),  # g' on the fine grid, four stages an internal step
+        ("covector", np.int64),
+        ("on_b", np.int64),
+        ("on_c", np.int64),
+        ("on_force", np.int64),
+        # Behind, not in front: a record that begins as PLAN does would be taken for one.
+        *((name, PLAN[name]) for name in PLAN.names or ()),
+    ]
+)
+
+
+@jit
+def taped(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> int:
+    """As `kernel.nonlinear`, and g'(u) to `tape`."""
+    t = plan.fine
+    split(w, plan.x, plan.z1, d, t, c, e)
+    z = inverse(w, plan.z1, plan.z2, d, t, c, e)
+    for j in range(0, t.m, 8):
+        put(w, tape + j, d, get(w, z + j, d))
+    call_c(plan.derivative, (w + 8 * tape, t.m))
+    call_c(plan.derivative, (w + 8 * (tape + d), t.m))
+    call_c(plan.pointwise, (w + 8 * z, t.m))
+    call_c(plan.pointwise, (w + 8 * (z + d), t.m))
+    return forward(w, z, plan.z1 + plan.z2 - z, d, t, c, e)
+
+
+@jit
+def integrate_taped(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> None:
+    """As `kernel.integrate`, the same numbers to the bit, with the tape."""
+    m, factors, modes = plan.fine.m, plan.fine.split, plan.modes
+    x, next_x, to_b, to_c = plan.x, plan.next, plan.b, plan.c
+    z = taped(w, d, plan, c, e, tape)
+    for k in range(0, modes, 8):
+        g, v, qf = joined(w, z, d, m, factors, k, c, e), get(w, x + k, d), get(w, plan.qf + k, d)
+        half, qg = plus(product(c, plan.e2 + k, e, v), qf), product(c, plan.qm + k, e, g)
+        a = plus(half, qg)
+        put(w, x + k, d, a)
+        put(w, to_b + k, d, half)
+        put(w, to_c + k, d, minus(plus(product(c, plan.e2 + k, e, a), qf), qg))
+        whole = plus(product(c, plan.e + k, e, v), get(w, plan.ff + k, d))
+        put(w, next_x + k, d, plus(whole, product(c, plan.f1m + k, e, g)))
+    z = taped(w, d, plan, c, e, tape + m)
+    for k in range(0, modes, 8):
+        g = joined(w, z, d, m, factors, k, c, e)
+        put(w, x + k, d, plus(get(w, to_b + k, d), product(c, plan.qm + k, e, g)))
+        put(w, next_x + k, d, plus(get(w, next_x + k, d), product(c, plan.f2m + k, e, g)))
+    z = taped(w, d, plan, c, e, tape + 2 * m)
+    for k in range(0, modes, 8):
+        g = joined(w, z, d, m, factors, k, c, e)
+        qg = product(c, plan.qm + k, e, g)
+        put(w, x + k, d, plus(get(w, to_c + k, d), plus(qg, qg)))
+        put(w, next_x + k, d, plus(get(w, next_x + k, d), product(c, plan.f2m + k, e, g)))
+    z = taped(w, d, plan, c, e, tape + 3 * m)
+    for k in range(0, modes, 8):
+        g = joined(w, z, d, m, factors, k, c, e)
+        put(w, x + k, d, plus(get(w, next_x + k, d), product(c, plan.f3m + k, e, g)))
+
+
+@jit
+def conjugate_product(c: int, at: int, e: int, value: Any) -> Any:
+    """Conjugate constants times a value."""
+    real, imag = load(c, at), load(c, at + e)
+    return real * value[0] + imag * value[1], real * value[1] - imag * value[0]
+
+
+@jit
+def transposed(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> int:
+    """Where the transform of g'(u) times the field of the spectrum x stands."""
+    t = plan.fine
+    split(w, plan.x, plan.z1, d, t, c, e)
+    z = inverse(w, plan.z1, plan.z2, d, t, c, e)
+    for j in range(0, t.m, 8):
+        u, g = get(w, z + j, d), get(w, tape + j, d)
+        put(w, z + j, d, (u[0] * g[0], u[1] * g[1]))
+    return forward(w, z, plan.z1 + plan.z2 - z, d, t, c, e)
+
+
+@jit
+def pull_back_internal(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> None:
+    """Turn the covector of the spectrum after an internal step into that before it."""
+    m, factors, modes, x = plan.fine.m, plan.fine.split, plan.modes, plan.x
+    on_v, on_b, on_c = plan.covector, plan.on_b, plan.on_c
+    for k in range(0, modes, 8):
+        put(w, x + k, d, conjugate_product(c, plan.f3m + k, e, get(w, on_v + k, d)))
+    z = transposed(w, d, plan, c, e, tape + 3 * m)
+    for k in range(0, modes, 8):
+        own = joined(w, z, d, m, factors, k, c, e)
+        put(w, on_c + k, d, own)
+        part = conjugate_product(c, plan.qm + k, e, own)
+        through = conjugate_product(c, plan.f2m + k, e, get(w, on_v + k, d))
+        put(w, x + k, d, plus(through, plus(part, part)))
+    z = transposed(w, d, plan, c, e, tape + 2 * m)
+    for k in range(0, modes, 8):
+        own = joined(w, z, d, m, factors, k, c, e)
+        put(w, on_b + k, d, own)
+        through = conjugate_product(c, plan.f2m + k, e, get(w, on_v + k, d))
+        put(w, x + k, d, plus(through, conjugate_product(c, plan.qm + k, e, own)))
+    z = transposed(w, d, plan, c, e, tape + m)
+    for k in range(0, modes, 8):
+        b, c_, v = get(w, on_b + k, d), get(w, on_c + k, d), get(w, on_v + k, d)
+        own = joined(w, z, d, m, factors, k, c, e)
+        a = plus(own, conjugate_product(c, plan.e2 + k, e, c_))
+        through = conjugate_product(c, plan.f1m + k, e, v)
+        put(w, x + k, d, plus(through, conjugate_product(c, plan.qm + k, e, minus(a, c_))))
+        held = conjugate_product(c, plan.q + k, e, plus(plus(a, b), c_))
+        held = plus(held, conjugate_product(c, plan.f + k, e, v))
+        put(w, plan.on_force + k, d, plus(get(w, plan.on_force + k, d), held))
+        linear = conjugate_product(c, plan.e2 + k, e, plus(a, b))
+        put(w, on_v + k, d, plus(linear, conjugate_product(c, plan.e + k, e, v)))
+    z = transposed(w, d, plan, c, e, tape)
+    for k in range(0, modes, 8):
+        put(w, on_v + k, d, plus(get(w, on_v + k, d), joined(w, z, d, m, factors, k, c, e)))
+
+
+def compile_pull_back(sources: str) -> Any:
+    @kept
+    def pull_back(
+        states: Array,
+        actions: Array,
+        covectors: Array,
+        on_states: Array,
+        on_actions: Array,
+        plans: NDArray[np.void],
+        which: int,
+        begin: int,
+        end: int,
+    ) -> None:
+        """Environments begin..end, with the scratch of plans[which]; writes on_states, on_actions."""
+        sources  # noqa: B018  # closed over to be part of the key on disk
+        plan = plans[which]
+        w, d, c, e = plan.scratch, plan.scratch_apart, plan.constants, plan.constants_apart
+        last, block = plan.n_z // 2, 4 * plan.fine.m
+        for i in range(begin, end):
+            state = states.ctypes.data + 8 * plan.n_z * i
+            force(actions.ctypes.data + 8 * plan.n_a * i, w, d, plan, c, e)
+            analyse(state, w, d, plan, c, e)
+            for n in range(plan.steps):
+                integrate_taped(w, d, plan, c, e, plan.tape + n * block)
+            # Synthesis transposed is analysis, but for the last mode, of weight 1 on the published
+            # grid and 2 on the fine one.
+            analyse(covectors.ctypes.data + 8 * plan.n_z * i, w, d, plan, c, e)
+            for k in range(0, plan.modes, 8):
+                put(w, plan.covector + k, d, get(w, plan.x + k, d))
+                put(w, plan.on_force + k, d, (splat(0.0), splat(0.0)))
+            write(w, plan.covector + last, 0.5 * read(w, plan.covector + last))
+            write(w, plan.covector + d + last, 0.0)
+            for n in range(plan.steps - 1, -1, -1):
+                pull_back_internal(w, d, plan, c, e, plan.tape + n * block)
+            for j in range(plan.n_a):
+                at, total = plan.supports + j * plan.modes, 0.0
+                for k in range(last + 1):
+                    own = read(w, plan.on_force + k) * read(c, at + k)
+                    own += read(w, plan.on_force + d + k) * read(c, at + e + k)
+                    total += own if k == 0 else 2.0 * own
+                on_actions[i, j] = plan.n_z * total
+            for k in range(last + 1):
+                write(w, plan.x + k, read(w, plan.covector + k))
+                write(w, plan.x + d + k, read(w, plan.covector + d + k))
+            for k in range(last + 1, plan.modes):
+                write(w, plan.x + k, 0.0)
+                write(w, plan.x + d + k, 0.0)
+            write(w, plan.x + last, 2.0 * read(w, plan.x + last))
+            synthesise(on_states.ctypes.data + 8 * plan.n_z * i, w, d, plan, c, e)
+
+    return pull_back
+
+
+_pull_back = compile_pull_back(fingerprint(cache, native, simd, fft, spectra, kernel))
+
+
+class Adjoint:
+    """Gradients through a plant's step.
+
+    Parameters
+    ----------
+    plant
+        Whose step it is; it is not changed.
+    threads
+        Environments computed at the same time.
+
+    Raises
+    ------
+    ValueError
+        The equation's nonlinearity has no derivative that can be computed.
+    """
+
+    def __init__(self, plant: Plant, threads: int = 1) -> None:
+        self._plant = plant
+        integrator = plant._integrator
+        if not isinstance(integrator, Integrator):
+            raise ValueError(
+                f"{plant.equation.name} is advanced by an exact propagator; expected an equation "
+                "that is integrated by ETDRK4"
+            )
+        team = integrator._team
+        self._constants = team._constants  # kept alive: the plan has its address
+        self._loop = derivative_loop(plant.equation)
+        plan = np.zeros(1, PLAN_AND_TAPE)[0]
+        for name in PLAN.names or ():
+            plan[name] = team._plans[0][name]
+        offset = int(plan["scratch_apart"])
+        sizes = {"tape": 4 * int(plan["steps"]) * int(plan["fine"]["m"])}
+        sizes |= dict.fromkeys(("covector", "on_b", "on_c", "on_force"), plan["modes"])
+        for name, size in sizes.items():
+            plan[name] = offset
+            offset += int(size)
+        plan["scratch_apart"], plan["derivative"] = offset, self._loop.address
+        self._scratch = [aligned(2 * offset) for _ in range(threads)]
+        self._plans = np.repeat(plan, threads)
+        self._plans["scratch"] = [scratch.ctypes.data for scratch in self._scratch]
+        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
+
+    def pull_back(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array]:
+        """(df/dz)^T y and (df/da)^T y of every environment.
+
+        Parameters
+        ----------
+        states : (M, n_z)
+            z; one whose successor diverges gives numbers of no meaning.
+        actions : (M, n_a)
+            a, held for a sampling time.
+        covectors : (M, n_z)
+            y.
+
+        Returns
+        -------
+        (M, n_z), (M, n_a)
+        """
+        z, a, y = (np.ascontiguousarray(x, dtype=np.float64) for x in (states, actions, covectors))
+        batch, plant = len(z), self._plant
+        for what, given, size in (("states", z, plant.n_z), ("actions", a, plant.n_a)):
+            if given.shape != (batch, size):
+                raise ValueError(f"{what} must have shape ({batch}, {size}), got {given.shape}")
+        if y.shape != z.shape:
+            raise ValueError(f"covectors must have the states' shape {z.shape}, got {y.shape}")
+        on_states, on_actions = np.empty_like(z), np.empty_like(a)
+        count = len(self._scratch)
+
+        def work(part: int) -> None:
+            begin, end = batch * part // count, batch * (part + 1) // count
+            _pull_back(z, a, y, on_states, on_actions, self._plans, part, begin, end)
+
+        if self._pool is None:
+            work(0)
+        else:
+            list(self._pool.map(work, range(count)))
+        return on_states, on_actions
+
+
+def derivative_loop(equation: Equation) -> Any:
+    """Machine code of u[i] = g'(u[i]), a cfunc of (double *, intp), by the complex step.
+
+    Raises
+    ------
+    ValueError
+        g does not compile for a complex number, or is not analytic (|u|, max, ...): then the
+        complex step does not agree with a finite difference.
+    """
+    g: Any = register_jitable(error_model="numpy")(equation.nonlinearity)
+    signature = types.void(types.CPointer(types.float64), types.intp)  # type: ignore[no-untyped-call]
+    try:
+
+        @numba.cfunc(signature)
+        def loop(data: Any, count: int) -> None:
+            u = carray(data, count)
+            for i in range(count):
+                u[i] = g(complex(u[i], COMPLEX_STEP)).imag / COMPLEX_STEP
+
+    except NumbaError as error:
+        reason = str(error).strip().splitlines()[-1]
+        raise ValueError(
+            f"the nonlinearity of {equation.name} has no derivative by the complex step; it must "
+            f"be one expression that Numba compiles for a complex number: {reason}"
+        ) from error
+    points = np.linspace(-2.03, 2.01, 41)
+    slopes = points.copy()
+    loop.ctypes(slopes.ctypes.data_as(ctypes.POINTER(ctypes.c_double)), slopes.size)
+    h = 1e-5
+    function = equation.nonlinearity
+    finite = np.array([(function(u + h) - function(u - h)) / (2 * h) for u in points.tolist()])
+    if not np.allclose(slopes, finite, rtol=1e-5, atol=1e-5):
+        raise ValueError(
+            f"the nonlinearity of {equation.name} is not an analytic function of u, so that its "
+            "derivative cannot be taken by the complex step; gradients need one without |u|, "
+            "max, min or branches"
+        )
+    return loop

@@ -1,0 +1,166 @@
+"""The compiled step of the plant: ETDRK4 for one environment after the other.
+
+With N = m F[g(u)] + F_a the nonlinear part and the forcing of a held action, one internal step is
+
+    a = E2 v + Q N(v)
+    b = E2 v + Q N(a)
+    c = E2 a + Q (2 N(b) - N(v))
+    v' = E v + f1 N(v) + 2 f2 (N(a) + N(b)) + f3 N(c).
+
+F_a does not change within a step, so its parts Q F_a and (f1 + 4 f2 + f3) F_a are worked out once;
+the multiplier m is contained in the coefficients (names with an m).
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numba.extending import register_jitable
+from numpy.typing import NDArray
+
+from loop_interfaces.jit import native, simd
+from loop_interfaces.jit.cache import jit, kept
+from loop_interfaces.jit.native import call_c
+from loop_interfaces.jit.simd import fma, read, splat
+from pde_sim_node.solver import fft, spectra
+from pde_sim_node.solver.batch_step import environments_of
+from pde_sim_node.solver.spectra import (
+    TRANSFORM,
+    analyse,
+    forward,
+    get,
+    inverse,
+    joined,
+    minus,
+    plus,
+    plus_product,
+    product,
+    put,
+    split,
+    synthesise,
+)
+
+__all__ = ["PLAN", "all_finite", "environments"]
+
+PLAN = np.dtype(
+    [
+        ("constants", np.int64),  # address of c
+        ("constants_apart", np.int64),  # distance e of its planes
+        ("scratch", np.int64),  # address of w
+        ("scratch_apart", np.int64),  # distance d of its planes
+        ("pointwise", np.int64),  # address of the compiled nonlinearity
+        ("n_x", np.int64),  # grid points
+        ("n_z", np.int64),  # size of the state, the same
+        ("n_a", np.int64),
+        ("steps", np.int64),  # internal steps of a sampling time
+        ("modes", np.int64),  # n_z//2 + 1, up to whole lanes
+        ("fine", TRANSFORM),  # of the dealiased grid
+        ("coarse", TRANSFORM),  # of the published grid
+        ("state_weight", np.float64),
+        ("action_weight", np.float64),
+        ("bound", np.float64),
+        # Offsets in c.
+        ("e", np.int64),
+        ("e2", np.int64),
+        ("q", np.int64),
+        ("qm", np.int64),
+        ("f1m", np.int64),
+        ("f2m", np.int64),  # twice f2
+        ("f3m", np.int64),
+        ("f", np.int64),  # f1 + 4 f2 + f3
+        ("supports", np.int64),  # their spectra, n_a by modes
+        ("target", np.int64),
+        ("analysis", np.int64),  # matrices of the coarse transform, n_z by modes
+        ("synthesis", np.int64),
+        # Offsets in w.
+        ("x", np.int64),  # the spectrum to be transformed next, zero above the modes
+        ("z1", np.int64),
+        ("z2", np.int64),
+        ("next", np.int64),
+        ("b", np.int64),
+        ("c", np.int64),
+        ("qf", np.int64),
+        ("ff", np.int64),
+        ("state", np.int64),
+    ]
+)
+
+
+@jit
+def nonlinear(w: int, d: int, plan: Any, c: int, e: int) -> int:
+    """Where the transform of g(u) stands, u being the field of the spectrum x on the fine grid."""
+    t = plan.fine
+    split(w, plan.x, plan.z1, d, t, c, e)
+    z = inverse(w, plan.z1, plan.z2, d, t, c, e)
+    call_c(plan.pointwise, (w + 8 * z, t.m))
+    call_c(plan.pointwise, (w + 8 * (z + d), t.m))
+    return forward(w, z, plan.z1 + plan.z2 - z, d, t, c, e)
+
+
+@jit
+def integrate(w: int, d: int, plan: Any, c: int, e: int) -> None:
+    """One internal step of the spectrum x."""
+    # Read here, as the compiler cannot know that what is stored below is not the plan.
+    m, factors, modes = plan.fine.m, plan.fine.split, plan.modes
+    x, next_x, to_b, to_c = plan.x, plan.next, plan.b, plan.c
+    e1, e2, qm, f2m = plan.e, plan.e2, plan.qm, plan.f2m
+    f1m, f3m, qfs, ffs = plan.f1m, plan.f3m, plan.qf, plan.ff
+    z = nonlinear(w, d, plan, c, e)
+    for k in range(0, modes, 8):
+        g, v, qf = joined(w, z, d, m, factors, k, c, e), get(w, x + k, d), get(w, qfs + k, d)
+        half, qg = plus_product(qf, c, e2 + k, e, v), product(c, qm + k, e, g)
+        a = plus(half, qg)
+        put(w, x + k, d, a)
+        put(w, to_b + k, d, half)
+        put(w, to_c + k, d, minus(plus_product(qf, c, e2 + k, e, a), qg))
+        whole = plus_product(get(w, ffs + k, d), c, e1 + k, e, v)
+        put(w, next_x + k, d, plus_product(whole, c, f1m + k, e, g))
+    z = nonlinear(w, d, plan, c, e)
+    for k in range(0, modes, 8):
+        g = joined(w, z, d, m, factors, k, c, e)
+        put(w, x + k, d, plus_product(get(w, to_b + k, d), c, qm + k, e, g))
+        put(w, next_x + k, d, plus_product(get(w, next_x + k, d), c, f2m + k, e, g))
+    z = nonlinear(w, d, plan, c, e)
+    for k in range(0, modes, 8):
+        g = joined(w, z, d, m, factors, k, c, e)
+        qg = product(c, qm + k, e, g)
+        put(w, x + k, d, plus(get(w, to_c + k, d), plus(qg, qg)))
+        put(w, next_x + k, d, plus_product(get(w, next_x + k, d), c, f2m + k, e, g))
+    z = nonlinear(w, d, plan, c, e)
+    for k in range(0, modes, 8):
+        g = joined(w, z, d, m, factors, k, c, e)
+        put(w, x + k, d, plus_product(get(w, next_x + k, d), c, f3m + k, e, g))
+
+
+@jit
+def force(action: int, w: int, d: int, plan: Any, c: int, e: int) -> None:
+    """Q F_a and (f1 + 4 f2 + f3) F_a of an action."""
+    for k in range(0, plan.modes, 8):
+        total = splat(0.0), splat(0.0)
+        for j in range(plan.n_a):
+            a = splat(read(action, j))
+            support = get(c, plan.supports + j * plan.modes + k, e)
+            total = fma(a, support[0], total[0]), fma(a, support[1], total[1])
+        put(w, plan.qf + k, d, product(c, plan.q + k, e, total))
+        put(w, plan.ff + k, d, product(c, plan.f + k, e, total))
+
+
+@register_jitable  # type: ignore[untyped-decorator, unused-ignore]
+def advance(state: int, action: int, w: int, d: int, plan: Any, c: int, e: int) -> None:
+    """The state a sampling time later, in the scratch."""
+    force(action, w, d, plan, c, e)
+    analyse(state, w, d, plan, c, e)
+    for _ in range(plan.steps):
+        integrate(w, d, plan, c, e)
+    synthesise(w + 8 * plan.state, w, d, plan, c, e)
+
+
+environments = environments_of(PLAN, advance, native, simd, fft, spectra)
+
+
+@kept
+def all_finite(values: NDArray[np.float64]) -> bool:
+    finite = True
+    for value in values.flat:
+        finite &= math.isfinite(value)
+    return finite

@@ -1,0 +1,55 @@
+"""The nonlinearity of an equation, a scalar function, as machine code over an array."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numba
+from numba import carray, types  # type: ignore[attr-defined, unused-ignore]
+from numba.core.errors import NumbaError
+from numba.extending import register_jitable
+
+from loop_interfaces.jit.cache import fingerprint
+from loop_interfaces.jit.native import MachineCode
+
+__all__ = ["pointwise_loop"]
+
+LOOPS: dict[Callable[[float], float], MachineCode] = {}
+
+
+def pointwise_loop(function: Callable[[float], float]) -> tuple[int, bool]:
+    """Machine code of u[i] = function(u[i]) over an array, a void (*)(double *, intp).
+
+    Returns
+    -------
+    Its address, the same one for the same function, and whether it was compiled by this call.
+
+    Raises
+    ------
+    ValueError
+        Numba cannot compile the function for a float64, or it returns something else.
+    """
+    # A plain function in the closure keeps the key on disk the same in every process; a dispatcher
+    # would not.
+    scalar = register_jitable(error_model="numpy")(function)
+    code = MachineCode(lambda: compile_loop(scalar, fingerprint(function)))
+    try:
+        return LOOPS.setdefault(function, code)()
+    except NumbaError as error:
+        reason = str(error).strip().splitlines()[-1]
+        raise ValueError(
+            f"the nonlinearity {function.__qualname__} must be a scalar function u -> g(u) "
+            f"that Numba can compile for a float64: {reason}"
+        ) from error
+
+
+def compile_loop(scalar: Callable[[float], float], sources: str) -> Any:
+    signature = types.void(types.CPointer(types.float64), types.intp)  # type: ignore[no-untyped-call]
+
+    @numba.cfunc(signature, cache=True)
+    def loop(data: Any, count: int) -> None:
+        sources  # noqa: B018  # closed over to be part of the key on disk
+        u = carray(data, count)
+        for i in range(count):
+            u[i] = scalar(u[i])
+
+    return loop

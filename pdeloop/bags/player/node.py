@@ -1,0 +1,210 @@
+"""bag_player: publishes a bag's messages over topics, as a ROS 2 node.
+
+Publishes   what the bag holds: the recorded bytes, under the recorded names, types and quality of
+            service, in the recorded time
+Parameters  those of the recorded run, read-only, so that who watches can ask for them
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from loop_interfaces.isolation import keep_on_this_machine
+from loop_interfaces.ros.introspection import NAMELESS
+from loop_interfaces.ros.node_loop import NodeLoop
+from loop_interfaces.ros.node_main import ConfigurationError, ros_node
+from pdeloop.bags.playback import Channel, Playback, channels
+from pdeloop.bags.reader import Bag
+from pdeloop.domain import own_domain
+from pdeloop.live import announced
+from tuner_node.results import TRANSIENT
+
+NAME = "bag_player"
+LOOK_FOR = 2.5
+"""Seconds in which a live loop in this domain is found."""
+LOOK = 1.0
+"""Seconds between two looks for one while playing."""
+UNKNOWN = 1.0
+"""Seconds in which the name of a publisher's node should come."""
+NAP = 0.02
+"""Longest sleep, so that signals are noticed."""
+LINGER = 0.5
+"""Seconds after the last message in which it arrives everywhere."""
+
+
+class PlayerError(RuntimeError):
+    """The bag is not played, or not further; the text says why and what to do."""
+
+
+class PlayerNode:
+    """Publishes the messages of one bag.
+
+    wait: begin when somebody subscribes.
+    """
+
+    def __init__(self, bag: Bag, playback: Playback, *, wait: bool) -> None:
+        self._bag, self._playback = bag, playback
+        self._channels = channels(bag)
+        self._waiting = wait
+        self._left: float | None = None
+
+    def run(self) -> str:
+        """Play to the end, or until a signal comes; the reason."""
+        while True:
+            with ros_node(NAME, ["--ros-args", "--disable-external-lib-logs"]) as (node, loop):
+                self._join(node, loop)
+                reason = loop.run(
+                    tick=self._tick, deadline=lambda: 0.0, housekeeping=self._housekeeping
+                )
+                if not loop.suspended:
+                    return reason
+                self._left = loop.now()
+
+    def _join(self, node: Node, loop: NodeLoop) -> None:
+        self._node, self._loop = node, loop
+        self._publishers: dict[str, Publisher] = {}
+        self._until = loop.now() + LOOK_FOR
+        self._look_at = 0.0
+        self._seen_at: float | None = None
+        self._linger: float | None = None
+        for name, value in self._recorded_parameters().items():
+            node.declare_parameter(name, value, ParameterDescriptor(read_only=True))
+
+    def _tick(self, now: float) -> None:
+        playback = self._playback
+        if not self._publishers:
+            time.sleep(NAP)
+            return
+        if self._waiting:
+            self._waiting = not any(p.get_subscription_count() for p in self._publishers.values())
+            time.sleep(NAP)
+            return
+        if playback.due is None and not playback.over:
+            playback.begin(now)
+        for message in playback.take(now):
+            publisher = self._publishers.get(message.topic)
+            if publisher is not None:
+                publisher.publish(message.data)
+        if playback.over:
+            self._linger = self._linger or now + LINGER
+            if now >= self._linger:
+                self._loop.stop("end")
+        due = playback.due
+        time.sleep(NAP if due is None else min(NAP, max(0.0, due - time.monotonic())))
+
+    def _housekeeping(self, now: float) -> None:
+        if not self._publishers:
+            self._refuse_company(now)
+            if now >= self._until and self._seen_at is None:
+                self._create()
+                if self._left is not None:
+                    self._playback.delay(now - self._left)
+                    self._left = None
+        elif now >= self._look_at:
+            self._look_at = now + LOOK
+            self._refuse_company(now)
+
+    def _create(self) -> None:
+        for channel in self._channels:
+            kind = _message_type(channel.type)
+            if kind is None:
+                self._node.get_logger().warning(
+                    f"{channel.topic} is not played: its type {channel.type} is not installed"
+                )
+                continue
+            self._publishers[channel.topic] = self._node.create_publisher(
+                kind, channel.topic, _qos(channel)
+            )
+        if not self._publishers:
+            raise PlayerError(f"{self._bag.path} holds nothing that can be published here")
+
+    def _refuse_company(self, now: float) -> None:
+        """A live loop must not be told what happened long ago."""
+        for channel in self._channels:
+            topic = channel.topic
+            if self._node.count_publishers(topic) <= (topic in self._publishers):
+                continue
+            names = [
+                f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+                for info in self._node.get_publishers_info_by_topic(topic)
+                if info.node_name != NAMELESS
+            ]
+            others = [name for name in names if name != f"/{NAME}"]
+            self._seen_at = self._seen_at or now
+            if not others and now - self._seen_at < UNKNOWN:
+                return  # the name comes a little later than the publisher
+            who = others[0] if others else "another node"
+            raise PlayerError(
+                f"{who} publishes {topic} in this ROS domain; a bag is not played beside a live loop, "
+                "which would take its messages for its own. Stop that loop (what was killed is seen "
+                "for 3 s more), or play in another ROS_DOMAIN_ID"
+            )
+        self._seen_at = None
+
+    def _recorded_parameters(self) -> dict[str, Any]:
+        """What defines the last run in the bag, as far as it knows: not its folders and the like."""
+        runs = list(self._bag.parameters().values())
+        known = {} if not runs else {k: v for k, v in runs[-1].items() if k not in TRANSIENT}
+        return {k: v for k, v in known.items() if isinstance(v, str | bool | int | float)}
+
+
+def _message_type(name: str) -> Any:
+    """The class of a message type like std_msgs/msg/String; None if it is not installed."""
+    package, _, kind = name.partition("/msg/")
+    try:
+        return getattr(importlib.import_module(f"{package}.msg"), kind, None)
+    except ImportError:
+        return None
+
+
+def _qos(channel: Channel) -> QoSProfile:
+    return QoSProfile(
+        depth=channel.depth,
+        reliability=ReliabilityPolicy.RELIABLE
+        if channel.reliable
+        else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL
+        if channel.latched
+        else DurabilityPolicy.VOLATILE,
+    )
+
+
+def play(
+    path: Path,
+    *,
+    rate: float,
+    again: bool,
+    wait: bool,
+    network: bool,
+    tell: Callable[[str], None],
+) -> int:
+    """Play the bag at `path` in a domain of its own or ROS_DOMAIN_ID; the exit code."""
+    bag = Bag(path)
+    playback = Playback(bag, rate=rate, again=again)
+    player = PlayerNode(bag, playback, wait=wait)
+    if not network:
+        keep_on_this_machine()
+    with own_domain() as domain, announced(domain, bag.path, network=network):
+        os.environ["ROS_DOMAIN_ID"] = str(domain)
+        tell(f"play {bag.path} (ROS_DOMAIN_ID={domain}{', on the network' * network})")
+        if wait:
+            tell("  waiting for somebody who subscribes")
+        try:
+            reason = player.run()
+        except ConfigurationError as error:
+            raise PlayerError(str(error)) from error
+    tell(
+        f"  {playback.published} messages published"
+        + ("" if reason == "end" else f", stopped by {reason}")
+    )
+    return 0 if reason == "end" else 130

@@ -1,0 +1,111 @@
+"""The command line `pdeloop`: its commands, and what becomes of their errors.
+
+Exit codes: docs/command-line.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+
+DONE, FAILED, CRASHED, INTERRUPTED, NOBODY_READS = 0, 1, 70, 130, 141
+"""Exit codes; 2, a command that is not understood, is argparse's."""
+_EXTRAS = {
+    "rosbags": "record",
+    "mcap": "record",
+    "matplotlib": "report",
+    "aiohttp": "monitor",
+    "shtab": "completion",
+}
+"""Modules that only some commands need, and the extra that installs them."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Console script `pdeloop`."""
+    return run(parser, arguments)
+
+
+def run(
+    make_parser: Callable[[], argparse.ArgumentParser], arguments: Sequence[str] | None = None
+) -> int:
+    """Exit code of the command in `arguments`. Every error a user can cause is one line on stderr."""
+    try:
+        options = make_parser().parse_args(arguments)
+        code: int = options.command(options)
+        sys.stdout.flush()  # here, where it can still be said that nobody reads
+        return code
+    except (ValueError, RuntimeError) as error:
+        # RunFolderError, CheckpointError, ParameterError, DomainError, NodeError and the plant's
+        # and controller's refusals.
+        return _failed(str(error))
+    except ModuleNotFoundError as error:
+        extra = _EXTRAS.get((error.name or "").split(".")[0])
+        if extra is None:
+            return _crashed()
+        return _failed(f"needs {error.name}: pip install 'pdeloop[{extra}]'")
+    except KeyboardInterrupt:
+        print("pdeloop: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        with contextlib.suppress(OSError, ValueError):  # or the interpreter would try it again
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return NOBODY_READS
+    except OSError as error:
+        where = f" ({error.filename})" if error.filename else ""
+        return _failed(f"{error.strerror or error}{where}")
+    except Exception:
+        return _crashed()
+
+
+def _failed(text: str) -> int:
+    print(f"pdeloop: {text}", file=sys.stderr)
+    return FAILED
+
+
+def _crashed() -> int:
+    """A bug: the only case of a traceback."""
+    traceback.print_exc()
+    return CRASHED
+
+
+def parser() -> argparse.ArgumentParser:
+    """The parser of all commands."""
+    # Imported here, where `main` catches Ctrl-C: it takes most of a short command's time.
+    from pdeloop.commands import (
+        bag,
+        completion,
+        evaluate,
+        monitor,
+        problems,
+        reproduce,
+        secure,
+        train,
+    )
+
+    root = argparse.ArgumentParser(
+        prog="pdeloop",
+        description="Reduce, design and adapt controllers of PDEs over ROS 2 topics.",
+        epilog="example: pdeloop train burgers (every command has an example in its --help)",
+    )
+    root.add_argument("--version", action="version", version=f"pdeloop {_version()}")
+    commands = root.add_subparsers(required=True, metavar="COMMAND")
+    for module in (train, evaluate, bag, monitor, reproduce, secure, problems, completion):
+        module.add(commands)
+    return root
+
+
+def _version() -> str:
+    from importlib import metadata
+
+    try:
+        return metadata.version("pdeloop")
+    except metadata.PackageNotFoundError:  # run from its sources
+        return "(not installed)"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,183 @@
+"""`pdeloop bag` and `pdeloop identify`: what is done with recordings."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+
+from loop_interfaces.spec import ParameterError
+from pdeloop.commands.common import Commands, add_json, command
+from pdeloop.output import print_json
+
+
+def add(commands: Commands) -> None:
+    """The commands `bag` and `identify`."""
+    _add_bag(commands)
+    _add_identify(commands)
+
+
+def _add_bag(commands: Commands) -> None:
+    bag = command(
+        commands,
+        "bag",
+        None,
+        help="look into a recorded bag, verify it, recover it, play it",
+        description="Look into a bag that --record or recorder_node wrote, verify it, recover "
+        "it, or play it (docs/recording.md).",
+        example="pdeloop bag info runs/burgers-20260101-120000-1",
+    )
+    actions = bag.add_subparsers(required=True, metavar="ACTION")
+    info = command(
+        actions,
+        "info",
+        _bag_info,
+        help="topics and episodes of a bag",
+        example="pdeloop bag info runs/burgers-20260101-120000-1",
+    )
+    verify = command(
+        actions,
+        "verify",
+        _bag_verify,
+        help="recompute states, actions, costs, models and policies",
+        description="Recompute states, actions, costs, models and policies, and compare them to "
+        "the bit. Exit code 1 if anything differs.",
+        example="pdeloop bag verify runs/burgers-20260101-120000-1",
+    )
+    recover = command(
+        actions,
+        "recover",
+        _bag_recover,
+        help="make an ordinary bag of an unfinished one",
+        example="pdeloop bag recover runs/lab/bag --out runs/lab/whole",
+    )
+    for action in (info, recover):
+        action.add_argument("bag", type=Path, metavar="BAG", help="folder of a bag or of a run")
+    verify.add_argument(
+        "bag",
+        type=Path,
+        metavar="BAG",
+        nargs="+",
+        help="folder of a bag or of a run; all bags of a run",
+    )
+    verify.add_argument(
+        "--parameters", type=Path, metavar="FILE", help="instead of those in the bag"
+    )
+    recover.add_argument("--out", type=Path, metavar="DIR", help="new folder [BAG-recovered]")
+    for action in (info, verify, recover):
+        add_json(action)
+    _add_play(actions)
+
+
+def _add_play(actions: Commands) -> None:
+    play = command(
+        actions,
+        "play",
+        _bag_play,
+        help="publish a bag's messages over topics",
+        description="Publish a bag's messages again: the recorded bytes under the recorded names and "
+        "quality of service, in the recorded time. In a ROS domain of its own (pdeloop monitor finds "
+        "it), or in ROS_DOMAIN_ID if that is set; never beside a live loop.",
+        example="pdeloop bag play runs/lab/bag --rate 0.1 --wait",
+    )
+    play.add_argument("bag", type=Path, metavar="BAG", help="folder of a bag or of a run")
+    play.add_argument("--rate", type=float, default=1.0, metavar="R", help="times as fast [1]")
+    play.add_argument("--loop", action="store_true", help="begin again at the end, until Ctrl-C")
+    play.add_argument("--wait", action="store_true", help="begin when somebody subscribes")
+    play.add_argument(
+        "--network",
+        action="store_true",
+        help="let messages leave this machine (default: loopback interface only)",
+    )
+
+
+def _add_identify(commands: Commands) -> None:
+    identify = command(
+        commands,
+        "identify",
+        _identify,
+        help="reduced model from recorded episodes",
+        description="Identify a reduced model by DMDc from the exploratory episodes of a bag (all "
+        "episodes if none is), of this plant or a foreign one, and design LQ-tracking gains.",
+        example="pdeloop identify --bag runs/lab/bag --rank 8 --order 4 --out model.npz",
+    )
+    add = identify.add_argument
+    add("--bag", type=Path, metavar="BAG", required=True, help="folder of a bag or of a run")
+    add("--rank", type=int, metavar="P", help="p of the DMDc regression [that of the run]")
+    add("--order", type=int, metavar="NS", help="order n_s of the model [that of the run]")
+    add("--episode", type=int, metavar="N", help="only this episode")
+    add("--environment", type=int, metavar="M", help="only this environment of each episode")
+    add("--state-weight", type=float, metavar="Q", help="q of Q = q I [that of the run, or 1]")
+    add("--action-weight", type=float, metavar="R", help="r of R = r I [that of the run, or 1]")
+    add("--out", type=Path, metavar="FILE", help="write A, B, U, K_a, K_b, s_r to this .npz")
+    add_json(identify)
+
+
+def _bag_info(options: argparse.Namespace) -> int:
+    from pdeloop.bags.tools import describe, info_text
+
+    content = describe(options.bag)
+    if options.json:
+        print_json(content)
+    else:
+        print(info_text(content))
+    return 0
+
+
+def _bag_verify(options: argparse.Namespace) -> int:
+    from pdeloop.bags.verify import verify
+
+    report = verify(*options.bag, parameters=options.parameters)
+    if options.json:
+        print_json(asdict(report))
+    else:
+        print(report.text())
+    return 1 if report.count else 0
+
+
+def _bag_recover(options: argparse.Namespace) -> int:
+    from pdeloop.bags.tools import recover
+
+    path, messages = recover(options.bag, options.out)
+    if options.json:
+        print_json({"bag": str(path), "messages": messages})
+    else:
+        print(f"{messages} messages in {path}")
+    return 0
+
+
+def _bag_play(options: argparse.Namespace) -> int:
+    from pdeloop.bags.player.node import play
+
+    if not 1e-6 <= options.rate <= 1e6:
+        raise ParameterError(f"--rate is {options.rate:g}; expected a number from 1e-6 to 1e6")
+    return play(
+        options.bag,
+        rate=options.rate,
+        again=options.loop,
+        wait=options.wait,
+        network=options.network,
+        tell=lambda text: print(text, flush=True),
+    )
+
+
+def _identify(options: argparse.Namespace) -> int:
+    from pdeloop.bags.identification import identify, save
+
+    found = identify(
+        options.bag,
+        rank=options.rank,
+        order=options.order,
+        episode=options.episode,
+        environment=options.environment,
+        weights=(options.state_weight, options.action_weight),
+    )
+    if options.out is not None:
+        save(found, options.out)
+    if options.json:
+        print_json(found.summary() | {"out": options.out and str(options.out)})
+        return 0
+    print(found.text())
+    if options.out is not None:
+        print(f"  written to {options.out}")
+    return 0

@@ -1,0 +1,50 @@
+"""`pdeloop evaluate`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from pdeloop.commands.common import DEFAULTS, Commands, add_json, command
+from pdeloop.output import print_json
+
+
+def add(commands: Commands) -> None:
+    """The command `evaluate`."""
+    evaluate = command(
+        commands,
+        "evaluate",
+        _evaluate,
+        help="cost of a run's policies on other fields",
+        description="Roll out no control, LQT and the adapted policy of a finished run.",
+        example="pdeloop evaluate runs/burgers-20260101-120000-1 --fields 60 --seed 7",
+    )
+    evaluate.add_argument("folder", type=Path, metavar="DIR", help="folder of a finished run")
+    evaluate.add_argument(
+        "--fields", type=int, default=10, metavar="N", help="sampled initial fields [10]"
+    )
+    evaluate.add_argument(
+        "--seed", type=int, default=0, metavar="S", help="seed of those fields [0]"
+    )
+    evaluate.add_argument(
+        "--mean-field",
+        action="store_true",
+        help="the mean of the initial distribution instead of sampled fields",
+    )
+    add_json(evaluate, "print the costs as JSON: {controller: [[cost a field] a seed]}")
+
+
+def _evaluate(options: argparse.Namespace) -> int:
+    from pdeloop.evaluation import as_text, evaluate
+
+    spec = DEFAULTS["evaluation_fields"]
+    spec.check(options.fields)
+    DEFAULTS["evaluation_seed"].check(options.seed)
+    costs = evaluate(
+        options.folder, fields=options.fields, seed=options.seed, mean_field=options.mean_field
+    )
+    if options.json:
+        print_json(costs)
+    else:
+        print(as_text(costs))
+    return 0

@@ -1,0 +1,90 @@
+"""`pdeloop monitor`: the live page."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import webbrowser
+from pathlib import Path
+
+from loop_interfaces.spec import ParameterError
+from pdeloop.commands.common import Commands, command
+
+PORT = 8420
+
+
+def add(commands: Commands) -> None:
+    """The command `monitor`."""
+    monitor = command(
+        commands,
+        "monitor",
+        _monitor,
+        help="a page that shows a loop as it runs",
+        description="Serve a page on 127.0.0.1 that shows a loop as it runs: the field, the actions, "
+        "the profile against the target, the training curve, the nodes, and buttons to pause. "
+        "Without DIR and ROS_DOMAIN_ID it shows the newest training (or played bag) on this machine, "
+        "and the next one when that has ended. Ctrl-C ends it; the loop never waits for it.",
+        example="pdeloop monitor runs/burgers-20260101-120000-1 --environment 3",
+    )
+    add = monitor.add_argument
+    add(
+        "folder",
+        nargs="?",
+        type=Path,
+        metavar="DIR",
+        help="folder of a run: show this one only [the newest that runs]",
+    )
+    add("--port", type=int, default=PORT, metavar="N", help=f"0: a free one [{PORT}]")
+    add("--namespace", metavar="NS", help="of the pair to show first [the first there is]")
+    add("--environment", type=int, default=0, metavar="M", help="to show first [0]")
+    add("--open", action="store_true", help="open the page in the browser")
+    add(
+        "--network",
+        action="store_true",
+        help="the loop's messages may leave this machine (the page never does)",
+    )
+
+
+def _monitor(options: argparse.Namespace) -> int:
+    from pdeloop.domain import given_domain
+    from pdeloop.monitor.commands import Commands as Queue
+    from pdeloop.monitor.finder import Finder, run_id
+    from pdeloop.monitor.node import ConfigurationError, stand_back, watch
+    from pdeloop.monitor.server import Server
+    from pdeloop.monitor.view import View
+
+    folder, namespace = options.folder, options.namespace
+    if not 0 <= options.port < 65536:
+        raise ParameterError(f"--port is {options.port}; expected a whole number from 0 to 65535")
+    if options.environment < 0:
+        raise ParameterError(f"--environment is {options.environment}; expected 0 or more")
+    if folder is not None and run_id(folder) is None:
+        raise ParameterError(f"no run in {folder}; give the folder of one, or none")
+    view, queue = View(options.environment), Queue()
+    finder = Finder(folder, given_domain())
+    stand_back()
+    try:
+        server = Server(view, queue, options.port)
+    except OSError as error:
+        raise ParameterError(
+            f"port {options.port} on 127.0.0.1 cannot be had ({os.strerror(error.errno or 0)}); "
+            "choose another with --port N, or a free one with --port 0"
+        ) from error
+    server.start()
+    print(f"monitor at {server.url}  (Ctrl-C ends it)", flush=True)
+    if options.open:
+        webbrowser.open(server.url)
+    try:
+        watch(
+            view,
+            finder,
+            queue,
+            namespace=None if namespace is None else "/" + namespace.strip("/"),
+            watched=server.watched,
+            network=options.network,
+        )
+    except ConfigurationError as error:
+        raise RuntimeError(str(error)) from error
+    finally:
+        server.stop()
+    return 0

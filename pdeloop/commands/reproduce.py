@@ -1,0 +1,81 @@
+"""`pdeloop reproduce` and `pdeloop report`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from pdeloop.commands.common import DEFAULTS, Commands, add_json, command
+
+
+def add(commands: Commands) -> None:
+    """The commands `reproduce` and `report`."""
+    _add_reproduce(commands)
+    _add_report(commands)
+
+
+def _add_reproduce(commands: Commands) -> None:
+    reproduce = command(
+        commands,
+        "reproduce",
+        _reproduce,
+        help="the paper's experiment: four controllers, several seeds, a table",
+        description="For each problem and seed: no control, LQT, LQT-PO and pure PO, with the cost "
+        "of every iteration's policy on the evaluation fields. Ctrl-C interrupts; --out DIR of an "
+        "interrupted reproduction continues it.",
+        example="pdeloop reproduce burgers kdv --seeds 6 --out runs/paper",
+    )
+    add = reproduce.add_argument
+    add("problems", nargs="*", metavar="PROBLEM", help="shipped names or YAML files [the paper's]")
+    add("--seeds", type=int, metavar="N", help="trainings of each problem, side by side [6]")
+    add("--iterations", type=int, metavar="N", help="iterations of the adapt phase [40]")
+    add("--seed", type=int, metavar="S", help="the first seed [0]")
+    add(
+        "--identification-attempts",
+        type=int,
+        metavar="N",
+        help="exploratory episodes a seed may use until LQT beats no control; 1: the first, "
+        f"unchecked, as in the paper [{DEFAULTS['identification_attempts'].default}]",
+    )
+    add("--processes", type=int, metavar="N", help="jobs at the same time [one a core]")
+    add("--out", type=Path, metavar="DIR", help="folder of the results [runs/reproduce-TIME]")
+    add_json(reproduce, "print the table as JSON; progress goes to stderr")
+
+
+def _add_report(commands: Commands) -> None:
+    report = command(
+        commands,
+        "report",
+        _report,
+        help="figures and an HTML page of a run or a reproduction",
+        description="Figures for a paper (PNG and SVG) and one HTML page that needs no network.",
+        example="pdeloop report runs/paper",
+    )
+    report.add_argument(
+        "folder", type=Path, metavar="DIR", help="folder of a finished run or reproduction"
+    )
+    report.add_argument("--out", type=Path, metavar="DIR", help="[DIR/report]")
+    report.add_argument(
+        "--limits",
+        type=Path,
+        metavar="DIR",
+        help="what `python -m benchmarks optimum --save DIR` wrote [that of the shipped problems]",
+    )
+
+
+def _reproduce(options: argparse.Namespace) -> int:
+    from pdeloop.reproduce.experiment import reproduce
+
+    names = ("seeds", "iterations", "seed", "identification_attempts")
+    given = {n: getattr(options, n) for n in names if getattr(options, n) is not None}
+    for name, value in given.items():
+        DEFAULTS[name].check(value)
+    return reproduce(options.problems, given, options.out, options.processes, options.json)
+
+
+def _report(options: argparse.Namespace) -> int:
+    from pdeloop.report.page import report
+
+    page = report(options.folder, options.out, options.limits)
+    print(f"report in {page}")
+    return 0

@@ -1,0 +1,185 @@
+"""`pdeloop train`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from loop_interfaces.parameters import INSTRUMENTS
+from loop_interfaces.problem import shipped_problems
+from loop_interfaces.spec import ParameterError
+from pdeloop.commands.common import DEFAULTS, Commands, add_json, command
+
+
+def add(commands: Commands) -> None:
+    """The command `train`."""
+    train = command(
+        commands,
+        "train",
+        _train,
+        help="identify, design, adapt and evaluate",
+        description="Train a controller: identify a reduced model, design LQ-tracking gains, adapt "
+        "them by policy gradient, evaluate. The plant, the controller and the tuner run as ROS 2 "
+        "nodes in processes of their own.",
+        example="pdeloop train burgers --iterations 40 --seed 0",
+    )
+    train.add_argument(
+        "problem",
+        nargs="?",
+        metavar="PROBLEM",
+        help=f"{', '.join(shipped_problems())}, or the path of a problem's YAML file",
+    )
+    for name, metavar in (("iterations", "N"), ("seed", "S"), ("seeds", "N")):
+        spec = DEFAULTS[name]
+        train.add_argument(
+            f"--{name}", type=int, metavar=metavar, help=f"{spec.description} [{spec.default}]"
+        )
+    for name in ("start", "optimizer"):
+        spec = DEFAULTS[name]
+        train.add_argument(
+            f"--{name}",
+            type=lambda text: text.replace("-", "_"),  # gauss-newton as well as gauss_newton
+            choices=spec.choices,
+            help=f"{spec.description} [{spec.default}]",
+        )
+    train.add_argument(
+        "--equation",
+        metavar="NAME",
+        help="the plant's PDE instead of that of the problem; an own one, 'file.py:Class' or "
+        "'package.module:Class', has to be named here, as a problem's file alone runs no code",
+    )
+    train.add_argument(
+        "--model",
+        type=Path,
+        metavar="FILE",
+        help="start from this model of `pdeloop identify --out` instead of identifying one",
+    )
+    train.add_argument(
+        "--policy-features",
+        choices=DEFAULTS["policy_features"].choices,
+        help=f"{DEFAULTS['policy_features'].description} [affine]",
+    )
+    train.add_argument(
+        "--extra-modes",
+        type=int,
+        metavar="N",
+        help=f"{DEFAULTS['extra_modes'].description} [0]",
+    )
+    train.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder of the results [runs/PROBLEM-TIME]"
+    )
+    train.add_argument(
+        "--in-process",
+        action="store_true",
+        help="run the same code without ROS; the policy is the same to the bit",
+    )
+    train.add_argument(
+        "--network",
+        action="store_true",
+        help="let messages leave this machine (default: loopback interface only)",
+    )
+    train.add_argument(
+        "--faulty-line",
+        metavar="LOSS,DUPLICATION,DELAY",
+        help="for tests: a relay between plant and controller that loses and repeats messages with "
+        "these probabilities and delays them by up to so many seconds",
+    )
+    train.add_argument(
+        "--resume", type=Path, metavar="DIR", help="continue the interrupted run in DIR"
+    )
+    train.add_argument(
+        "--record", action="store_true", help="record all topics to a rosbag2 bag in the folder"
+    )
+    train.add_argument(
+        "--bag-storage", choices=("mcap", "sqlite3"), help="format of the bag [mcap]"
+    )
+    train.add_argument(
+        "--bag-per-episode", action="store_true", help="one bag an episode instead of one"
+    )
+    train.add_argument(
+        "--record-or-stop",
+        action="store_true",
+        help="as --record, and stop the training if the recording fails",
+    )
+    train.add_argument(
+        "--directions",
+        type=int,
+        metavar="D",
+        help="several directions an iteration, 2 D environments a seed (--optimizer directions)",
+    )
+    train.add_argument(
+        "--pairs", type=int, default=1, metavar="K", help="plants with a controller each [1]"
+    )
+    train.add_argument(
+        "--pin",
+        action="store_true",
+        help="keep each plant and its controller on one core, and let the plant's helpers on the "
+        "others look for work all the time: less time per step, more power",
+    )
+    train.add_argument(
+        "--spread",
+        action="store_true",
+        help="plant and controller on any cores, instead of one for both (docs/performance.md)",
+    )
+    for spec in INSTRUMENTS:
+        train.add_argument(
+            f"--{spec.name.replace('_', '-')}",
+            type=spec.type,
+            metavar="N" if spec.type is int else "X",
+            help=f"{spec.description} [{spec.default}]",
+        )
+    train.add_argument(
+        "--view",
+        action="store_true",
+        help="a viewer_node beside the others, for RViz, Foxglove and PlotJuggler (docs/views.md)",
+    )
+    add_json(train, "print the result as JSON at the end; progress goes to stderr")
+
+
+def _train(options: argparse.Namespace) -> int:
+    from pde_sim_node.equations import allow
+    from pdeloop.training_run import Recording, Transport, run_again, run_new
+
+    recording = None
+    if options.record or options.record_or_stop:
+        import recorder_node.bag  # noqa: F401  # the recorder would only say so in its log
+
+        storage = options.bag_storage or "mcap"
+        recording = Recording(storage, options.bag_per_episode, options.record_or_stop)
+    elif options.bag_storage or options.bag_per_episode:
+        raise ParameterError("--bag-storage and --bag-per-episode go with --record")
+    transport = Transport(
+        options.in_process,
+        recording,
+        options.network,
+        options.faulty_line,
+        options.pairs,
+        options.pin,
+        options.view,
+        options.spread,
+    )
+    names = ["iterations", "seed", "seeds", "start", "optimizer", "directions", "policy_features"]
+    names += ["extra_modes"]
+    names += [spec.name for spec in INSTRUMENTS]
+    given = {n: getattr(options, n) for n in names if getattr(options, n) is not None}
+    if (
+        options.directions is not None
+        and given.setdefault("optimizer", "directions") != "directions"
+    ):
+        raise ParameterError("--directions goes with --optimizer directions")
+    own = {} if options.equation is None else {"equation": allow(options.equation)}
+    if options.model is not None:
+        given["model"] = str(options.model.resolve())
+    if options.resume is not None:
+        if options.problem or given or options.out:
+            raise ParameterError(
+                "--resume continues a run with its own parameters; "
+                "give it alone (or with --in-process)"
+            )
+        return run_again(options.resume, transport, options.json)
+    if options.problem is None:
+        raise ParameterError(
+            f"no problem given; expected one of {', '.join(shipped_problems())}, a YAML file, "
+            "or --resume DIR"
+        )
+    return run_new(options.problem, {**given, **own}, options.out, transport, options.json)

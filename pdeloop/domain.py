@@ -1,0 +1,67 @@
+"""A ROS domain of one's own, so that two runs on a machine never meet."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import random
+import socket
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+DOMAINS = range(1, 101)
+"""Domains whose ports lie outside the ephemeral range on Linux; 0 is everybody's default."""
+DOMAINS_FOLDER = Path(tempfile.gettempdir()) / f"pdeloop-domains-{os.getuid()}"
+"""Locks of the domains in use, and who uses them (pdeloop.live)."""
+FIRST_PARTICIPANTS = 16
+"""Participants of a domain whose ports are looked at: more than a run of a few pairs has."""
+
+
+class DomainError(RuntimeError):
+    """No free ROS domain."""
+
+
+def given_domain() -> int | None:
+    """ROS_DOMAIN_ID, None if the user has not set it."""
+    chosen = os.environ.get("ROS_DOMAIN_ID")
+    if not chosen:
+        return None
+    if not chosen.isdigit() or int(chosen) > 232:
+        raise DomainError(f"ROS_DOMAIN_ID is {chosen!r}; expected a whole number from 0 to 232")
+    return int(chosen)
+
+
+@contextlib.contextmanager
+def own_domain() -> Iterator[int]:
+    """ROS_DOMAIN_ID if the user set it, else a free domain, held until the end of the block.
+
+    A domain is free when no other run holds its lock and nobody is bound to a discovery port of its
+    first participants (7410 + 250 d + 2 i on loopback): the first of them may have left.
+    """
+    chosen = given_domain()
+    if chosen is not None:
+        yield chosen
+        return
+    DOMAINS_FOLDER.mkdir(exist_ok=True)
+    for domain in random.sample(DOMAINS, len(DOMAINS)):
+        with (DOMAINS_FOLDER / str(domain)).open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                continue
+            if _unused(domain):
+                yield domain
+                return
+    raise DomainError(f"all ROS domains from {DOMAINS[0]} to {DOMAINS[-1]} are in use")
+
+
+def _unused(domain: int) -> bool:
+    for participant in range(FIRST_PARTICIPANTS):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(("127.0.0.1", 7410 + 250 * domain + 2 * participant))
+            except OSError:
+                return False
+    return True

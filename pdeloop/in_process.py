@@ -1,0 +1,141 @@
+"""The training without ROS: the same plant, controller and training code, called directly.
+
+It gives the bit-identical policy of the loop over topics, because every number is made by the same
+pure functions from the same float64 arrays; only the transport is missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controller_node.identification import DesignSettings, design
+from controller_node.policy import ProjectedLaw, excitation
+from loop_interfaces import model_rows
+from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn, noise_seeds
+from pde_sim_node.build import build_plant, fingerprint
+from pde_sim_node.plant import Plant
+from tuner_node.batch import Batch, BatchResult
+from tuner_node.training import Training
+from tuner_node.trajectory_collector import cut
+
+Array = NDArray[np.float64]
+Report = Callable[[Mapping[str, Any]], None]
+
+
+class LocalPair:
+    """A plant and a controller in this process."""
+
+    def __init__(self, values: Mapping[str, Any], plant: Plant | None = None) -> None:
+        self.plant = plant or build_plant(values)
+        self._fingerprint = fingerprint(values)
+        self._settings = DesignSettings(
+            n_a=values["n_a"],
+            dmdc_rank=values["dmdc_rank"],
+            reduced_order=values["reduced_order"],
+            state_weight=values["state_weight"],
+            action_weight=values["action_weight"],
+            action_limit=values["action_limit"],
+        )
+        self._law: ProjectedLaw | None = None
+        self._generation = 0
+
+    def follow(self, training: Training) -> None:
+        """Use the models of a training, if they are others than before."""
+        if training.ready and self._generation != training.generation:
+            assert training.models is not None
+            self._generation = training.generation
+            self.use_models(training.models)
+
+    def use_models(self, models: Array) -> None:
+        """Take the reduced models (S, rows, n_s) that policies refer to."""
+        bases = [model_rows.unpack(rows, self._settings.n_a).U for rows in models]
+        self._law = ProjectedLaw(bases, self.plant.target, self._settings.action_limit)
+
+    def run(self, batch: Batch, max_batch: int = 1024) -> BatchResult:
+        """Roll the batch out. ValueError if exploration gives no model."""
+        parts = [
+            self._episode(
+                Batch(
+                    batch.rows[i : i + max_batch],
+                    None if batch.policies is None else batch.policies[i : i + max_batch],
+                    batch.trajectories,
+                )
+            )
+            for i in range(0, len(batch.rows), max_batch)
+        ]
+        models = [part.models for part in parts if part.models is not None]
+        return BatchResult(
+            np.concatenate([part.costs for part in parts]),
+            np.concatenate(models) if models else None,
+            self._fingerprint,
+            [t for part in parts for t in part.trajectories or ()] if batch.trajectories else None,
+            self.plant.target,
+        )
+
+    def _episode(self, batch: Batch) -> BatchResult:
+        plant, settings = self.plant, self._settings
+        states = plant.reset(
+            batch.rows[:, StartColumn.SEED].astype(np.int64), noise_seeds(batch.rows)
+        )
+        columns = batch.rows[:, [StartColumn.EXCITATION, StartColumn.VARIANCE]]
+        excitations = [(int(seed), float(variance)) for seed, variance in columns]
+        watched = batch.exploratory or batch.trajectories
+        history, actions_taken = [states.copy()], []
+        if not batch.exploratory:
+            assert self._law is not None and batch.policies is not None
+            self._law.set(batch.policies, batch.rows[:, StartColumn.MODEL].astype(np.int64))
+        for k in range(plant.horizon):
+            if batch.exploratory:
+                actions = np.stack(
+                    [
+                        excitation(s, k, settings.n_a, v, settings.action_limit)
+                        for s, v in excitations
+                    ]
+                )
+            else:
+                assert self._law is not None
+                actions = self._law.actions(states)
+            states = plant.step(actions)
+            if watched:
+                actions_taken.append(actions.copy())
+                history.append(states.copy())
+        costs = plant.episode_costs()
+        ended = np.where(costs.diverged_step >= 0, costs.diverged_step, COMPLETED)
+        table = np.column_stack([costs.mean, costs.total, ended.astype(np.float64)])
+        seen = None
+        if batch.trajectories:
+            seen = cut(np.stack(history), np.stack(actions_taken), table[:, CostColumn.ENDED])
+        if not batch.exploratory:
+            return BatchResult(table, trajectories=seen)
+        if (ended != COMPLETED).any():
+            raise ValueError(
+                f"no reduced model: the plant diverged under exploration at step "
+                f"{int(ended.max())}; lower exploration_variance"
+            )
+        trajectory, applied = np.stack(history), np.stack(actions_taken)
+        models = [
+            model_rows.pack(design(trajectory[:, m], applied[:, m], plant.target, settings))
+            for m in range(len(excitations))
+        ]
+        return BatchResult(table, np.stack(models), trajectories=seen)
+
+
+def train(training: Training, pair: LocalPair, report: Report, *, max_batch: int = 1024) -> None:
+    """Run `training` to its end on `pair`."""
+    pair.follow(training)
+    phase = ""
+    while True:
+        batch = training.next_batch()
+        if training.phase != phase:
+            phase = training.phase
+            report({"event": "phase", "phase": phase})
+        if batch is None:
+            return
+        result = pair.run(batch, max_batch)
+        for row in training.finish(result):
+            report(row)
+        pair.follow(training)

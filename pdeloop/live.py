@@ -1,0 +1,90 @@
+"""Which loops run on this machine: `pdeloop train` and `bag play` say so here, `monitor` asks.
+
+Each puts a file into a folder of this user's under the temporary one and holds a lock on it. The
+lock ends with its process, however that ends, so what is found here does run.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from pdeloop.domain import DOMAINS_FOLDER
+
+_PREFIX = "live-"
+_MAX_TEXT = 10_000
+
+
+@dataclass(frozen=True)
+class Live:
+    """A loop that runs: its ROS domain, the folder of its run (or bag), since when (epoch s).
+
+    network: whether its messages may leave the machine.
+    """
+
+    domain: int
+    folder: Path | None
+    started: float
+    network: bool = False
+
+
+@contextlib.contextmanager
+def announced(domain: int, folder: Path, *, network: bool = False) -> Iterator[None]:
+    """Say for the time of the block that a loop with this folder runs in this domain.
+
+    A temporary folder that cannot be written only means that nobody finds it.
+    """
+    content = {
+        "domain": domain,
+        "folder": str(folder.resolve()),
+        "started": time.time(),
+        "network": network,
+    }
+    with contextlib.ExitStack() as held:
+        with contextlib.suppress(OSError):
+            DOMAINS_FOLDER.mkdir(exist_ok=True)
+            path = DOMAINS_FOLDER / f"{_PREFIX}{os.getpid()}-{domain}"
+            new = path.with_name(f"new-{path.name}")
+            file = held.enter_context(new.open("w"))
+            fcntl.flock(file, fcntl.LOCK_EX)
+            file.write(json.dumps(content))
+            file.flush()
+            held.callback(path.unlink, missing_ok=True)
+            new.rename(path)  # under this name it is locked and whole
+        yield
+
+
+def running() -> list[Live]:
+    """The loops of this user that run now, the newest first."""
+    found = []
+    with contextlib.suppress(OSError):
+        if DOMAINS_FOLDER.stat().st_uid != os.getuid():
+            return []
+        for path in DOMAINS_FOLDER.glob(f"{_PREFIX}*"):
+            with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
+                found += _read(path)
+    return sorted(found, key=lambda live: -live.started)
+
+
+def _read(path: Path) -> list[Live]:
+    with path.open() as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            content = json.loads(file.read(_MAX_TEXT))
+            return [
+                Live(
+                    int(content["domain"]),
+                    Path(content["folder"]),
+                    float(content["started"]),
+                    bool(content["network"]),
+                )
+            ]
+    path.unlink(missing_ok=True)  # of a process that was killed
+    return []

@@ -1,0 +1,59 @@
+"""Which loop the monitor watches: the one it was told, or the training that runs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+from pdeloop.live import Live, running
+
+_MAX_TEXT = 1_000_000
+
+
+class Finder:
+    """Finds the loop to watch.
+
+    folder: of a run (or a bag that is played), to watch this one only; domain: watch this ROS
+    domain, whatever runs there. With neither, the newest loop on this machine that runs, and the
+    next one when it has ended.
+    """
+
+    def __init__(
+        self,
+        folder: Path | None,
+        domain: int | None,
+        look: Callable[[], list[Live]] = running,
+    ) -> None:
+        self._folder = None if folder is None else folder.resolve()
+        self._domain = domain
+        self._look = look
+        self._found: Live | None = None
+
+    def find(self) -> Live | None:
+        """The loop to watch now; None as long as there is none. One that has ended stays, until
+        there is another.
+        """
+        running = self._look()
+        if self._folder is not None:
+            running = [live for live in running if live.folder == self._folder]
+        if self._domain is not None:
+            running = [live for live in running if live.domain == self._domain]
+            running = running or [Live(self._domain, self._folder, 0.0)]
+        if self._found not in running:
+            self._found = running[0] if running else self._found
+        return self._found
+
+    @property
+    def only_run(self) -> int | None:
+        """The run to show, when a folder was given and has one."""
+        return None if self._folder is None else run_id(self._folder)
+
+
+def run_id(folder: Path) -> int | None:
+    """The id of the run in `folder`, None if there is none."""
+    try:
+        with (folder / "run.json").open("rb") as file:
+            return int(json.loads(file.read(_MAX_TEXT))["run"])
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
+        return None

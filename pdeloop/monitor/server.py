@@ -1,0 +1,218 @@
+"""The web server of the live page: on 127.0.0.1 only, and for no other page than its own.
+
+GET   /, /NAME     the page and its files, all of them from this package
+GET   /ws          a WebSocket with what is new (monitor.view), at most FRAMES times a second
+POST  /api/call    {"node", "verb"}: call a service of a node; {"success", "message"}
+POST  /api/watch   {"namespace"}, {"environment"} or {"component"}: what is shown
+
+Any page of the web that is open in a browser can send requests to 127.0.0.1. So a request must name
+this server as its host (a foreign name that was made to resolve to 127.0.0.1 does not), one from a
+page must come from ours, and one that changes something must carry a token that only ours knows: it
+comes over the WebSocket.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import secrets
+import socket
+import threading
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+from aiohttp import WSMsgType, web
+
+from pdeloop.monitor.commands import VERBS, Call, Commands, Watch
+from pdeloop.monitor.messages import Cursor
+from pdeloop.monitor.view import View
+
+FRAMES = 20.0
+"""Pictures a second at the most."""
+MOST_PAGES = 16
+"""Pages that may look at the same time."""
+MAX_BODY = 10_000
+ANSWER = 8.0
+"""Seconds in which the node's thread must have answered a call."""
+HOST = "127.0.0.1"
+TOKEN = "X-Pdeloop-Token"
+PAGE = Path(__file__).parent / "page"
+TYPES = {
+    "index.html": "text/html",
+    "style.css": "text/css",
+    "main.js": "text/javascript",
+    "link.js": "text/javascript",
+    "plot.js": "text/javascript",
+    "charts.js": "text/javascript",
+    "field.js": "text/javascript",
+    "panel.js": "text/javascript",
+    "cividis.js": "text/javascript",
+    "icon.svg": "image/svg+xml",
+}
+"""The files of the page; nothing else is served."""
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "img-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+_Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+class Server:
+    """Serves the page from a thread of its own, between `start` and `stop`.
+
+    port: 0 takes a free one. Raises OSError where the port is taken.
+    """
+
+    def __init__(self, view: View, commands: Commands, port: int) -> None:
+        self._view, self._commands = view, commands
+        self._token = secrets.token_urlsafe(32)
+        self._socket = socket.create_server((HOST, port))
+        self.port: int = self._socket.getsockname()[1]
+        self._pages: set[web.WebSocketResponse] = set()
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._serve, name="page", daemon=True)
+        self._ended = asyncio.Event()
+
+    @property
+    def url(self) -> str:
+        return f"http://{HOST}:{self.port}/"
+
+    def watched(self) -> bool:
+        """Whether a page is open."""
+        return bool(self._pages)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Close every page's connection and the server."""
+        self._loop.call_soon_threadsafe(self._ended.set)
+        self._thread.join(5.0)
+
+    def _serve(self) -> None:
+        asyncio.set_event_loop(self._loop)
+        self._loop.run_until_complete(self._main())
+
+    async def _main(self) -> None:
+        app = web.Application(middlewares=[self._guard], client_max_size=MAX_BODY)
+        app.router.add_get("/ws", self._on_page)
+        app.router.add_post("/api/call", self._on_call)
+        app.router.add_post("/api/watch", self._on_watch)
+        app.router.add_get("/{name:[a-z.]*}", _on_file)
+        runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
+        await runner.setup()
+        try:
+            await web.SockSite(runner, self._socket).start()
+            await self._ended.wait()
+            for page in list(self._pages):
+                with contextlib.suppress(Exception):
+                    await asyncio.wait_for(page.close(code=1001), 1.0)
+        finally:
+            await runner.cleanup()
+
+    @web.middleware
+    async def _guard(self, request: web.Request, handler: _Handler) -> web.StreamResponse:
+        """Refuse what no page of ours sends."""
+        names = [f"{name}:{self.port}" for name in (HOST, "localhost")]
+        own = [f"http://{name}" for name in names]
+        origin = request.headers.get("Origin")
+        changes = request.method not in ("GET", "HEAD")
+        if request.headers.get("Host") not in names:
+            raise web.HTTPForbidden(text=f"expected a request to {names[0]}")
+        if origin not in own and (origin is not None or changes or request.path == "/ws"):
+            raise web.HTTPForbidden(text="expected a request from the monitor's own page")
+        given = request.headers.get(TOKEN, "").encode()
+        if changes and not secrets.compare_digest(given, self._token.encode()):
+            raise web.HTTPForbidden(text="expected the page's token; load the page again")
+        response = await handler(request)
+        if not response.prepared:
+            response.headers.update(_HEADERS)
+        return response
+
+    async def _on_page(self, request: web.Request) -> web.WebSocketResponse:
+        if len(self._pages) >= MOST_PAGES:
+            raise web.HTTPServiceUnavailable(text=f"{MOST_PAGES} pages look already; close one")
+        page = web.WebSocketResponse(heartbeat=10.0, max_msg_size=MAX_BODY, compress=False)
+        await page.prepare(request)
+        self._pages.add(page)
+        telling = asyncio.create_task(self._tell(page))
+        try:
+            async for message in page:  # a page says nothing; this notices that it has gone
+                if message.type is not WSMsgType.PING:
+                    break
+        finally:
+            self._pages.discard(page)
+            telling.cancel()
+            with contextlib.suppress(asyncio.CancelledError, ConnectionError):
+                await telling
+            await page.close()
+        return page
+
+    async def _tell(self, page: web.WebSocketResponse) -> None:
+        """Tell a page what is new; a slow one gets fewer pictures, as each `send` waits for it."""
+        cursor = Cursor()
+        await page.send_json({"part": "hello", "token": self._token})
+        while not page.closed:
+            for update in self._view.updates(cursor):
+                if update.startswith(b"{"):
+                    await page.send_str(update.decode())
+                else:
+                    await page.send_bytes(update)
+            await asyncio.sleep(1.0 / FRAMES)
+
+    async def _on_call(self, request: web.Request) -> web.Response:
+        asked = await _body(request)
+        node, verb = asked.get("node"), asked.get("verb")
+        if not isinstance(node, str) or not self._view.offers(node, verb):
+            raise web.HTTPBadRequest(
+                text=f"no node of this loop offers that; expected one of {', '.join(VERBS)}"
+            )
+        call = Call(node, str(verb))
+        self._commands.put(call)
+        try:
+            success, message = await asyncio.wait_for(asyncio.wrap_future(call.answer), ANSWER)
+        except TimeoutError:
+            success, message = False, "the loop is not connected at the moment"
+        return web.json_response({"success": success, "message": message})
+
+    async def _on_watch(self, request: web.Request) -> web.Response:
+        asked = await _body(request)
+        namespace = asked.get("namespace")
+        chosen = {n: asked[n] for n in ("environment", "component") if n in asked}
+        if chosen:
+            if any(type(i) is not int or not 0 <= i < 2**24 for i in chosen.values()):
+                raise web.HTTPBadRequest(text="expected the index of an environment or component")
+            self._view.choose(**chosen)
+        elif isinstance(namespace, str) and namespace in self._view.known_namespaces():
+            self._commands.put(Watch(namespace))
+        else:
+            raise web.HTTPBadRequest(
+                text="expected an environment, a component or a known namespace"
+            )
+        return web.json_response({"success": True})
+
+
+async def _on_file(request: web.Request) -> web.Response:
+    name = request.match_info["name"] or "index.html"
+    if name not in TYPES:
+        raise web.HTTPNotFound
+    return web.Response(body=(PAGE / name).read_bytes(), content_type=TYPES[name], charset="utf-8")
+
+
+async def _body(request: web.Request) -> dict[str, Any]:
+    """The JSON object in the request."""
+    try:
+        content = json.loads(await request.text())
+    except (ValueError, RecursionError):
+        content = None
+    if not isinstance(content, dict):
+        raise web.HTTPBadRequest(text="expected a JSON object")
+    return content

@@ -1,0 +1,150 @@
+"""The nodes of a run: which plants and controllers serve one tuner, and what each is told.
+
+`pdeloop train` starts them as processes (pdeloop.supervisor), `ros2 launch` by the launch files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from loop_interfaces.affinity import core_text, free_cores, usable_cores
+from loop_interfaces.spec import ParameterError
+from pde_sim_node.build import fingerprint
+from tuner_node.results import RunFolder
+
+MAX_PAIRS = 64
+"""On one machine; on several, start the pairs by hand (docs/scaling.md)."""
+
+
+@dataclass(frozen=True)
+class LoopNode:
+    """A node of a run: name of its process, package, parameters NAME:=VALUE, remaps FROM:=TO.
+
+    namespace: relative to that of the run; empty: the run's own.
+    """
+
+    name: str
+    package: str
+    parameters: Sequence[str] = ()
+    remaps: Sequence[str] = ()
+    namespace: str = ""
+
+    def arguments(self, parameter_file: Path) -> list[str]:
+        """Parameters and remaps as ROS arguments, without the namespace."""
+        words = ["--params-file", str(parameter_file)]
+        for value in self.parameters:
+            words += ["-p", value]
+        for remap in self.remaps:
+            words += ["-r", remap]
+        return words
+
+    def ros_arguments(self, parameter_file: Path) -> list[str]:
+        """All that follows `--ros-args` in its command, for a run without a namespace."""
+        own = ["-r", f"__ns:=/{self.namespace}"] if self.namespace else []
+        return [*self.arguments(parameter_file), *own]
+
+
+PAIR = ("pde_sim_node", "controller_node")
+"""The packages of a pair's nodes."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """How a run is recorded; required: it stops if the recorder does."""
+
+    storage: str = "mcap"
+    bag_per_episode: bool = False
+    required: bool = False
+
+
+def namespaces(pairs: int) -> list[str]:
+    """Namespaces of the pairs; one alone needs none."""
+    return [f"pair{i}" for i in range(pairs)] if pairs > 1 else [""]
+
+
+def pair_nodes(
+    pairs: int,
+    pin: bool,
+    remaps: Mapping[str, Sequence[str]] | None = None,
+    *,
+    shared: bool = False,
+) -> list[LoopNode]:
+    """The nodes of `pairs` pairs; with `pin` each pair stays on a core of its own.
+
+    remaps: by package; shared: each pair will be kept on one core (pdeloop.core_affinity), but the
+    plant's solver has all of them. ParameterError when there are too many for this machine.
+    """
+    if not 1 <= pairs <= MAX_PAIRS:
+        raise ParameterError(f"--pairs is {pairs}; expected a whole number from 1 to {MAX_PAIRS}")
+    cores = free_cores(pairs)
+    if pin and len(set(cores)) < pairs:
+        raise ParameterError(
+            f"--pin gives each of the {pairs} pairs of plant and controller a core of its own, but "
+            f"there are {len(set(cores))}; leave out --pin, or use fewer pairs"
+        )
+    nodes = []
+    for number, namespace in enumerate(namespaces(pairs)):
+        for package in PAIR:
+            parameters = [f"pin:={cores[number]}"] if pin else []
+            if number and package == "pde_sim_node":  # /clock is one topic for all
+                parameters.append("publish_clock:=false")
+            if (shared or pin) and package == "pde_sim_node":
+                parameters.append(f"solver_cores:={quoted(core_text(usable_cores()))}")
+            name = f"{package}-{namespace}" if namespace else package
+            more = (remaps or {}).get(package, ())
+            nodes.append(LoopNode(name, package, parameters, more, namespace))
+    return nodes
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The nodes of one training: `pairs` pairs, `pin`ned or not, their tuner, perhaps a recorder.
+
+    remaps: of plants and controllers, by package; view: with a viewer of the first pair; shared:
+    see `pair_nodes`.
+    """
+
+    pairs: int = 1
+    pin: bool = False
+    recording: Recording | None = None
+    remaps: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    view: bool = False
+    shared: bool = False
+
+    def nodes(self, folder: Path, bag: Path | None = None) -> list[LoopNode]:
+        """Who is started for the training in `folder`; the recorder, if any, comes first.
+
+        The folder holds a run that was begun (RunFolder.create), so that a tuner that is started
+        again goes on where it was. bag: the new folder of a recording; None: it is given when the
+        recorder starts.
+        """
+        serving = tuner_parameter(self.pairs)
+        tuner = [f"out:={quoted(folder.resolve())}", "resume:=true"]
+        tuner.append(f"plant:={fingerprint(RunFolder(folder).values())}")
+        nodes = pair_nodes(self.pairs, self.pin, self.remaps, shared=self.shared)
+        if self.view:
+            first = namespaces(self.pairs)[0]
+            nodes.append(LoopNode("viewer_node", "viewer_node", namespace=first))
+        recording = self.recording
+        if recording is not None:
+            own = [] if bag is None else [f"bag:={quoted(bag.resolve())}"]
+            own += [
+                f"bag_storage:={recording.storage}",
+                f"bag_per_episode:={str(recording.bag_per_episode).lower()}",
+            ]
+            nodes.insert(0, LoopNode("recorder_node", "recorder_node", [*own, *serving]))
+        wait = "none" if recording is None else "required" if recording.required else "start"
+        nodes.append(LoopNode("tuner_node", "tuner_node", [*tuner, f"recorder:={wait}", *serving]))
+        return nodes
+
+
+def tuner_parameter(pairs: int) -> list[str]:
+    """What the tuner and the recorder have to know of the pairs."""
+    return [f"pairs:=[{', '.join(namespaces(pairs) if pairs > 1 else [quoted('')])}]"]
+
+
+def quoted(text: object) -> str:
+    """A text as a ROS argument: without quotes `5`, `no` or `a: b` would be something else."""
+    return "'" + str(text).replace("'", "''") + "'"

@@ -1,0 +1,216 @@
+"""Starts the nodes of a run as processes, restarts what dies, and leaves nobody behind."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from loop_interfaces.protocol import STOPPED
+from pdeloop.core_affinity import SharedCores
+
+STOP_GRACE = 2.0
+"""Seconds between SIGINT and SIGKILL when the run ends."""
+RECORDER_GRACE = 10.0
+"""The same for a recorder, which has a bag to finish."""
+BACK_OFF = (0.0, 0.5, 1.0, 2.0, 4.0)
+"""Seconds before the first, second, ... restart of a node."""
+STEADY = 30.0
+"""Seconds of life after which earlier deaths of a node no longer count."""
+REFUSED, CRASHED = 1, 70
+"""Exit codes of a node that was asked for something it cannot do, so that restarting would not help,
+and of one with a bug (loop_interfaces.ros.node_main)."""
+_KILLED = range(-64, 0)
+"""Exit codes by signals."""
+
+
+class NodeError(RuntimeError):
+    """A node that cannot be kept running; the text has its last words."""
+
+
+@dataclass
+class Child:
+    """One node: how it is started and how its life went.
+
+    optional: the others go on without it when it ends by itself, or dies too often. before_start:
+    called before each start, to change the arguments. pair: number of the pair that it belongs to.
+    """
+
+    name: str
+    arguments: Sequence[str]
+    log: Path
+    process: subprocess.Popen[bytes] | None = None
+    deaths: int = 0
+    restarts: int = 0
+    started: float = 0.0
+    due: float | None = 0.0
+    optional: bool = False
+    before_start: Callable[[], None] | None = None
+    pair: int | None = None
+    ended: bool = False
+
+    def last_words(self) -> str:
+        """The last line of the node's log."""
+        lines = self._logged()
+        return lines[-1] if lines else ""
+
+    def refusal(self) -> str:
+        """Why the process refused to run, in its one sentence; what ends after it may say more."""
+        node = self.name.partition("-")[0]  # behind a hyphen stands its namespace
+        said = [line for line in self._logged() if line.startswith(f"{node}: ")]
+        return said[-1] if said else self.last_words()
+
+    def _logged(self) -> list[str]:
+        try:
+            return self.log.read_text(errors="replace").strip().splitlines()
+        except OSError:
+            return []
+
+
+@dataclass
+class Supervisor:
+    """Keeps `children` running until the one called `main` ends by itself.
+
+    domain: ROS_DOMAIN_ID of all of them; tell: one line for the user when something happens.
+    """
+
+    children: list[Child]
+    main: str
+    domain: int
+    log_folder: Path
+    tell: Callable[[str], None]
+    isolation: Mapping[str, str]
+    """Environment variables that say where messages may go (loop_interfaces.isolation)."""
+    shared: SharedCores | None = None
+    """Where the processes of pairs run; None: wherever the scheduler puts them."""
+    stopped: bool = False
+    """Whether the main node ended because an operator asked it to, through its service."""
+    _environment: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._environment = {
+            **os.environ,
+            **self.isolation,
+            "ROS_DOMAIN_ID": str(self.domain),
+            "ROS_LOG_DIR": str(self.log_folder),
+            "PYTHONUNBUFFERED": "1",
+        }
+
+    def poll(self) -> bool:
+        """Start what is due, notice what died; True once the main node has ended well.
+
+        Raises NodeError when a node refuses to run or keeps dying.
+        """
+        now = time.monotonic()
+        if self.shared is not None:
+            self.shared.look(now)
+        for child in self.children:
+            if child.process is None:
+                if child.due is not None and now >= child.due:
+                    self._start(child, now)
+                continue
+            code = child.process.poll()
+            if code is None:
+                continue
+            if child.name == self.main and code in (0, STOPPED):
+                self.stopped = code == STOPPED
+                return True
+            self._bury(child, code, now)
+        return False
+
+    def stop(self) -> None:
+        """End every node: SIGINT to all, SIGKILL to who is left after STOP_GRACE.
+
+        With a recorder (an optional child) the main node ends first, then the recorder: it must see
+        all that the main node did, but a reader drops what it has not taken when the writer leaves.
+        """
+        recorders = [child for child in self.children if child.optional and child.process]
+        groups = [(self.children, STOP_GRACE)]
+        if recorders:
+            main = [child for child in self.children if child.name == self.main]
+            groups = [(main, STOP_GRACE), (recorders, RECORDER_GRACE), *groups]
+        for group, grace in groups:
+            alive = [child.process for child in group if child.process is not None]
+            for process in alive:
+                _signal(process, signal.SIGINT)
+            deadline = time.monotonic() + grace
+            for process in alive:
+                try:
+                    process.wait(max(0.0, deadline - time.monotonic()))
+                except subprocess.TimeoutExpired:
+                    _signal(process, signal.SIGKILL)
+                    process.wait()
+            for child in group:
+                child.process, child.due = None, None
+
+    def _start(self, child: Child, now: float) -> None:
+        if child.before_start is not None:
+            child.before_start()
+        with child.log.open("ab") as log:
+            child.process = subprocess.Popen(
+                child.arguments,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=self._environment,
+                start_new_session=True,  # Ctrl-C in the terminal reaches the supervisor only
+                preexec_fn=die_with_parent,
+            )
+        if self.shared is not None and child.pair is not None:
+            self.shared.place(child.pair, child.name, child.process.pid, now)
+        elif self.shared is not None and child.optional:
+            self.shared.keep_away(child.name, child.process.pid)
+        child.started, child.due = now, None
+
+    def _bury(self, child: Child, code: int, now: float) -> None:
+        how = (
+            f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
+        )
+        child.process = None
+        if code == REFUSED:
+            raise NodeError(child.refusal() or f"{child.name} {how}; see {child.log}")
+        child.deaths = 1 if now - child.started > STEADY else child.deaths + 1
+        often = child.deaths > len(BACK_OFF)
+        if child.optional and (often or code not in (CRASHED, *_KILLED)):
+            child.ended = True
+            self.tell(f"{child.name} {how}; {child.last_words()}")
+            return
+        if often:
+            raise NodeError(
+                f"{child.name} {how} for the {child.deaths}th time; its last words: "
+                f"{child.last_words() or 'none'} (see {child.log})"
+            )
+        wait = BACK_OFF[child.deaths - 1]
+        child.due = now + wait
+        child.restarts += 1
+        self.tell(f"{child.name} {how}; starting it again" + (f" in {wait:g} s" if wait else ""))
+
+
+def node_command(name: str, *ros_arguments: str) -> list[str]:
+    """The command that runs a node with this interpreter."""
+    # The log is the child's output: a second one by rcl's logging library would only repeat it.
+    own = ("--ros-args", "--disable-external-lib-logs")
+    return [sys.executable, "-m", f"{name}.node", *own, *ros_arguments]
+
+
+def _signal(process: subprocess.Popen[bytes], number: signal.Signals) -> None:
+    try:
+        os.killpg(process.pid, number)
+        os.killpg(process.pid, signal.SIGCONT)  # a stopped process must be able to die
+    except ProcessLookupError:
+        pass
+
+
+_LIBC = ctypes.CDLL(None, use_errno=True)
+_PR_SET_PDEATHSIG = 1
+
+
+def die_with_parent() -> None:
+    """For `preexec_fn`: the child is killed when the process that started it ends."""
+    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -1,0 +1,354 @@
+"""`pdeloop train`: one training, over topics or in this process, in a folder of its own."""
+
+from __future__ import annotations
+
+import importlib.util
+import itertools
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import controller_node.reflex
+import pde_sim_node.reflex
+from loop_interfaces.isolation import NETWORK, PROFILE, loopback_environment
+from loop_interfaces.problem import load_parameters
+from loop_interfaces.spec import ParameterError
+from pde_sim_node.build import build_equation, build_plant
+from pdeloop.core_affinity import SharedCores, possible
+from pdeloop.display import Display, ProgressFile, summary_text
+from pdeloop.domain import own_domain
+from pdeloop.in_process import LocalPair, train
+from pdeloop.live import announced
+from pdeloop.output import print_json
+from pdeloop.pairs import PAIR, Layout, Recording, namespaces, pair_nodes, quoted
+from pdeloop.supervisor import Child, NodeError, Supervisor, node_command
+from tuner_node.build import build_training
+from tuner_node.results import RunFolder, RunFolderError, timestamp
+from tuner_node.run_store import Recorder
+
+POLL = 0.05
+"""Seconds between two looks at the nodes."""
+
+
+class Interruption(BaseException):
+    """SIGINT or SIGTERM reached the command line."""
+
+
+def resolve(problem: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters of a new run; ValueError if the problem's plant cannot be built from them."""
+    values = load_parameters(problem, options)
+    # Compiled code is kept on disk, so that this is slow once only, and not for the nodes.
+    notice = threading.Timer(4.0, print, ["compiling, once ..."], {"file": sys.stderr})
+    notice.daemon = True
+    notice.start()
+    try:
+        build_plant(values)
+        controller_node.reflex.load_compiled()
+        pde_sim_node.reflex.load_compiled()
+    finally:
+        notice.cancel()
+    physical = asdict(build_equation(values))
+    del physical["length"]
+    return {**values, **{f"physical.{name}": value for name, value in physical.items()}}
+
+
+@dataclass(frozen=True)
+class Transport:
+    """How a training is carried out; nothing of this changes its results.
+
+    in_process: without ROS; network: let the messages leave this machine; faulty_line: 'LOSS,
+    DUPLICATION,DELAY' of a relay between plant and controller; pairs: of plant and controller; pin:
+    give each of their nodes a core; view: a viewer_node of the first pair beside them; spread: leave
+    the cores to the scheduler (pdeloop.core_affinity).
+    """
+
+    in_process: bool = False
+    recording: Recording | None = None
+    network: bool = False
+    faulty_line: str | None = None
+    pairs: int = 1
+    pin: bool = False
+    view: bool = False
+    spread: bool = False
+
+    def __post_init__(self) -> None:
+        if self.in_process and (self.recording or self.network or self.faulty_line):
+            raise ParameterError(
+                "--record, --network and --faulty-line are about topics; leave out --in-process"
+            )
+        if self.network and os.environ.get(PROFILE):
+            raise ParameterError(
+                f"--network and {PROFILE}={os.environ[PROFILE]} both say where messages go; leave "
+                "out --network to use that profile, or unset the variable"
+            )
+        if self.in_process and (self.pairs > 1 or self.pin or self.spread or self.view):
+            raise ParameterError(
+                "--pairs, --pin, --spread and --view are about nodes; leave out --in-process"
+            )
+        if self.pin and self.spread:
+            raise ParameterError(
+                "--pin keeps each pair on a core, --spread on none; leave out one of them"
+            )
+        if self.pairs > 1 and self.faulty_line:
+            raise ParameterError("--faulty-line is the line of one pair; leave out --pairs")
+        pair_nodes(self.pairs, self.pin)
+        if self.faulty_line is not None:
+            self.line_arguments()
+
+    def layout(self) -> Layout:
+        """The nodes of the training."""
+        remaps = {"pde_sim_node": ["state:=state_sent"], "controller_node": ["action:=action_sent"]}
+        remaps = remaps if self.faulty_line else {}
+        return Layout(
+            self.pairs, self.pin, self.recording, remaps, self.view, shared=self.shares_cores
+        )
+
+    @property
+    def shares_cores(self) -> bool:
+        """Whether plant and controller of a pair are kept on one core."""
+        return possible() and not (self.pin or self.spread)
+
+    def line_arguments(self) -> list[str]:
+        """The relay's ROS parameters."""
+        words = (self.faulty_line or "").split(",")
+        try:
+            numbers = [float(word) for word in words]
+        except ValueError:
+            numbers = []
+        if len(numbers) != 3:
+            raise ParameterError(
+                f"--faulty-line is {self.faulty_line!r}; expected LOSS,DUPLICATION,DELAY "
+                "like 0.01,0.02,0.005 (two probabilities and seconds)"
+            )
+        names = ("loss", "duplicate", "delay")
+        return [f"{name}:={number}" for name, number in zip(names, numbers, strict=True)]
+
+
+def begin(
+    problem: str, options: Mapping[str, Any], out: Path | None
+) -> tuple[Path, dict[str, Any]]:
+    """Folder and parameters of a new training, of which nothing has been done yet."""
+    values = resolve(problem, options)
+    folder = out or Path("runs") / f"{values['problem']}-{timestamp()}"
+    RunFolder(folder).create(values)
+    return folder, values
+
+
+def reopen(folder: Path) -> dict[str, Any]:
+    """The parameters of the unfinished training in `folder`; RunFolderError if there is none."""
+    values = RunFolder(folder).values()
+    if (folder / "result.json").exists():
+        raise RunFolderError(f"the run in {folder} is complete; there is nothing to continue")
+    return values
+
+
+def run_new(
+    problem: str,
+    options: Mapping[str, Any],
+    out: Path | None,
+    transport: Transport,
+    as_json: bool = False,
+) -> int:
+    """Train from the start in a new folder; returns the exit code.
+
+    as_json: the result alone on stdout, as JSON; progress goes to stderr.
+    """
+    folder, values = begin(problem, options, out)
+    return _run(folder, values, transport, as_json)
+
+
+def run_again(folder: Path, transport: Transport, as_json: bool = False) -> int:
+    """Continue the training in `folder`; returns the exit code."""
+    return _run(folder, reopen(folder), transport, as_json)
+
+
+def _run(folder: Path, values: dict[str, Any], transport: Transport, as_json: bool) -> int:
+    stream = sys.stderr if as_json else sys.stdout
+    display = Display(values["iterations"], values["seeds"], stream)
+    started = time.monotonic()
+    try:
+        with interruptible() as check:
+            if transport.in_process:
+                _train_here(folder, values, display, check)
+            else:
+                _train_over_topics(folder, display, transport, check)
+    except Interruption as signal_name:
+        display.close()
+        display.line(
+            f"stopped by {signal_name}; continue with: pdeloop train --resume {folder}"
+            + (" --in-process" if transport.in_process else "")
+        )
+        return 130
+    finally:
+        display.close()
+    summary = json.loads((folder / "result.json").read_text())
+    if as_json:
+        print_json({"folder": str(folder), **summary})
+        return 0
+    display.line(summary_text(values["problem"], summary, folder))
+    display.line(f"  {time.monotonic() - started:.1f} s with start-up")
+    return 0
+
+
+def _train_here(
+    folder: Path, values: dict[str, Any], display: Display, check: Callable[[], None]
+) -> None:
+    with RunFolder(folder).held():
+        _train_holding(folder, values, display, check)
+
+
+def _train_holding(
+    folder: Path, values: dict[str, Any], display: Display, check: Callable[[], None]
+) -> None:
+    training = build_training(values)
+    recorder = Recorder(folder, values, training, resume=True, warn=display.line)
+
+    def report(row: Mapping[str, Any]) -> None:
+        recorder.note(row)
+        recorder.keep(now=time.monotonic())
+        display.row(row)
+        check()
+
+    # Nothing is saved on the way out of an interruption: it may come in the middle of an update.
+    train(training, LocalPair(values), report, max_batch=values["max_batch"])
+    try:
+        recorder.finish({"transport": "in-process"})
+    except OSError as error:
+        raise RunFolderError(
+            f"cannot write the results to {folder}: {error.strerror}; make room and "
+            f"continue with: pdeloop train --resume {folder} --in-process"
+        ) from error
+
+
+def _train_over_topics(
+    folder: Path, display: Display, transport: Transport, check: Callable[[], None]
+) -> None:
+    if importlib.util.find_spec("rclpy") is None:
+        raise NodeError(
+            "needs rclpy: source an installed ROS 2 Jazzy, or pip install 'pdeloop[ros]', or train "
+            f"without ROS: pdeloop train --resume {folder} --in-process"
+        )
+    logs = folder / "logs"
+    logs.mkdir(exist_ok=True)
+    pairs = namespaces(transport.pairs)
+    children = {
+        node.name: Child(
+            node.name,
+            node_command(node.package, *node.ros_arguments(folder / "parameters.yaml")),
+            logs / f"{node.name}.log",
+            optional=node.package in ("recorder_node", "viewer_node"),
+            pair=pairs.index(node.namespace) if node.package in PAIR else None,
+        )
+        for node in transport.layout().nodes(folder)
+    }
+    if transport.faulty_line is not None:
+        arguments = [word for value in transport.line_arguments() for word in ("-p", value)]
+        command = node_command("pdeloop.relay", *arguments)
+        children["relay"] = Child("relay", command, logs / "relay.log")
+    recorder = children.get("recorder_node")
+    bags: list[Path] = []
+    if recorder is not None:
+        recorder.before_start = partial(_into_new_bag, recorder, folder, bags)
+    progress = ProgressFile(folder / "progress.jsonl")
+    begun = False
+    with own_domain() as domain, announced(domain, folder, network=transport.network):
+        display.line(f"start (ROS_DOMAIN_ID={domain}{', on the network' * transport.network})")
+        supervisor = Supervisor(
+            list(children.values()),
+            "tuner_node",
+            domain,
+            logs,
+            display.line,
+            {NETWORK: "1"} if transport.network else loopback_environment(),
+            SharedCores(transport.pairs) if transport.shares_cores else None,
+        )
+        try:
+            done = False
+            while not done:
+                check()
+                done = supervisor.poll()
+                for row in progress.rows():
+                    display.row(row)
+                    begun |= row.get("event") != "phase"
+                if recorder is not None and recorder.ended and not done:
+                    if not begun:
+                        raise NodeError(f"nothing can be recorded: {recorder.last_words()}")
+                    _go_on_unrecorded(children["tuner_node"])
+                time.sleep(0 if done else POLL)
+        finally:
+            supervisor.stop()
+    if supervisor.stopped:
+        raise Interruption("request")
+    if recorder is not None:
+        names_of_bags = ", ".join(str(bag) for bag in bags)
+        display.line(f"  recorded in {names_of_bags}" + ", not to the end" * recorder.ended)
+
+
+def _go_on_unrecorded(tuner: Child) -> None:
+    """A tuner that is started again must not wait for a recorder that has ended."""
+    tuner.arguments = [
+        word.replace("recorder:=start", "recorder:=none") for word in tuner.arguments
+    ]
+
+
+def _into_new_bag(recorder: Child, folder: Path, bags: list[Path]) -> None:
+    """A recorder that is started again writes another bag, and leaves the unfinished one alone."""
+    bags.append(unused(folder / "bag"))
+    kept = [word for word in recorder.arguments if not word.startswith("bag:=")]
+    if kept[-1] == "-p":
+        kept.pop()
+    recorder.arguments = [*kept, "-p", f"bag:={quoted(bags[-1].resolve())}"]
+
+
+def unused(path: Path) -> Path:
+    """`path`, or the first of path-2, path-3, ... that does not exist."""
+    numbered = (path.with_name(f"{path.name}-{n}") for n in itertools.count(2))
+    return next(p for p in itertools.chain([path], numbered) if not p.exists())
+
+
+@contextmanager
+def interruptible() -> Iterator[Callable[[], None]]:
+    """SIGINT and SIGTERM raise Interruption within the block, once.
+
+    Yields a function to be called now and then, which raises it, too: an exception that comes in the
+    middle of a finalizer or a callback of some library is lost.
+    """
+    caught: list[str] = []
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        if not caught:  # the way out is not interrupted again
+            caught.append(signal.Signals(number).name)
+            raise Interruption(caught[0])
+
+    def check() -> None:
+        if caught:
+            raise Interruption(caught[0])
+
+    known = {n: signal.signal(n, interrupt) for n in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield check
+    finally:
+        for number, handler in known.items():
+            signal.signal(number, handler)
+
+
+__all__ = [
+    "Interruption",
+    "NodeError",
+    "Recording",
+    "Transport",
+    "interruptible",
+    "resolve",
+    "run_again",
+    "run_new",
+]

@@ -1,0 +1,328 @@
+"""`python -m tests.soak`: trainings under random faults, each compared bit for bit with a quiet one.
+
+Every training runs as `pdeloop train` in processes of its own, with a relay that loses, repeats and
+delays messages between plant and controller. Meanwhile nodes and the supervisor itself are killed,
+stopped and continued, and checkpoints are damaged. A training that was cut down is continued with
+`--resume`. At its end its policy and costs must be those of the same training in this process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from pdeloop.in_process import LocalPair, train
+from pdeloop.progress import Share
+from pdeloop.training_run import resolve
+from tuner_node.build import build_training
+
+NODES = ("pde_sim_node", "controller_node", "tuner_node", "relay")
+LINE = "0.01,0.02,0.002"
+"""Loss, duplication and largest delay (s) on the line between plant and controller."""
+KINDS, SHARES = ("kill", "stop", "supervisor", "checkpoint"), (0.4, 0.4, 0.1, 0.1)
+"""What is done to processes, and how often."""
+PAUSE = (0.1, 2.5)
+"""Seconds between two faults: now within a start-up, now after some checkpoints."""
+LIMIT = 600.0
+"""Seconds that one training may take under faults."""
+SETTLE = 10.0
+"""Seconds of life before a process's memory counts as its memory at the start."""
+
+
+@dataclass
+class SoakReport:
+    """What a soak did and found."""
+
+    seconds: float = 0.0
+    trainings: int = 0
+    mismatches: int = 0
+    environment_steps: int = 0
+    restarts: int = 0
+    resumes: int = 0
+    faults: Counter[str] = field(default_factory=Counter)
+    memory_mb: dict[str, list[float]] = field(default_factory=dict)
+    """Per node: resident memory shortly after its start and last, of the process that grew most."""
+
+
+def soak(
+    minutes: float,
+    *,
+    problem: str,
+    iterations: int,
+    seed: int,
+    tell: Callable[[str], None],
+    tick: Callable[[float, str], None] = lambda share, status: None,
+    folder: Path | None = None,
+) -> SoakReport:
+    """Run trainings of `problem` under faults for `minutes`; the last one is brought to its end.
+
+    tell: a line after each training; tick(share, status): often, with the share of the time.
+    """
+    report, rng = SoakReport(), np.random.default_rng(seed)
+    began = time.monotonic()
+    with contextlib.ExitStack() as stack:
+        place = folder or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        place.mkdir(parents=True, exist_ok=True)
+        while time.monotonic() - began < 60 * minutes:
+            number = report.trainings
+            training = _Training(problem, iterations, seed + number, place / f"{number}", report)
+
+            def now() -> None:
+                share = min(1.0, (time.monotonic() - began) / (60 * minutes))
+                faults = sum(report.faults.values())
+                tick(share, f"training {report.trainings + 1}, {faults} faults")
+
+            training.run(rng, now)
+            report.trainings += 1
+            same = training.matches()
+            report.mismatches += not same
+            tell(
+                f"training {number + 1}: {'same policy' if same else 'MISMATCH'}, "
+                f"{sum(report.faults.values())} faults so far"
+            )
+    report.seconds = time.monotonic() - began
+    return report
+
+
+class _Training:
+    """One training under faults."""
+
+    def __init__(
+        self, problem: str, iterations: int, seed: int, out: Path, report: SoakReport
+    ) -> None:
+        # The optimiser that needs costs only and the one that needs trajectories take turns.
+        # A Gauss-Newton step takes a second to compute, and is computed again after a kill.
+        optimizer, share = (("two_point", 1), ("gauss_newton", 10))[seed % 2]
+        iterations = max(1, iterations // share)
+        self._options = {"iterations": iterations, "seed": seed, "optimizer": optimizer}
+        self._problem, self._out, self._report = problem, out, report
+        self._log = out.with_suffix(".log")
+        self._seen: dict[int, tuple[str, float, float]] = {}
+
+    def run(self, rng: np.random.Generator, tick: Callable[[], None] = lambda: None) -> None:
+        """Start it, disturb it, and start it again until it has its result."""
+        report = self._report
+        options = [
+            word for name, value in self._options.items() for word in (f"--{name}", f"{value}")
+        ]
+        fresh = (self._problem, *options, "--out", str(self._out))
+        process = self._start(*fresh, "--record")
+        limit = time.monotonic() + LIMIT
+        while not (self._out / "result.json").exists():
+            if time.monotonic() > limit:
+                self._end_of(process, kill=True)
+                last = self._log.read_text(errors="replace").strip().splitlines()[-1:]
+                raise RuntimeError(f"a training did not end within {LIMIT:g} s: {last}")
+            if process.poll() is not None:
+                self._end_of(process)
+                report.resumes += 1
+                begun = (self._out / "parameters.yaml").exists()
+                process = self._start(
+                    *(("--resume", str(self._out)) if begun else fresh), "--record"
+                )
+            deadline = time.monotonic() + float(rng.uniform(*PAUSE))
+            while time.monotonic() < deadline and process.poll() is None:
+                self._watch_memory()
+                tick()
+                time.sleep(0.05)
+            if process.poll() is None and not (self._out / "result.json").exists():
+                self._disturb(process, rng)
+        self._end_of(process)
+        report.restarts += self._log.read_text(errors="replace").count("; starting it again")
+        settings = resolve(self._problem, self._options)
+        report.environment_steps += settings["horizon"] * sum(
+            row.get("rollouts", 0) - previous.get("rollouts", 0)
+            for previous, row in _pairs(self._history())
+        )
+
+    def matches(self) -> bool:
+        """Whether policy and costs are those of the quiet training, bit for bit."""
+        values = resolve(self._problem, self._options)
+        quiet = build_training(values)
+        train(quiet, LocalPair(values), lambda row: None)
+        assert quiet.evaluation is not None
+        result = json.loads((self._out / "result.json").read_text())
+        costs = np.array([result["costs_by_field"][n] for n in ("none", "lqt", "adapted")])
+        with np.load(self._out / "policy.npz", allow_pickle=False) as arrays:
+            same = arrays["policy"].tobytes() == quiet.policies().tobytes()
+        return same and costs.transpose(1, 0, 2).tobytes() == quiet.evaluation.tobytes()
+
+    def _start(self, *arguments: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "pdeloop.cli", "train", *arguments, "--faulty-line", LINE]
+        with self._log.open("ab") as log:
+            return subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, MARK: str(self._out)},
+                start_new_session=True,
+                preexec_fn=_hear_interruptions,
+            )
+
+    def _disturb(self, supervisor: subprocess.Popen[bytes], rng: np.random.Generator) -> None:
+        """One random fault."""
+        nodes = self._nodes()
+        kind = str(rng.choice(KINDS, p=SHARES))
+        if kind in ("kill", "stop") and nodes:
+            pid, name = nodes[int(rng.integers(len(nodes)))]
+            with contextlib.suppress(ProcessLookupError):
+                if kind == "kill":
+                    os.kill(pid, signal.SIGKILL)
+                else:
+                    os.kill(pid, signal.SIGSTOP)
+                    time.sleep(float(rng.choice((0.05, 0.3, 1.0, 4.0))))
+                    os.kill(pid, signal.SIGCONT)
+                self._report.faults[f"{'SIGKILL' if kind == 'kill' else 'SIGSTOP'} {name}"] += 1
+        elif kind == "supervisor":
+            number = signal.SIGKILL if rng.random() < 0.5 else signal.SIGINT
+            _end(supervisor, number)
+            self._report.faults[f"{number.name} supervisor"] += 1
+        elif kind == "checkpoint":
+            path = self._out / "checkpoint"
+            if not (path.exists() and (self._out / "checkpoint.previous").exists()):
+                return
+            supervisor.kill()
+            supervisor.wait(30.0)
+            self._end_of(supervisor)
+            (self._out / "checkpoint.new").unlink(missing_ok=True)
+            path.write_bytes(path.read_bytes()[: int(rng.integers(1, 200))])
+            self._report.faults["power cut with a truncated checkpoint"] += 1
+
+    def _nodes(self) -> list[tuple[int, str]]:
+        """Process id and name of every living node of this training."""
+        mark, found = f"{MARK}={self._out}".encode(), []
+        for entry in Path("/proc").glob("[0-9]*"):
+            with contextlib.suppress(OSError):
+                if mark not in (entry / "environ").read_bytes():
+                    continue
+                command = (entry / "cmdline").read_bytes().decode(errors="replace")
+                found += [(int(entry.name), n) for n in NODES if f"{n}.node" in command]
+        return sorted(found)
+
+    def _end_of(self, supervisor: subprocess.Popen[bytes], *, kill: bool = False) -> None:
+        """Wait until the supervisor and all its nodes are gone."""
+        if kill:
+            supervisor.kill()
+        supervisor.wait(60.0)
+        deadline = time.monotonic() + 10.0
+        while self._nodes():
+            if time.monotonic() > deadline:
+                raise RuntimeError(f"nodes outlive their supervisor: {self._nodes()}")
+            time.sleep(0.02)
+
+    def _watch_memory(self) -> None:
+        now = time.monotonic()
+        for pid, name in self._nodes():
+            with contextlib.suppress(OSError, IndexError):
+                pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+                size = pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+                _, born, first = self._seen.setdefault(pid, (name, now, size))
+                if now - born < SETTLE:
+                    self._seen[pid] = (name, born, size)
+                    continue
+                known = self._report.memory_mb.setdefault(name, [first, size])
+                if size - first >= known[1] - known[0]:
+                    self._report.memory_mb[name] = [round(first, 1), round(size, 1)]
+
+    def _history(self) -> list[dict[str, Any]]:
+        result = json.loads((self._out / "result.json").read_text())
+        history: list[dict[str, Any]] = result["history"]
+        return history
+
+
+MARK = "PDELOOP_SOAK"
+"""Environment variable by which the processes of one training are found."""
+
+
+def _end(process: subprocess.Popen[bytes], number: signal.Signals) -> None:
+    """Signal a process until it ends: one that comes while Python starts may be lost in an import."""
+    for _ in range(6):
+        process.send_signal(number)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(15.0)
+            return
+    raise RuntimeError(f"the supervisor did not end by {number.name}")
+
+
+def _hear_interruptions() -> None:
+    """For `preexec_fn`: a shell starts what runs in its background deaf to SIGINT."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def _pairs(rows: list[dict[str, Any]]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+    return list(zip([{}, *rows[:-1]], rows, strict=True))
+
+
+def run(minutes: float, problem: str, iterations: int, seed: int) -> dict[str, Any]:
+    """The soak of the command line: on stderr a line per training and, on a terminal, a bar.
+
+    Raises RuntimeError when a training ended with another policy or other costs.
+    """
+    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    progress = Share(console, "soak")
+
+    def tell(text: str) -> None:
+        console.print(text, markup=False)
+
+    try:
+        report = soak(
+            minutes,
+            problem=problem,
+            iterations=iterations,
+            seed=seed,
+            tell=tell,
+            tick=progress.tell,
+        )
+    finally:
+        progress.close()
+    result = as_dict(report)
+    if report.mismatches:
+        tell(text(result))
+        raise RuntimeError(f"{report.mismatches} of {report.trainings} trainings differ")
+    return result
+
+
+def as_dict(report: SoakReport) -> dict[str, Any]:
+    """The report as JSON knows it."""
+    return asdict(replace(report, faults=Counter())) | {"faults": dict(report.faults)}
+
+
+def text(result: dict[str, Any]) -> str:
+    """The report as people read it."""
+    lines = [
+        f"{result['trainings']} trainings in {result['seconds']:.0f} s, "
+        f"{result['environment_steps']} environment steps of the adapt phase",
+        f"mismatches: {result['mismatches']}",
+        f"nodes restarted: {result['restarts']}, trainings resumed: {result['resumes']}",
+        "faults:",
+        *(f"  {count:5d}  {kind}" for kind, count in sorted(result["faults"].items())),
+        f"  and on the line between plant and controller: loss, repeats, delay {LINE}",
+        "memory in MB, after the start and last, of the process that grew most:",
+        *(f"  {n:<16} {a:8.1f} {b:8.1f}" for n, (a, b) in sorted(result["memory_mb"].items())),
+    ]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    words = argparse.ArgumentParser(prog="python -m tests.soak", description=__doc__)
+    words.add_argument("--minutes", type=float, default=20.0, metavar="N", help="[20]")
+    words.add_argument("--problem", default="allen-cahn", metavar="PROBLEM", help="[allen-cahn]")
+    words.add_argument("--iterations", type=int, default=100, metavar="N", help="of each [100]")
+    words.add_argument("--seed", type=int, default=0, metavar="S", help="of faults and trainings")
+    print(text(run(**vars(words.parse_args()))))

@@ -1,0 +1,214 @@
+"""What the nodes say of themselves: levels and values by what has happened to them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from controller_node.diagnostics import ControllerHealth
+from controller_node.identification import DesignSettings
+from controller_node.responder import Responder
+from loop_interfaces.diagnostics import Health, Level, Rate
+from loop_interfaces.frames import Frame
+from loop_interfaces.topics import COST, STATE, VOID
+from pde_sim_node.diagnostics import PlantHealth
+from recorder_node.diagnostics import RecorderHealth
+from recorder_node.recording import Recording, sources
+from tests.test_lockstep import RUN, answer, plant_protocol, run_episode, start
+from tests.test_session import ITERATIONS, Loop, values
+from tuner_node.build import build_training
+from tuner_node.diagnostics import TunerHealth
+
+
+def test_texts_and_worse_levels():
+    health = Health(Level.OK, "fine", {"a": 1 / 3, "b": True, "c": None, "d": 2**40})
+    assert health.texts() == [("a", "0.333333"), ("b", "yes"), ("c", ""), ("d", "1099511627776")]
+    worse = health.worsened(Level.WARN, "odd")
+    assert (worse.level, worse.message) == (Level.WARN, "odd")
+    worst = worse.worsened(Level.ERROR, "broken").worsened(Level.WARN, "odd again")
+    assert (worst.level, worst.message) == (Level.ERROR, "odd; broken; odd again")
+
+
+def test_a_rate_is_the_growth_since_the_last_look():
+    rate = Rate()
+    assert rate.per_second(100, 1.0) == 0.0
+    assert rate.per_second(150, 3.0) == 25.0
+    assert rate.per_second(150, 4.0) == 0.0
+
+
+def test_a_plant_is_ready_runs_is_overdue_is_paused_and_is_void():
+    protocol = plant_protocol()
+    health = PlantHealth(protocol)
+    idle = health.report(0.0)
+    assert (idle.level, idle.message) == (Level.OK, "no run; ready for one")
+    assert idle.values["run"] is None
+    assert idle.values["last cost"] is None
+    (send,) = protocol.start(start(1), 0.0)
+    for _ in range(10):
+        (send,) = protocol.action(answer(send.frame), 0.0)
+    running = health.report(1.0)
+    assert (running.level, running.message) == (Level.OK, "step 10 of episode 1")
+    assert running.values["steps/s"] == 10.0
+    assert running.values["environment steps/s"] == 20.0
+    assert (running.values["horizon"], running.values["environments"]) == (30, 2)
+    protocol.action(replace(answer(send.frame), step=13), 1.0)  # too early
+    assert health.report(2.0).values["stale messages"] == 1
+    protocol.pause(2.0)
+    paused = health.report(3.0)
+    assert (paused.level, paused.message) == (Level.WARN, "paused at step 10 of episode 1")
+    protocol.resume(3.0)
+    slow = plant_protocol()
+    slow.adjust(0.0, action_timeout=1.0, max_repeats=3, run_hold=10.0, real_time_factor=0.0)
+    slow.start(start(1), 0.0)
+    slow_health = PlantHealth(slow)
+    for now in (1.1, 2.2, 3.3):
+        slow.tick(now)
+    overdue = slow_health.report(3.5)
+    assert overdue.level is Level.WARN
+    assert "no action for step 0 of episode 1" in overdue.message
+    slow.tick(5.0)
+    void = slow_health.report(5.0)
+    assert void.level is Level.ERROR
+    assert "episode 1 is void" in void.message
+    assert void.values["episodes void"] == 1
+    assert void.values["last cost"] is None
+
+
+def test_a_plant_tells_the_cost_of_the_environments_that_completed():
+    protocol = plant_protocol()
+    health = PlantHealth(protocol)
+    cost = run_episode(protocol, 1)[-1]
+    done = health.report(0.0)
+    assert done.values["last cost"] == cost.values[:, 0].mean()
+    (send,) = protocol.start(start(2), 0.0)
+    while send.topic is STATE:
+        reply = answer(send.frame)
+        if send.frame.step == 3:
+            reply.values[0] = 1e9
+        (send,) = protocol.action(reply, 0.0)
+    assert send.topic is COST
+    after = health.report(1.0)
+    assert after.values["last diverged"] == 1
+    assert after.values["last cost"] == send.frame.values[1, 0]
+
+
+def test_states_that_are_late_for_real_time_are_a_warning_once():
+    protocol = plant_protocol()
+    protocol.adjust(0.0, action_timeout=0.5, max_repeats=3, run_hold=10.0, real_time_factor=1.0)
+    health = PlantHealth(protocol)
+    (send,) = protocol.start(start(1), 0.0)
+    protocol.action(answer(send.frame), 0.3)  # due at 0.05
+    (send,) = protocol.tick(0.3)
+    late = health.report(0.3)
+    assert late.level is Level.WARN
+    assert "1 states too late for real time" in late.message
+    assert health.report(0.35).level is Level.OK
+
+
+def responder() -> Responder:
+    return Responder(
+        DesignSettings(n_a=2, dmdc_rank=4, reduced_order=2, state_weight=1.0, action_weight=1.0)
+    )
+
+
+def exploration(episode: int) -> Frame:
+    return Frame(RUN, episode, 0, 0.0, np.array([[1.0, 5.0, 0.1, 0.0]]))
+
+
+def test_a_controller_waits_answers_grows_stale_and_is_at_rest():
+    controller = responder()
+    health = ControllerHealth(controller)
+    assert health.report(0.0).message == "no episode under way"
+    state = Frame(RUN, 1, 0, 0.0, np.ones((1, 8)), 9)
+    controller.state(state)
+    assert health.waiting(0.0) == []
+    waiting = health.report(2.5)
+    assert waiting.level is Level.WARN
+    assert waiting.message.endswith("until there is: episode/start, target")
+    controller.start(exploration(1))
+    controller.target(Frame(0, 0, 0, 0.0, np.zeros(8), 9))
+    running = health.report(3.0)
+    assert (running.level, running.message) == (Level.OK, "step 0 of episode 1")
+    assert running.values["exploring"] is True
+    assert running.values["answers/s"] == 2.0  # one in half a second
+    stale = health.report(9.0)
+    assert stale.level is Level.STALE
+    assert stale.message == "no state for 6 s, after step 0 of episode 1"
+    health.plant_paused = True
+    assert health.report(10.0).level is Level.OK
+    health.plant_paused = False
+    controller.cost(Frame(RUN, 1, 0, 0.0, np.array([[0.5, 5.0, VOID]]), 9))
+    assert health.report(20.0).message.startswith("no reduced model: the exploratory episode")
+    controller.start(exploration(2))
+    controller.state(Frame(RUN, 2, 0, 0.0, np.ones((1, 8)), 9))
+    assert health.report(21.0).level is Level.OK
+    controller.cost(Frame(RUN, 2, 5, 0.0, np.array([[0.5, 5.0, 3.0]]), 9))
+    controller.failure, kept = "", controller.failure
+    health.plants = 1
+    assert health.report(22.0).message == "no episode under way"
+    health.plants = 0
+    assert health.report(23.0).level is Level.OK
+    gone = health.report(28.0)
+    assert gone.level is Level.STALE
+    assert gone.message == "no state for 7 s, after step 0 of episode 2, and no plant any more"
+    controller.failure = kept
+    failed = health.report(28.0)
+    assert failed.level is Level.ERROR
+    assert "diverged under exploration" in failed.message
+    assert failed.values["identifications failed"] == 2
+
+
+def test_a_tuner_tells_how_far_it_is_who_is_missing_and_what_holds_it():
+    loop = Loop(build_training(values()))
+    health = TunerHealth(loop.session, ITERATIONS)
+    first = health.report(0.0, [])
+    assert (first.level, first.message) == (Level.OK, "identify")
+    while loop.iterations() < 2:
+        loop.episode()
+    told = health.report(10.0, [])
+    assert (told.level, told.message) == (Level.OK, f"iteration 2 of {ITERATIONS}")
+    assert told.values["iterations/s"] == pytest.approx(0.2)
+    history = loop.session.training.history
+    assert told.values["iteration cost"] == history[-1]["cost"]
+    checked = [row for row in loop.rows if row["event"] == "checked"]
+    last = {row["seed"]: row["lqt"] for row in checked}
+    assert told.values["cost with LQT"] == pytest.approx(np.mean(list(last.values())))
+    absent = health.report(11.0, ["plant", "controller"])
+    assert absent.level is Level.WARN
+    assert absent.message == "waiting for plant and controller"
+    frame = loop.start
+    void = np.full((len(frame.values), 3), float(VOID))
+    loop.take(loop.session.cost(0, Frame(7, frame.episode, 3, 0.0, void, 1), 0.0))
+    repeated = health.report(12.0, [])
+    assert repeated.level is Level.WARN
+    assert "an episode had to be repeated" in repeated.message
+    assert repeated.values["episodes repeated"] == 1
+    assert health.report(30.0, []).level is Level.OK
+    loop.session.pause()
+    assert health.report(31.0, []).message == f"paused in iteration 2 of {ITERATIONS}"
+    loop.take(loop.session.resume(31.0))
+    loop.session.paused(0, Frame(7, 1, 0, 0.0, np.array([1.0]), 1), 31.0)
+    assert health.report(32.0, []).message == f"the plant is paused in iteration 2 of {ITERATIONS}"
+    assert health.report(32.0, []).values["paused plants"] == 1
+    assert health.report(50.0, []).values["paused plants"] == 0
+    loop.session.stop()
+    assert health.report(50.0, []).message.endswith("stopping after it")
+    restarted = Loop(build_training(values()), incarnation=3)
+    assert TunerHealth(restarted.session, ITERATIONS).report(0.0, []).values["restarts"] == 3
+
+
+def test_a_recorder_warns_until_it_is_matched_and_once_for_what_it_missed(tmp_path):
+    what = sources("/")
+    recording = Recording(tmp_path / "bag", what, storage="sqlite3", bag_per_episode=False)
+    health = RecorderHealth(recording)
+    assert health.report(0.0, matched=False).level is Level.WARN
+    good = health.report(1.0, matched=True)
+    assert (good.level, good.message) == (Level.OK, "recording")
+    recording.incomplete += 2
+    worse = health.report(2.0, matched=True)
+    assert worse.level is Level.WARN
+    assert worse.values["episodes incomplete"] == 2
+    assert health.report(3.0, matched=True).level is Level.OK
+    recording.close()

@@ -1,0 +1,97 @@
+"""Trajectories from the topics: complete, attributed, cut where they diverged, or not there at all."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from loop_interfaces.frames import Frame
+from loop_interfaces.topics import COMPLETED
+from tests.test_dispatch import RUN, batch, costs_of, dispatcher, starts
+from tuner_node.batch import Batch
+from tuner_node.trajectory_collector import Observer
+
+STEPS = 30
+
+
+def samples(start: Frame, plant: int = 0):
+    """States and actions of an episode whose values tell (env, step)."""
+    count = len(start.values)
+    for k in range(STEPS + 1):
+        states = np.tile(np.array([k, 0.5]), (count, 1)) + np.arange(count)[:, None] * 100
+        yield Frame(RUN, start.episode, k, 0.0, states, plant), -states[:, :1]
+
+
+def feed(served, pair: int, start: Frame, lose_state: int = -1, lose_action: int = -1) -> None:
+    for frame, actions in samples(start):
+        if frame.step != lose_state:
+            served.state(pair, frame)
+        if frame.step != lose_action:
+            served.action(pair, replace(frame, values=actions))
+
+
+def observed(count: int) -> Batch:
+    return replace(batch(count), trajectories=True)
+
+
+def test_trajectories_come_with_the_costs_in_the_batchs_order_over_several_episodes():
+    served = dispatcher(pairs=2)
+    served.target(0, Frame(0, 0, 0, 0.0, np.ones(2)), 0.0)
+    for pair, start in reversed(starts(served.assign(observed(3), 0.0))):
+        feed(served, pair, start)
+        served.cost(pair, costs_of(start), 0.0)
+    result = served.result()
+    assert result is not None
+    assert result.trajectories is not None
+    assert len(result.trajectories) == 3
+    assert [t.states.shape for t in result.trajectories] == [(STEPS + 1, 2)] * 3
+    assert [t.actions.shape for t in result.trajectories] == [(STEPS, 1)] * 3
+    assert result.trajectories[0].states[:, 0].tolist() == list(range(STEPS + 1))
+    assert result.target is not None
+
+
+def test_a_late_sample_is_waited_for_and_a_lost_one_repeats_the_episode():
+    served = dispatcher()
+    served.target(0, Frame(0, 0, 0, 0.0, np.ones(2)), 0.0)
+    ((_, start),) = starts(served.assign(observed(1), 0.0))
+    feed(served, 0, start, lose_action=STEPS - 1)
+    assert served.cost(0, costs_of(start), 1.0) == []
+    assert served.result() is None
+    late = list(samples(start))[STEPS - 1]
+    served.action(0, replace(late[0], values=late[1]))
+    served.tick(1.2)
+    assert served.result() is not None
+
+    ((_, start),) = starts(served.assign(observed(1), 2.0))
+    feed(served, 0, start, lose_state=7)
+    served.cost(0, costs_of(start), 2.0)
+    assert served.tick(2.4) == []
+    ((_, again),) = starts(served.tick(2.6))
+    assert again.episode == start.episode + 1
+    assert "missed 1 samples" in served.notes[-1]
+    feed(served, 0, again)
+    served.cost(0, costs_of(again), 3.0)
+    assert served.result() is not None
+
+
+def test_samples_of_other_runs_episodes_and_plants_are_not_mixed_in():
+    observer = Observer()
+    start = Frame(RUN, 5, 0, 0.0, np.zeros((1, 4)))
+    observer.begin(RUN, 5)
+    for frame, actions in samples(start, plant=1):
+        for stranger in (
+            replace(frame, run=RUN + 1),
+            replace(frame, episode=4),
+            replace(frame, plant=2),
+        ):
+            observer.state(replace(stranger, values=frame.values + 9))
+            observer.action(replace(stranger, values=actions + 9))
+        observer.state(frame)
+        observer.action(replace(frame, values=actions))
+    assert observer.lost(1, STEPS) == 0
+    (trajectory,) = observer.trajectories(1, STEPS, np.array([COMPLETED]))
+    assert trajectory.states[:, 0].tolist() == list(range(STEPS + 1))
+    (short,) = observer.trajectories(1, STEPS, np.array([12.0]))
+    assert short.states.shape == (13, 2)
+    assert short.actions.shape == (12, 1)

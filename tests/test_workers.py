@@ -1,0 +1,158 @@
+"""The threads that share a step: who takes which piece, and on which cores they are."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loop_interfaces.affinity import core_list, core_text, helps_solver
+from pde_sim_node.equations import Burgers
+from pde_sim_node.plant import Plant
+from pde_sim_node.solver import workers
+from pde_sim_node.solver.workers import TEAMWORK, Crew
+from pdeloop import core_affinity
+
+several = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
+P1 = {
+    "n_z": 128, "n_a": 6, "width": 0.15, "sample_time": 0.05, "integration_time": 0.0025,
+    "horizon": 300, "state_weight": 1.0, "action_weight": 1.0,
+}  # fmt: skip
+
+
+def rollout(plant: Plant, seeds: range, steps: int = 20) -> bytes:
+    plant.reset(np.array(seeds))
+    for _ in range(steps):
+        states = plant.step(np.full((len(seeds), plant.n_a), 0.1))
+    return states.tobytes() + plant.episode_costs().total.tobytes()
+
+
+def test_plants_in_several_threads_share_the_helpers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "_CREW", [Crew(range(1))])
+    alone = Plant(Burgers(), **P1)
+    expected = [rollout(alone, range(first, first + 12)) for first in (0, 50, 100)]
+    monkeypatch.setattr(workers, "_CREW", [Crew(range(4))])
+    plants = [Plant(Burgers(), **P1) for _ in expected]
+    found: list[list[bytes]] = [[] for _ in expected]
+
+    def work(which: int) -> None:
+        for _ in range(10):
+            found[which].append(rollout(plants[which], range(50 * which, 50 * which + 12)))
+
+    started = [threading.Thread(target=work, args=(which,)) for which in range(len(plants))]
+    for worker in started:
+        worker.start()
+    for worker in started:
+        worker.join(60)
+    assert found == [[bits] * 10 for bits in expected]
+
+
+def test_who_comes_late_takes_nothing_of_the_next_step() -> None:
+    plant = Plant(Burgers(), **P1)
+    team = plant._integrator._team
+    plant.reset(np.arange(4))
+    before = plant.states.copy()
+    board, (work_off, _, start, _, done) = team._board.ctypes.data, TEAMWORK
+    costs, diverged = np.zeros(4), np.full(4, -1)
+    code, plan = team._code, team._addresses[0]
+    what = code, plan, plant.states, np.zeros((4, 6)), costs, diverged, 0
+    start(board, 8)
+    for turn in (7, 9):
+        work_off(*what, board, turn, 4)
+    assert np.array_equal(plant.states, before)
+    work_off(*what, board, 8, 4)
+    assert (plant.states != before).any(axis=1).all()
+    assert done(board, 4)
+    assert not done(board, 5)
+
+
+def test_helpers_exist_from_the_first_large_batch_on_and_hold_no_plant() -> None:
+    program = """
+import gc, sys, threading, weakref
+import numpy as np
+from pde_sim_node.solver import workers
+from pde_sim_node.equations import Burgers
+from pde_sim_node.plant import Plant
+from tests.test_workers import P1, rollout
+workers.use_cores(range(3))
+plant = Plant(Burgers(), **P1)
+rollout(plant, range(2))
+assert threading.active_count() == 1
+rollout(plant, range(12))
+assert threading.active_count() == 3
+gone = weakref.ref(plant._integrator._team)
+del plant
+gc.collect()
+for _ in range(100):
+    if gone() is None: break
+    import time; time.sleep(0.05)
+print(gone())
+"""
+    root = Path(__file__).parent.parent
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=120, cwd=root,
+        env={**os.environ, "PYTHONPATH": str(root)},
+    )  # fmt: skip
+    assert done.stdout.strip() == "None", done.stderr
+
+
+@several
+def test_helpers_leave_the_core_that_their_process_is_kept_on() -> None:
+    """A real process is moved, as a pair is, before and after its helpers exist."""
+    cores = sorted(os.sched_getaffinity(0))
+    program = f"""
+import sys, time
+from pde_sim_node.solver import workers
+from pde_sim_node.equations import Burgers
+from pde_sim_node.plant import Plant
+from tests.test_workers import P1, rollout
+sys.stdin.readline()
+workers.use_cores({cores})
+plant = Plant(Burgers(), **P1)
+rollout(plant, range(12))
+print("there", flush=True)
+sys.stdin.readline()
+"""
+    root = Path(__file__).parent.parent
+    process = subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        cwd=root, env={**os.environ, "PYTHONPATH": str(root)},
+    )  # fmt: skip
+    assert process.stdin is not None
+    assert process.stdout is not None
+
+    def places() -> dict[bool, set[int]]:
+        """Cores of the helpers (True) and of all other threads (False)."""
+        found: dict[bool, set[int]] = {True: set(), False: set()}
+        for thread in Path(f"/proc/{process.pid}/task").iterdir():
+            number = int(thread.name)
+            found[helps_solver(process.pid, number)] |= os.sched_getaffinity(number)
+        return found
+
+    with process:
+        core_affinity._move(process.pid, cores[0], cores)
+        process.stdin.write("go on\n")
+        process.stdin.flush()
+        assert process.stdout.readline() == "there\n"
+        limit = time.monotonic() + 10
+        while places() != {True: set(cores[1:]), False: {cores[0]}}:
+            assert time.monotonic() < limit, places()
+            time.sleep(0.05)
+        core_affinity._move(process.pid, cores[1], cores)
+        assert places() == {True: set(cores) - {cores[1]}, False: {cores[1]}}
+
+
+def test_lists_of_cores() -> None:
+    present = os.cpu_count() or 1
+    assert core_list("0") == [0]
+    assert core_list(f"0-{present - 1}") == list(range(present))
+    assert core_list(core_text(range(present))) == list(range(present))
+    for wrong in ("", "a", "-1", f"{present}", "1-0", "0,,0", "0-99999"):
+        with pytest.raises(ValueError, match="expected some of 0-"):
+            core_list(wrong)

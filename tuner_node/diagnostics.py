@@ -1,0 +1,80 @@
+"""How the training is, as the tuner's /diagnostics show it. Pure."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from loop_interfaces.diagnostics import Health, Level, Rate
+from tuner_node.session import Session
+
+RECENT = 10.0
+"""Seconds for which a repeated episode is worth a warning."""
+
+
+class TunerHealth:
+    """Reports on a session, from one call to the next. iterations: of the whole training."""
+
+    def __init__(self, session: Session, iterations: int) -> None:
+        self._session, self._iterations = session, iterations
+        self._rate = Rate()
+        self._repeated = 0
+        self._repeated_at = float("-inf")
+
+    def report(self, now: float, absent: list[str]) -> Health:
+        """Level, sentence and values at time `now` (monotonic s); absent: nodes that are waited for."""
+        session, dispatcher = self._session, self._session.dispatcher
+        training = session.training
+        repeated = dispatcher.tally["episodes repeated"] + dispatcher.tally["episodes taken over"]
+        if repeated > self._repeated:
+            self._repeated, self._repeated_at = repeated, now
+        level, message = self._state(now, absent)
+        costs = dispatcher.last_costs
+        return Health(
+            level,
+            message,
+            {
+                "run": dispatcher.run,
+                "restarts": dispatcher.incarnation,
+                "phase": training.phase,
+                "iteration": training.iteration,
+                "iterations": self._iterations,
+                "iterations/s": self._rate.per_second(training.iteration, now),
+                "episode": dispatcher.newest_episode,
+                "episodes under way": len(dispatcher.episodes()),
+                "last cost": float(np.mean(costs)) if costs is not None and len(costs) else None,
+                "iteration cost": self._last("cost"),
+                "cost without control": session.baseline("none"),
+                "cost with LQT": session.baseline("lqt"),
+                "episodes repeated": repeated,
+                "stale messages": (
+                    dispatcher.tally["answers of another run"]
+                    + dispatcher.tally["answers of another episode"]
+                ),
+                "paused": dispatcher.held,
+                "paused plants": len(dispatcher.paused_pairs(now)),
+                "waiting for": " and ".join(absent),
+            },
+        )
+
+    def _state(self, now: float, absent: list[str]) -> tuple[Level, str]:
+        session = self._session
+        where = session.training.phase
+        if where == "adapt":
+            where = f"iteration {session.training.iteration} of {self._iterations}"
+        if absent:
+            return Level.WARN, f"waiting for {' and '.join(absent)}"
+        if session.dispatcher.held:
+            return Level.WARN, f"paused in {where}"
+        if session.dispatcher.paused_pairs(now):
+            return Level.WARN, f"the plant is paused in {where}"
+        if session.stopping:
+            return Level.OK, f"{where}; stopping after it"
+        if now - self._repeated_at < RECENT:
+            return Level.WARN, f"{where}; an episode had to be repeated"
+        return Level.OK, where
+
+    def _last(self, name: str) -> float | None:
+        """The newest number of that name in the history."""
+        found = (row[name] for row in reversed(self._session.training.history) if name in row)
+        value = next(found, None)
+        return float(value) if value is not None else None
