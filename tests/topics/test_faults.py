@@ -17,6 +17,7 @@ import pytest
 
 from pde_sim_node.build import fingerprint
 from tests.loop_harness import Processes, until
+from tests.operator_harness import held_training, operator
 from tests.small import SMALL, parameters
 from tests.topics.test_loop import (
     LIMIT,
@@ -127,14 +128,16 @@ def test_a_node_that_keeps_dying_is_given_up_with_its_last_words(loop, tmp_path)
 def test_a_second_tuner_is_refused_and_the_first_one_unharmed(loop, tmp_path):
     start_pair(loop)
     out = tmp_path / "run"
-    # Long enough to outlast the 6 s after which a second one is refused, on a fast machine, too.
-    first = start_tuner(loop, out, iterations=3000)
+    first = start_tuner(loop, out, iterations=300)
     until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
-    second = start_tuner(loop, tmp_path / "second", seed=9)
-    text = loop.wait(second, 20.0, code=1)
+    with operator(loop) as desk:
+        desk.call("/tuner_node/pause")  # so that it outlasts the other one's refusal
+        second = start_tuner(loop, tmp_path / "second", seed=9)
+        text = loop.wait(second, LIMIT, code=1)
+        desk.call("/tuner_node/resume")
     assert "another tuner publishes /episode/start" in text.strip().splitlines()[-1]
     loop.wait(first, LIMIT)
-    assert_same_training(out, in_process(iterations=3000))
+    assert_same_training(out, in_process(iterations=300))
     assert iterations_done(tmp_path / "second") == 0
 
 
@@ -143,7 +146,8 @@ def test_a_second_plant_with_other_parameters_never_mixes_in(loop, tmp_path):
     out = tmp_path / "run"
     tuner = start_tuner(loop, out, iterations=800)
     until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
-    loop.node("pde_sim_node", *PARAMETERS, "-p", "physical.viscosity:=0.02")
+    with held_training(loop, "/pde_sim_node"):
+        loop.node("pde_sim_node", *PARAMETERS, "-p", "physical.viscosity:=0.02")
     text = loop.wait(tuner, LIMIT)
     assert_same_training(out, in_process(iterations=800))
     assert "plant with other parameters" in text
@@ -165,7 +169,8 @@ def test_a_second_plant_with_the_same_parameters_is_harmless(loop, tmp_path):
     out = tmp_path / "run"
     tuner = start_tuner(loop, out, iterations=500)
     until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
-    loop.node("pde_sim_node", *PARAMETERS)
+    with held_training(loop, "/pde_sim_node"):
+        loop.node("pde_sim_node", *PARAMETERS)
     loop.wait(tuner, LIMIT)
     assert_same_training(out, in_process(iterations=500))
 
@@ -295,7 +300,10 @@ def test_a_strange_publisher_is_reported_by_name_and_changes_nothing(loop, tmp_p
     out = tmp_path / "run"
     tuner = start_tuner(loop, out, iterations=600)
     until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
-    stranger = loop.start("-c", STRANGER, name="stranger")
+    with held_training(loop, "/stranger"):
+        stranger = loop.start("-c", STRANGER, name="stranger")
+        # Strangers are looked for from time to time, whether the training is paused or not.
+        until(lambda: "/stranger" in loop.output(running["plant"]), LIMIT, "report of the stranger")
     loop.wait(tuner, LIMIT)
     assert_same_training(out, in_process(iterations=600))
     assert "2 nodes publish /action: /controller_node, /stranger" in loop.output(running["plant"])
@@ -327,7 +335,8 @@ def test_a_second_controller_that_answers_otherwise_never_mixes_in(loop, tmp_pat
     out = tmp_path / "run"
     tuner = start_tuner(loop, out, iterations=2000, max_attempts=1000)
     until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
-    second = loop.start("-c", SECOND_CONTROLLER, name="second")
+    with held_training(loop, "/second_controller"):
+        second = loop.start("-c", SECOND_CONTROLLER, name="second")
     until(
         lambda: "two different actions came for step" in loop.output(running["plant"]),
         LIMIT,

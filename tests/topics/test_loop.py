@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
+import resource
 import signal
 import time
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 
@@ -19,8 +22,8 @@ from tests.small import SMALL, parameters, same_bits, train_here
 from tuner_node.training import Training
 
 pytestmark = pytest.mark.topics
-LIMIT = 60.0
-"""Seconds a whole small training may take, start-up on a busy machine included."""
+LIMIT = 240.0
+"""Seconds after which a small training has failed, however busy the machine; an idle one needs 5."""
 NODES = ("pde_sim_node", "controller_node", "tuner_node")
 
 
@@ -131,18 +134,35 @@ def test_nodes_restarted_between_and_within_episodes_change_nothing(loop: Proces
     assert_same_training(out, in_process(iterations=iterations))
 
 
+def processor_seconds(pids: Iterable[int]) -> float:
+    """Processor time of these processes and of those that they have waited for, in s (Linux)."""
+    total = 0
+    for pid in pids:
+        fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+        total += sum(map(int, fields[11:15]))
+    return total / os.sysconf("SC_CLK_TCK")
+
+
+def children_seconds() -> float:
+    """Processor time of this process's children that have ended, and of theirs, in s."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
 @pytest.mark.parametrize("transport", [[], ["--in-process"]], ids=["topics", "in-process"])
 def test_ctrl_c_ends_everything_and_the_run_continues(loop: Processes, tmp_path, transport):
     out = tmp_path / "run"
     iterations = 2000 if transport else 400
     options = ("--iterations", str(iterations), "--out", str(out))
+    children = children_seconds()
     run = loop.pdeloop("train", str(SMALL), *options, *transport)
     until(lambda: iterations_done(out) >= 30, LIMIT, "iteration 30")
-    interrupted = time.monotonic()
+    before = processor_seconds(loop.left_behind())
     run.send_signal(signal.SIGINT)
-    text = loop.wait(run, 10.0, code=130)
-    assert time.monotonic() - interrupted < 2.0
-    until(lambda: loop.left_behind() == [], 1.0, "end of all nodes")
+    text = loop.wait(run, LIMIT, code=130)
+    # Not by the clock: on an idle machine it takes as long as this, on a busy one longer.
+    assert children_seconds() - children - before < 2.0
+    until(lambda: loop.left_behind() == [], LIMIT, "end of all nodes")
     assert iterations_done(out) < iterations
     assert f"continue with: pdeloop train --resume {out}" in text
     again = loop.pdeloop("train", "--resume", str(out), *transport)

@@ -16,7 +16,7 @@ from tests.topics.test_loop import LIMIT, assert_same_training, in_process, iter
 pytestmark = pytest.mark.topics
 ITERATIONS = 400
 """Enough that the training goes on when an operator comes after 20 of them."""
-LONG = 3 * LIMIT
+LONG = LIMIT
 
 
 def complaints(text: str) -> list[str]:
