@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 from threadpoolctl import threadpool_limits
 
-from controller_node.dmdc import ReducedModel
+from controller_node.reduced_model import ReducedModel
 
 __all__ = ["DesignError", "Gains", "track"]
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from controller_node.dmdc import ReducedModel, identify
+from controller_node.dmdc import identify
+from controller_node.reduced_model import ReducedModel
 
 N_S, N_A, STEPS = 3, 2, 40
 

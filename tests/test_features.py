@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from controller_node.dmdc import ReducedModel
 from controller_node.lqt import track
 from controller_node.policy import ProjectedLaw
+from controller_node.reduced_model import ReducedModel
 from loop_interfaces.policy_columns import policy_columns, quadratic_columns, with_features
 from tuner_node.optimizers import Context, GaussNewton, RolloutResult, Trajectory
 from tuner_node.optimizers.features import Features, known_columns

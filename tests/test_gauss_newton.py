@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from controller_node.dmdc import ReducedModel
 from controller_node.lqt import track
+from controller_node.reduced_model import ReducedModel
 from pdeloop.training_run import resolve
 from tests.small import train_here
 from tuner_node.optimizers import Context, GaussNewton, Rollout, RolloutResult, Trajectory

@@ -1,0 +1,160 @@
+"""A reduced linear model of the plant, and what every way to identify one begins with.
+
+    z_{k+1} = f(z_k, a_k)    is approximated on s = U^T z by    s_{k+1} = A s_k + B a_k
+
+Trajectories of the plant give the columns of Z = [z_0 .. z_{N-1}], Z' = [z_1 .. z_N] and
+Y = [a_0 .. a_{N-1}]; U holds the leading left singular vectors of Z'.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import linalg
+
+__all__ = ["ReducedModel", "Steps", "leading_modes", "numerical_rank", "steps_of"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedModel:
+    """The linear model s_{k+1} = A s_k + B a_k of the projected state s = U^T z.
+
+    Attributes
+    ----------
+    A : (n_s, n_s) array
+    B : (n_s, n_a) array
+    U : (n_z, n_s) array
+        Orthonormal columns; the largest entry of each column is positive, so that U is unique.
+
+    The arrays are read-only copies. A ValueError names the array whose shape or values do not fit.
+    """
+
+    A: Array
+    B: Array
+    U: Array
+
+    def __post_init__(self) -> None:
+        for name in ("A", "B", "U"):
+            array = np.array(getattr(self, name), dtype=np.float64, order="C")
+            if array.ndim != 2 or 0 in array.shape:
+                raise ValueError(
+                    f"{name} of a reduced model must be a non-empty matrix, but its shape is "
+                    f"{array.shape}."
+                )
+            if not np.isfinite(array).all():
+                raise ValueError(
+                    f"{name} of a reduced model must be finite, but it has NaN or infinity."
+                )
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+        n_s = self.U.shape[1]
+        if self.A.shape != (n_s, n_s) or self.B.shape[0] != n_s:
+            raise ValueError(
+                f"a reduced model with U of shape {self.U.shape} needs A of shape ({n_s}, {n_s}) "
+                f"and B with {n_s} rows, but A is {self.A.shape} and B is {self.B.shape}."
+            )
+
+    @property
+    def n_z(self) -> int:
+        """Dimension of the full state."""
+        return int(self.U.shape[0])
+
+    @property
+    def n_s(self) -> int:
+        """Dimension of the reduced state."""
+        return int(self.U.shape[1])
+
+    @property
+    def n_a(self) -> int:
+        """Number of actuators."""
+        return int(self.B.shape[1])
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """The steps of one or more trajectories, a row each.
+
+    Attributes
+    ----------
+    before, after : (N, n_z) arrays
+        z_k and z_{k+1}: the transposes of Z and Z'.
+    inputs : (N, n_a) array
+        a_k: the transpose of Y.
+    """
+
+    before: Array
+    after: Array
+    inputs: Array
+
+
+def steps_of(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> Steps:
+    """The steps of trajectories (states (N + 1, n_z), actions (N, n_a)) of one plant, pooled.
+
+    Raises
+    ------
+    ValueError
+        Shapes that do not fit, NaN or infinity.
+    """
+    befores, afters, inputs = [], [], []
+    for states, actions in trajectories:
+        z, own = _matrix("states", states), _matrix("actions", actions)
+        if z.shape[0] != len(own) + 1:
+            raise ValueError(
+                f"{len(own)} actions belong to {len(own) + 1} states, but {z.shape[0]} states were "
+                "given; pass the states from before the first action to after the last."
+            )
+        befores.append(z[:-1])
+        afters.append(z[1:])
+        inputs.append(own)
+    return Steps(*(np.concatenate(parts) for parts in (befores, afters, inputs)))
+
+
+def leading_modes(after: Array, n_s: int) -> tuple[Array, Array]:
+    """The first n_s left singular vectors of Z', (n_z, n_s), and all its singular values.
+
+    after : (N, n_z) array
+        The transpose of Z'.
+
+    A ValueError says so where the states have fewer modes than that. Call it with one LAPACK thread.
+    """
+    left, values, _ = linalg.svd(after.T, full_matrices=False)
+    rank = numerical_rank(values, *after.shape)
+    if n_s > rank:
+        raise ValueError(
+            f"n_s must be at most the numerical rank of the states, {rank}, but n_s is {n_s}; "
+            "lower n_s or excite more."
+        )
+    return _unique_signs(left[:, :n_s]), values
+
+
+def _matrix(name: str, values: ArrayLike) -> Array:
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim != 2 or 0 in array.shape:
+        raise ValueError(
+            f"{name} must be a non-empty matrix with one row per step, but the shape is "
+            f"{array.shape}."
+        )
+    if not np.isfinite(array).all():
+        row = int(np.argmin(np.isfinite(array).all(axis=1)))
+        raise ValueError(
+            f"{name} must be finite, but row {row} has NaN or infinity; the episode diverged, so "
+            "excite less."
+        )
+    return array
+
+
+def numerical_rank(singular_values: Array, rows: int, columns: int) -> int:
+    """How many singular values of a matrix are above the rounding errors of the largest."""
+    threshold = max(rows, columns) * np.finfo(np.float64).eps * singular_values[0]
+    return int(np.count_nonzero(singular_values > threshold))
+
+
+def _unique_signs(columns: Array) -> Array:
+    largest = np.argmax(np.abs(columns), axis=0)
+    signs = np.where(columns[largest, np.arange(columns.shape[1])] < 0.0, -1.0, 1.0)
+    return columns * signs

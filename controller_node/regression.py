@@ -1,0 +1,100 @@
+"""A reduced linear model of the plant by least squares in reduced coordinates.
+
+With U the first n_s left singular vectors of Z' = [z_1 .. z_N], Z = [z_0 .. z_{N-1}] and
+Y = [a_0 .. a_{N-1}] (one column per step),
+
+    [A B] = argmin || U^T Z' - A U^T Z - B Y ||_F^2,
+
+the solution of least norm where there are several. States are projected and inputs are kept whole, so
+that there is no second rank to choose and nothing depends on the unit of the inputs. The truncated
+regression of `controller_node.dmdc` is the same where the states have no more than n_s modes and p
+keeps everything; with p < n_s + n_a it cuts into the inputs.
+
+References
+----------
+Proctor, Brunton, Kutz, "Dynamic Mode Decomposition with Control", SIAM J. Appl. Dyn. Syst. 15(1),
+2016 (the regression).
+Peherstorfer, Willcox, "Data-driven operator inference for nonintrusive projection-based model
+reduction", CMAME 306, 2016 (least squares on projected states).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import linalg
+from threadpoolctl import threadpool_limits
+
+from controller_node.reduced_model import ReducedModel, leading_modes, steps_of
+
+__all__ = ["identify", "identify_from"]
+
+Array = NDArray[np.float64]
+
+
+def identify(states: ArrayLike, actions: ArrayLike, *, n_s: int) -> ReducedModel:
+    """Identify a reduced model from one trajectory; see `identify_from`.
+
+    Examples
+    --------
+    A plant z_{k+1} = 0.9 z_k + 2 a_k is found again:
+
+    >>> import numpy as np
+    >>> a = np.array([[1.0], [-1.0], [0.5], [2.0]])
+    >>> z = [np.array([1.0])]
+    >>> for a_k in a:
+    ...     z.append(0.9 * z[-1] + 2.0 * a_k)
+    >>> model = identify(z, a, n_s=1)
+    >>> model.A.round(12), model.B.round(12)
+    (array([[0.9]]), array([[2.]]))
+    """
+    return identify_from([(states, actions)], n_s=n_s)
+
+
+def identify_from(trajectories: Sequence[tuple[ArrayLike, ArrayLike]], *, n_s: int) -> ReducedModel:
+    """Identify a reduced model from trajectories of one plant, whose steps are pooled.
+
+    Parameters
+    ----------
+    trajectories : sequence of (states (N + 1, n_z), actions (N, n_a))
+        z_0 .. z_N and a_0 .. a_{N-1}; a_k is held from z_k to z_{k+1}.
+    n_s : int
+        Modes of the reduced state. All steps together must be at least n_s + n_a, as many as there are
+        unknowns in a row of [A B].
+
+    Returns
+    -------
+    ReducedModel
+        With U from all z_1 .. z_N.
+
+    Raises
+    ------
+    ValueError
+        Shapes that do not fit, NaN or infinity, fewer steps than unknowns, or more modes than the
+        states have.
+    """
+    data = steps_of(trajectories)
+    steps, n_a = data.inputs.shape
+    if n_s < 1:
+        raise ValueError(f"n_s must be at least 1, but it is {n_s}.")
+    if steps < n_s + n_a:
+        raise ValueError(
+            f"a model of n_s = {n_s} modes and n_a = {n_a} inputs needs at least {n_s + n_a} steps, "
+            f"but there are {steps}; lower n_s or record a longer trajectory."
+        )
+    # One thread: a threaded LAPACK rounds differently for another number of threads.
+    with threadpool_limits(limits=1):
+        U, _ = leading_modes(data.after, n_s)
+        s, y = data.before @ U, data.inputs
+        # In units in which both have the norm 1, so that what counts as zero does not depend on theirs.
+        scales = np.repeat([_norm(s), _norm(y)], [n_s, n_a])
+        coefficients: Array = linalg.lstsq(np.hstack([s, y]) / scales, data.after @ U)[0]
+        coefficients /= scales[:, None]
+        return ReducedModel(A=coefficients[:n_s].T, B=coefficients[n_s:].T, U=U)
+
+
+def _norm(values: Array) -> float:
+    norm = float(linalg.norm(values))
+    return norm if norm > 0.0 else 1.0
