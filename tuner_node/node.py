@@ -229,7 +229,9 @@ class TunerNode:
 
     def _guarded(self, event: Callable[[float], list[Order]]) -> None:
         try:
-            self._perform(event(self._loop.now()))
+            with self._loop.working(self._session.training.computation):
+                orders = event(self._loop.now())
+            self._perform(orders)
         except DispatchError as error:
             self._failure = str(error)
             self._loop.stop("failure")
@@ -240,7 +242,8 @@ class TunerNode:
         self._send(orders)
         self._tell()
         if self._recorder:
-            self._recorder.keep(now=self._loop.now())
+            with self._loop.working("writing the checkpoint"):
+                self._recorder.keep(now=self._loop.now())
         if self._session.done or self._session.stopped:
             self._loop.stop("done")
 

@@ -138,6 +138,12 @@ class Training:
         return 1 + sum(self.attempts) + rebased
 
     @property
+    def computation(self) -> str:
+        """What `finish` computes in this phase, in words."""
+        fits = self.phase == "adapt" and self.settings.trajectories
+        return "fitting models" if fits else "evaluating rollouts"
+
+    @property
     def ready(self) -> bool:
         """Whether there are the models that the next rollouts are about."""
         return self.models is not None and self.phase != "identify"

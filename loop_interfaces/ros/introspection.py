@@ -7,7 +7,10 @@ the loop.
 from __future__ import annotations
 
 import socket
-from collections.abc import Callable, Sequence
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
@@ -21,6 +24,8 @@ NAMELESS = "_NODE_NAME_UNKNOWN_"
 DIAGNOSTICS = "/diagnostics"
 PERIOD = 1.0
 """Seconds between two reports, and between two looks at the graph."""
+WORKING = 1.0
+"""Seconds of one computation after which it is reported while it lasts."""
 NAMESAKE_GRACE = 6.0
 """Seconds a second node of our name may be seen before it counts: a killed one is seen for 3 s."""
 
@@ -46,6 +51,9 @@ class Introspection:
         self._began: float | None = None
         self._refused_before = 0
         self._namesake_since: float | None = None
+        self._last = Health(Level.OK, "")
+        self._working: tuple[str, float] | None = None
+        self._publishing = threading.Lock()
 
     def report(self, task: str, health: Callable[[float], Health]) -> None:
         """Publish what `health(now)` says once a second, under the node's name and `task`."""
@@ -65,9 +73,35 @@ class Introspection:
         self._look_for_strangers()
         namesakes = self._namesakes(now)
         if self._publisher is not None:
-            self._publish(self._publisher, namesakes, now - self._began, now)
+            self._last = self._health_now(namesakes, now - self._began, now)
+            self._publish(self._publisher, self._last)
 
-    def _publish(self, publisher: Publisher, namesakes: int, uptime: float, now: float) -> None:
+    @contextmanager
+    def working(self, what: str) -> Iterator[None]:
+        """The node's thread computes `what` for the time of the block, and may not come to `round`."""
+        self._working = what, time.monotonic()
+        try:
+            yield
+        finally:
+            self._working = None
+
+    def round_while_working(self, now: float) -> None:
+        """`round` from another thread, while a computation keeps the node's own from it.
+
+        Publishes the last report with the values `activity` and `activity for` (s) added.
+        """
+        working, publisher = self._working, self._publisher
+        if working is None or publisher is None or now < self._due:
+            return
+        what, since = working
+        if now - since < WORKING:
+            return
+        self._due = now + PERIOD
+        seconds = now - since
+        values = {**self._last.values, "activity": what, "activity for": round(seconds, 1)}
+        self._publish(publisher, Health(self._last.level, f"{what} for {seconds:.0f} s", values))
+
+    def _health_now(self, namesakes: int, uptime: float, now: float) -> Health:
         health = self._health(now)
         total, reason = self._refused()
         if total > self._refused_before:
@@ -78,12 +112,16 @@ class Introspection:
         if namesakes:
             health = health.worsened(Level.WARN, "another node has this name")
         health.values = {**health.values, "refused messages": total, "uptime": round(uptime, 1)}
-        status = self._status
-        status.level, status.message = bytes([health.level]), health.message
-        status.values = [KeyValue(key=key, value=value) for key, value in health.texts()]
-        message = DiagnosticArray(status=[status])
-        message.header.stamp = self._node.get_clock().now().to_msg()
-        publisher.publish(message)
+        return health
+
+    def _publish(self, publisher: Publisher, health: Health) -> None:
+        with self._publishing:
+            status = self._status
+            status.level, status.message = bytes([health.level]), health.message
+            status.values = [KeyValue(key=key, value=value) for key, value in health.texts()]
+            message = DiagnosticArray(status=[status])
+            message.header.stamp = self._node.get_clock().now().to_msg()
+            publisher.publish(message)
 
     def _look_for_strangers(self) -> None:
         """Say who else publishes what one node of the loop should publish."""

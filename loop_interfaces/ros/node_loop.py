@@ -13,7 +13,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -183,6 +183,10 @@ class NodeLoop:
         """Publish what `health(now)` says on /diagnostics, once a second."""
         self._introspection.report(task, health)
 
+    def working(self, what: str) -> AbstractContextManager[None]:
+        """Say on /diagnostics that the node computes `what`, if the block takes long."""
+        return self._introspection.working(what)
+
     @staticmethod
     def now() -> float:
         """Monotonic time in s, as handed to `tick` and `housekeeping`."""
@@ -313,12 +317,14 @@ class NodeLoop:
         return self._stop_reason or "shutdown"
 
     def _look_after(self) -> None:
-        """In another thread: end a wait that takes too long.
+        """In another thread: report a long computation, and end a wait that takes too long.
 
         Fast DDS waits until a point of the machine's clock where it was built with an old C++
         library, as the wheels are; when that clock is set back meanwhile, until it gets there again.
         """
-        if self.now() - self._turned > STUCK:
+        now = self.now()
+        if now - self._turned > STUCK:
+            self._introspection.round_while_working(now)
             self._guard.trigger_guard_condition()
 
     def _sources(self) -> tuple[list[Any], dict[int, Callable[[], int]]]:

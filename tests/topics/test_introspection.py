@@ -247,3 +247,33 @@ def test_a_second_node_of_the_same_name_is_reported(loop: Processes):
         second.send_signal(signal.SIGINT)
         loop.wait(second, 10.0)
         until(lambda: desk.status("controller_node")[1] == 0, LIMIT, "one node of that name")
+
+
+COMPUTES = """
+import time
+from loop_interfaces.diagnostics import Health, Level
+from loop_interfaces.ros.node_main import ros_node
+with ros_node("busy_node", ["--ros-args"]) as (node, loop):
+    loop.diagnose("work", lambda now: Health(Level.OK, "idle", {"run": 1}))
+    began = time.monotonic()
+    def housekeeping(now):
+        if now > began + 2.5:
+            with loop.working("fitting models"):
+                while True:
+                    sum(range(10_000))
+    loop.run(tick=lambda now: None, deadline=lambda: None, housekeeping=housekeeping)
+"""
+
+
+def test_a_node_that_computes_for_long_tells_what_and_since_when(loop: Processes):
+    loop.start("-c", COMPUTES, name="busy")
+    with operator(loop) as desk:
+        until(lambda: desk.status("busy_node")[2] == "idle", LIMIT, "report")
+        until(lambda: desk.values("busy_node").get("activity"), LIMIT, "report of the computation")
+        desk.wait_for_reports("busy_node", 2)
+        _, level, message, values = desk.status("busy_node")
+        assert (
+            level == 0 and message == f"fitting models for {round(float(values['activity for']))} s"
+        )
+        assert values["activity"] == "fitting models" and values["run"] == "1"
+        assert float(values["activity for"]) >= 2.0
