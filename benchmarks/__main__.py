@@ -118,17 +118,26 @@ def parser() -> argparse.ArgumentParser:
     monitor.add_argument(
         "--browser", action="store_true", help="with the page drawn by a headless chromium"
     )
-    beyond = _add(
+    robustness = _add(
         programs,
-        "beyond",
+        "robustness",
         "trainings with noise, action limits and few sensors",
         "--problems burgers --parts limit",
     )
-    beyond.add_argument("--problems", nargs="+", metavar="PROBLEM", help="[all three]")
-    beyond.add_argument(
+    robustness.add_argument("--problems", nargs="+", metavar="PROBLEM", help="[all three]")
+    robustness.add_argument(
         "--parts", nargs="+", metavar="PART", help="[ideal measurement process limit sensors both]"
     )
-    beyond.add_argument("--seeds", type=int, default=3, metavar="N", help="[3]")
+    robustness.add_argument("--seeds", type=int, default=3, metavar="N", help="[3]")
+    linearised = _add(
+        programs,
+        "linearised",
+        "what the LQR law of the exact linearisation about 0 costs",
+        "wave cahn-hilliard",
+    )
+    linearised.add_argument("problems", nargs="+", metavar="PROBLEM", help="names or YAML files")
+    linearised.add_argument("--n-a", type=int, metavar="N", help="actuators [the problem's]")
+    linearised.add_argument("--width", type=float, metavar="X", help="of one, as a share of L")
     kernel = _add(
         programs, "kernel", "time of a step beside other implementations", "--batches 1 12 --json"
     )

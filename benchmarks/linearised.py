@@ -1,22 +1,18 @@
-"""How far linear theory gets: LQR of the exact linearisation about 0, with the full state.
+"""`python -m benchmarks linearised`: LQR of the exact linearisation about 0, with the full state.
 
 For the linear problems it is the optimum over an infinite horizon; for the others it is what a perfect
 model of small fields gives. Costs are those of `pdeloop train`'s closing evaluation.
-
-    python -m benchmarks.linearised wave cahn-hilliard
-    python -m benchmarks.linearised ginzburg-landau --n-a 20 --width 0.05
 """
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.problem import load_parameters, shipped_problems
+from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import Plant
 from tuner_node.seeds import Purpose, derive
@@ -67,22 +63,22 @@ def costs(problem: str, changes: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("problem", nargs="+", choices=shipped_problems(), metavar="PROBLEM")
-    parser.add_argument("--n-a", type=int, help="actuators [those of the problem]")
-    parser.add_argument("--width", type=float, help="width of one as a share of L")
-    options = parser.parse_args()
-    given = {"n_a": options.n_a, "actuator_width": options.width}
-    for problem in options.problem:
-        found = costs(problem, {k: v for k, v in given.items() if v is not None})
-        lqr = "no stabilising law" if found["lqr"] is None else f"{found['lqr']:.4g}"
-        print(
-            f"{problem}: {found['none']:.4g} without control, {lqr} with the LQR of the exact "
-            f"linearisation (spectral radius {found['radius']:.4f})",
-            flush=True,
+def run(
+    problems: Sequence[str], n_a: int | None = None, width: float | None = None
+) -> list[dict[str, Any]]:
+    """One row for each problem: its costs, with so many actuators of that width (share of L)."""
+    given = {"n_a": n_a, "actuator_width": width}
+    changes = {name: value for name, value in given.items() if value is not None}
+    return [{"problem": problem, **costs(problem, changes)} for problem in problems]
+
+
+def text(rows: Sequence[Mapping[str, Any]]) -> str:
+    """A line for each problem."""
+    lines = []
+    for row in rows:
+        law = "no stabilising law" if row["lqr"] is None else f"{row['lqr']:.4g}"
+        lines.append(
+            f"{row['problem']}: {row['none']:.4g} without control, {law} with the LQR of the exact "
+            f"linearisation (spectral radius {row['radius']:.4f})"
         )
-
-
-if __name__ == "__main__":
-    main()
+    return "\n".join(lines)

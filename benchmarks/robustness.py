@@ -1,4 +1,4 @@
-"""`python -m benchmarks beyond`: trainings with noise, with action limits and with few sensors.
+"""`python -m benchmarks robustness`: trainings with noise, with action limits and with few sensors.
 
 Every line of the tables is a training of `--seeds` seeds side by side in this process, as
 `pdeloop train --in-process` does it, 80 rollouts a seed, judged on the same ten sampled fields.

@@ -52,7 +52,7 @@ INSTRUMENTS = (
         1024,
     ),
 )
-"""What stands between the field and its controller, beyond the paper's setting; see docs/beyond.md."""
+"""What stands between the field and its controller (docs/robustness.md)."""
 
 PROBLEM = (
     Spec("problem", "burgers", "name of the problem, used in messages and result folders"),
