@@ -190,9 +190,9 @@ class _Run:
         used: set[bytes] = set()
         report = self._report
         while (batch := training.next_batch()) is not None:
-            keys = _keys(batch.rows, batch.policies)
+            keys = _keys(batch.rows, batch.policies, training.generation)
             if absent := [i for i, key in enumerate(keys) if key not in self._results]:
-                self._explain(batch, absent[0], used, training.iteration)
+                self._explain(batch, absent[0], used, training)
                 return
             used.update(keys)
             results = [self._results[key] for key in keys]
@@ -229,8 +229,6 @@ class _Run:
         for bases in {id(frame): frame for frame in map(self._bases.get, keys) if frame}.values():
             where = f"models number {bases.step} of run {self._number}"
             self._report.compare("models", where, bases.values, training.models)
-            if bases.step != training.generation:
-                self._report.differs(f"{where}: expected number {training.generation}")
 
     def _keep(self, episode: RecordedEpisode, where: str) -> None:
         """Note what each rollout of the episode gave, for the replay of the training."""
@@ -245,7 +243,7 @@ class _Run:
         seen: list[Trajectory] = []
         if self._values["optimizer"] in NEED_TRAJECTORIES and not episode.missing:
             seen = cut(*episode.trajectory(), episode.cost.values[:, CostColumn.ENDED])
-        for i, key in enumerate(_keys(episode.start.values, policies)):
+        for i, key in enumerate(_keys(episode.start.values, policies, episode.start.step)):
             model = episode.model.values[i] if episode.model is not None else None
             cost = episode.cost.values[i]
             self._rows.append((key, episode, i))
@@ -345,27 +343,32 @@ class _Run:
             text = f"model of {where}, environment {env}"
             self._report.compare("rows of models", text, recorded, model_rows.pack(own))
 
-    def _explain(self, batch: Batch, index: int, used: set[bytes], iteration: int) -> None:
+    def _explain(self, batch: Batch, index: int, used: set[bytes], training: Training) -> None:
         """Say why the training wants a rollout that is not in the bag."""
-        report = self._report
+        report, iteration = self._report, training.iteration
         left = [(e, i) for key, e, i in self._rows if key not in used]
         if not left:
             report.notes.append(
                 f"the bag ends after iteration {iteration}; up to there the training was followed"
             )
             return
-        row = batch.rows[index]
-        for episode, i in left:
-            assert episode.start is not None
-            if batch.policies is None or episode.policy is None:
-                continue
-            if np.array_equal(episode.start.values[i], row):
+        row, policies = batch.rows[index], batch.policies
+        alike = [
+            (episode, i)
+            for episode, i in left
+            if episode.start is not None
+            and episode.policy is not None
+            and np.array_equal(episode.start.values[i], row)
+        ]
+        for episode, i in alike:
+            assert episode.start is not None and episode.policy is not None
+            if policies is not None and episode.start.step == training.generation:
                 report.compare(
                     "policies",
                     f"policy of episode {episode.number}, environment {i}, "
                     f"after iteration {iteration}",
                     episode.policy.values[i],
-                    batch.policies[index],
+                    policies[index],
                 )
                 return
         if self._report.incomplete:
@@ -376,16 +379,19 @@ class _Run:
             return
         report.differs(
             f"after iteration {iteration} the training asks for a rollout from seed "
-            f"{int(row[StartColumn.SEED])}, which is not in the bag; "
-            f"episode {left[0][0].number} has another one"
+            f"{int(row[StartColumn.SEED])} with models number {training.generation}, which is not in "
+            f"the bag; episode {left[0][0].number} has another one"
         )
 
 
-def _keys(rows: Array, policies: Array | None) -> list[bytes]:
-    """What identifies each rollout: its seeds, its model and its policy, bit by bit."""
+def _keys(rows: Array, policies: Array | None, models: int) -> list[bytes]:
+    """What identifies each rollout, bit by bit: its seeds, and under a policy that policy and the
+    number of the models it is about, for each exploration repeats the rollouts without control.
+    """
+    rows = np.ascontiguousarray(rows)
     if policies is None:
-        return [row.tobytes() for row in np.ascontiguousarray(rows)]
+        return [row.tobytes() for row in rows]
     return [
-        np.ascontiguousarray(row).tobytes() + np.ascontiguousarray(policy).tobytes()
+        models.to_bytes(8, "little") + row.tobytes() + np.ascontiguousarray(policy).tobytes()
         for row, policy in zip(rows, policies, strict=True)
     ]
