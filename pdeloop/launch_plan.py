@@ -100,6 +100,8 @@ _TRAINING = (
     "start",
     "optimizer",
     "directions",
+    "policy_features",
+    "extra_modes",
 )
 TRAIN_ARGUMENTS = (
     *LOOP_ARGUMENTS,

@@ -12,12 +12,13 @@ import pytest
 from loop_interfaces.frames import Frame
 from loop_interfaces.topics import COMPLETED, VOID
 from pdeloop.monitor.attention import Attention
-from pdeloop.monitor.curve import MOST, Curve
+from pdeloop.monitor.commands import Call
+from pdeloop.monitor.curve import MOST, POINTS, LearningCurve
 from pdeloop.monitor.diagnostics import Endpoint, Health, Rate
 from pdeloop.monitor.episode import COLUMNS, COMPONENTS, ROWS, Episode, rows_of
 from pdeloop.monitor.messages import Cursor
 from pdeloop.monitor.view import View
-from pdeloop.monitor.watched import Watched
+from pdeloop.monitor.watched import FAILURE, Watched
 
 PLANT = 7
 
@@ -190,30 +191,47 @@ def test_an_endless_episode_and_large_messages_do_not_escape_the_budget():
 # The curve.
 
 
-def iteration(seed: int, k: int, cost: float, **more: Any) -> dict[str, Any]:
-    return {"event": "iteration", "seed": seed, "iteration": k, "cost": cost, "diverged": 0, **more}
+def adapted(seed: int, rollouts: int, cost: float | None, **more: Any) -> dict[str, Any]:
+    known = {} if cost is None else {"cost": cost}
+    return {"event": "iteration", "seed": seed, "rollouts": rollouts, "diverged": 0} | known | more
+
+
+def points(curve: LearningCurve) -> list[tuple[float, ...]]:
+    """What a page is sent: x, mean, low, high."""
+    sent = curve.message()
+    json.dumps(sent, allow_nan=False)
+    return list(zip(*(sent[name] for name in ("x", "mean", "low", "high")), strict=True))
 
 
 def test_the_band_of_several_seeds_is_over_the_seeds_and_of_one_over_its_rollouts():
-    several, one = Curve(), Curve()
+    several, one = LearningCurve(), LearningCurve()
     for seed, value in enumerate((1.0, 2.0, 6.0)):
-        several.row(iteration(seed, 1, value, cost_plus=value + 9, cost_minus=value - 9))
-    one.row(iteration(0, 1, 2.0, cost_plus=2.5, cost_minus=1.5))
-    assert several.told()["points"] == [[1, 3.0, 1.0, 6.0, 0]] and several.told()["band"] == "seeds"
-    assert one.told()["points"] == [[1, 2.0, 1.5, 2.5, 0]] and one.told()["band"] == "rollouts"
+        several.row(adapted(seed, 2, value, cost_plus=value + 9, cost_minus=value - 9))
+    one.row(adapted(0, 2, 2.0, cost_plus=2.5, cost_minus=1.5))
+    assert points(several) == [(2, 3.0, 1.0, 6.0)] and several.message()["band"] == "seeds"
+    assert points(one) == [(2, 2.0, 1.5, 2.5)] and one.message()["band"] == "rollouts"
 
 
-def test_a_diverged_iteration_is_a_gap_and_broken_lines_are_left_out():
-    curve = Curve()
-    curve.row({"event": "iteration", "seed": 0, "iteration": 1, "diverged": 2})
-    for line in ({}, {"event": "iteration"}, {"event": "iteration", "seed": "x", "iteration": 1}):
+def test_seeds_that_are_at_other_rollouts_keep_their_cost_until_their_next_point():
+    curve = LearningCurve()
+    for seed, rollouts, value in ((0, 3, 4.0), (1, 4, 2.0), (0, 5, 3.0), (1, 9, 1.0)):
+        curve.row(adapted(seed, rollouts, value))
+    assert points(curve) == [(3, 4, 4, 4), (4, 3, 2, 4), (5, 2.5, 2, 3), (9, 2, 1, 3)]
+    assert curve.message()["costs"] == [[4, 4, 3, 3], [None, 2, 2, 1]]
+    curve.row(adapted(0, 5, 3.5))  # a tuner that was killed repeats what it had not kept
+    assert points(curve)[2] == (5, 2.75, 2, 3.5)
+
+
+def test_what_diverged_has_no_point_and_broken_lines_are_left_out():
+    curve = LearningCurve()
+    curve.row(adapted(0, 2, None, diverged=2))
+    for line in ({}, {"event": "iteration"}, {"event": "iteration", "seed": "x", "rollouts": 1}):
         curve.row(line)
-    assert curve.told()["points"] == [[1, None, None, None, 2]]
-    json.dumps(curve.told(), allow_nan=False)
+    assert points(curve) == [] and curve.message()["diverged"] == 2 and curve.message()["done"] == 2
 
 
 def test_references_are_those_of_the_check_and_then_of_the_evaluation():
-    curve = Curve()
+    curve = LearningCurve()
     curve.row({"event": "checked", "seed": 0, "none": 9.0, "lqt": 99.0, "accepted": False})
     assert curve.references == {}
     for seed, lqt in ((0, 2.0), (1, 4.0)):
@@ -221,30 +239,45 @@ def test_references_are_those_of_the_check_and_then_of_the_evaluation():
     assert curve.references == {"none": 9.0, "lqt": 3.0}
     curve.row({"event": "evaluated", "seed": 0, "none": 8.0, "lqt": 2.5, "adapted": 1.5})
     assert curve.references == {"none": 8.0, "lqt": 2.5, "adapted": 1.5}
+    assert curve.evaluations == {0: {"none": 8.0, "lqt": 2.5, "adapted": 1.5}}
 
 
 def test_a_long_training_stays_within_bounds():
-    curve = Curve()
-    for k in range(1, MOST + 101):
-        curve.row(iteration(0, k, 1.0))
-    assert len(curve.points) == MOST
-    points = curve.told()["points"]
-    assert len(points) <= 1000 and points[-1][0] == MOST + 100
+    curve = LearningCurve()
+    for k in range(1, 3 * MOST):
+        curve.row(adapted(0, k, 1.0))
+    xs = curve.message()["x"]
+    assert len(xs) <= POINTS and xs[-1] == 3 * MOST - 1
+    assert len(curve._points[0]) <= MOST
+
+
+def test_the_time_that_is_left_follows_from_the_rollouts_of_the_last_minute():
+    curve = LearningCurve()
+    assert curve.remaining(0.0) is None
+    curve.row({"event": "phase", "phase": "adapt", "budget": [100, 100], "rollouts": [0, 0]})
+    for k in range(1, 31):  # ten seconds each at first, then one
+        for seed in (0, 1):
+            curve.row(adapted(seed, k, 1.0, time=10.0 * min(k, 10) + max(0, k - 10)))
+    rate = 2 * (30 - 6) / 60.0
+    assert curve.remaining(120.0) == pytest.approx(2 * 70 / rate, rel=0.05)
+    assert curve.remaining(130.0) == pytest.approx(curve.remaining(120.0) - 10.0)
+    curve.row({"event": "phase", "phase": "evaluate", "budget": [100, 100], "rollouts": [30, 30]})
+    assert curve.remaining(130.0) is None
 
 
 def test_from_the_topics_alone_policies_are_points_and_a_row_without_control_is_a_reference():
-    curve, acts = Curve(), [[3, -1, 0, 0], [3, -1, 0, 0], [4, -1, 0, 1], [4, -1, 0, 1]]
+    curve, acts = LearningCurve(), [[3, -1, 0, 0], [3, -1, 0, 0], [4, -1, 0, 1], [4, -1, 0, 1]]
     gains = np.ones((4, 2, 3))
     curve.rollouts(start(acts), frame(gains), cost([1.0, 3.0, 5.0, 7.0]))
-    assert curve.told()["points"] == [[1, 4.0, 2.0, 6.0, 0]]
+    assert points(curve) == [(1, 4.0, 2.0, 6.0)]
     gains[:2] = 0.0
     curve.rollouts(start(acts), frame(gains), cost([8.0, 10.0, 1.0, 1.0]))
-    assert curve.references == {"none": 9.0} and len(curve.points) == 1
+    assert curve.references == {"none": 9.0} and len(points(curve)) == 1
     curve.rollouts(start([[3, 17, 0.1, 0]]), None, cost([50.0]))
     curve.rollouts(start(acts), frame(np.ones((4, 2, 3))), cost([1, 1, 1, 1], ended=VOID))
-    assert len(curve.points) == 1 and curve.phase == "identify"
+    assert len(points(curve)) == 1 and curve.phase == "identify"
     curve.rollouts(start(acts), None, cost([1e9, 1e9, 2.0, 2.0], ended=12))
-    assert curve.told()["points"][-1] == [2, None, None, None, 4]
+    assert len(points(curve)) == 1 and curve.message()["diverged"] == 4
 
 
 def test_episodes_that_come_in_at_once_are_a_point_each():
@@ -256,10 +289,10 @@ def test_episodes_that_come_in_at_once_are_a_point_each():
     watched.start(frame(np.empty((0, 4)), episode=0), 1.0)
     for episode in (1, 2, 3):
         watched.cost(cost([episode, episode + 2.0], episode=episode), 1.0)
-    points = watched.curve.told()["points"]
-    assert [point[:2] for point in points] == [[1, 2.0], [2, 3.0], [3, 4.0]]
+    three = [(1, 2.0), (2, 3.0), (3, 4.0)]
+    assert [point[:2] for point in points(watched.curve)] == three
     watched.cost(cost([9.0, 9.0], episode=4), 1.0)  # nobody knows what it was
-    assert len(watched.curve.points) == 3
+    assert len(points(watched.curve)) == 3
 
 
 # Nodes.
@@ -350,14 +383,50 @@ def test_who_holds_the_loop_is_told_by_the_plant_by_diagnostics_or_by_the_answer
     watched.paused(frame([0.0]), 1.0)
     watched.health.diagnosis("t: training", 1, "", [("paused", "yes")], 2.0)
     assert watched.held() == ["tuner"]
-    watched.answered("/t", "resume", 2.5)  # what it said before that no longer counts
+    watched.answered(Call("/t", "resume"), 2.5, None)  # what it said before that no longer counts
     assert watched.held() == []
-    watched.answered("/p", "pause", 3.0)
+    watched.answered(Call("/p", "pause"), 3.0, None)
     assert watched.held() == ["plant"]
     watched.state(state(1), 9.0, 0)  # somebody else has resumed it
     assert watched.held() == []
     watched.start(frame(np.empty((0, 4))), 9.0)
     assert watched.doing(9.0) == "ended"
+
+
+def test_what_was_asked_for_is_told_until_it_is_answered_and_a_failure_for_a_while():
+    watched = Watched()
+    watched.health.look({"tuner": [Endpoint("/t", b"t")]})
+    pause, stop = Call("/t", "pause"), Call("/t", "stop")
+    watched.asked(pause, 1.0)
+    asked = {"role": "tuner", "verb": "pause", "seconds": 7, "failure": ""}
+    assert watched.requests(8.0) == [asked] and watched.held() == []
+    watched.answered(pause, 8.0, None)
+    assert watched.requests(8.0) == [] and watched.held() == ["tuner"]
+    watched.answered(pause, 9.0, "no")
+    assert [r["failure"] for r in watched.requests(9.0 + FAILURE)] == ["no"]
+    assert watched.requests(9.1 + FAILURE) == []
+    watched.asked(stop, 30.0)
+    assert not watched.stopping
+    watched.answered(stop, 31.0, None)
+    assert watched.stopping and watched.held() == []
+    watched.asked(pause, 32.0)
+    watched.health.look({"tuner": [Endpoint("/t", b"u")]})  # another one, that continues the run
+    assert not watched.stopping
+    watched.health.look({})
+    assert watched.requests(33.0) == []  # nobody is there who could answer
+
+
+def test_an_activity_is_told_with_its_seconds_while_its_node_reports_it():
+    health = Health()
+    health.look({"tuner": [Endpoint("/t", b"t")]})
+    assert health.activity(0.0) is None
+    values = [("activity", "fitting models"), ("activity for", "5.0")]
+    health.diagnosis("t: training", 0, "fitting models for 5 s", values, 10.0)
+    told = {"role": "tuner", "what": "fitting models", "seconds": 7}
+    assert health.activity(12.0) == told
+    assert health.activity(20.0) is None
+    health.diagnosis("t: training", 0, "adapt", [("phase", "adapt")], 21.0)
+    assert health.activity(21.0) is None
 
 
 def test_a_loop_that_is_gone_without_a_word_has_ended_too():

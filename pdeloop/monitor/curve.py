@@ -1,92 +1,97 @@
-"""The training curve: from a run's progress lines, or from the costs on the topics. Pure."""
+"""The learning curve: from a run's progress lines, or from the costs on the topics. Pure."""
 
 from __future__ import annotations
 
 import itertools
 import math
+from bisect import insort
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from loop_interfaces.frames import Frame
 from loop_interfaces.topics import COMPLETED, VOID, CostColumn, StartColumn
 
-MOST = 20_000
-"""Points that are kept; older ones go."""
-POINTS = 1_000
-"""Points that a page is told: more than its pixels would be wasted."""
+POINTS = 400
+"""Points that a page is sent: more than its pixels would be wasted."""
+MOST = 4_000
+"""Points of one seed that are kept; then every second one goes."""
+MOST_SEEDS = 1024
+RATE_WINDOW = 60.0
+"""Seconds over which the speed is taken that the remaining time is estimated with."""
+
+
+@dataclass(frozen=True, order=True)
+class CurvePoint:
+    """Costs of one seed: x, mean cost, lowest and highest of the rollouts that it is made of."""
+
+    x: int
+    cost: float
+    low: float
+    high: float
 
 
 @dataclass
-class Point:
-    """Costs of one iteration: by seed, and of all its rollouts."""
+class LearningCurve:
+    """Mean stage cost by the rollouts that a seed has made, or by episode where only topics tell.
 
-    seeds: dict[int, float] = field(default_factory=dict)
-    rollouts: list[float] = field(default_factory=list)
-    diverged: int = 0
-
-    def told(self, x: int) -> list[float | int | None]:
-        """[x, mean, low, high, diverged]: the band is over seeds, of a single one over rollouts."""
-        costs = list(self.seeds.values())
-        if not costs:
-            return [x, None, None, None, self.diverged]
-        spread = costs if len(costs) > 1 else (self.rollouts or costs)
-        return [x, float(np.mean(costs)), min(spread), max(spread), self.diverged]
-
-
-@dataclass
-class Curve:
-    """Cost by iteration.
-
-    axis: what its x is; phase: what the training does; references: mean stage costs to compare
-    with, by controller; total: iterations asked for, 0 if unknown; version grows with each change.
+    axis: what x is; phase: what the training does; budget: the rollouts of a seed, 0 if unknown;
+    references: mean stage costs to compare with, by controller; evaluations: those of each seed's
+    closing evaluation; version grows with each change.
     """
 
     axis: str = "episode"
     phase: str = ""
-    total: int = 0
-    seeds: set[int] = field(default_factory=set)
+    budget: int = 0
     references: dict[str, float] = field(default_factory=dict)
-    points: dict[int, Point] = field(default_factory=dict)
+    evaluations: dict[int, dict[str, float]] = field(default_factory=dict)
+    diverged: int = 0
     version: int = 0
     number: int = field(default_factory=itertools.count().__next__)
     """Tells one curve from another."""
+    _points: dict[int, list[CurvePoint]] = field(default_factory=dict)
+    _rollouts: dict[int, int] = field(default_factory=dict)
     _checked: dict[int, tuple[float, float]] = field(default_factory=dict)
-    _evaluated: dict[int, dict[str, float]] = field(default_factory=dict)
+    _marks: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=2000))
 
     def row(self, row: Mapping[str, Any]) -> None:
         """Take one line of progress.jsonl; what has another form is left out."""
-        self.axis = "iteration"
-        event = row.get("event")
+        self.axis = "rollouts"
         try:
-            if event == "phase":
-                self.phase = str(row["phase"])[:40]
-            elif event == "iteration":
-                self._iteration(row)
-            elif event == "checked" and row["accepted"]:
-                self._checked[int(row["seed"])] = float(row["none"]), float(row["lqt"])
-                none, lqt = np.mean(list(self._checked.values()), axis=0).tolist()
-                self.references |= {"none": none, "lqt": lqt}
-            elif event == "evaluated":
-                names = ("none", "lqt", "adapted")
-                self._evaluated[int(row["seed"])] = {n: float(row[n]) for n in names}
-                done = self._evaluated.values()
-                self.references |= {n: float(np.mean([e[n] for e in done])) for n in names}
+            match row.get("event"):
+                case "phase":
+                    self.phase = str(row["phase"])[:40]
+                    self.budget = max((int(n) for n in row.get("budget", ())), default=self.budget)
+                case "iteration" | "adapted":
+                    self._adapted(row)
+                case "checked" if row["accepted"]:
+                    self._checked[int(row["seed"])] = float(row["none"]), float(row["lqt"])
+                    none, lqt = np.mean(list(self._checked.values()), axis=0).tolist()
+                    self.references |= {"none": none, "lqt": lqt}
+                case "evaluated":
+                    names = ("none", "lqt", "adapted")
+                    self.evaluations[int(row["seed"])] = {n: float(row[n]) for n in names}
+                    done = self.evaluations.values()
+                    self.references |= {n: float(np.mean([e[n] for e in done])) for n in names}
         except (KeyError, TypeError, ValueError, OverflowError):
             return
         self.version += 1
 
-    def _iteration(self, row: Mapping[str, Any]) -> None:
-        seed = int(row["seed"])
-        self.seeds.add(seed)
-        point = self._point(int(row["iteration"]))
-        point.diverged += int(row.get("diverged", 0))
-        if "cost" in row and math.isfinite(float(row["cost"])):
-            point.seeds[seed] = float(row["cost"])
+    def _adapted(self, row: Mapping[str, Any]) -> None:
+        seed, x = int(row["seed"]), int(row["rollouts"])
+        if seed not in self._rollouts and len(self._rollouts) >= MOST_SEEDS:
+            return
+        self._rollouts[seed] = x
+        self._marks.append((float(row.get("time", 0.0)), sum(self._rollouts.values())))
+        self.diverged += int(row.get("diverged", 0))
+        if "cost" in row and math.isfinite(cost := float(row["cost"])):
             pair = [float(row[name]) for name in ("cost_plus", "cost_minus") if name in row]
-            point.rollouts += [cost for cost in pair if math.isfinite(cost)]
+            made_of = [value for value in pair if math.isfinite(value)] or [cost]
+            self._add(seed, CurvePoint(x, cost, min(made_of), max(made_of)))
 
     def rollouts(self, start: Frame, policy: Frame | None, cost: Frame) -> None:
         """Take an episode that is over, from the topics alone.
@@ -110,30 +115,85 @@ class Curve:
                 if (none & good).any():
                     self.references["none"] = float(mean[none & good].mean())
                 return
-        point = self._point(1 + max(self.points, default=0))
-        point.diverged = int((~good).sum())
-        point.rollouts = mean[good].tolist()
+        self.diverged += int((~good).sum())
+        x = 1 + max(self._rollouts.values(), default=0)
         models = start.values[:, StartColumn.MODEL]
-        for model in np.unique(models):
-            own = good & (models == model)
-            self.seeds.add(int(model))
-            if own.any():
-                point.seeds[int(model)] = float(mean[own].mean())
+        for model in np.unique(models).astype(int).tolist()[:MOST_SEEDS]:
+            self._rollouts[model] = x
+            own = mean[good & (models == model)]
+            if own.size:
+                point = CurvePoint(x, float(own.mean()), float(own.min()), float(own.max()))
+                self._add(model, point)
 
-    def told(self) -> dict[str, Any]:
-        """What a page is told."""
-        every = max(1, -(-len(self.points) // POINTS))
+    @property
+    def seeds(self) -> list[int]:
+        """The seeds that were seen, in order."""
+        return sorted(self._rollouts)
+
+    def costs(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Rollouts (X,) and the cost of each seed by then (S, X), NaN before its first.
+
+        A seed keeps its cost until its next point. X is at most POINTS.
+        """
+        xs = np.unique([point.x for points in self._points.values() for point in points])
+        every = max(1, -(-len(xs) // POINTS))
+        xs = xs[::-every][::-1].astype(np.float64)
+        rows = np.full((len(self._points), len(xs)), np.nan)
+        for row, seed in zip(rows, sorted(self._points), strict=True):
+            points = self._points[seed]
+            known = np.searchsorted([point.x for point in points], xs, side="right") - 1
+            row[known >= 0] = np.array([point.cost for point in points])[known[known >= 0]]
+        return xs, rows
+
+    def remaining(self, now: float) -> float | None:
+        """Estimated seconds to the end of the adaptation at time `now` (epoch s); None if unknown."""
+        if self.phase != "adapt" or not self.budget or len(self._marks) < 2:
+            return None
+        last, done = self._marks[-1]
+        since, before = next(mark for mark in self._marks if last - mark[0] <= RATE_WINDOW)
+        if done <= before or last <= since:
+            since, before = self._marks[0]
+        if done <= before or last <= since:
+            return None
+        left = max(0, self.budget * len(self._rollouts) - done)
+        return max(0.0, left * (last - since) / (done - before) - max(0.0, now - last))
+
+    def message(self) -> dict[str, Any]:
+        """What a page is sent: x, mean, low and high by point, and the cost of every seed."""
+        xs, costs = self.costs()
+        several = len(costs) > 1
+        if several:
+            # A seed without a point yet is left out of the mean; there is one with, or no x.
+            mean, low, high = (f(costs, axis=0) for f in (np.nanmean, np.nanmin, np.nanmax))
+        else:
+            points = {p.x: p for own in self._points.values() for p in own}
+            found = [points[int(x)] for x in xs]
+            mean, low, high = (
+                np.array([getattr(p, name) for p in found]) for name in ("cost", "low", "high")
+            )
         return {
             "axis": self.axis,
             "phase": self.phase,
-            "total": self.total,
-            "band": "seeds" if len(self.seeds) > 1 else "rollouts",
-            "seeds": len(self.seeds),
+            "budget": self.budget,
+            "band": "seeds" if several else "rollouts",
+            "seeds": self.seeds,
+            "done": max(self._rollouts.values(), default=0),
+            "diverged": self.diverged,
             "references": self.references,
-            "points": [point.told(x) for x, point in list(self.points.items())[::-every][::-1]],
+            "evaluations": self.evaluations,
+            "x": xs.tolist(),
+            "mean": mean.tolist(),
+            "low": low.tolist(),
+            "high": high.tolist(),
+            "costs": [[None if math.isnan(c) else c for c in row] for row in costs.tolist()]
+            if several
+            else [],
         }
 
-    def _point(self, x: int) -> Point:
-        if x not in self.points and len(self.points) >= MOST:
-            del self.points[next(iter(self.points))]
-        return self.points.setdefault(x, Point())
+    def _add(self, seed: int, point: CurvePoint) -> None:
+        points = self._points.setdefault(seed, [])
+        if points and point.x <= points[-1].x:  # repeated by a tuner that began again
+            points[:] = [other for other in points if other.x != point.x]
+        insort(points, point)
+        if len(points) > MOST:
+            del points[1::2]

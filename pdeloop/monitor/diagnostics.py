@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -12,9 +13,11 @@ from typing import Any
 
 ROLES = {"plant": "state", "controller": "action", "tuner": "episode/start"}
 """Who a node is follows from what it publishes, whatever its name."""
+REPORT = 2.5
+"""Seconds for which a report of an activity holds: nodes report once a second."""
 WINDOW = 3.0
 """Seconds over which rates are taken."""
-MOST_VALUES = 24
+MOST_VALUES = 32
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,19 @@ class Health:
                 row |= {"level": known.level, "message": known.message, "values": known.values}
             rows.append(row)
         return rows
+
+    def activity(self, now: float) -> dict[str, Any] | None:
+        """What a node says that it is computing, and for how many seconds; None if none does."""
+        for role in ("tuner", "controller", "plant"):
+            known = self._diagnoses.get(self.peers[role].name.strip("/"))
+            if known is None or not self.peers[role].present or now - known.when > REPORT:
+                continue
+            values = dict(known.values)
+            if what := values.get("activity"):
+                with contextlib.suppress(ValueError):
+                    seconds = float(values.get("activity for", 0.0)) + now - known.when
+                    return {"role": role, "what": what, "seconds": round(seconds)}
+        return None
 
     def value(self, role: str, key: str, since: float) -> str | None:
         """What the node in `role` said of itself under `key` in /diagnostics, if not before `since`."""

@@ -11,34 +11,38 @@ from std_srvs.srv import Trigger
 from pdeloop.monitor.commands import Call
 from pdeloop.monitor.view import View
 
-PATIENCE = 5.0
-"""Seconds in which a service must answer."""
+CONNECTION = 5.0
+"""Seconds within which the service must be there."""
+ANSWER = 300.0
+"""Seconds within which it must answer: a node that computes answers when it is done."""
 
 
 class ServiceCall:
     """A call of a service that is under way."""
 
-    def __init__(self, node: Node, call: Call) -> None:
-        self.call, self._node, self._since = call, node, time.monotonic()
+    def __init__(self, node: Node, call: Call, view: View) -> None:
+        self._node, self._call, self._view = node, call, view
+        self._since = time.monotonic()
         self._client = node.create_client(Trigger, f"{call.node}/{call.verb}")
         self._future: Any = None
+        view.asked(call, self._since)
 
-    def poll(self, view: View) -> bool:
+    def poll(self) -> bool:
         """Go on; True when it is over."""
         now = time.monotonic()
         if self._future is None and self._client.service_is_ready():
             self._future = self._client.call_async(Trigger.Request())
-        done = self._future is not None and self._future.done()
-        if done:
+        if self._future is not None and self._future.done():
             answer = self._future.result()
-            if answer.success:
-                view.answered(self.call.node, self.call.verb, now)
-            self.call.tell(bool(answer.success), str(answer.message))
-        elif now - self._since > PATIENCE:
-            self.call.fail(
-                f"{self.call.node}/{self.call.verb} did not answer within {PATIENCE:g} s"
-            )
+            self._view.answered(self._call, now, None if answer.success else str(answer.message))
+        elif now - self._since > (CONNECTION if self._future is None else ANSWER):
+            waited = f"did not answer within {now - self._since:.0f} s"
+            self._view.answered(self._call, now, waited)
         else:
             return False
-        self._node.destroy_client(self._client)
+        self.close()
         return True
+
+    def close(self) -> None:
+        """Wait for it no more."""
+        self._node.destroy_client(self._client)

@@ -141,7 +141,7 @@ class MonitorNode:
         self._obey()
         if self._samples is not None:
             self._samples.look()
-        self._calls = [call for call in self._calls if not call.poll(self._view)]
+        self._calls = [call for call in self._calls if not call.poll()]
         for parameters in self._asked.values():
             if parameters.values is None:
                 parameters.poll()
@@ -170,8 +170,8 @@ class MonitorNode:
                 self._given = True
                 self._begin(command.namespace)
                 self._look_at = 0.0
-            elif not command.answer.cancelled():  # nobody waits for it any more
-                self._calls.append(ServiceCall(self._node, command))
+            else:
+                self._calls.append(ServiceCall(self._node, command, self._view))
 
     def _look(self) -> None:
         found = self._namespaces()

@@ -2,7 +2,7 @@
 
 GET   /, /NAME     the page and its files, all of them from this package
 GET   /ws          a WebSocket with what is new (monitor.view), at most FRAMES times a second
-POST  /api/call    {"node", "verb"}: call a service of a node; {"success", "message"}
+POST  /api/call    {"node", "verb"}: call a service of a node; the status tells what comes of it
 POST  /api/watch   {"namespace"}, {"environment"} or {"component"}: what is shown
 
 Any page of the web that is open in a browser can send requests to 127.0.0.1. So a request must name
@@ -25,6 +25,7 @@ from typing import Any
 
 from aiohttp import WSMsgType, web
 
+from loop_interfaces.controllers import CONTROLLERS
 from pdeloop.monitor.commands import VERBS, Call, Commands, Watch
 from pdeloop.monitor.messages import Cursor
 from pdeloop.monitor.view import View
@@ -34,24 +35,22 @@ FRAMES = 20.0
 MOST_PAGES = 16
 """Pages that may look at the same time."""
 MAX_BODY = 10_000
-ANSWER = 8.0
-"""Seconds in which the node's thread must have answered a call."""
 HOST = "127.0.0.1"
 TOKEN = "X-Pdeloop-Token"
 PAGE = Path(__file__).parent / "page"
 TYPES = {
-    "index.html": "text/html",
-    "style.css": "text/css",
-    "main.js": "text/javascript",
-    "link.js": "text/javascript",
-    "plot.js": "text/javascript",
-    "charts.js": "text/javascript",
-    "field.js": "text/javascript",
-    "panel.js": "text/javascript",
-    "cividis.js": "text/javascript",
-    "icon.svg": "image/svg+xml",
+    ".html": "text/html",
+    ".css": "text/css",
+    ".js": "text/javascript",
+    ".svg": "image/svg+xml",
 }
-"""The files of the page; nothing else is served."""
+FILES = {
+    path.name: path
+    for folder in (PAGE, PAGE / "vendor")
+    for path in sorted(folder.iterdir())
+    if path.suffix in TYPES
+}
+"""The files of the page by name; nothing else is served."""
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
     "img-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'none'; "
@@ -106,7 +105,7 @@ class Server:
         app.router.add_get("/ws", self._on_page)
         app.router.add_post("/api/call", self._on_call)
         app.router.add_post("/api/watch", self._on_watch)
-        app.router.add_get("/{name:[a-z.]*}", _on_file)
+        app.router.add_get("/{name:[A-Za-z.]*}", _on_file)
         runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
         await runner.setup()
         try:
@@ -159,7 +158,8 @@ class Server:
     async def _tell(self, page: web.WebSocketResponse) -> None:
         """Tell a page what is new; a slow one gets fewer pictures, as each `send` waits for it."""
         cursor = Cursor()
-        await page.send_json({"part": "hello", "token": self._token})
+        hello = {"part": "hello", "token": self._token, "controllers": CONTROLLERS}
+        await page.send_json(hello)
         while not page.closed:
             for update in self._view.updates(cursor):
                 if update.startswith(b"{"):
@@ -175,13 +175,8 @@ class Server:
             raise web.HTTPBadRequest(
                 text=f"no node of this loop offers that; expected one of {', '.join(VERBS)}"
             )
-        call = Call(node, str(verb))
-        self._commands.put(call)
-        try:
-            success, message = await asyncio.wait_for(asyncio.wrap_future(call.answer), ANSWER)
-        except TimeoutError:
-            success, message = False, "the loop is not connected at the moment"
-        return web.json_response({"success": success, "message": message})
+        self._commands.put(Call(node, str(verb)))
+        return web.json_response({"success": True})
 
     async def _on_watch(self, request: web.Request) -> web.Response:
         asked = await _body(request)
@@ -202,9 +197,11 @@ class Server:
 
 async def _on_file(request: web.Request) -> web.Response:
     name = request.match_info["name"] or "index.html"
-    if name not in TYPES:
+    if name not in FILES:
         raise web.HTTPNotFound
-    return web.Response(body=(PAGE / name).read_bytes(), content_type=TYPES[name], charset="utf-8")
+    path = FILES[name]
+    kind = TYPES[path.suffix]
+    return web.Response(body=path.read_bytes(), content_type=kind, charset="utf-8")
 
 
 async def _body(request: web.Request) -> dict[str, Any]:

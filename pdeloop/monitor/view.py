@@ -8,21 +8,23 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from loop_interfaces.frames import Frame
-from pdeloop.monitor.curve import Curve
+from pdeloop.monitor.commands import Call
+from pdeloop.monitor.curve import LearningCurve
 from pdeloop.monitor.diagnostics import Endpoint
 from pdeloop.monitor.episode import COMPONENTS
 from pdeloop.monitor.messages import Cursor, sample, target
-from pdeloop.monitor.watched import Watched
+from pdeloop.monitor.watched import SILENT, Watched
 
 FRESH = 0.5
 """Seconds between two looks at the range of the colours."""
 _PARAMETERS = (
     *("problem", "length", "n_z", "n_a", "horizon", "sample_time"),
-    *("optimizer", "seeds", "iterations"),
+    *("optimizer", "seeds"),
 )
 """Parameters that the page shows or needs."""
 
@@ -116,7 +118,6 @@ class View:
         """Take parameters that a node told."""
         with self._lock:
             self._watched.parameters |= {k: values[k] for k in _PARAMETERS if k in values}
-            self._tell_total()
 
     def components(self, names: Sequence[str]) -> None:
         """Take the names of the components that make up a state, one after the other."""
@@ -127,8 +128,7 @@ class View:
         """The curve comes from the lines of the run in `folder` from now on (`progress`)."""
         with self._lock:
             self._place["folder"], self._watched.from_topics = folder, False
-            self._watched.curve = Curve()
-            self._tell_total()
+            self._watched.curve = LearningCurve()
 
     def progress(self, rows: Iterable[Mapping[str, Any]]) -> None:
         """Take new lines of the run's progress.jsonl."""
@@ -136,10 +136,17 @@ class View:
             for row in rows:
                 self._watched.curve.row(row)
 
-    def answered(self, node: str, verb: str, now: float) -> None:
-        """A node did what it was asked to."""
+    def asked(self, call: Call, now: float) -> None:
+        """A page asks a node for something."""
         with self._lock:
-            self._watched.answered(node, verb, now)
+            self._watched.asked(call, now)
+        self.refresh(now)
+
+    def answered(self, call: Call, now: float, failure: str | None) -> None:
+        """A node did what it was asked to, or not: then why."""
+        with self._lock:
+            self._watched.answered(call, now, failure)
+        self.refresh(now)
 
     @property
     def run(self) -> int:
@@ -180,11 +187,17 @@ class View:
             names = watched.components[:COMPONENTS]
             watched.join(now)
             searching = self._place["domain"] is None
+            quiet, remaining = watched.quiet(now), watched.curve.remaining(time.time())
             status = {
                 "part": "status",
                 "place": self._place,
                 "state": "searching" if searching else watched.doing(now),
                 "paused": watched.held(),
+                "stopping": watched.stopping,
+                "requests": watched.requests(now),
+                "activity": watched.health.activity(now),
+                "quiet": None if quiet is None or quiet < SILENT else round(quiet),
+                "remaining": None if remaining is None else round(remaining),
                 "parameters": watched.parameters,
                 "environment": self._environment,
                 "environments": 0 if watched.shown is None else watched.shown.batch,
@@ -214,7 +227,7 @@ class View:
             curve = (watched.curve.number, watched.curve.version)
             if cursor.curve != curve:
                 cursor.curve = curve
-                found.append(json.dumps({"part": "curve", **watched.curve.told()}).encode())
+                found.append(json.dumps({"part": "curve", **watched.curve.message()}).encode())
             if watched.shown is None:
                 return found
             aims = (watched.begun, len(watched.targets), self._component)
@@ -230,9 +243,3 @@ class View:
                 colours=self._colours,
             )
             return [*found, message] if message else found
-
-    def _tell_total(self) -> None:
-        watched = self._watched
-        if not watched.from_topics and isinstance(watched.parameters.get("iterations"), int):
-            watched.curve.total = int(watched.parameters["iterations"])
-            watched.curve.version += 1

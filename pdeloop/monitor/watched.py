@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,8 @@ from numpy.typing import NDArray
 
 from loop_interfaces.frames import Frame, Recent
 from loop_interfaces.topics import VOID, CostColumn, StartColumn
-from pdeloop.monitor.curve import Curve
+from pdeloop.monitor.commands import Call
+from pdeloop.monitor.curve import LearningCurve
 from pdeloop.monitor.diagnostics import Health, Rate
 from pdeloop.monitor.episode import Episode, Key, key_of, rows_of
 
@@ -24,8 +26,19 @@ EXTREMES = (0.3, 99.7)
 """Percentiles of the field that the colours span, as in the report."""
 STEADY = 0.15
 """Share of the colours' range by which it must change to be changed: they would only flicker."""
+FAILURE = 15.0
+"""Seconds for which a page says that a request failed."""
 _MOST = 100
 """Episodes and plants that are remembered."""
+
+
+@dataclass
+class Request:
+    """A service that a page asked for: since when; why and when it failed."""
+
+    since: float
+    failure: str = ""
+    failed: float | None = None
 
 
 class Watched:
@@ -38,7 +51,7 @@ class Watched:
     def __init__(self, *, only: int | None = None, from_topics: bool = True) -> None:
         self.only, self.from_topics = only, from_topics
         self.health = Health()
-        self.curve = Curve()
+        self.curve = LearningCurve()
         self.rounds, self.episodes = Rate(), Rate()
         self.shown: Episode | None = None
         self.begun = 0
@@ -57,6 +70,8 @@ class Watched:
         self._plant_paused = False
         self._paused: dict[str, float] = {}
         self._answered: dict[str, float] = {}
+        self._requests: dict[Call, Request] = {}
+        self._stopping: tuple[str, int] | None = None
         self._heard: float | None = None
         self._ended = False
 
@@ -95,7 +110,7 @@ class Watched:
             return
         before = self._starts.newest
         if before is not None and before.run != frame.run and self.from_topics:
-            self.curve = Curve()
+            self.curve = LearningCurve()
         self._starts.add(frame)
         explores = (frame.values[:, StartColumn.EXCITATION] >= 0).any()
         self.kinds[frame.run, frame.episode] = "exploration" if explores else "policy"
@@ -137,13 +152,50 @@ class Watched:
         self.health.heard(now, "plant")
         self._plant_paused = bool(frame.values.any())
 
-    def answered(self, node: str, verb: str, now: float) -> None:
-        """A node did what it was asked to."""
-        self._answered[node] = now
-        if verb == "pause":
-            self._paused[node] = now
-        elif verb in ("resume", "stop"):
-            self._paused.pop(node, None)
+    def asked(self, call: Call, now: float) -> None:
+        """A page asks a node for something."""
+        self._requests[call] = Request(now)
+
+    def answered(self, call: Call, now: float, failure: str | None) -> None:
+        """A node did what it was asked to, or not: then why."""
+        if failure is not None:
+            self._requests[call] = Request(now, failure, now)
+            return
+        self._requests.pop(call, None)
+        self._answered[call.node] = now
+        if call.verb == "pause":
+            self._paused[call.node] = now
+        elif call.verb in ("resume", "stop"):
+            self._paused.pop(call.node, None)
+        if call.verb == "stop":
+            self._stopping = call.node, self.health.peers["tuner"].starts
+
+    def requests(self, now: float) -> list[dict[str, Any]]:
+        """What was asked for and is not answered yet, and what has just failed."""
+        for call, request in list(self._requests.items()):
+            if request.failed is not None and now - request.failed > FAILURE:
+                del self._requests[call]
+        roles = {peer.name: role for role, peer in self.health.peers.items() if peer.present}
+        return [
+            {
+                "role": roles[call.node],
+                "verb": call.verb,
+                "seconds": round(now - request.since),
+                "failure": request.failure,
+            }
+            for call, request in self._requests.items()
+            if call.node in roles
+        ]
+
+    @property
+    def stopping(self) -> bool:
+        """Whether the tuner has agreed to stop, and is still there."""
+        tuner = self.health.peers["tuner"]
+        return tuner.present and self._stopping == (tuner.name, tuner.starts)
+
+    def quiet(self, now: float) -> float | None:
+        """Seconds since the last message of the loop; None before the first."""
+        return None if self._heard is None else now - self._heard
 
     def join(self, now: float) -> None:
         """Show an episode of which the beginning was seen, or any if there is no better for long."""

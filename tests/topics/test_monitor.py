@@ -21,12 +21,13 @@ LIMIT = 180.0
 SLOW = ("-p", "real_time_factor:=4.0")
 """80 rounds a second: an episode of the small problem takes 0.4 s."""
 STATE = "document.querySelector('#state').textContent"
-ITERATION = "(Number(document.querySelectorAll('#figures dd span')[1]?.textContent) || 0)"
+ROLLOUTS = "(Number(document.querySelectorAll('#figures dd span')[1]?.textContent) || 0)"
+NOTICE = "document.querySelector('#notice').textContent"
 FIELD = "document.querySelector('#field-text').textContent"
 """What the page says of the field: the number of the episode, what it is, the step."""
 PAINTED = """
 (() => {
-  const canvas = document.getElementById(%r);
+  const canvas = document.querySelector("#" + %r + " canvas");
   const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d");
   copy.drawImage(canvas, 0, 0);
   const { data } = copy.getImageData(0, 0, canvas.width, canvas.height);
@@ -89,11 +90,11 @@ def test_the_page_shows_a_running_loop_and_survives_a_restart_of_the_plant(loop,
             f"picture of {name}",
         )
         assert page.ask(f"document.getElementById({name!r}).getAttribute('aria-label')")
-    page.until(f"{ITERATION} >= 3", LIMIT)
+    page.until(f"{ROLLOUTS} >= 3", LIMIT)
     assert page.ask("document.querySelector('#problem').textContent") == "small"
     for role in ("plant", "controller", "tuner"):
         assert "there" in card(page, role) and present(page, role) == "true"
-    before = page.ask(ITERATION)
+    before = page.ask(ROLLOUTS)
     episode = page.ask(FIELD)
 
     nodes["plant"].send_signal(signal.SIGKILL)
@@ -101,7 +102,7 @@ def test_the_page_shows_a_running_loop_and_survives_a_restart_of_the_plant(loop,
     assert "gone" in card(page, "plant")
     loop.node("pde_sim_node", "--params-file", str(SMALL), *SLOW)
     page.wait_for(lambda: "joined again once" in card(page, "plant"), LIMIT, "new plant")
-    page.until(f"{ITERATION} > {before + 2}", LIMIT)
+    page.until(f"{ROLLOUTS} > {before + 2}", LIMIT)
     page.until(f"{FIELD} !== {episode!r}", LIMIT)
     page.until(f"{STATE} === 'running'", LIMIT)
     assert page.console == []
@@ -116,7 +117,7 @@ def test_pause_step_and_resume_on_the_page_move_the_plant_and_stop_ends_the_trai
     nodes = start_loop(loop, tmp_path / "run")
     monitor = loop.pdeloop("monitor", "--port", "0")
     page.go(address(loop, monitor))
-    page.until(f"{ITERATION} >= 1", LIMIT)
+    page.until(f"{ROLLOUTS} >= 1", LIMIT)
     page.until("!document.querySelector('#plant-pause').disabled", LIMIT)
     page.click("#plant-pause")
     page.until(f"{STATE} === 'plant paused'", LIMIT)
@@ -124,10 +125,10 @@ def test_pause_step_and_resume_on_the_page_move_the_plant_and_stop_ends_the_trai
     held = at_step(page)
     page.click("#plant-step")
     page.wait_for(lambda: at_step(page) not in (None, held), LIMIT, "step")
-    iteration = page.ask(ITERATION)
+    rollouts = page.ask(ROLLOUTS)
     page.click("#plant-resume")
     page.until(f"{STATE} === 'running'", LIMIT)
-    page.until(f"{ITERATION} > {iteration}", LIMIT)
+    page.until(f"{ROLLOUTS} > {rollouts}", LIMIT)
     page.click("#tuner-pause")
     page.until(f"{STATE} === 'training paused'", LIMIT)
     page.click("#tuner-resume")
@@ -137,8 +138,51 @@ def test_pause_step_and_resume_on_the_page_move_the_plant_and_stop_ends_the_trai
     assert nodes["tuner"].poll() is None
     page.click("#tuner-stop")
     page.until(f"{STATE} === 'ended'", LIMIT)
+    page.until(f"{NOTICE} === ''", LIMIT)
     nodes["tuner"].wait(LIMIT)
     page.until("document.querySelector('#tuner-pause').disabled", LIMIT)
+    assert page.console == []
+
+
+SLOW_FITS = """
+import sys, time
+from tuner_node import node, training
+finish = training.Training.finish
+def slowly(self, result):
+    time.sleep(12.0 if self.phase == "adapt" else 0.0)
+    return finish(self, result)
+training.Training.finish = slowly
+sys.exit(node.main(sys.argv[1:]))
+"""
+"""The tuner, on a problem whose models take long to fit."""
+
+
+def test_a_tuner_that_computes_says_what_and_a_pause_meanwhile_is_confirmed_at_once(
+    loop, page, tmp_path
+):
+    given = ("--params-file", str(SMALL))
+    loop.node("pde_sim_node", *given)
+    loop.node("controller_node", *given)
+    own = ("-p", "optimizer:=gauss_newton", "-p", f"out:={tmp_path / 'run'}")
+    tuner = loop.start("-c", SLOW_FITS, "--ros-args", *given, *own, name="tuner")
+    page.go(address(loop, loop.pdeloop("monitor", "--port", "0")))
+    page.until(f"/^fitting models, \\d+ s$/.test({STATE})", LIMIT)
+    page.until(f"Number({STATE}.match(/\\d+/)) >= 6", LIMIT)  # longer than the rest is silent
+    page.click("#tuner-pause")
+    page.until(f"{NOTICE}.startsWith('Pause training: asked for')", 3.0)
+    assert page.ask("document.querySelector('#tuner-pause').disabled")
+    page.until(f"{STATE} === 'training paused'", LIMIT)
+    page.until(f"{NOTICE} === ''", LIMIT)
+
+    page.click("#tuner-resume")
+    page.until(f"/^fitting models, \\d+ s$/.test({STATE})", LIMIT)
+    page.click("#tuner-stop")
+    page.click("#tuner-stop")
+    page.until("document.querySelector('#tuner-stop').textContent === 'Stopping…'", LIMIT)
+    assert page.ask("document.querySelector('#tuner-stop').disabled")
+    page.until(f"{STATE} === 'ended'", LIMIT)
+    tuner.wait(LIMIT)
+    page.until(f"{NOTICE} === ''", LIMIT)
     assert page.console == []
 
 
@@ -159,15 +203,15 @@ def test_the_monitor_finds_a_training_that_starts_after_it_and_the_page_a_new_mo
         out = tmp_path / "run"
         run = loop.pdeloop("train", str(SMALL), "--iterations", "100000", "--out", str(out))
         page.until(f"{STATE} === 'running'", LIMIT)
-        page.until(f"{ITERATION} >= 3", LIMIT)
+        page.until(f"{ROLLOUTS} >= 3", LIMIT)
         assert "ROS domain" in page.ask("document.querySelector('#place').textContent")
 
         monitor.send_signal(signal.SIGKILL)
         page.until(f"{STATE} === 'no connection to the monitor'", LIMIT)
-        before = page.ask(ITERATION)
+        before = page.ask(ROLLOUTS)
         port = url.rstrip("/").rpartition(":")[2]
         again = loop.pdeloop("monitor", "--port", port)
-        page.until(f"{STATE} === 'running' && {ITERATION} > {before}", LIMIT)
+        page.until(f"{STATE} === 'running' && {ROLLOUTS} > {before}", LIMIT)
         assert [text for text in page.console if REFUSED not in text] == []
 
         run.send_signal(signal.SIGINT)
@@ -176,7 +220,7 @@ def test_the_monitor_finds_a_training_that_starts_after_it_and_the_page_a_new_mo
         second = tmp_path / "second"
         loop.pdeloop("train", str(SMALL), "--iterations", "100000", "--out", str(second))
         page.until("document.querySelector('#place').textContent.includes('second')", LIMIT)
-        page.until(f"{STATE} === 'running' && {ITERATION} >= 1", LIMIT)
+        page.until(f"{STATE} === 'running' && {ROLLOUTS} >= 1", LIMIT)
         again.send_signal(signal.SIGTERM)
         loop.wait(again, 10.0)
 

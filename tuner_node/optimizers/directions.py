@@ -70,6 +70,7 @@ class Directions:
 
     name = "directions"
     needs_trajectories = False
+    basis = None
 
     def __init__(
         self,

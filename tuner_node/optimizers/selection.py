@@ -41,7 +41,7 @@ _WORST = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two measured trajectories, and by how much theta differs, (n_a, n_s + 1)."""
+    """Two measured trajectories, and by how much theta differs, (n_a, n_f)."""
 
     first: Path
     second: Path
@@ -55,6 +55,9 @@ def mismatches(models: Sequence[LocalModel], pairs: Sequence[Pair], horizon: int
         return errors
     x = np.stack([pair.first.x for pair in pairs])
     measured = np.stack([pair.second.x for pair in pairs]) - x
+    K = pairs[0].first.K
+    if K.ndim == 3:
+        K = np.stack([pair.first.K for pair in pairs])
     forcing = np.stack([pair.second.features @ pair.change.T for pair in pairs])
     size = np.maximum(np.sum(measured**2, axis=(1, 2)), 1e-300)
     free = None
@@ -67,7 +70,7 @@ def mismatches(models: Sequence[LocalModel], pairs: Sequence[Pair], horizon: int
             predicted = predict_difference(
                 model.jacobians(x),
                 model.B,
-                pairs[0].first.K,
+                K,
                 initial=measured[:, 0],
                 forcing=forcing,
                 gammas=gammas,

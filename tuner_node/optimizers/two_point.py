@@ -57,6 +57,7 @@ class TwoPoint:
 
     name = "two_point"
     needs_trajectories = False
+    basis = None
 
     def __init__(
         self,

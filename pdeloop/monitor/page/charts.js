@@ -1,17 +1,21 @@
-// Actions, profile and training curve.
+// Actions, profile and learning curve.
 
+import { Chart } from "./chart.js";
 import { css } from "./cividis.js";
-import { Plot, colour, text } from "./plot.js";
+import { DARK, colour, text } from "./format.js";
 
 // Okabe and Ito's colours, readable with any colour vision; more lines than these go along cividis.
 const LINES = ["#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00"];
 const DOTTED = [2, 3];
 const DASHED = [7, 4];
+const BAR = 74; // width of the field's colour bar: what has the same time axis keeps it free, too
+const MOST_SEEDS = 24; // whose lines can be told apart at all
 
-function extent(...lists) {
+export function extent(...lists) {
   let [low, high] = [Infinity, -Infinity];
   for (const list of lists) {
     for (const value of list) {
+      if (value === null) continue;
       if (value < low) low = value;
       if (value > high) high = value;
     }
@@ -19,194 +23,149 @@ function extent(...lists) {
   return low <= high ? [low, high] : [0, 1];
 }
 
-export function actionsPlot(episode, facts) {
-  const dark = matchMedia("(prefers-color-scheme: dark)");
+export function actionsChart(episode, facts) {
+  const chart = new Chart("actions", { right: BAR });
   // Of cividis the part that stands out from the background.
-  const along = (share) => css(dark.matches ? 0.35 + 0.65 * share : 0.8 * share);
+  const along = (share) => css(DARK.matches ? 0.35 + 0.65 * share : 0.8 * share);
   const style = (j, count) => (count <= LINES.length ? LINES[j] : along((j + 0.5) / count));
 
-  function draw(plot) {
+  chart.update = () => {
     const { header } = episode;
-    const count = header ? header.actions : 0;
-    plot.x = header ? episode.span(facts.horizon) : [0, 1];
-    const [low, high] = extent(episode.actions);
-    const largest = Math.max(Math.abs(low), Math.abs(high)) || 1;
-    plot.y = count ? [-1.1 * largest, 1.35 * largest] : [-1, 1];
-    plot.frame(episode.timeLabel, "action");
-    if (!count) {
-      plot.message("no action has come yet");
-      plot.caption = "";
-      plot.say("Actions: nothing yet");
-      return;
-    }
-    const columns = episode.actions.length / count;
-    const times = Array.from({ length: columns + 1 }, (_, i) => episode.time(episode.step(i)));
-    plot.clip(() => {
-      for (let j = 0; j < count; j++) {
-        const own = times.map((_, i) => episode.actions[Math.min(i, columns - 1) * count + j]);
-        plot.line(times, own, style(j, count), { width: 1.3, held: true });
-      }
-    });
-    plot.legend(
-      count <= LINES.length
-        ? Array.from({ length: count }, (_, j) => [`${j + 1}`, style(j, count)])
-        : [["1", style(0, count)], [`${count}`, style(count - 1, count)]],
-    );
-    plot.caption = facts.n_a > count ? `the first ${count} of ${facts.n_a} actuators` : "";
-    plot.say(`Actions of ${count} actuators, at most ${text(largest)} in magnitude`);
-  }
-
-  function describe(t) {
-    const { header } = episode;
-    if (!header?.actions) return "";
-    const column = Math.floor((t / (header.sample_time || 1) - header.begin) / header.stride);
-    const own = episode.actions.subarray(column * header.actions, (column + 1) * header.actions);
-    if (column < 0 || !own.length) return "";
-    const shown = Array.from(own.subarray(0, 8), (a) => text(a)).join(", ");
-    return `t ${text(t)}: ${shown}${own.length > 8 ? ", …" : ""}`;
-  }
-
-  const plot = new Plot("actions", draw, describe);
-  plot.margin.right = 74; // so that its time axis is that of the field above
-  return plot;
-}
-
-export function profilePlot(episode, facts) {
-  const grid = (count) => Array.from({ length: count }, (_, i) => (i / count) * plot.x[1]);
-
-  function draw() {
-    const { header, latest, target } = episode;
-    plot.x = [0, facts.length || Math.max(1, latest.length)];
-    const label = facts.length ? "x (m)" : "grid point";
-    if (!header) {
-      plot.y = [-1, 1];
-      plot.frame(label, facts.name);
-      plot.message("no state has come yet");
-      plot.say("Profile: nothing yet");
-      return;
-    }
-    const initial = header.begin === 0 ? episode.fields.subarray(0, header.rows) : [];
-    const [low, high] = extent(latest, target, initial, header.range);
-    plot.y = [low - 0.08 * (high - low), high + 0.28 * (high - low)]; // with room for the legend
-    plot.frame(label, facts.name);
-    plot.clip(() => {
-      if (initial.length) plot.line(grid(initial.length), initial, colour("none"), { dash: DOTTED, width: 1.3 });
-      if (target.length) plot.line(grid(target.length), target, colour("text"), { dash: DASHED, width: 1.3 });
-      plot.line(grid(latest.length), latest, colour("adapted"), { width: 2 });
-    });
-    const entries = [];
-    if (initial.length) entries.push(["initial", colour("none"), DOTTED]);
-    if (target.length) entries.push(["target", colour("text"), DASHED]);
-    plot.legend([...entries, [`${facts.name}(x, t)`, colour("adapted")]]);
-    let error = 0;
-    for (let i = 0; i < target.length; i++) error += (latest[i] - target[i]) ** 2;
-    const distance = target.length ? Math.sqrt(error / target.length) : null;
-    const when = header.sample_time ? `t = ${text(episode.time(header.last))} s` : `step ${header.last}`;
-    plot.caption = distance === null ? when : `${when}, rms distance to the target ${text(distance)}`;
-    plot.say(`Profile at ${plot.caption}`);
-  }
-
-  function describe(x) {
-    const { latest, target } = episode;
-    const at = (values) => values[Math.min(values.length - 1, Math.floor((x / plot.x[1]) * values.length))];
-    if (!latest.length) return "";
-    const aim = target.length ? `, target ${text(at(target))}` : "";
-    return `x ${text(x)}: ${facts.name} = ${text(at(latest))}${aim}`;
-  }
-
-  const plot = new Plot("profile", draw, describe);
-  return plot;
-}
-
-const NAMES = { none: "no control", lqt: "LQT", adapted: "adapted" };
-const REFERENCES = { none: DOTTED, lqt: DASHED };
-
-export function curvePlot(curve) {
-  function range(points, references) {
-    const costs = points.flatMap(([, ...costs]) => costs.slice(0, 3)).filter((c) => c !== null);
-    let [low, high] = extent(costs);
-    // What it is compared with is shown unless it would squeeze the curve flat.
-    for (const value of Object.values(references)) {
-      if (!costs.length || (value < 1.6 * high && value > low / 1.6)) {
-        [low, high] = [Math.min(low, value), Math.max(high, value)];
-        if (!costs.length) [low, high] = extent(Object.values(references));
-      }
-    }
-    return [low, high];
-  }
-
-  function draw(plot) {
-    const { points, references, axis, total, band } = curve.told;
-    const last = points.length ? points[points.length - 1][0] : 0;
-    const first = points.length ? Math.min(points[0][0], 1) : 1;
-    let end = 10; // grows in jumps, so that the curve stays where it is for a while
-    while (end < last) end *= 2;
-    plot.x = [first, total ? Math.max(Math.min(end, total), last, first + 1) : end];
-    const [low, high] = range(points, references);
-    plot.log = low > 0 && high / low > 6;
-    const room = 0.12 * (high - low) || 0.5 * Math.abs(high) || 1;
-    plot.y = plot.log ? [low / 1.25, high * 1.6] : [low - room, high + 2 * room];
-    plot.frame(axis, "mean stage cost", { whole: true });
-    plot.clip(() => {
-      for (const [name, dash] of Object.entries(REFERENCES)) {
-        const value = references[name];
-        if (value !== undefined) plot.line(plot.x, [value, value], colour(name), { dash, width: 1.5 });
-      }
-      area(plot, points);
-      plot.line(points.map((p) => p[0]), points.map((p) => p[1]), colour("adapted"), { width: 2 });
-      const known = points.filter((p) => p[1] !== null);
-      if (known.length) dot(plot, known[known.length - 1]);
-    });
-    if (!points.length) plot.message("no iteration yet");
-    const [bottom, top] = plot.y;
-    const entries = Object.keys(REFERENCES)
-      .filter((name) => references[name] !== undefined)
-      .map((name) => {
-        const outside = references[name] > top ? " ↑" : references[name] < bottom ? " ↓" : "";
-        const value = outside ? ` ${text(references[name])}${outside}` : "";
-        return [`${NAMES[name]}${value}`, colour(name), REFERENCES[name]];
+    const count = header?.actions ?? 0;
+    const columns = count ? episode.actions.length / count : 0;
+    const times = Array.from({ length: count ? columns + 1 : 0 }, (_, i) => episode.time(episode.step(i)));
+    const held = (j) =>
+      times.map((_, i) => {
+        const a = episode.actions[Math.min(i, columns - 1) * count + j];
+        return Number.isNaN(a) ? null : a;
       });
-    const over = points.length ? ` (band: ${band})` : "";
-    plot.legend([...entries, [`adapting${over}`, colour("adapted")]]);
-    plot.caption = summary(points, references);
-    plot.say(`Training: ${plot.caption || "no iteration yet"}`);
+    const [low, high] = extent(episode.actions);
+    const largest = 1.1 * (count ? Math.max(Math.abs(low), Math.abs(high)) || 1 : 1);
+    chart.show({
+      data: count ? [times, ...Array.from({ length: count }, (_, j) => held(j))] : [[]],
+      series: Array.from({ length: count }, (_, j) => ({
+        label: `a${j + 1}`,
+        stroke: style(j, count),
+        width: 1.3,
+        steps: true,
+      })),
+      x: { label: header ? episode.timeLabel : "t (s)", range: header ? episode.span(facts.horizon) : [0, 1] },
+      y: { label: "action", range: [-largest, largest] },
+      caption: facts.n_a > count && count ? `the first ${count} of ${facts.n_a} actuators` : "",
+      words: count ? `Actions of ${count} actuators, at most ${text(largest / 1.1)} in magnitude` : "Actions: nothing yet",
+    });
+  };
+  return chart;
+}
+
+export function profileChart(episode, facts) {
+  const chart = new Chart("profile");
+
+  chart.update = () => {
+    const { header, target } = episode;
+    const now = episode.profile();
+    const initial = header?.begin === 0 ? episode.fields.subarray(0, header.rows) : [];
+    const length = facts.length || Math.max(1, now.length);
+    const lines = [];
+    if (initial.length) lines.push(["initial", initial, { stroke: colour("none"), dash: DOTTED, width: 1.3 }]);
+    if (target.length === now.length && now.length) {
+      lines.push(["target", target, { stroke: colour("text"), dash: DASHED, width: 1.3 }]);
+    }
+    if (header) lines.push([facts.name, now, { stroke: colour("adapted"), width: 2 }]);
+    const [low, high] = extent(...lines.map(([, values]) => values), header?.range ?? []);
+    let caption = "";
+    if (header) {
+      const step = episode.column === null ? header.last : episode.step(episode.column);
+      caption = header.sample_time ? `t = ${text(episode.time(step))} s` : `step ${step}`;
+      if (target.length === now.length) {
+        const squares = now.reduce((sum, u, i) => sum + (u - target[i]) ** 2, 0);
+        caption += `, rms distance to the target ${text(Math.sqrt(squares / now.length))}`;
+      }
+    }
+    chart.show({
+      data: [
+        Array.from(now, (_, i) => (i / now.length) * length),
+        ...lines.map(([, values]) => Array.from(values, (u) => (Number.isNaN(u) ? null : u))),
+      ],
+      series: lines.map(([label, , style]) => ({ label, ...style })),
+      x: { label: facts.length ? "x (m)" : "grid point", range: [0, length] },
+      y: { label: facts.name, range: [low - 0.08 * (high - low), high + 0.08 * (high - low)] },
+      caption,
+      words: `Profile ${caption ? `at ${caption}` : ": nothing yet"}`,
+    });
+  };
+  return chart;
+}
+
+export function curveChart(curve, controllers) {
+  const chart = new Chart("curve");
+
+  // What it is compared with is in the picture unless it would squeeze the curve flat.
+  function range({ low, high }, references) {
+    let [bottom, top] = extent(low, high);
+    if (!low.length) return extent(references);
+    for (const value of references) {
+      if (value < 1.6 * top && value > bottom / 1.6) [bottom, top] = [Math.min(bottom, value), Math.max(top, value)];
+    }
+    return [bottom, top];
   }
 
-  function area(plot, points) {
-    const c = plot.context;
-    const known = points.filter((p) => p[2] !== null);
-    c.fillStyle = colour("band");
-    c.beginPath();
-    for (const [x, , , high] of known) c.lineTo(plot.px(x), plot.py(high));
-    for (const [x, , low] of known.slice().reverse()) c.lineTo(plot.px(x), plot.py(low));
-    c.fill();
-  }
-
-  function dot(plot, [x, mean]) {
-    const c = plot.context;
-    c.fillStyle = colour("adapted");
-    c.beginPath();
-    c.arc(plot.px(x), plot.py(mean), 3.2, 0, 2 * Math.PI);
-    c.fill();
-  }
-
-  function summary(points, { lqt, adapted }) {
+  function summary({ references: { lqt, adapted }, diverged }) {
+    const words = [];
     if (adapted !== undefined && lqt) {
       const share = 100 * (1 - adapted / lqt);
       const side = share >= 0 ? "below" : "above";
-      return `evaluated: ${text(adapted)}, ${Math.abs(share).toFixed(1)} % ${side} LQT`;
+      words.push(`evaluated: ${text(adapted)}, ${Math.abs(share).toFixed(1)} % ${side} ${controllers.lqt}`);
     }
-    const lost = points.reduce((sum, p) => sum + p[4], 0);
-    return lost ? `${lost} rollouts diverged` : "";
+    if (diverged) words.push(`${diverged} rollout${diverged === 1 ? "" : "s"} diverged`);
+    return words.join("; ");
   }
 
-  function describe(x) {
-    const { points, axis } = curve.told;
-    if (!points.length) return "";
-    const near = points.reduce((a, b) => (Math.abs(b[0] - x) < Math.abs(a[0] - x) ? b : a));
-    if (near[1] === null) return `${axis} ${near[0]}: diverged`;
-    return `${axis} ${near[0]}: ${text(near[1])} (${text(near[2])} to ${text(near[3])})`;
-  }
-
-  return new Plot("curve", draw, describe);
+  chart.update = () => {
+    const told = curve.told;
+    const { x, mean, low, high, costs, axis, budget } = told;
+    const last = x.length ? x[x.length - 1] : 0;
+    let grown = 10; // in jumps, so that the curve stays where it is for a while
+    while (grown < last) grown *= 2;
+    const end = budget ? Math.max(budget, last) : grown;
+    const references = ["none", "lqt"].filter((name) => told.references[name] !== undefined);
+    const [bottom, top] = range(told, references.map((name) => told.references[name]));
+    const log = bottom > 0 && top / bottom > 6;
+    const room = 0.12 * (top - bottom) || 0.5 * Math.abs(top) || 1;
+    const span = log ? [bottom / 1.25, top * 1.25] : [bottom - room, top + room];
+    const within = (list) => [null, ...list, null];
+    const ends = [0, ...x, end];
+    const seeds = costs.length <= MOST_SEEDS ? costs : [];
+    const value = (_, v, __, i) =>
+      i === null || v === null ? "" : `${text(v)} (${text(curve.told.low[i - 1])} to ${text(curve.told.high[i - 1])})`;
+    const hidden = { class: "unnamed", stroke: "transparent", width: 0 };
+    const flat = references.map((name) => {
+      const cost = told.references[name];
+      const outside = cost > span[1] ? ` ${text(cost)} ↑` : cost < span[0] ? ` ${text(cost)} ↓` : "";
+      return { label: `${controllers[name]}${outside}`, stroke: colour(name), dash: name === "none" ? DOTTED : DASHED, width: 1.5 };
+    });
+    chart.show({
+      data: [
+        ends,
+        within(high),
+        within(low),
+        ...seeds.map(within),
+        ...references.map((name) => ends.map(() => told.references[name])),
+        within(mean),
+      ],
+      series: [
+        { label: "high", ...hidden },
+        { label: "low", ...hidden },
+        ...seeds.map((_, i) => ({ ...hidden, label: `seed ${told.seeds[i]}`, stroke: colour("seed"), width: 1 })),
+        ...flat,
+        { label: `${controllers.adapted} (band: ${told.band})`, stroke: colour("adapted"), width: 2, value },
+      ],
+      bands: [{ series: [1, 2], fill: colour("band") }],
+      x: { label: axis, range: [0, end], whole: true },
+      y: { label: "mean stage cost", range: span, log },
+      caption: summary(told) || (x.length ? "" : "no rollout of the adaptation yet"),
+      words: `Training: ${summary(told) || (x.length ? `${last} ${axis}, mean stage cost ${text(mean[mean.length - 1])}` : "nothing yet")}`,
+    });
+  };
+  return chart;
 }

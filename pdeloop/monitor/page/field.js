@@ -1,7 +1,8 @@
 // What was seen of the shown episode, and its picture in space and time.
 
 import { CIVIDIS, css } from "./cividis.js";
-import { Plot, colour, text } from "./plot.js";
+import { Chart } from "./chart.js";
+import { colour, text } from "./format.js";
 
 const BAR = 12; // width of the colour bar
 
@@ -14,6 +15,14 @@ export class Episode {
     this.latest = new Float32Array(0);
     this.target = new Float32Array(0);
     this.changed = 0; // the first column that is new since the last picture
+    this.column = null; // the one whose profile is shown; null: the newest state
+  }
+
+  // The field of the shown column.
+  profile() {
+    if (this.column === null || this.column >= this.columns) return this.latest;
+    const { rows } = this.header;
+    return this.fields.subarray(this.column * rows, (this.column + 1) * rows);
   }
 
   take(header, numbers) {
@@ -72,7 +81,7 @@ function put(all, part, at) {
   return grown;
 }
 
-export function fieldPlot(episode, facts) {
+export function fieldChart(episode, facts) {
   const picture = document.createElement("canvas");
   const paint = picture.getContext("2d");
 
@@ -81,8 +90,7 @@ export function fieldPlot(episode, facts) {
   function render() {
     const { rows, range, run, episode: number, environment, stride } = episode.header;
     const [low, high] = range;
-    const scheme = colour("blank");
-    const what = JSON.stringify([rows, range, run, number, environment, stride, scheme]);
+    const what = JSON.stringify([rows, range, run, number, environment, stride]);
     const columns = episode.columns;
     let from = episode.changed;
     if (what !== painted || picture.width < columns || picture.height !== rows) {
@@ -112,68 +120,96 @@ export function fieldPlot(episode, facts) {
     paint.putImageData(image, from, 0);
   }
 
-  function bar(plot) {
-    const { context: c, box } = plot;
-    const left = box.right + 12;
-    const height = box.bottom - box.top;
-    for (let y = 0; y < height; y++) {
-      c.fillStyle = css(1 - y / height);
-      c.fillRect(left, box.top + y, BAR, 1.5);
+  // Into uPlot's canvas, in its pixels, below the axes.
+  function drawPicture(plot) {
+    if (!episode.header) return;
+    render();
+    const { ctx: c, bbox: box } = plot;
+    const columns = episode.columns;
+    const start = plot.valToPos(episode.time(episode.step(0)), "x", true);
+    const end = plot.valToPos(episode.time(episode.step(columns)), "x", true);
+    c.save();
+    c.beginPath();
+    c.rect(box.left, box.top, box.width, box.height);
+    c.clip();
+    c.fillStyle = colour("blank");
+    c.fillRect(box.left, box.top, box.width, box.height);
+    c.imageSmoothingEnabled = false;
+    c.drawImage(picture, 0, 0, columns, episode.header.rows, start, box.top, end - start, box.height);
+    if (episode.column !== null) {
+      const at = Math.round(plot.valToPos(episode.time(episode.step(episode.column)), "x", true));
+      c.fillStyle = "#ffffff";
+      c.fillRect(at - uPlot.pxRatio, box.top, 2 * uPlot.pxRatio, box.height);
+    }
+    c.restore();
+  }
+
+  function drawBar(plot) {
+    if (!episode.header) return;
+    const { ctx: c, bbox: box } = plot;
+    const px = uPlot.pxRatio;
+    const left = box.left + box.width + 12 * px;
+    c.save();
+    for (let y = 0; y < box.height; y++) {
+      c.fillStyle = css(1 - y / box.height);
+      c.fillRect(left, box.top + y, BAR * px, 1.5);
     }
     const [low, high] = episode.header.range;
     c.fillStyle = colour("muted");
     c.textAlign = "left";
+    c.font = `${12 * px}px system-ui, "DejaVu Sans", sans-serif`;
     for (const share of [0, 0.25, 0.5, 0.75, 1]) {
       c.textBaseline = share === 0 ? "bottom" : share === 1 ? "top" : "middle";
       const u = low + share * (high - low);
-      c.fillText(text(u, (high - low) / 40), left + BAR + 5, box.bottom - share * height);
+      c.fillText(text(u, (high - low) / 40), left + (BAR + 5) * px, box.top + (1 - share) * box.height);
     }
+    c.restore();
   }
 
-  function draw(plot) {
+  // What the pointer is on.
+  function point(plot) {
+    const { left, top } = plot.cursor;
     const { header } = episode;
-    plot.y = [0, facts.length || Math.max(1, header ? header.rows - 1 : 1)];
-    plot.x = header ? episode.span(facts.horizon) : [0, 1];
-    const yLabel = facts.length ? "x (m)" : "grid point";
-    if (!header) {
-      plot.frame("t (s)", yLabel, { grid: false });
-      plot.message("no state has come yet");
-      plot.caption = "";
-      plot.say("Field in space and time: nothing yet");
-      return;
+    chart.pointed = false;
+    if (header && left >= 0 && top >= 0) {
+      const [t, x] = [plot.posToVal(left, "x"), plot.posToVal(top, "y")];
+      const { rows, begin, stride, sample_time: dt } = header;
+      const column = Math.floor((t / (dt || 1) - begin) / stride);
+      const row = Math.min(rows - 1, Math.floor((x / (facts.length || rows)) * rows));
+      if (column >= 0 && column < episode.columns && row >= 0) {
+        chart.pointed = true;
+        chart.say(`t ${text(t)}, x ${text(x)}: ${facts.name} = ${text(episode.value(column, row))}`);
+      }
     }
-    render();
-    const { context: c, box } = plot;
-    c.fillStyle = colour("blank");
-    c.fillRect(box.left, box.top, box.right - box.left, box.bottom - box.top);
-    const columns = episode.columns;
-    const start = plot.px(episode.time(episode.step(0)));
-    const end = plot.px(episode.time(episode.step(columns)));
-    c.imageSmoothingEnabled = false;
-    plot.clip(() =>
-      c.drawImage(picture, 0, 0, columns, header.rows, start, box.top, end - start, box.bottom - box.top),
-    );
-    plot.frame(episode.timeLabel, yLabel, { grid: false });
-    bar(plot);
-    const number = header.episode % 2 ** 32; // the rest counts the restarts of the tuner
-    const kind = header.kind ? ` (${header.kind})` : "";
-    plot.caption = `${facts.name}(x, t), episode ${number}${kind}, step ${header.last}`;
-    plot.say(
-      `Field ${facts.name}(x, t) of episode ${number}, environment ${header.environment}, up to step ` +
-        `${header.last}, values from ${text(header.range[0])} to ${text(header.range[1])}`,
-    );
+    if (!chart.pointed) chart.say(chart.shown.caption);
   }
 
-  function describe(t, x) {
-    if (!episode.header) return "";
-    const { rows, begin, stride, sample_time: dt } = episode.header;
-    const column = Math.floor((t / (dt || 1) - begin) / stride);
-    const row = Math.min(rows - 1, Math.floor((x / (facts.length || rows)) * rows));
-    if (column < 0 || column >= episode.columns || row < 0) return "";
-    return `t ${text(t)}, x ${text(x)}: ${facts.name} = ${text(episode.value(column, row))}`;
-  }
+  const hooks = { drawClear: [drawPicture], draw: [drawBar], setCursor: [point] };
+  const chart = new Chart("field", { right: 74, legend: false, grid: false, hooks });
 
-  const plot = new Plot("field", draw, describe);
-  plot.margin.right = 74;
-  return plot;
+  chart.update = () => {
+    const { header } = episode;
+    const range = header ? episode.span(facts.horizon) : [0, 1];
+    let [caption, words] = ["no state has come yet", "Field in space and time: nothing yet"];
+    if (header) {
+      const number = header.episode % 2 ** 32; // the rest counts the restarts of the tuner
+      const kind = header.kind ? ` (${header.kind})` : "";
+      caption = `${facts.name}(x, t), episode ${number}${kind}, step ${header.last}`;
+      words =
+        `Field ${facts.name}(x, t) of episode ${number}, environment ${header.environment}, up to step ` +
+        `${header.last}, values from ${text(header.range[0])} to ${text(header.range[1])}`;
+    }
+    chart.show({
+      data: [range, [null, null]],
+      series: [{ label: facts.name }],
+      x: { label: header ? episode.timeLabel : "t (s)", range },
+      y: {
+        label: facts.length ? "x (m)" : "grid point",
+        range: [0, facts.length || Math.max(1, header ? header.rows - 1 : 1)],
+      },
+      caption,
+      words,
+    });
+  };
+  return chart;
 }

@@ -47,7 +47,7 @@ export class Link {
     if (typeof data === "string") {
       const message = JSON.parse(data);
       if (message.part === "hello") this.token = message.token;
-      else this.take(message, null);
+      this.take(message, null);
       return;
     }
     const length = new DataView(data).getUint32(0, true);

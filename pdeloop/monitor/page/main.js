@@ -1,52 +1,65 @@
 // The live page: what comes over the link goes into the charts and the panel.
 
-import { actionsPlot, curvePlot, profilePlot } from "./charts.js";
-import { Episode, fieldPlot } from "./field.js";
+import { actionsChart, curveChart, profileChart } from "./charts.js";
+import { Episode, fieldChart } from "./field.js";
 import { Link } from "./link.js";
 import { Panel } from "./panel.js";
 
-const EMPTY = { axis: "iteration", phase: "", total: 0, band: "seeds", references: {}, points: [] };
+const EMPTY = {
+  ...{ axis: "rollouts", phase: "", budget: 0, band: "seeds", diverged: 0, done: 0 },
+  ...{ seeds: [], references: {}, evaluations: {}, x: [], mean: [], low: [], high: [], costs: [] },
+};
 
 const episode = new Episode();
 const facts = { length: 0, horizon: 0, n_a: 0, name: "u" }; // of the loop, as far as its nodes told
 const curve = { told: EMPTY };
+const controllers = {}; // names, by key
 let status = null;
 
 const panel = new Panel(() => link);
-const field = fieldPlot(episode, facts);
-const actions = actionsPlot(episode, facts);
-const profile = profilePlot(episode, facts);
-const training = curvePlot(curve);
-const ofEpisode = [field, actions, profile];
+const training = curveChart(curve, controllers);
+const ofEpisode = [fieldChart(episode, facts), actionsChart(episode, facts), profileChart(episode, facts)];
 
-function redraw(plots) {
-  for (const plot of plots) plot.redraw();
+function update(charts) {
+  for (const chart of charts) chart.update();
 }
 
 const take = {
+  hello(message) {
+    const { style } = document.documentElement;
+    for (const [key, [name, light, dark]] of Object.entries(message.controllers)) {
+      controllers[key] = name;
+      style.setProperty(`--${key}-light`, light);
+      style.setProperty(`--${key}-dark`, dark);
+    }
+    for (const chart of [training, ...ofEpisode]) chart.restyle();
+  },
   status(message) {
     const moved = status && status.place.begun !== message.place.begun;
     status = message;
     const { length = 0, horizon = 0, n_a = 0 } = message.parameters;
-    const changed = facts.length !== length || facts.horizon !== horizon || facts.name !== message.components[message.component];
     const name = message.components[message.component];
+    const changed = facts.length !== length || facts.horizon !== horizon || facts.name !== name;
     Object.assign(facts, { length, horizon, n_a, name });
+    if (moved) {
+      Object.assign(episode, new Episode());
+      curve.told = EMPTY;
+    }
     panel.status(message, curve);
-    if (moved) Object.assign(episode, new Episode());
-    if (changed || moved) redraw(ofEpisode);
+    if (changed || moved) update(ofEpisode);
   },
   curve(message) {
     curve.told = message;
     if (status) panel.figures(status, curve);
-    redraw([training]);
+    update([training]);
   },
   target(message, numbers) {
     episode.target = numbers.slice();
-    redraw([profile]);
+    update(ofEpisode.slice(2));
   },
   episode(message, numbers) {
     episode.take(message, numbers);
-    redraw(ofEpisode);
+    update(ofEpisode);
   },
 };
 
@@ -54,4 +67,4 @@ const link = new Link(
   (header, numbers) => take[header.part]?.(header, numbers),
   (yes) => panel.connected(yes),
 );
-redraw([...ofEpisode, training]);
+update([...ofEpisode, training]);

@@ -1,13 +1,13 @@
 // What is text on the page: title, state, figures, nodes, buttons.
 
-import { text } from "./plot.js";
+import { duration, text } from "./format.js";
 
 const STATES = {
   searching: ["", "looking for a training", "No training runs on this machine. Start one: pdeloop train burgers"],
   empty: ["warn", "no nodes", "Nobody publishes the loop's topics in this domain and namespace."],
-  waiting: ["warn", "waiting", ""],
+  waiting: ["warn", "waiting for the first message", ""],
   running: ["good", "running", ""],
-  silent: ["warn", "silent", ""],
+  silent: ["warn", "nothing heard", ""],
   paused: ["warn", "paused", ""],
   ended: ["", "ended", ""],
 };
@@ -21,6 +21,8 @@ const TITLES = {
   step: "one step, then pause again",
   stop: "end after this iteration",
 };
+const VERBS = { pause: "Pause", resume: "Resume", step: "Step", stop: "Stop" };
+const DOING = { pause: "Pausing…", resume: "Resuming…", step: "Stepping…", stop: "Stopping…" };
 const NAMES = {
   burgers: "Burgers",
   "allen-cahn": "Allen-Cahn",
@@ -33,9 +35,10 @@ const NAMES = {
   wave: "Wave equation",
   schrodinger: "Schrödinger",
 };
-const PAUSED = { plant: "plant", tuner: "training" };
+const WHAT = { plant: "plant", tuner: "training" };
 const LEVELS = ["good", "warn", "bad", "warn"];
-const SURE = 3000; // ms in which a second click confirms
+const SURE = 5000; // ms in which a second click confirms
+const NOTICE = 10000; // ms for which a notice of the page's own stays
 
 const find = (id) => document.getElementById(id);
 
@@ -54,6 +57,8 @@ export class Panel {
   constructor(link) {
     this.link = link;
     this.buttons = new Map();
+    this.told = { requests: [], activity: null, state: "", stopping: false };
+    this.own = "";
     this.cards = {};
     for (const [role, name, verbs] of BUTTONS) this.group(role, name, verbs);
     this.choice("environment", (value) => ({ environment: Number(value) }));
@@ -67,6 +72,7 @@ export class Panel {
     for (const [verb, words] of verbs) {
       const button = make("button", words);
       button.id = `${role}-${verb}`;
+      button.dataset.words = words;
       button.disabled = true;
       button.setAttribute("aria-label", `${words} ${name}: ${TITLES[verb]}`);
       button.addEventListener("click", () => this.click(button, role, verb, words));
@@ -84,8 +90,9 @@ export class Panel {
       return;
     }
     this.calm(button, words);
+    button.disabled = true; // until the next status, which tells what came of it
     const answer = await this.link().post("/api/call", { node: button.dataset.node, verb });
-    this.notice(answer.success ? "" : `${role} ${verb}: ${answer.message}`);
+    if (!answer.success) this.say(`${words} ${WHAT[role]}: ${answer.message}`);
   }
 
   calm(button, words) {
@@ -96,13 +103,32 @@ export class Panel {
   choice(id, request) {
     find(id).addEventListener("change", async (event) => {
       const answer = await this.link().post("/api/watch", request(event.target.value));
-      this.notice(answer.success ? "" : answer.message);
+      if (!answer.success) this.say(answer.message);
     });
   }
 
-  notice(words) {
-    put(find("notice"), words);
-    find("notice").hidden = !words;
+  // A notice of the page itself, which goes by itself.
+  say(words) {
+    this.own = words;
+    clearTimeout(this.forget);
+    this.forget = setTimeout(() => this.say(""), words ? NOTICE : 2 ** 30);
+    this.notice();
+  }
+
+  // What stands below the title is a function of the newest status, so that nothing old stays.
+  notice() {
+    const { requests, activity, state, stopping } = this.told;
+    const words = requests.map(({ role, verb, seconds, failure }) => {
+      const asked = `${VERBS[verb]} ${WHAT[role] ?? role}`;
+      if (failure) return `${asked}: ${failure}`;
+      const when = activity?.role === role ? `; takes effect after ${activity.what}` : "";
+      return `${asked}: asked for${seconds > 1 ? ` ${duration(seconds)} ago` : ""}${when}`;
+    });
+    if (stopping && state !== "ended") words.push("The training ends after the rollouts under way.");
+    const hint = STATES[state]?.[2];
+    const all = [this.own, hint, ...words].filter(Boolean).join(" · ");
+    put(find("notice"), all);
+    find("notice").hidden = !all;
   }
 
   connected(yes) {
@@ -118,14 +144,11 @@ export class Panel {
   }
 
   status(status, curve) {
+    this.told = status;
     const { place, parameters, controls } = status;
-    let [className, words, hint] = STATES[status.state] ?? ["", status.state, ""];
-    if (status.state === "paused") words = `${status.paused.map((r) => PAUSED[r] ?? r).join(" and ")} paused`;
-    this.pill(className, words);
-    if (hint || find("notice").dataset.hint) {
-      this.notice(hint);
-      find("notice").dataset.hint = hint;
-    }
+    const [className, words] = Panel.doing(status);
+    if (!this.offline) this.pill(className, words);
+    this.notice();
     const problem = NAMES[parameters.problem] ?? parameters.problem ?? "pdeloop";
     put(find("problem"), problem);
     document.title = `${problem} – ${words} – pdeloop`;
@@ -139,7 +162,10 @@ export class Panel {
     for (const [key, button] of this.buttons) {
       const [role, verb] = key.split("/");
       const offer = controls.find((c) => c.role === role && c.verbs.includes(verb));
-      button.disabled = !offer || this.offline;
+      const asked = status.requests.some((r) => r.role === role && r.verb === verb && !r.failure);
+      const late = verb === "stop" && status.stopping;
+      button.disabled = !offer || this.offline || asked || late;
+      if (!button.classList.contains("sure")) put(button, asked || late ? DOING[verb] : button.dataset.words);
       button.dataset.node = offer ? offer.node : "";
       button.title = offer ? `${TITLES[verb]} (${offer.node}/${verb})` : `no ${role} offers the service ~/${verb}`;
     }
@@ -150,6 +176,17 @@ export class Panel {
     const pairs = place.namespaces ?? [];
     find("pair-label").hidden = pairs.length < 2;
     this.list("pair", pairs, place.namespace);
+  }
+
+  // Class and words of the state: what the nodes compute says more than that they are silent.
+  static doing({ state, paused, activity, quiet, stopping }) {
+    const [className, words] = STATES[state] ?? ["", state];
+    if (state === "paused") return [className, `${paused.map((r) => WHAT[r] ?? r).join(" and ")} paused`];
+    const busy = state === "running" || state === "silent" || state === "waiting";
+    if (busy && activity) return ["good", `${activity.what}, ${duration(activity.seconds)}`];
+    if (state === "silent") return [className, `${words} for ${duration(quiet ?? 0)}`];
+    if (state === "running" && stopping) return [className, "stopping"];
+    return [className, words];
   }
 
   options(id, count, chosen) {
@@ -169,19 +206,17 @@ export class Panel {
   }
 
   figures(status, curve) {
-    const { points, references, total, axis, phase, seeds } = curve.told;
-    const last = points.length ? points[points.length - 1] : null;
-    const cost = last ? last[1] : null;
+    const { mean, references, budget, axis, phase, seeds, done } = curve.told;
+    const cost = mean.length ? mean[mean.length - 1] : null;
     const rows = [["phase", phase || "–", ""]];
-    rows.push([axis, last ? String(last[0]) : "–", total ? ` of ${total}` : ""]);
+    rows.push([axis, done ? String(done) : "–", budget ? ` of ${budget}` : ""]);
+    rows.push(["time left", status.remaining === null ? "–" : duration(status.remaining), ""]);
     rows.push(["cost now", text(cost), ""]);
-    const best = points.reduce((m, p) => (p[1] !== null && p[1] < m ? p[1] : m), Infinity);
     const lqt = references.lqt;
     const share = lqt && cost !== null ? 100 * (1 - cost / lqt) : null;
-    rows.push(["lowest", text(best), ""]);
     const side = share === null ? "" : share >= 0 ? " % below" : " % above";
     rows.push(["against LQT", share === null ? "–" : Math.abs(share).toFixed(1), side]);
-    rows.push(["seeds", seeds ? String(seeds) : "–", ""]);
+    rows.push(["seeds", seeds.length ? String(seeds.length) : "–", ""]);
     rows.push(["rounds", text(status.rounds < 10 ? status.rounds : Math.round(status.rounds)), " 1/s"]);
     rows.push(["episodes", text(status.episodes), " 1/s"]);
     const list = find("figures");
