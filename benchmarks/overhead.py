@@ -19,12 +19,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from loop_interfaces.affinity import usable_cores
 from loop_interfaces.isolation import loopback_environment
 from loop_interfaces.problem import find_problem
-from pdeloop.core_affinity import SharedCores, possible
 from pdeloop.domain import own_domain
-from pdeloop.pairs import PAIR
-from pdeloop.supervisor import node_command
+from pdeloop.pairs import pair_cores, pair_nodes
+from pdeloop.supervisor import keep_on, node_command
 
 
 @dataclass
@@ -33,8 +33,8 @@ class Setting:
 
     folder: Path
     environment: dict[str, str]
-    cores: SharedCores | None = None
-    """Which of them the pair is on, as `pdeloop train` does it."""
+    others: Sequence[int] = ()
+    """Cores that plant and controller, which share one, leave to others."""
     processes: list[subprocess.Popen[bytes]] = field(default_factory=list)
 
     def start(self, command: Sequence[str], name: str) -> subprocess.Popen[bytes]:
@@ -49,8 +49,7 @@ class Setting:
     def start_child(self, command: Sequence[str], name: str) -> subprocess.Popen[bytes]:
         """The same, where `pdeloop train` starts such a process itself."""
         process = self.start(command, name)
-        if self.cores is not None:
-            self.cores.keep_away(name, process.pid)
+        keep_on(process.pid, self.others)
         return process
 
     def log(self, name: str) -> str:
@@ -82,14 +81,10 @@ def measure(
             return setting.start(command, node)
 
         try:
-            nodes = [start(name) for name in PAIR]
-            cores = None
-            if possible():
-                cores = SharedCores(1)
-                for name, node in zip(PAIR, nodes, strict=True):
-                    cores.place(0, name, node.pid)
+            cores = pair_cores(1, "shared")
+            setting.others = [core for core in usable_cores() if core not in cores]
+            nodes = [start(node.package, *node.parameters) for node in pair_nodes(cores)]
             start("tuner_node", f"out:={run}", "iterations:=100000", "optimizer:=two_point", *tuner)
-            setting.cores = cores
             progress = run / "progress.jsonl"
 
             def observe(beside: int) -> None:

@@ -10,7 +10,7 @@ import re
 from typing import Any
 
 from benchmarks.processes import BenchError, bench, machine, markdown
-from loop_interfaces.affinity import free_cores
+from loop_interfaces.affinity import least_busy_cores
 from loop_interfaces.problem import load_parameters
 
 PROBLEM = "burgers"
@@ -29,7 +29,7 @@ def run(seconds: float = 10.0, pin: bool = False, rates: tuple[float, ...] = RAT
     for rate in rates:
         factor = rate * sample_time
         horizon = f"horizon:={max(1, round(seconds * rate))}"
-        core = free_cores(1)[0] if pin else -1
+        core = least_busy_cores(1)[0] if pin else -1
         with bench() as running:
             plant = running.start(
                 "pde_sim_node",

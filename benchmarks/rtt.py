@@ -13,18 +13,17 @@ from statistics import median
 from typing import Any
 
 from benchmarks.processes import Bench, BenchProcess, bench, machine, markdown
-from loop_interfaces.affinity import core_text, free_cores, usable_cores
+from loop_interfaces.affinity import least_busy_cores
 from loop_interfaces.problem import load_parameters
-from pdeloop.core_affinity import SharedCores
-from pdeloop.pairs import PAIR
+from pdeloop.pairs import pair_cores, pair_nodes
 
 PROBLEM = "allen-cahn"
 """P2: of the paper's problems the one whose step is shortest."""
 BATCHES = (2, 64)
 CORES = ("any", "shared", "pinned")
 """Where plant and controller are: wherever the scheduler puts them (nodes started by hand), on one
-core for both (as `pdeloop train` does it), on one for good, the plant's helpers looking for work on
-the others (`--pin`). The ping-pong is on any two, and with `pinned` on one each, polling."""
+core for both (as `pdeloop train` does it), the same with the plant's helpers looking for work on the
+others all the time (`--pin`). The ping-pong is on any two, and with `pinned` on one each, polling."""
 PAYLOAD = 256
 """Numbers in a request of the bare ping-pong."""
 
@@ -40,19 +39,15 @@ def measure(
 def _measure(
     running: Bench, batches: tuple[int, ...], turns: int, seconds: float, cores: str
 ) -> list[dict[str, Any]]:
-    one, two = free_cores(2) if cores == "pinned" else (-1, -1)
+    one, two = least_busy_cores(2) if cores == "pinned" else (-1, -1)
     ping = running.start("benchmarks.ping", f"pin:={one}")
     running.start("benchmarks.ping", "end:=pong", f"pin:={two}")
     horizon = "horizon:=1000"
-    solver = [] if cores == "any" else [f"solver_cores:='{core_text(usable_cores())}'"]
+    plant, controller = pair_nodes(pair_cores(1, cores), solver_polls=cores == "pinned")
     pair = (
-        running.start("pde_sim_node", horizon, f"pin:={one}", *solver, problem=PROBLEM),
-        running.start("controller_node", f"pin:={one}", problem=PROBLEM),
+        running.start(plant.package, horizon, *plant.parameters, problem=PROBLEM),
+        running.start(controller.package, *controller.parameters, problem=PROBLEM),
     )
-    if cores == "shared":
-        placement = SharedCores(1)
-        for name, node in zip(PAIR, pair, strict=True):
-            placement.place(0, name, node.process.pid)
     driver = running.start("benchmarks.driver", horizon, f"solver_pin:={one}", problem=PROBLEM)
     n_z = load_parameters(PROBLEM, {})["n_z"]
     for batch in batches:  # compile, find each other, warm up

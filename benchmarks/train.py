@@ -19,7 +19,6 @@ from statistics import median
 from typing import Any
 
 from benchmarks.processes import BenchError, machine, markdown
-from loop_interfaces.affinity import free_cores
 
 LIMIT = 600.0
 """Seconds after which a training is given up."""
@@ -31,7 +30,6 @@ def run(
     """One row for each way to train."""
     ways: dict[str, list[str]] = {"in-process": ["--in-process"], "topics": []}
     if pin:
-        free_cores(2)
         ways["topics --spread"] = ["--spread"]
         ways["topics --pin"] = ["--pin"]
     runs: dict[str, list[dict[str, Any]]] = {way: [] for way in ways}

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import os
+import random
 import threading
+import time
 from collections.abc import Collection
 from pathlib import Path
 
+SAMPLE = 0.1
+"""Seconds over which `least_busy_cores` looks at how busy the cores are."""
 SOLVER = "solver"
 """Name, for the operating system, of the threads that help a plant with its step."""
 
@@ -81,7 +85,26 @@ def pin_process(core: int) -> None:
             os.sched_setaffinity(int(thread.name), {core})
 
 
-def free_cores(count: int) -> list[int]:
-    """A core for each of `count` processes, of those this one may use, evenly."""
-    cores = usable_cores()
+def least_busy_cores(count: int) -> list[int]:
+    """A core for each of `count` processes, of those this one may use: evenly, the least busy first.
+
+    Of cores that are equally busy it takes any, so that programs that start at once spread out.
+    """
+    before = _busy_ticks()
+    time.sleep(SAMPLE)
+    after = _busy_ticks()
+    busy = {core: after.get(core, 0) - before.get(core, 0) for core in usable_cores()}
+    cores = sorted(busy, key=lambda core: (busy[core], random.random()))
     return [cores[i % len(cores)] for i in range(count)]
+
+
+def _busy_ticks(file: Path = Path("/proc/stat")) -> dict[int, int]:
+    """Ticks that each core was not idle since the machine was started (proc_stat(5)); {}: unknown."""
+    ticks = {}
+    with contextlib.suppress(OSError):
+        for line in file.read_text().splitlines():
+            name, *numbers = line.split()
+            if name.startswith("cpu") and name != "cpu":
+                spent = [int(number) for number in numbers[:8]]
+                ticks[int(name[3:])] = sum(spent) - spent[3] - spent[4]  # idle, waiting for a disk
+    return ticks

@@ -152,14 +152,18 @@ PLANT = (
         "cores of the threads that share a step of many environments, like 0-3,6; empty: those of "
         "the node",
     ),
+    Spec(
+        "solver_polls",
+        False,
+        "those threads look for work all the time within an episode, instead of sleeping",
+    ),
 )
 
 EXECUTION = (
     Spec(
         "pin",
         -1,
-        "core on which every thread of the node stays, but a plant's helpers if it has "
-        "solver_cores, which then look for work all the time within an episode; -1: any core",
+        "core on which every thread of the node stays, but those of solver_cores; -1: any core",
         -1,
         4095,
     ),

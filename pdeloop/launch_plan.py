@@ -16,7 +16,16 @@ from loop_interfaces.parameters import INSTRUMENTS, PLANT, RECORDER, TUNER
 from loop_interfaces.problem import find_problem, load_parameters, shipped_problems
 from loop_interfaces.spec import ParameterError, Spec
 from pde_sim_node.equations import ALLOWED, allow
-from pdeloop.pairs import MAX_PAIRS, Layout, LoopNode, Recording, pair_nodes, quoted
+from pdeloop.pairs import (
+    MAX_PAIRS,
+    Layout,
+    LoopNode,
+    Recording,
+    check_pairs,
+    pair_cores,
+    pair_nodes,
+    quoted,
+)
 from pdeloop.training_run import begin, reopen, unused
 
 _KNOWN = {spec.name: spec for spec in (*INSTRUMENTS, *PLANT, *TUNER, *RECORDER)}
@@ -71,7 +80,9 @@ LOOP_ARGUMENTS = (
     ),
     Argument(Spec("namespace", "", "namespace of all nodes; empty: none")),
     Argument(Spec("pairs", 1, "plants with a controller each", 1, MAX_PAIRS)),
-    Argument(Spec("pin", False, "keep each pair on a core, helpers look for work all the time")),
+    Argument(
+        Spec("pin", False, "a core of its own for each pair, helpers look for work all the time")
+    ),
     Argument(
         Spec(
             "equation",
@@ -138,9 +149,10 @@ def loop_plan(texts: Mapping[str, str]) -> Plan:
     # The nodes would look for a relative file of an equation in their working directory.
     own["equation"] = quoted(resolved["equation"])
     more = [f"{name}:={value}" for name, value in own.items()]
+    placement = "pinned" if given["pin"] else "shared"
     nodes = [
         LoopNode(n.name, n.package, [*n.parameters, *more], n.remaps, n.namespace)
-        for n in pair_nodes(given["pairs"], given["pin"])
+        for n in pair_nodes(pair_cores(given["pairs"], placement), solver_polls=given["pin"])
     ]
     return _plan(nodes, find_problem(given["problem"]).resolve(), given)
 
@@ -157,8 +169,10 @@ def train_plan(texts: Mapping[str, str]) -> Plan:
     own |= _plant_parameters(given)
     if given["model"]:
         own["model"] = str(Path(given["model"]).resolve())
-    layout = Layout(given["pairs"], given["pin"], recording, view=given["view"])
-    pair_nodes(layout.pairs, layout.pin)  # refuses before there is a folder
+    layout = Layout(
+        given["pairs"], "pinned" if given["pin"] else "shared", recording, view=given["view"]
+    )
+    check_pairs(layout.pairs, layout.placement)  # refuses before there is a folder
     if given["resume"]:
         changes = [name for name in own if name != "equation"] + ["out"] * bool(given["out"])
         if changes:

@@ -5,24 +5,30 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from loop_interfaces.affinity import core_text, free_cores, usable_cores
+from loop_interfaces.affinity import core_text, least_busy_cores, usable_cores
 from loop_interfaces.spec import ParameterError
 from pde_sim_node.build import fingerprint
 from tuner_node.results import RunFolder
 
 MAX_PAIRS = 64
 """On one machine; on several, start the pairs by hand (docs/scaling.md)."""
+PLACEMENTS = ("shared", "pinned", "any")
+"""Where plant and controller of a pair run, for good: on one core for both, which they take in turns,
+so that a message wakes no idle core; the same, with a core for each pair and the plant's helpers
+polling on the others; or wherever the scheduler puts them."""
 
 
 @dataclass(frozen=True)
 class LoopNode:
     """A node of a run: name of its process, package, parameters NAME:=VALUE, remaps FROM:=TO.
 
-    namespace: relative to that of the run; empty: the run's own.
+    namespace: relative to that of the run; empty: the run's own. cores: of all its threads, from its
+    start; empty: any.
     """
 
     name: str
@@ -30,6 +36,7 @@ class LoopNode:
     parameters: Sequence[str] = ()
     remaps: Sequence[str] = ()
     namespace: str = ""
+    cores: Sequence[int] = ()
 
     def arguments(self, parameter_file: Path) -> list[str]:
         """Parameters and remaps as ROS arguments, without the namespace."""
@@ -64,34 +71,46 @@ def namespaces(pairs: int) -> list[str]:
     return [f"pair{i}" for i in range(pairs)] if pairs > 1 else [""]
 
 
-def pair_nodes(
-    pairs: int,
-    pin: bool,
-    remaps: Mapping[str, Sequence[str]] | None = None,
-    *,
-    shared: bool = False,
-) -> list[LoopNode]:
-    """The nodes of `pairs` pairs; with `pin` each pair stays on a core of its own.
-
-    remaps: by package; shared: each pair will be kept on one core (pdeloop.core_affinity), but the
-    plant's solver has all of them. ParameterError when there are too many for this machine.
-    """
+def check_pairs(pairs: int, placement: str = "shared") -> None:
+    """ParameterError when there are too many pairs for this machine."""
     if not 1 <= pairs <= MAX_PAIRS:
         raise ParameterError(f"--pairs is {pairs}; expected a whole number from 1 to {MAX_PAIRS}")
-    cores = free_cores(pairs)
-    if pin and len(set(cores)) < pairs:
+    cores = len(usable_cores())
+    if placement == "pinned" and cores < pairs:
         raise ParameterError(
             f"--pin gives each of the {pairs} pairs of plant and controller a core of its own, but "
-            f"there are {len(set(cores))}; leave out --pin, or use fewer pairs"
+            f"there are {cores}; leave out --pin, or use fewer pairs"
         )
+
+
+def pair_cores(pairs: int, placement: str) -> list[int | None]:
+    """The core that each pair shares, the least busy ones first; None: any."""
+    check_pairs(pairs, placement)
+    choice = len(usable_cores()) > 1 and hasattr(os, "sched_setaffinity")
+    if placement == "any" or not (choice or placement == "pinned"):
+        return [None] * pairs
+    return list(least_busy_cores(pairs))
+
+
+def pair_nodes(
+    cores: Sequence[int | None],
+    remaps: Mapping[str, Sequence[str]] | None = None,
+    *,
+    solver_polls: bool = False,
+) -> list[LoopNode]:
+    """The nodes of as many pairs as there are `cores` (see `pair_cores`).
+
+    remaps: by package; solver_polls: the plant's helpers look for work all the time.
+    """
     nodes = []
-    for number, namespace in enumerate(namespaces(pairs)):
+    for number, (namespace, core) in enumerate(zip(namespaces(len(cores)), cores, strict=True)):
         for package in PAIR:
-            parameters = [f"pin:={cores[number]}"] if pin else []
+            parameters = [] if core is None else [f"pin:={core}"]
             if number and package == "pde_sim_node":  # /clock is one topic for all
                 parameters.append("publish_clock:=false")
-            if (shared or pin) and package == "pde_sim_node":
+            if core is not None and package == "pde_sim_node":
                 parameters.append(f"solver_cores:={quoted(core_text(usable_cores()))}")
+                parameters.append(f"solver_polls:={str(solver_polls).lower()}")
             name = f"{package}-{namespace}" if namespace else package
             more = (remaps or {}).get(package, ())
             nodes.append(LoopNode(name, package, parameters, more, namespace))
@@ -100,18 +119,17 @@ def pair_nodes(
 
 @dataclass(frozen=True)
 class Layout:
-    """The nodes of one training: `pairs` pairs, `pin`ned or not, their tuner, perhaps a recorder.
+    """The nodes of one training: `pairs` pairs, their tuner, perhaps a recorder.
 
-    remaps: of plants and controllers, by package; view: with a viewer of the first pair; shared:
-    see `pair_nodes`.
+    placement: one of PLACEMENTS; remaps: of plants and controllers, by package; view: with a viewer
+    of the first pair. Recorder and viewer leave the cores of the pairs to them, if there are others.
     """
 
     pairs: int = 1
-    pin: bool = False
+    placement: str = "shared"
     recording: Recording | None = None
     remaps: Mapping[str, Sequence[str]] = field(default_factory=dict)
     view: bool = False
-    shared: bool = False
 
     def nodes(self, folder: Path, bag: Path | None = None) -> list[LoopNode]:
         """Who is started for the training in `folder`; the recorder, if any, comes first.
@@ -123,10 +141,12 @@ class Layout:
         serving = tuner_parameter(self.pairs)
         tuner = [f"out:={quoted(folder.resolve())}", "resume:=true"]
         tuner.append(f"plant:={fingerprint(RunFolder(folder).values())}")
-        nodes = pair_nodes(self.pairs, self.pin, self.remaps, shared=self.shared)
+        cores = pair_cores(self.pairs, self.placement)
+        nodes = pair_nodes(cores, self.remaps, solver_polls=self.placement == "pinned")
+        others = tuple(core for core in usable_cores() if core not in cores)
         if self.view:
             first = namespaces(self.pairs)[0]
-            nodes.append(LoopNode("viewer_node", "viewer_node", namespace=first))
+            nodes.append(LoopNode("viewer_node", "viewer_node", namespace=first, cores=others))
         recording = self.recording
         if recording is not None:
             own = [] if bag is None else [f"bag:={quoted(bag.resolve())}"]
@@ -134,7 +154,9 @@ class Layout:
                 f"bag_storage:={recording.storage}",
                 f"bag_per_episode:={str(recording.bag_per_episode).lower()}",
             ]
-            nodes.insert(0, LoopNode("recorder_node", "recorder_node", [*own, *serving]))
+            nodes.insert(
+                0, LoopNode("recorder_node", "recorder_node", [*own, *serving], cores=others)
+            )
         wait = "none" if recording is None else "required" if recording.required else "start"
         nodes.append(LoopNode("tuner_node", "tuner_node", [*tuner, f"recorder:={wait}", *serving]))
         return nodes

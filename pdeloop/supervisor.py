@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import signal
@@ -13,7 +14,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from loop_interfaces.protocol import STOPPED
-from pdeloop.core_affinity import SharedCores
 
 STOP_GRACE = 2.0
 """Seconds between SIGINT and SIGKILL when the run ends."""
@@ -39,7 +39,7 @@ class Child:
     """One node: how it is started and how its life went.
 
     optional: the others go on without it when it ends by itself, or dies too often. before_start:
-    called before each start, to change the arguments. pair: number of the pair that it belongs to.
+    called before each start, to change the arguments. cores: that it may use; empty: any.
     """
 
     name: str
@@ -52,7 +52,7 @@ class Child:
     due: float | None = 0.0
     optional: bool = False
     before_start: Callable[[], None] | None = None
-    pair: int | None = None
+    cores: Sequence[int] = ()
     ended: bool = False
 
     def last_words(self) -> str:
@@ -87,8 +87,6 @@ class Supervisor:
     tell: Callable[[str], None]
     isolation: Mapping[str, str]
     """Environment variables that say where messages may go (loop_interfaces.isolation)."""
-    shared: SharedCores | None = None
-    """Where the processes of pairs run; None: wherever the scheduler puts them."""
     stopped: bool = False
     """Whether the main node ended because an operator asked it to, through its service."""
     _environment: dict[str, str] = field(default_factory=dict)
@@ -108,8 +106,6 @@ class Supervisor:
         Raises NodeError when a node refuses to run or keeps dying.
         """
         now = time.monotonic()
-        if self.shared is not None:
-            self.shared.look(now)
         for child in self.children:
             if child.process is None:
                 if child.due is not None and now >= child.due:
@@ -162,10 +158,7 @@ class Supervisor:
                 start_new_session=True,  # Ctrl-C in the terminal reaches the supervisor only
                 preexec_fn=die_with_parent,
             )
-        if self.shared is not None and child.pair is not None:
-            self.shared.place(child.pair, child.name, child.process.pid, now)
-        elif self.shared is not None and child.optional:
-            self.shared.keep_away(child.name, child.process.pid)
+        keep_on(child.process.pid, child.cores)
         child.started, child.due = now, None
 
     def _bury(self, child: Child, code: int, now: float) -> None:
@@ -197,6 +190,13 @@ def node_command(name: str, *ros_arguments: str) -> list[str]:
     # The log is the child's output: a second one by rcl's logging library would only repeat it.
     own = ("--ros-args", "--disable-external-lib-logs")
     return [sys.executable, "-m", f"{name}.node", *own, *ros_arguments]
+
+
+def keep_on(process: int, cores: Sequence[int]) -> None:
+    """Keep a process that was just started, and its threads to come, on `cores`; empty: on any."""
+    if cores and hasattr(os, "sched_setaffinity"):
+        with contextlib.suppress(ProcessLookupError):
+            os.sched_setaffinity(process, cores)
 
 
 def _signal(process: subprocess.Popen[bytes], number: signal.Signals) -> None:

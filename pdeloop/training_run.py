@@ -24,13 +24,12 @@ from loop_interfaces.isolation import NETWORK, PROFILE, loopback_environment
 from loop_interfaces.problem import load_parameters
 from loop_interfaces.spec import ParameterError
 from pde_sim_node.build import build_equation, build_plant
-from pdeloop.core_affinity import SharedCores, possible
 from pdeloop.display import Display, ProgressFile, summary_text
 from pdeloop.domain import own_domain
 from pdeloop.in_process import LocalPair, train
 from pdeloop.live import announced
 from pdeloop.output import print_json
-from pdeloop.pairs import PAIR, Layout, Recording, namespaces, pair_nodes, quoted
+from pdeloop.pairs import Layout, Recording, check_pairs, quoted
 from pdeloop.supervisor import Child, NodeError, Supervisor, node_command
 from tuner_node.build import build_training
 from tuner_node.results import RunFolder, RunFolderError, timestamp
@@ -68,8 +67,8 @@ class Transport:
 
     in_process: without ROS; network: let the messages leave this machine; faulty_line: 'LOSS,
     DUPLICATION,DELAY' of a relay between plant and controller; pairs: of plant and controller; pin:
-    give each of their nodes a core; view: a viewer_node of the first pair beside them; spread: leave
-    the cores to the scheduler (pdeloop.core_affinity).
+    keep each pair on a core of its own, and its solver's helpers polling; view: a viewer_node of the
+    first pair beside them; spread: leave the cores to the scheduler (pdeloop.pairs.PLACEMENTS).
     """
 
     in_process: bool = False
@@ -101,7 +100,7 @@ class Transport:
             )
         if self.pairs > 1 and self.faulty_line:
             raise ParameterError("--faulty-line is the line of one pair; leave out --pairs")
-        pair_nodes(self.pairs, self.pin)
+        check_pairs(self.pairs, self.placement)
         if self.faulty_line is not None:
             self.line_arguments()
 
@@ -109,14 +108,12 @@ class Transport:
         """The nodes of the training."""
         remaps = {"pde_sim_node": ["state:=state_sent"], "controller_node": ["action:=action_sent"]}
         remaps = remaps if self.faulty_line else {}
-        return Layout(
-            self.pairs, self.pin, self.recording, remaps, self.view, shared=self.shares_cores
-        )
+        return Layout(self.pairs, self.placement, self.recording, remaps, self.view)
 
     @property
-    def shares_cores(self) -> bool:
-        """Whether plant and controller of a pair are kept on one core."""
-        return possible() and not (self.pin or self.spread)
+    def placement(self) -> str:
+        """One of PLACEMENTS."""
+        return "pinned" if self.pin else "any" if self.spread else "shared"
 
     def line_arguments(self) -> list[str]:
         """The relay's ROS parameters."""
@@ -240,14 +237,13 @@ def _train_over_topics(
         )
     logs = folder / "logs"
     logs.mkdir(exist_ok=True)
-    pairs = namespaces(transport.pairs)
     children = {
         node.name: Child(
             node.name,
             node_command(node.package, *node.ros_arguments(folder / "parameters.yaml")),
             logs / f"{node.name}.log",
             optional=node.package in ("recorder_node", "viewer_node"),
-            pair=pairs.index(node.namespace) if node.package in PAIR else None,
+            cores=node.cores,
         )
         for node in transport.layout().nodes(folder)
     }
@@ -270,7 +266,6 @@ def _train_over_topics(
             logs,
             display.line,
             {NETWORK: "1"} if transport.network else loopback_environment(),
-            SharedCores(transport.pairs) if transport.shares_cores else None,
         )
         try:
             done = False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -15,16 +16,19 @@ from loop_interfaces import affinity
 from loop_interfaces.spec import ParameterError
 from pdeloop import pairs
 from pdeloop.cli import main
-from pdeloop.supervisor import Child
+from pdeloop.supervisor import Child, keep_on
+from pdeloop.training_run import resolve
+from tests.small import SMALL
+from tuner_node.results import RunFolder
 
 
 def test_one_pair_has_no_namespace_and_several_share_one_clock() -> None:
-    plant, controller = pairs.pair_nodes(1, pin=False)
+    plant, controller = pairs.pair_nodes([None])
     assert (plant.name, controller.name) == ("pde_sim_node", "controller_node")
     assert plant.namespace == controller.namespace == ""
     assert plant.ros_arguments(Path("f")) == ["--params-file", "f"]
     assert pairs.tuner_parameter(1) == ["pairs:=['']"]
-    nodes = pairs.pair_nodes(3, pin=False)
+    nodes = pairs.pair_nodes([None] * 3)
     assert len({node.name for node in nodes}) == 6
     with_clock = [
         node.name
@@ -35,19 +39,64 @@ def test_one_pair_has_no_namespace_and_several_share_one_clock() -> None:
     assert pairs.tuner_parameter(3) == ["pairs:=[pair0, pair1, pair2]"]
 
 
-def test_pinning_gives_every_pair_its_own_core_or_refuses(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pairs_get_the_least_busy_cores_and_pinning_one_each(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {3, 5, 6, 7})
-    nodes = pairs.pair_nodes(2, pin=True)
+    busy = iter([{}, {3: 10, 5: 4, 6: 0, 7: 9}])
+    monkeypatch.setattr(affinity, "_busy_ticks", lambda: next(busy))
+    cores = pairs.pair_cores(3, "pinned")
+    assert cores == [6, 5, 7]
+    nodes = pairs.pair_nodes(cores, solver_polls=True)
     pins = [word for node in nodes for word in node.parameters if word.startswith("pin")]
-    assert pins == [f"pin:={core}" for core in (3, 3, 5, 5)]
+    assert pins == [f"pin:={core}" for core in (6, 6, 5, 5, 7, 7)]
     helpers = [node.name for node in nodes if "solver_cores:='3,5,6,7'" in node.parameters]
-    assert helpers == ["pde_sim_node-pair0", "pde_sim_node-pair1"]
+    assert helpers == ["pde_sim_node-pair0", "pde_sim_node-pair1", "pde_sim_node-pair2"]
+    assert all(
+        ("solver_polls:=true" in node.parameters) == (node.name in helpers) for node in nodes
+    )
     with pytest.raises(ParameterError, match="a core of its own, but there are 4"):
-        pairs.pair_nodes(5, pin=True)
+        pairs.pair_cores(5, "pinned")
     with pytest.raises(ParameterError, match="--pairs is 0; expected a whole number from 1 to 64"):
-        pairs.pair_nodes(0, pin=False)
+        pairs.check_pairs(0)
     with pytest.raises(ValueError, match=r"'pin' is 4; expected -1 or one of the cores \[3, 5"):
         affinity.pin_process(4)
+
+
+def test_pairs_are_anywhere_if_asked_for_or_where_there_is_one_core(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert pairs.pair_cores(2, "any") == [None, None]
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {3})
+    assert pairs.pair_cores(2, "shared") == [None, None]
+    assert pairs.pair_cores(1, "pinned") == [3]
+
+
+def test_the_busy_time_of_a_core_is_what_it_neither_idled_nor_waited(tmp_path: Path) -> None:
+    stat = tmp_path / "stat"
+    stat.write_text("cpu 9 9 9 9 9 9 9 9 0 0\ncpu0 1 2 4 800 16 32 64 128 256 512\nintr 5\n")
+    assert affinity._busy_ticks(stat) == {0: 1 + 2 + 4 + 32 + 64 + 128}
+    assert affinity._busy_ticks(tmp_path / "none") == {}
+
+
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
+def test_recorder_and_viewer_leave_the_core_of_the_pair_to_it(tmp_path: Path) -> None:
+    folder, values = tmp_path / "run", resolve(str(SMALL), {})
+    RunFolder(folder).create(values)
+    layout = pairs.Layout(1, "shared", pairs.Recording(), view=True)
+    nodes = {node.package: node for node in layout.nodes(folder)}
+    (pin,) = (word for word in nodes["controller_node"].parameters if word.startswith("pin"))
+    others = os.sched_getaffinity(0) - {int(pin.removeprefix("pin:="))}
+    assert set(nodes["recorder_node"].cores) == set(nodes["viewer_node"].cores) == others
+    assert nodes["tuner_node"].cores == ()
+    process = subprocess.Popen(["sleep", "60"])
+    try:
+        keep_on(process.pid, sorted(others))
+        assert os.sched_getaffinity(process.pid) == others
+    finally:
+        process.kill()
+        process.wait()
+    keep_on(process.pid, sorted(others))  # one that has ended is nothing to move
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,6 @@ from pde_sim_node.equations import Burgers
 from pde_sim_node.plant import Plant
 from pde_sim_node.solver import workers
 from pde_sim_node.solver.workers import TEAMWORK, Crew
-from pdeloop import core_affinity
 
 several = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
 P1 = {
@@ -104,15 +103,16 @@ print(gone())
 
 @several
 def test_helpers_leave_the_core_that_their_process_is_kept_on() -> None:
-    """A real process is moved, as a pair is, before and after its helpers exist."""
+    """A real process is kept on a core, as a pair is, before its helpers exist."""
     cores = sorted(os.sched_getaffinity(0))
     program = f"""
-import sys, time
+import sys
+from loop_interfaces.affinity import pin_process
 from pde_sim_node.solver import workers
 from pde_sim_node.equations import Burgers
 from pde_sim_node.plant import Plant
 from tests.test_workers import P1, rollout
-sys.stdin.readline()
+pin_process({cores[0]})
 workers.use_cores({cores})
 plant = Plant(Burgers(), **P1)
 rollout(plant, range(12))
@@ -136,16 +136,11 @@ sys.stdin.readline()
         return found
 
     with process:
-        core_affinity._move(process.pid, cores[0], cores)
-        process.stdin.write("go on\n")
-        process.stdin.flush()
         assert process.stdout.readline() == "there\n"
         limit = time.monotonic() + 10
         while places() != {True: set(cores[1:]), False: {cores[0]}}:
             assert time.monotonic() < limit, places()
             time.sleep(0.05)
-        core_affinity._move(process.pid, cores[1], cores)
-        assert places() == {True: set(cores) - {cores[1]}, False: {cores[1]}}
 
 
 def test_lists_of_cores() -> None:

@@ -113,7 +113,7 @@ def add(commands: Commands) -> None:
     train.add_argument(
         "--pin",
         action="store_true",
-        help="keep each plant and its controller on one core, and let the plant's helpers on the "
+        help="a core of its own for each plant and its controller, and let the plant's helpers on the "
         "others look for work all the time: less time per step, more power",
     )
     train.add_argument(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import time
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,6 @@ from benchmarks import realtime as bench_realtime
 from benchmarks.hosts import can_make_hosts, hosts
 from benchmarks.processes import bench
 from loop_interfaces.affinity import helps_solver
-from pdeloop.core_affinity import START_UP
 from pdeloop.in_process import LocalPair, train
 from pdeloop.training_run import resolve
 from tests.loop_harness import Processes, until
@@ -86,16 +84,9 @@ def test_plant_and_controller_share_a_core(loop, tmp_path, seeds, flags) -> None
             if not helps_solver(pid, int(thread.name))
         }
 
-    if flags:
-        time.sleep(1.5 * START_UP)
-        assert places("pde_sim_node") == places("controller_node") == free
-    else:
-
-        def together() -> bool:
-            plant, controller = places("pde_sim_node"), places("controller_node")
-            return plant == controller and [len(cores) for cores in plant] == [1]
-
-        until(together, 20.0, "one core for both")
+    plant, controller = places("pde_sim_node"), places("controller_node")
+    assert plant == controller
+    assert plant == free if flags else [len(cores) for cores in plant] == [1]
     assert places("tuner_node") == free
     run.send_signal(signal.SIGINT)
     loop.wait(run, 20.0, code=130)
