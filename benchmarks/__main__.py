@@ -150,12 +150,12 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _add_optimizers(programs: Commands) -> None:
-    """The comparison of optimisers and laws; its defaults are those of the program."""
+    """The comparison of optimisers; its defaults are those of the program."""
     add = _add(
         programs,
         "optimizers",
-        "what an optimiser and a law reach in so many rollouts",
-        "--problem allen-cahn --features quadratic --seeds 2",
+        "what an optimiser reaches in so many rollouts",
+        "--problem allen-cahn --seeds 2",
     ).add_argument
     add("--optimizer", choices=DEFAULTS["optimizer"].choices, help="[gauss_newton]")
     add(
@@ -163,11 +163,6 @@ def _add_optimizers(programs: Commands) -> None:
         action="append",
         metavar="PROBLEM",
         help="a shipped problem or a YAML file, may be repeated [those of the paper]",
-    )
-    add(
-        "--features",
-        choices=DEFAULTS["policy_features"].choices,
-        help="the law that is adapted [affine]",
     )
     add("--seeds", type=int, metavar="N", help="number of seeds [6]")
     add("--first-seed", type=int, metavar="S", help="the first seed [0]")

@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 from controller_node import identification
 from controller_node.identification import DesignSettings
 from controller_node.policy import ProjectedLaw, excitation
-from loop_interfaces.policy_columns import with_features
 from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import Plant
@@ -54,7 +53,6 @@ class Job:
     evaluation_fields: int
     fresh_fields: int
     attempts: int | None
-    features: str
     marks: tuple[int, ...]
     options: dict[str, Any]
 
@@ -139,7 +137,6 @@ def design(
         **weights,
     )
     model = identification.design(exploration.states, exploration.actions, plant.target, settings)
-    model = model.with_room(parameters.get("extra_modes", 0))
     context = Context(
         U=model.U,
         target=plant.target,
@@ -155,9 +152,7 @@ def train(job: Job) -> dict[str, Any]:
     options = {} if job.attempts is None else {"identification_attempts": job.attempts}
     parameters = load_parameters(job.problem, options)
     plant = build_plant(parameters)
-    parameters["extra_modes"] = job.options.get("extra_modes", 0)
     policy, context = warm_start(plant, parameters, job.seed)
-    policy = with_features(policy, job.features)
     optimizer = OPTIMIZERS[job.optimizer](
         policy,
         seed=job.seed,
@@ -172,12 +167,9 @@ def train(job: Job) -> dict[str, Any]:
         for i in range(job.evaluation_fields)
     ]
 
-    def basis() -> Array:
-        return context.U if optimizer.basis is None else optimizer.basis
-
     def evaluate(candidate: Array) -> list[float]:
         rollouts = [Rollout(candidate, seed) for seed in held_out]
-        return [result.cost for result in run_rollouts(plant, basis(), rollouts)]
+        return [result.cost for result in run_rollouts(plant, context.U, rollouts)]
 
     budget = 2 * job.iterations
     costs = {"0": evaluate(policy)}
@@ -189,7 +181,7 @@ def train(job: Job) -> dict[str, Any]:
         rollouts = optimizer.ask()
         while marks and used + len(rollouts) > marks[0]:
             costs[str(marks.pop(0))] = evaluate(optimizer.best_policy)
-        results = run_rollouts(plant, basis(), rollouts)
+        results = run_rollouts(plant, context.U, rollouts)
         used += len(results)
         diverged += sum(result.diverged for result in results)
         begin = time.perf_counter()
@@ -200,7 +192,7 @@ def train(job: Job) -> dict[str, Any]:
         derive(job.evaluation_seed + 1 + job.seed, Purpose.EVALUATION_FIELD, i)
         for i in range(job.fresh_fields)
     ]
-    last = run_rollouts(plant, basis(), [Rollout(optimizer.best_policy, seed) for seed in fresh])
+    last = run_rollouts(plant, context.U, [Rollout(optimizer.best_policy, seed) for seed in fresh])
     return {
         "problem": job.problem,
         "seed": job.seed,
@@ -272,8 +264,7 @@ def reference_of(problem: str, settings: Mapping[str, Any]) -> Reference | None:
     names = {"attempts": "identification_attempts"}
     names |= {name: name for name in ("evaluation_seed", "evaluation_fields")}
     given = {new: settings[name] for name, new in names.items() if settings[name] is not None}
-    law = {"policy_features": settings["features"], **_options(settings["settings"])}
-    return find({**load_parameters(problem, given), **law})
+    return find(load_parameters(problem, given))
 
 
 def _options(settings: Sequence[str]) -> dict[str, Any]:
@@ -299,7 +290,6 @@ def run(
     fresh_fields: int = 0,
     settings: Sequence[str] = (),
     attempts: int | None = None,
-    features: str = "affine",
     marks: Sequence[int] = (),
     jobs: int = 1,
 ) -> dict[str, Any]:
@@ -319,7 +309,6 @@ def run(
             evaluation_fields,
             fresh_fields,
             attempts,
-            features,
             tuple(marks),
             options,
         )

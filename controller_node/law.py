@@ -33,14 +33,11 @@ LAW = np.dtype(
         ("n_z", np.int64),
         ("n_s", np.int64),
         ("n_a", np.int64),
-        ("pairs", np.int64),  # n_s (n_s + 1) / 2, or 0 without quadratic terms
         ("limit", np.float64),  # magnitude at which an action saturates; 0: none
-        # Addresses of arrays; the last axis of the first five is filled up to whole lanes.
+        # Addresses of arrays; the last axis of the first three is filled up to whole lanes.
         ("bases", np.int64),  # U, models by n_z by n_s
-        ("centres", np.int64),  # s_r, models by n_s
         ("constant", np.int64),  # K_b s_r, M by n_a
         ("feedback", np.int64),  # K_a^T, M by n_s by n_a
-        ("quadratic", np.int64),  # Q^T, M by pairs by n_a
         ("index", np.int64),  # model of every environment, M
         ("scratch", np.int64),  # four times n_s and once n_a, each up to whole lanes
     ]
@@ -91,21 +88,13 @@ def reduce(law: Any, states: int, first: int, batch: int) -> None:
 @jit
 def answer(law: Any, m: int, s: int, action: int) -> None:
     """The action of an environment whose reduced state is at the address s."""
-    n_s, n_a, pairs = law.n_s, law.n_a, law.pairs
+    n_s, n_a = law.n_s, law.n_a
     width, wide = -(-n_s // 8) * 8, -(-n_a // 8) * 8
-    centre = law.centres + 8 * width * read_word(law.index, m)
     sums = law.scratch + 8 * 4 * width
     for block in range(0, wide, 8):
         a = load(law.constant, m * wide + block)
         for j in range(n_s):
             a = fma(load(law.feedback, (m * n_s + j) * wide + block), splat(read(s, j)), a)
-        if pairs > 0:
-            row = m * pairs
-            for i in range(n_s):
-                for j in range(i, n_s):
-                    e_i, e_j = read(s, i) - read(centre, i), read(s, j) - read(centre, j)
-                    a = fma(load(law.quadratic, row * wide + block), splat(e_i * e_j), a)
-                    row += 1
         store(sums, block, a)
     for k in range(n_a):
         value, limit = read(sums, k), law.limit
@@ -118,7 +107,7 @@ def answer(law: Any, m: int, s: int, action: int) -> None:
 
 @jit
 def act(law: Any, states: int, actions: int, batch: int) -> None:
-    """a = K_a s + K_b s_r + Q (e x e) of every environment, with s = U^T z and e = s - s_r."""
+    """a = K_a s + K_b s_r of every environment, with s = U^T z."""
     width = -(-law.n_s // 8) * 8
     for first in range(0, batch, 4):
         reduce(law, states, first, batch)

@@ -2,8 +2,7 @@
 
     a = K_a U^T z + K_b U^T z_r,        policy = [K_a K_b], shape (n_a, 2 n_s)
 
-saturated at +- action_limit if there is one. A policy [K_a K_b Q] with n_s (n_s + 1) / 2 columns more
-adds sum_{i <= j} Q_ij e_i e_j with e = U^T (z - z_r); see `loop_interfaces.policy_columns`.
+saturated at +- action_limit if there is one.
 
 An environment's action does not depend on how many environments are in the batch, nor on its place
 in it, to the last bit: see `controller_node.law`.
@@ -19,7 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from controller_node.law import LAW, control, padded
 from loop_interfaces.jit.simd import whole_lanes
-from loop_interfaces.policy_columns import quadratic_columns
 
 __all__ = ["ProjectedLaw", "excitation"]
 
@@ -72,14 +70,10 @@ class ProjectedLaw:
         # feedback.
         count = len(bases)
         self._reduced_targets = np.zeros((count, self._n_s))
-        self._centres = padded(self._reduced_targets)
-        plan["centres"] = self._centres.ctypes.data
         self._shape = (0, 0)
         identity = np.broadcast_to(np.eye(self._n_s), (count, self._n_s, self._n_s))
         self._take(np.concatenate([identity] * 2, axis=2), np.arange(count))
         control(self._plan, np.tile(z_r, (count, 1)), self._reduced_targets)
-        self._centres = padded(self._reduced_targets)
-        plan["centres"] = self._centres.ctypes.data
         plan["limit"] = action_limit
         self._set = False
 
@@ -104,18 +98,17 @@ class ProjectedLaw:
 
         Parameters
         ----------
-        policies : (M, n_a, 2 n_s) or (M, n_a, 2 n_s + n_s (n_s + 1) / 2) array
-            [K_a K_b] or [K_a K_b Q] of every environment.
+        policies : (M, n_a, 2 n_s) array
+            [K_a K_b] of every environment.
         model_index : (M,) array of int, optional
             Which of the models an environment projects with; the first one if not given.
         """
         gains = np.asarray(policies, dtype=np.float64)
-        affine = 2 * self._n_s
-        known = (affine, affine + quadratic_columns(self._n_s))
-        if gains.ndim != 3 or 0 in gains.shape or gains.shape[2] not in known:
+        columns = 2 * self._n_s
+        if gains.ndim != 3 or 0 in gains.shape or gains.shape[2] != columns:
             raise ValueError(
-                f"policies must have shape (environments, actuators, {known[0]}), or {known[1]} with "
-                f"quadratic terms, for {self._n_s} modes, but the shape is {gains.shape}."
+                f"policies must have shape (environments, actuators, {columns}) for {self._n_s} "
+                f"modes, but the shape is {gains.shape}."
             )
         if not np.isfinite(gains).all():
             raise ValueError("policies must be finite, but there is NaN or infinity in them.")
@@ -140,14 +133,13 @@ class ProjectedLaw:
         for j in range(self._n_s):
             constant += gains[:, :, self._n_s + j] * self._reduced_targets[index, j, None]
         feedback = gains[:, :, : self._n_s].transpose(0, 2, 1)
-        quadratic = gains[:, :, 2 * self._n_s :].transpose(0, 2, 1)
         self._shape = gains.shape[:2]
         self._model_index = index.astype(np.int64)
-        self._gains = padded(constant), padded(feedback), padded(quadratic)
+        self._gains = padded(constant), padded(feedback)
         plan = self._plan[0]
-        plan["n_a"], plan["pairs"] = gains.shape[1], quadratic.shape[1]
+        plan["n_a"] = gains.shape[1]
         plan["index"] = self._model_index.ctypes.data
-        plan["constant"], plan["feedback"], plan["quadratic"] = (a.ctypes.data for a in self._gains)
+        plan["constant"], plan["feedback"] = (array.ctypes.data for array in self._gains)
         self._scratch = np.zeros(4 * whole_lanes(self._n_s) + whole_lanes(gains.shape[1]))
         plan["scratch"] = self._scratch.ctypes.data
 

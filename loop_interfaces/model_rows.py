@@ -11,14 +11,11 @@ Every part has n_s columns (or is transposed to have), so the parts stack:
     1                 s_r      U^T z_r, the target in reduced coordinates
 
 n_s is the number of columns, n_a that of the axis `actuator`; n_z follows from the row count.
-
-U may have room for modes of the rollouts, which are none of the reduced model: its last columns,
-where A, B and both gains are zero.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,29 +41,6 @@ class ModelRows:
     def policy(self) -> Array:
         """[K_a K_b], shape (n_a, 2 n_s)."""
         return np.hstack([self.K_a, self.K_b])
-
-    @property
-    def order(self) -> int:
-        """Modes of the reduced model: n_s without the room for others."""
-        return int(np.count_nonzero(np.abs(self.A).max(axis=1)))
-
-    def with_room(self, modes: int) -> ModelRows:
-        """The same law with `modes` further columns of zeros."""
-        right = ((0, 0), (0, modes))
-        return ModelRows(
-            A=np.pad(self.A, (0, modes)),
-            B=np.pad(self.B, ((0, modes), (0, 0))),
-            U=np.pad(self.U, right),
-            K_a=np.pad(self.K_a, right),
-            K_b=np.pad(self.K_b, right),
-            s_r=np.pad(self.s_r, (0, modes)),
-        )
-
-    def with_basis(self, U: Array, target: Array) -> ModelRows:
-        """The same law on the basis U (n_z, n_s), which has modes where this one has room."""
-        s_r = np.sum(U * target[:, np.newaxis], axis=0)
-        s_r[: self.order] = self.s_r[: self.order]
-        return replace(self, U=U, s_r=s_r)
 
 
 def pack(model: ModelRows) -> Array:

@@ -238,20 +238,6 @@ TUNER = (
         choices=("two_point", "directions", "gauss_newton"),
     ),
     Spec(
-        "policy_features",
-        "affine",
-        "law that the optimizer gauss_newton adapts: affine in s = U^T z, or quadratic in it, with "
-        "the LQT law as the start of both",
-        choices=("affine", "quadratic"),
-    ),
-    Spec(
-        "extra_modes",
-        0,
-        "POD modes of the first rollouts that the optimizer gauss_newton adds to the basis U",
-        0,
-        16,
-    ),
-    Spec(
         "directions",
         4,
         "directions D of an iteration of the optimizer 'directions': 2 D environments a seed; the "

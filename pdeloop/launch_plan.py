@@ -111,8 +111,6 @@ _TRAINING = (
     "start",
     "optimizer",
     "directions",
-    "policy_features",
-    "extra_modes",
 )
 TRAIN_ARGUMENTS = (
     *LOOP_ARGUMENTS,

@@ -116,8 +116,6 @@ def find(
     RunFolderError
         There is a file, and it cannot be read.
     """
-    if values.get("extra_modes") or values.get("policy_features", "affine") != "affine":
-        return None  # the optimum is that of the affine law on DMDc's U
     path = (folder or config_folder() / "optimum") / f"{values['problem']}.json"
     if not path.is_file():
         return None

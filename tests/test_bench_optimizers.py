@@ -13,8 +13,7 @@ from pde_sim_node.plant import DIVERGED_COST
 from tests.small import SMALL, parameters, train_here
 
 
-@pytest.mark.parametrize("features", ["affine", "quadratic"])
-def test_it_is_the_training_of_the_loop(features):
+def test_it_is_the_training_of_the_loop():
     job = Job(
         problem=str(SMALL),
         optimizer="gauss_newton",
@@ -24,13 +23,12 @@ def test_it_is_the_training_of_the_loop(features):
         evaluation_fields=2,
         fresh_fields=1,
         attempts=None,
-        features=features,
         marks=(4,),
         options={},
     )
     measured = train(job)
     options = {"seed": 3, "iterations": 6, "optimizer": "gauss_newton"}
-    training = train_here(parameters(**options, policy_features=features))
+    training = train_here(parameters(**options))
     rows = [
         {name: value for name, value in row.items() if name not in ("event", "seed")}
         for row in training.history

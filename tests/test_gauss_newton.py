@@ -14,6 +14,7 @@ from controller_node.reduced_model import ReducedModel
 from pdeloop.training_run import resolve
 from tests.small import train_here
 from tuner_node.optimizers import Context, GaussNewton, Rollout, RolloutResult, Trajectory
+from tuner_node.optimizers.proposal import Proposer
 
 N_Z, N_S, N_A, T = 7, 4, 2, 80
 Q, R = 1.0, 0.2
@@ -269,6 +270,18 @@ def test_needs_sound_trajectories_and_stays_as_it_was_without() -> None:
         optimizer.tell(good)
 
 
+def test_a_step_moves_the_gains_and_the_constant_part_by_what_it_says() -> None:
+    plant = Plant()
+    proposer = Proposer(plant.context(), plant.best, modes=N_S)
+    step = np.random.default_rng(8).standard_normal((N_A, N_S + 1))
+    moved = proposer.moved(plant.best, step)
+    s_r = plant.U.T @ plant.target
+    constant = (moved - plant.best)[:, N_S:] @ s_r
+    np.testing.assert_allclose((moved - plant.best)[:, :N_S], step[:, :N_S], atol=1e-12)
+    np.testing.assert_allclose(constant, step[:, N_S], atol=1e-12)
+    np.testing.assert_allclose(proposer.theta(moved) - proposer.theta(plant.best), step, atol=1e-12)
+
+
 def test_a_target_outside_of_the_basis_leaves_the_constant_part_alone() -> None:
     plant = Plant()
     outside = np.linalg.qr(np.column_stack([plant.U, np.ones(N_Z)]))[0][:, N_S]
@@ -286,7 +299,7 @@ def test_a_target_outside_of_the_basis_leaves_the_constant_part_alone() -> None:
         ({"fields": 0}, "fields must be positive"),
         ({"iterations": 0}, "iterations must be positive"),
         ({"modes": 3}, "at least n_s = 4"),
-        ({"policy": np.zeros((2, 6))}, "must have 8 or 18 columns"),
+        ({"policy": np.zeros((2, 6))}, "does not fit a basis"),
         ({"policy": np.zeros((3, 8))}, "exploratory trajectory must have"),
     ],
 )

@@ -20,7 +20,7 @@ UNKNOWN_PLANT = -1
 class Batch:
     """Rollouts wanted together; any split into episodes gives the same results.
 
-    rows (R, 4), with noise (R, 5): the columns of `episode/start`; policies (R, n_a, columns), or
+    rows (R, 4), with noise (R, 5): the columns of `episode/start`; policies (R, n_a, 2 n_s), or
     None for an exploratory batch, whose result is a model a row instead of a cost.
     """
 
@@ -69,9 +69,6 @@ class TrainingSettings:
     action_limit: float = 0.0
     model: Array | None = None
     """Rows of a reduced model to start from instead of identifying one."""
-    policy_features: str = "affine"
-    extra_modes: int = 0
-    """Columns that the models get for modes of the rollouts."""
 
 
 def batch_of(wanted: Sequence[tuple[int, Rollout]], trajectories: bool = False) -> Batch:

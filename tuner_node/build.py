@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from loop_interfaces.model_rows import unpack
 from loop_interfaces.parameters import noisy
 from tuner_node.batch import UNKNOWN_PLANT, TrainingSettings
-from tuner_node.optimizers import NEED_TRAJECTORIES, OPTIMIZERS, Context, GaussNewton, Optimizer
+from tuner_node.optimizers import NEED_TRAJECTORIES, OPTIMIZERS, Context, Optimizer
 from tuner_node.training import Training
 
 MAX_MODEL_BYTES = 1 << 30
@@ -54,21 +54,6 @@ def build_training(values: Mapping[str, Any]) -> Training:
                 "many as there are iterations and entries of the policy"
             )
         options["directions"] = values["directions"]
-    features = values["policy_features"]
-    if features != "affine" and values["optimizer"] != GaussNewton.name:
-        raise ValueError(
-            f"parameter 'policy_features' is '{features}'; expected 'affine' with the optimizer "
-            f"'{values['optimizer']}': only '{GaussNewton.name}' adapts another law"
-        )
-
-    extra = values["extra_modes"]
-    if extra:
-        if values["optimizer"] != GaussNewton.name:
-            raise ValueError(
-                f"parameter 'extra_modes' is {extra}; expected 0 with the optimizer "
-                f"'{values['optimizer']}': only '{GaussNewton.name}' adds modes to the basis"
-            )
-        options["extra_modes"] = extra
 
     def make_optimizer(
         policy: NDArray[np.float64], seed: int, context: Context | None
@@ -98,7 +83,5 @@ def build_training(values: Mapping[str, Any]) -> Training:
         noise=noisy(values),
         action_limit=values["action_limit"],
         model=read_model(Path(values["model"]), values["n_a"]) if values["model"] else None,
-        policy_features=features,
-        extra_modes=extra,
     )
     return Training(settings, make_optimizer, plant=values["plant"] or UNKNOWN_PLANT)

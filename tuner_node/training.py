@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces import model_rows
-from loop_interfaces.policy_columns import with_features
 from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, TrainingSettings, batch_of
 from tuner_node.noise import PURPOSES, evaluation_noise, rollout_noise
@@ -126,16 +125,14 @@ class Training:
         return np.stack([optimizer.best_policy for optimizer in self.optimizers])
 
     def warm_starts(self) -> Array:
-        """The LQT policies of the models, (S, n_a, columns): 2 n_s, more if the law has more terms."""
+        """The LQT policies of the models, (S, n_a, 2 n_s)."""
         assert self.models is not None
-        lqt = np.stack([model_rows.unpack(rows, self.settings.n_a).policy for rows in self.models])
-        return with_features(lqt, self.settings.policy_features)
+        return np.stack([model_rows.unpack(rows, self.settings.n_a).policy for rows in self.models])
 
     @property
     def generation(self) -> int:
         """Number of the present models: grows whenever one of them is another one."""
-        rebased = sum(optimizer.basis is not None for optimizer in self.optimizers)
-        return 1 + sum(self.attempts) + rebased
+        return 1 + sum(self.attempts)
 
     @property
     def computation(self) -> str:
@@ -222,8 +219,8 @@ class Training:
         if self.models is None:
             if len(models) != self.settings.seeds:
                 raise ValueError(f"expected {self.settings.seeds} models, got {len(models)}")
-            self.models = self._with_room(models)
-        self.models[self.pending] = self._with_room(models)
+            self.models = models.copy()
+        self.models[self.pending] = models
         rows = []
         for m, own in zip(self.pending, models, strict=True):
             A = model_rows.unpack(own, self.settings.n_a).A
@@ -241,11 +238,6 @@ class Training:
             self._start_adapting()
         return rows
 
-    def _with_room(self, models: Array) -> Array:
-        n_a, extra = self.settings.n_a, self.settings.extra_modes
-        found = [model_rows.unpack(rows, n_a).with_room(extra) for rows in models]
-        return np.stack([model_rows.pack(model) for model in found])
-
     def _given(self, identified: Array) -> list[dict[str, Any]]:
         """The given model instead of the identified ones, if it is one of this plant's size."""
         assert self.settings.model is not None
@@ -256,9 +248,7 @@ class Training:
                 f"the given model is of a state of {own - 3 * self.settings.n_a - 1} numbers, the "
                 f"plant's has {size - 3 * self.settings.n_a - 1}; identify one of this plant"
             )
-        self.models = self._with_room(
-            np.repeat(self.settings.model[np.newaxis], self.settings.seeds, axis=0)
-        )
+        self.models = np.repeat(self.settings.model[np.newaxis], self.settings.seeds, axis=0)
         self._start_adapting()
         return []
 
@@ -330,7 +320,7 @@ class Training:
         return [[] if optimizer.done else optimizer.ask() for optimizer in self.optimizers]
 
     def _tell(self, result: BatchResult) -> list[dict[str, Any]]:
-        rows, first, generation = [], 0, self.generation
+        rows, first = [], 0
         for seed, optimizer, asked in zip(
             self._seeds(), self.optimizers, self._asked(), strict=True
         ):
@@ -353,18 +343,8 @@ class Training:
             )
             rows.append({"event": "iteration", "seed": seed, **told})
         self.history += rows
-        if self.generation != generation:
-            self._take_bases()
         self._leave_adapt_if_done()
         return rows
-
-    def _take_bases(self) -> None:
-        """The models on the bases that the optimisers have chosen."""
-        for m, optimizer in enumerate(self.optimizers):
-            if optimizer.basis is not None:
-                assert self.models is not None and self.target is not None
-                model = model_rows.unpack(self.models[m], self.settings.n_a)
-                self.models[m] = model_rows.pack(model.with_basis(optimizer.basis, self.target))
 
     def _leave_adapt_if_done(self) -> None:
         done = all(optimizer.done for optimizer in self.optimizers)

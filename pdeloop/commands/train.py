@@ -55,17 +55,6 @@ def add(commands: Commands) -> None:
         help="start from this model of `pdeloop identify --out` instead of identifying one",
     )
     train.add_argument(
-        "--policy-features",
-        choices=DEFAULTS["policy_features"].choices,
-        help=f"{DEFAULTS['policy_features'].description} [affine]",
-    )
-    train.add_argument(
-        "--extra-modes",
-        type=int,
-        metavar="N",
-        help=f"{DEFAULTS['extra_modes'].description} [0]",
-    )
-    train.add_argument(
         "--out", type=Path, metavar="DIR", help="folder of the results [runs/PROBLEM-TIME]"
     )
     train.add_argument(
@@ -158,8 +147,7 @@ def _train(options: argparse.Namespace) -> int:
         options.view,
         options.spread,
     )
-    names = ["iterations", "seed", "seeds", "start", "optimizer", "directions", "policy_features"]
-    names += ["extra_modes"]
+    names = ["iterations", "seed", "seeds", "start", "optimizer", "directions"]
     names += [spec.name for spec in INSTRUMENTS]
     given = {n: getattr(options, n) for n in names if getattr(options, n) is not None}
     if (

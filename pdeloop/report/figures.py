@@ -118,12 +118,11 @@ def spectrum(problem: ProblemData) -> Figure:
     """Eigenvalues of the reduced model, without control and with the gains before and after."""
     groups: dict[str, list[Eigenvalues]] = {"none": [], "lqt": []}
     for s, model in enumerate(problem.models):
-        n_s = model.order
-        A, B = model.A[:n_s, :n_s], model.B[:n_s]
+        A, B = model.A, model.B
         groups["none"].append(np.linalg.eigvals(A))
-        groups["lqt"].append(np.linalg.eigvals(A + B @ model.K_a[:, :n_s]))
+        groups["lqt"].append(np.linalg.eigvals(A + B @ model.K_a))
         for name, policies in problem.adapted.items():
-            closed = A + B @ policies[s][:, :n_s]
+            closed = A + B @ policies[s][:, : len(A)]
             groups.setdefault(name, []).append(np.linalg.eigvals(closed))
     everything = np.concatenate([values for found in groups.values() for values in found])
     near = everything[(np.abs(everything) > 0.8) & (everything.real > 0.5)]

@@ -133,11 +133,6 @@ class Optimizer(Protocol):
         ...
 
     @property
-    def basis(self) -> Array | None:
-        """U of its policies, of the shape it was given; None where it is the given one."""
-        ...
-
-    @property
     def iteration(self) -> int:
         """How many times `tell` was called."""
         ...
@@ -164,17 +159,10 @@ class Optimizer(Protocol):
         ...
 
 
-def checked_policy(policy: ArrayLike, columns: Sequence[int] | None = None) -> Array:
-    """A finite copy of shape (n_a, 2 n_s), or of one of the given numbers of columns, or a
-    ValueError.
-    """
+def checked_policy(policy: ArrayLike) -> Array:
+    """A finite copy of shape (n_a, 2 n_s), or a ValueError."""
     array = np.array(policy, dtype=np.float64, order="C")
-    if columns is not None and (array.ndim != 2 or array.shape[1] not in columns):
-        raise ValueError(
-            f"a policy of this basis must have {' or '.join(map(str, columns))} columns, but its "
-            f"shape is {array.shape}."
-        )
-    if array.ndim != 2 or 0 in array.shape or (columns is None and array.shape[1] % 2):
+    if array.ndim != 2 or 0 in array.shape or array.shape[1] % 2:
         raise ValueError(
             f"a policy [K_a K_b] must have shape (n_a, 2 n_s), but its shape is {array.shape}."
         )

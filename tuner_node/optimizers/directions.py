@@ -70,7 +70,6 @@ class Directions:
 
     name = "directions"
     needs_trajectories = False
-    basis = None
 
     def __init__(
         self,

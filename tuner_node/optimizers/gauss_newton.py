@@ -22,7 +22,6 @@ Sources and equations: docs/optimizers.md.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -41,8 +40,6 @@ from tuner_node.optimizers.base import (
     require_results,
     require_state,
 )
-from tuner_node.optimizers.features import known_columns
-from tuner_node.optimizers.fit import extended_basis
 from tuner_node.optimizers.proposal import Proposer
 from tuner_node.optimizers.trajectories import Record, Records
 
@@ -66,8 +63,8 @@ class GaussNewton:
 
     Parameters
     ----------
-    policy0 : (n_a, 2 n_s) or (n_a, 2 n_s + n_s (n_s + 1) / 2) array
-        Where to start, [K_a K_b] or [K_a K_b Q]; the warm start.
+    policy0 : (n_a, 2 n_s) array
+        Where to start, [K_a K_b]; the warm start.
     seed : int
         Determines the initial fields.
     iterations : int
@@ -84,10 +81,6 @@ class GaussNewton:
         Coordinates of the fitted model, at least n_s; 32 by default, or n_s where that is more.
     cubic_modes : int
         How many of them, at most, its cubic part acts on; 0 leaves it out.
-    extra_modes : int
-        How many of the last columns of U are room for modes to come. They are zero; after the first
-        rollouts they become the leading POD modes of those outside of the other columns. The gains on
-        them are zero, so that the law stays the same.
     learning_rate, smoothing_radius : float, optional
         Not used; every optimiser takes them.
     """
@@ -106,18 +99,14 @@ class GaussNewton:
         most_fields: int = 6,
         modes: int | None = None,
         cubic_modes: int = 12,
-        extra_modes: int = 0,
         learning_rate: float | None = None,
         smoothing_radius: float | None = None,
     ) -> None:
         require_positive(iterations=iterations, fields=fields)
         n_s = context.U.shape[1]
-        self._columns = known_columns(n_s)
-        self._policy = checked_policy(policy0, self._columns)
+        self._policy = checked_policy(policy0)
         modes = max(_MODES, n_s) if modes is None else modes
-        self._modes = modes, min(cubic_modes, modes)
-        self._context, self._extra_modes = context, extra_modes
-        self._proposer = Proposer(context, self._policy, *self._modes)
+        self._proposer = Proposer(context, self._policy, modes, min(cubic_modes, modes))
         self._seed = seed
         self._budget = 2 * iterations
         self._field_count, self._most_fields = fields, max(fields, most_fields)
@@ -149,16 +138,6 @@ class GaussNewton:
     def done(self) -> bool:
         """Whether the rollouts that are left make no step."""
         return not self.ask()
-
-    @property
-    def basis(self) -> Array | None:
-        """U, once its room has been filled with modes of the rollouts."""
-        return self._context.U if self._grown else None
-
-    @property
-    def _grown(self) -> bool:
-        extra = self._extra_modes
-        return extra > 0 and bool(self._context.U[:, -extra:].any())
 
     def ask(self) -> list[Rollout]:
         """The incumbent on fields that are new to it, or the candidate on the next field."""
@@ -198,11 +177,8 @@ class GaussNewton:
             row["cost"] = cost
         row["rollouts"] = self._records.count
         row["damping"] = self._damping
-        if decided:
-            if self._extra_modes and not self._grown:
-                row["added_modes"] = self._grow_basis()
-            if not (self._incumbents == _NONE).any():
-                self._propose(row)
+        if decided and not (self._incumbents == _NONE).any():
+            self._propose(row)
         return row
 
     def state(self) -> State:
@@ -216,22 +192,19 @@ class GaussNewton:
             "seed": np.array(self._seed),
             "field_count": np.array(self._field_count),
             **self._records.state(self._proposer.n_z, n_a, gains),
-            **({"basis": self._context.U.copy()} if self._extra_modes else {}),
         }
 
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
         """Continue from a checkpoint with the same seed and number of fields."""
         require_state(state, self.state(), ("seed", "field_count"))
         self._policy, self._candidate = (
-            checked_policy(state[name], self._columns) for name in ("policy", "candidate")
+            checked_policy(state[name]) for name in ("policy", "candidate")
         )
         for name in _STAMPS:
             setattr(self, f"_{name}", state[name].astype(np.int64))
         for name in _NUMBERS:
             setattr(self, f"_{name}", state[name].item())
         self._records.restore(state)
-        if self._extra_modes:
-            self._use_basis(state["basis"].astype(np.float64))
 
     def _rollout(self, policy: Array, slot: int) -> Rollout:
         return Rollout(policy.copy(), oracle.field_seed(self._seed, int(self._fields[slot])))
@@ -284,23 +257,6 @@ class GaussNewton:
             oldest = int(np.argmin(self._fields))
             self._fields[oldest] = self._fields.max() + 1
             self._others[oldest] = self._incumbents[oldest] = _NONE
-
-    def _grow_basis(self) -> int:
-        """Modes of the rollouts in the room that U has for them; how many there are."""
-        U = self._context.U
-        own = U.shape[1] - self._extra_modes
-        states = [record.states for record in self._records.all() if record.usable]
-        with threadpool_limits(limits=1):
-            found = extended_basis(U[:, :own], states, U.shape[1])
-        wider = np.zeros_like(U)
-        wider[:, : found.shape[1]] = found
-        self._use_basis(wider)
-        added: int = found.shape[1] - own
-        return added
-
-    def _use_basis(self, U: Array) -> None:
-        self._context = replace(self._context, U=U)
-        self._proposer = Proposer(self._context, self._policy, *self._modes)
 
     def _propose(self, row: Row) -> None:
         if self._budget - self._records.count < len(self._fields):

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from tuner_node.optimizers.base import Array, Context, Row
-from tuner_node.optimizers.features import Features, known_columns
 from tuner_node.optimizers.fit import LocalModel, extended_basis, fit
 from tuner_node.optimizers.selection import KAPPAS, LOCAL, RIDGES, Pair, choices, mismatches
 from tuner_node.optimizers.sensitivity import Path, damped_step
@@ -34,7 +33,7 @@ class Proposal:
 
     Attributes
     ----------
-    policy : (n_a, columns) array
+    policy : (n_a, 2 n_s) array
     fall : float
         The fall of the mean stage cost that the quadratic model predicts.
     models : int
@@ -61,31 +60,13 @@ class Proposal:
         }
 
 
-class _Columns:
-    """Where the gains of a policy are.
-
-    The last columns of U may be zeros: room for modes to come (`GaussNewton`), and no part of the
-    law yet.
-
-    order: how many are not; K_a, K_b, Q: their columns of the policy.
-    """
-
-    def __init__(self, U: Array, columns: int) -> None:
-        n_s = U.shape[1]
-        self.order = int(np.count_nonzero(np.abs(U).max(axis=0)))
-        self.K_a, self.K_b = slice(0, self.order), slice(n_s, n_s + self.order)
-        rows, others = np.triu_indices(n_s)
-        Q = 2 * n_s + np.flatnonzero(np.maximum(rows, others) < self.order)
-        self.Q = Q if columns > 2 * n_s else Q[:0]
-
-
 class Proposer:
     """Proposes policies for one problem.
 
     Parameters
     ----------
     context : Context
-    policy : (n_a, columns) array
+    policy : (n_a, 2 n_s) array
         Any policy of the training, for its shape.
     modes : int
         Coordinates of the fitted models.
@@ -97,7 +78,7 @@ class Proposer:
         U = np.array(context.U, dtype=np.float64)
         target = np.array(context.target, dtype=np.float64)
         n_a, columns = policy.shape
-        if U.ndim != 2 or columns not in known_columns(U.shape[1]):
+        if U.ndim != 2 or columns != 2 * U.shape[1]:
             raise ValueError(
                 f"a policy of shape {policy.shape} does not fit a basis U of shape {U.shape}."
             )
@@ -115,8 +96,6 @@ class Proposer:
             raise ValueError(f"modes must be at least n_s = {U.shape[1]}, but it is {modes}.")
         if not 0 <= cubic_modes <= modes:
             raise ValueError(f"cubic_modes must be 0 .. modes = {modes}, but it is {cubic_modes}.")
-        self._columns = _Columns(U, columns)
-        U = U[:, : self._columns.order]
         self.n_z, self.n_s, self.n_a = U.shape[0], U.shape[1], n_a
         self._U, self._target, self._modes = U, target, modes
         self._cubic_modes = cubic_modes
@@ -129,21 +108,17 @@ class Proposer:
         self._s_r_square = float(np.sum(self._s_r * self._s_r))
         # A target outside of U leaves the law without a constant part.
         self._one = 1.0 if self._s_r_square > 1e-20 * float(np.sum(target * target)) else 0.0
-        self._features = Features(self._s_r, self._one, quadratic=self._columns.Q.size > 0)
 
     def theta(self, policy: Array) -> Array:
-        """[K_a b] or [K_a b Q] of a policy, (n_a, n_f)."""
-        at = self._columns
-        return np.column_stack([policy[:, at.K_a], policy[:, at.K_b] @ self._s_r, policy[:, at.Q]])
+        """[K_a b] of a policy, (n_a, n_s + 1)."""
+        return np.column_stack([policy[:, : self.n_s], policy[:, self.n_s :] @ self._s_r])
 
     def moved(self, policy: Array, step: Array) -> Array:
         """The policy after a step of theta; K_b moves least among those with the wanted b."""
-        at, moved = self._columns, policy.copy()
-        moved[:, at.K_a] += step[:, : self.n_s]
+        moved = policy.copy()
+        moved[:, : self.n_s] += step[:, : self.n_s]
         if self._one:
-            constant = np.outer(step[:, self.n_s], self._s_r / self._s_r_square)
-            moved[:, at.K_b] += constant
-        moved[:, at.Q] += step[:, self.n_s + 1 :]
+            moved[:, self.n_s :] += np.outer(step[:, self.n_s], self._s_r / self._s_r_square)
         return moved
 
     def propose(
@@ -240,14 +215,9 @@ class Proposer:
         free = None
         if self._action_limit:
             free = (np.abs(record.actions) < self._action_limit).astype(np.float64)
-        s = x[:, : self.n_s]
-        return Path(
-            x,
-            record.actions,
-            self._features(s),
-            self._features.feedback(self.theta(record.policy), s),
-            free,
-        )
+        features = np.hstack([x[:, : self.n_s], np.full((length, 1), self._one)])
+        K = np.ascontiguousarray(record.policy[:, : self.n_s])
+        return Path(x, record.actions, features, K, free)
 
     def _pairs(
         self, V: Array, incumbents: Sequence[Record], others: Sequence[Record | None]

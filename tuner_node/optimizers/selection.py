@@ -41,7 +41,7 @@ _WORST = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two measured trajectories, and by how much theta differs, (n_a, n_f)."""
+    """Two measured trajectories, and by how much theta differs, (n_a, n_s + 1)."""
 
     first: Path
     second: Path
@@ -55,9 +55,6 @@ def mismatches(models: Sequence[LocalModel], pairs: Sequence[Pair], horizon: int
         return errors
     x = np.stack([pair.first.x for pair in pairs])
     measured = np.stack([pair.second.x for pair in pairs]) - x
-    K = pairs[0].first.K
-    if K.ndim == 3:
-        K = np.stack([pair.first.K for pair in pairs])
     forcing = np.stack([pair.second.features @ pair.change.T for pair in pairs])
     size = np.maximum(np.sum(measured**2, axis=(1, 2)), 1e-300)
     free = None
@@ -70,7 +67,7 @@ def mismatches(models: Sequence[LocalModel], pairs: Sequence[Pair], horizon: int
             predicted = predict_difference(
                 model.jacobians(x),
                 model.B,
-                K,
+                pairs[0].first.K,
                 initial=measured[:, 0],
                 forcing=forcing,
                 gammas=gammas,

@@ -7,9 +7,7 @@ matrix B of a fitted model, X_k = dx_k/dtheta and G_k = da_k/dtheta follow
     G_k = K X_k[:n_s] + I (x) [s_k; 1]^T,        X_{k+1} = gamma (A_k X_k + B G_k),        X_0 = 0.
 
 A saturated action does not move with theta: its row of G_k is zero. gamma <= 1 forgets: it keeps
-the sensitivities of a model that is unstable where the plant is not from growing. A law with further
-features phi(s) = [s; 1; e_i e_j], e = s - s_r, has the parameters theta = [K b Q] and, along the
-trajectory, the feedback K_k = theta dphi/ds(s_k) in place of K.
+the sensitivities of a model that is unstable where the plant is not from growing.
 
 The cost itself needs no model. With the measured x_k and a_k its gradient and Gauss-Newton curvature
 are
@@ -41,7 +39,6 @@ Array = NDArray[np.float64]
 
 # Share of the trust region that bounds all gains alike, relative to the one in input energy.
 _ISOTROPY = 0.3
-_ISOTROPY_QUADRATIC = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,10 +50,10 @@ class Path:
     x : (T, r) array
         Whose first n_s columns are s.
     a : (T, n_a) array
-    features : (T, n_f) array
-        phi(s_k): [s_k; 1], or [s_k; 0] where the law has no constant part, and further features.
-    K : (n_a, n_s) or (T, n_a, n_s) array
-        Feedback da/ds of the law that it was measured under; one for every step if it changes.
+    features : (T, n_s + 1) array
+        phi(s_k) = [s_k; 1], or [s_k; 0] where the law has no constant part.
+    K : (n_a, n_s) array
+        Feedback da/ds of the law that it was measured under.
     free : (T, n_a) array, optional
         1 where the action moves with the gains, 0 where it was saturated; None: it never was.
     """
@@ -111,7 +108,7 @@ def expand(
     stacked = np.empty((steps, r + n_a, p))
     diagonal = np.arange(n_a)
     for k in range(steps):
-        G = (K if K.ndim == 2 else K[k]) @ X[:n_s]
+        G = K @ X[:n_s]
         G.reshape(n_a, n_a, n_f)[diagonal, diagonal] += path.features[k]
         if path.free is not None:
             G *= path.free[k][:, None]
@@ -150,8 +147,8 @@ def predict_difference(
         A_k along the measured trajectories of P pairs.
     B : (r, n_a) array
         Input matrix of the model.
-    K : (n_a, n_s) or (P, T, n_a, n_s) array
-        Feedback along the first trajectory of every pair.
+    K : (n_a, n_s) array
+        Feedback of the first trajectory of every pair: one policy, the incumbent's.
     initial : (P, r) array
         delta_0.
     forcing : (P, T, n_a) array
@@ -204,16 +201,14 @@ def damped_step(
     g and H are averaged over paths and models. An average over models that disagree has a large H
     where they do, and so a small step. F alone measures a step by the input energy that it adds;
     its second term bounds the gains in directions of s that the rollouts hardly excite, through
-    which the closed loop would otherwise leave the range of the linearisation. Quadratic features
-    have a second term of their own, with the trace over them.
+    which the closed loop would otherwise leave the range of the linearisation.
 
     Returns
     -------
-    (n_a, n_f) array and float
+    (n_a, n_s + 1) array and float
         NaN if g and H are not finite.
     """
     n_a, n_f = models[0].B.shape[1], paths[0].features.shape[1]
-    affine = paths[0].K.shape[-1] + 1
     p = n_a * n_f
     g, H, energy = np.zeros(p), np.zeros((p, p)), np.zeros((n_f, n_f))
     # A model that is unstable along a path overflows.
@@ -233,11 +228,7 @@ def damped_step(
                 g += share * expansion.gradient
                 H += share * expansion.curvature
             energy += path.features.T @ path.features / (len(path.features) * len(paths))
-        isotropy = np.full(n_f, _ISOTROPY * np.trace(energy[:affine, :affine]) / affine)
-        if n_f > affine:
-            further = np.trace(energy[affine:, affine:]) / (n_f - affine)
-            isotropy[affine:] = _ISOTROPY_QUADRATIC * further
-        energy[np.diag_indices(n_f)] += isotropy
+        energy[np.diag_indices(n_f)] += _ISOTROPY * np.trace(energy) / n_f
         matrix = H + damping * 2.0 * action_weight * np.kron(np.eye(n_a), energy)
         matrix[np.diag_indices(p)] += 1e-9 * np.trace(H) / p
         nothing = np.full((n_a, n_f), np.nan), np.nan

@@ -21,7 +21,7 @@ class Record:
     ----------
     stamp : int
         Its number among all rollouts, from 0.
-    policy : (n_a, columns) array
+    policy : (n_a, 2 n_s) array
     cost : float
         Mean stage cost; infinite if it diverged.
     states, actions : (L + 1, n_z) or (L, n_z), and (L, n_a) arrays

@@ -57,7 +57,6 @@ class TwoPoint:
 
     name = "two_point"
     needs_trajectories = False
-    basis = None
 
     def __init__(
         self,
