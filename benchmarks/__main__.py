@@ -166,7 +166,7 @@ def _add_optimizers(programs: Commands) -> None:
     )
     add("--seeds", type=int, metavar="N", help="number of seeds [6]")
     add("--first-seed", type=int, metavar="S", help="the first seed [0]")
-    add("--iterations", type=int, metavar="N", help="half the rollouts [40]")
+    add("--rollouts", type=int, metavar="N", help="of the adaptation [80]")
     add("--evaluation-seed", type=int, metavar="S", help="draws the held-out fields [2024]")
     add("--evaluation-fields", type=int, metavar="N", help="held-out fields [10]")
     add(

@@ -2,7 +2,7 @@
 
     python -m benchmarks optimizers --optimizer gauss_newton --problem kdv --seeds 6
 
-For every seed: an exploratory episode, the reduced model and its tracking gains, 2 * iterations
+For every seed: an exploratory episode, the reduced model and its tracking gains, a number of
 rollouts of the optimiser, and then the cost of its policy on held-out initial fields that no
 optimiser has seen, and the share of the possible gain where the limit is known (`pdeloop bench
 optimum`). Prints a table; `--out` writes all numbers as JSON. No topics, no nodes: what is
@@ -48,7 +48,7 @@ class Job:
     problem: str
     optimizer: str
     seed: int
-    iterations: int
+    rollouts: int
     evaluation_seed: int
     evaluation_fields: int
     fresh_fields: int
@@ -156,7 +156,7 @@ def train(job: Job) -> dict[str, Any]:
     optimizer = OPTIMIZERS[job.optimizer](
         policy,
         seed=job.seed,
-        iterations=job.iterations,
+        rollouts=job.rollouts,
         learning_rate=parameters["learning_rate"],
         smoothing_radius=parameters["smoothing_radius"],
         context=context,
@@ -171,7 +171,7 @@ def train(job: Job) -> dict[str, Any]:
         rollouts = [Rollout(candidate, seed) for seed in held_out]
         return [result.cost for result in run_rollouts(plant, context.U, rollouts)]
 
-    budget = 2 * job.iterations
+    budget = job.rollouts
     costs = {"0": evaluate(policy)}
     marks = [mark for mark in job.marks or (budget // 4, budget // 2) if 0 < mark < budget]
     used = diverged = 0
@@ -284,7 +284,7 @@ def run(
     problem: Sequence[str] = (),
     seeds: int = 6,
     first_seed: int = 0,
-    iterations: int = 40,
+    rollouts: int = 80,
     evaluation_seed: int = 2024,
     evaluation_fields: int = 10,
     fresh_fields: int = 0,
@@ -304,7 +304,7 @@ def run(
             each,
             optimizer,
             seed,
-            iterations,
+            rollouts,
             evaluation_seed,
             evaluation_fields,
             fresh_fields,

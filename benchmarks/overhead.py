@@ -93,7 +93,7 @@ def measure(
                 times[beside].extend(found)
                 processor[beside].append((_processor_time(nodes) - before) / (len(found) + 1))
 
-            while not (progress.exists() and '"iteration"' in progress.read_text()):
+            while not (progress.exists() and '"adapted"' in progress.read_text()):
                 time.sleep(0.1)
             for window in range(windows):
                 observe(0)

@@ -40,7 +40,8 @@ def run(
     problem: str = "burgers",
 ) -> dict[str, Any]:
     """A row for each number of pairs, without and with faults, and one with a pair killed."""
-    values = resolve(problem, {"iterations": iterations, "seeds": SEEDS, "evaluation_fields": 4})
+    budget = {"iterations": iterations, "optimizer": "two_point"}
+    values = resolve(problem, {**budget, "seeds": SEEDS, "evaluation_fields": 4})
     training = build_training(values)
     began = time.monotonic()
     train(training, LocalPair(values), lambda row: None)
@@ -99,7 +100,7 @@ def serve(
         while tuner.process.poll() is None:
             if time.monotonic() > limit:
                 raise BenchError(f"no end of a training over {count} pairs within {LIMIT:g} s")
-            if kill and _done(out, "iteration") >= half:
+            if kill and _done(out, "adapted") >= half:
                 for node in nodes[0]:
                     node.process.send_signal(signal.SIGKILL)
                 kill = False

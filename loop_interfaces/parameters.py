@@ -13,6 +13,8 @@ from typing import Any
 from loop_interfaces.spec import Spec
 
 MAX_SEED = 2**53 - 1
+ROLLOUTS = 80
+"""The budget of a seed that is given neither rollouts nor iterations."""
 
 INSTRUMENTS = (
     Spec(
@@ -175,7 +177,22 @@ TUNER = (
     Spec(
         "seeds", 1, "trainings side by side in one batch, with seeds seed, seed + 1, ...", 1, 1024
     ),
-    Spec("iterations", 40, "iterations of the adapt phase", 1, 1_000_000),
+    Spec(
+        "rollouts",
+        0,
+        "budget of a seed: all rollouts before the closing evaluation, explorations and checks among "
+        f"them; 0: {ROLLOUTS}, unless 'iterations' is given",
+        0,
+        2_000_000,
+    ),
+    Spec(
+        "iterations",
+        0,
+        "instead of 'rollouts', for the optimizer two_point: iterations of two rollouts each, after "
+        "exploration and check, as the paper counts; 0: not given",
+        0,
+        1_000_000,
+    ),
     Spec(
         "start",
         "lqt",
@@ -240,8 +257,7 @@ TUNER = (
     Spec(
         "directions",
         4,
-        "directions D of an iteration of the optimizer 'directions': 2 D environments a seed; the "
-        "budget of 'iterations' is shared out, so that there are iterations / D of them",
+        "directions D of a step of the optimizer 'directions', which takes 2 D rollouts side by side",
         1,
         1_000_000,
     ),
@@ -282,6 +298,12 @@ VIEWER = (
 def table() -> tuple[Spec, ...]:
     """Every parameter of the nodes."""
     return (*PROBLEM, *PLANT, *EXECUTION, *TUNER, *RECORDER, *VIEWER)
+
+
+def with_budget(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters with the default budget, if they give none."""
+    given = values["rollouts"] or values["iterations"]
+    return {**values, "rollouts": values["rollouts"] if given else ROLLOUTS}
 
 
 def noisy(values: Mapping[str, Any]) -> bool:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from loop_interfaces.parameters import table
+from loop_interfaces.parameters import table, with_budget
 from loop_interfaces.spec import (
     ParameterError,
     check,
@@ -59,7 +59,7 @@ def load_parameters(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
     given = {**read_yaml(path), **options}
     check_names(given, [spec.name for spec in table()])
     given["equation"] = _equation_path(str(given.get("equation", "")), path)
-    return {**check(table(), given), **_physical(given)}
+    return {**with_budget(check(table(), given)), **_physical(given)}
 
 
 def _physical(given: Mapping[str, Any]) -> dict[str, float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -21,11 +21,9 @@ _MOST_AT_ONCE = 4_000_000
 class Display:
     """Shows progress rows: a live bar on a terminal, plain lines elsewhere."""
 
-    def __init__(self, iterations: int, seeds: int, stream: TextIO | None = None) -> None:
+    def __init__(self, seed: int, stream: TextIO | None = None) -> None:
         self._console = Console(file=stream or sys.stdout, highlight=False, soft_wrap=True)
-        self._total = 2 * iterations * seeds  # rollouts: an iteration is another thing everywhere
-        self._every = max(1, self._total // 8)
-        self._told = 0
+        self._seed, self._budget, self._told = seed, 1, 0
         self._rollouts: dict[int, int] = {}
         self._progress: Progress | None = None
         self._task: Any = None
@@ -38,7 +36,7 @@ class Display:
         """Show one row of progress.jsonl."""
         match row.get("event"):
             case "phase":
-                self._phase(str(row["phase"]))
+                self._phase(row)
             case "designed":
                 self.line(
                     f"  seed {row['seed']}: reduced model of order {row['reduced_order']}, "
@@ -49,13 +47,13 @@ class Display:
                 if row["again"]:
                     verdict += ", exploring again"
                 elif not row["accepted"]:
-                    verdict += ", and no attempts are left: a poor warm start"
+                    verdict += ", and no other exploration is left: a poor warm start"
                 self.line(
                     f"  seed {row['seed']}: a rollout costs {row['none']:.4g} without control, "
                     f"{row['lqt']:.4g} with LQT{verdict}"
                 )
-            case "iteration":
-                self._iteration(row)
+            case "adapted":
+                self._adapted(row)
             case "evaluated":
                 self.line(
                     f"  seed {row['seed']}: cost {row['none']:.4g} without control, "
@@ -70,23 +68,28 @@ class Display:
             self._progress.stop()
             self._progress = None
 
-    def _phase(self, phase: str) -> None:
+    def _phase(self, row: Mapping[str, Any]) -> None:
+        phase = str(row["phase"])
+        self._rollouts = dict(enumerate(row["rollouts"]))
+        self._told, self._budget = sum(row["rollouts"]), sum(row["budget"])
         if phase == "adapt" and self._console.is_terminal:
             self._progress = bar(self._console, "adapt", MofNCompleteColumn())
             self._progress.start()
-            self._task = self._progress.add_task("", total=self._total, status="")
+            self._task = self._progress.add_task(
+                "", total=self._budget, completed=self._told, status=""
+            )
             return
         self.close()
         if phase != "done":
             self.line(phase)
 
-    def _iteration(self, row: Mapping[str, Any]) -> None:
-        self._rollouts[row["seed"]] = row["rollouts"]
+    def _adapted(self, row: Mapping[str, Any]) -> None:
+        self._rollouts[row["seed"] - self._seed] = row["rollouts"]
         before, self._told = self._told, sum(self._rollouts.values())
         cost = f"cost {row['cost']:.4g}" if "cost" in row else "diverged"
         if self._progress is not None:
             self._progress.update(self._task, completed=self._told, status=cost)
-        elif self._told // self._every > before // self._every or row["diverged"]:
+        elif 8 * self._told // self._budget > 8 * before // self._budget or row["diverged"]:
             self.line(f"  seed {row['seed']}, {row['rollouts']} rollouts: {cost}")
 
 
@@ -137,16 +140,31 @@ def summary_text(problem: str, summary: Mapping[str, Any], folder: Path) -> str:
             return f"diverged in {diverged[name]} of {rollouts} rollouts"
         return f"{costs[name]:.4g}" + (f"{change})" if comparable and name == "adapted" else "")
 
-    budget = max((row["rollouts"] for row in summary["history"]), default=0)
-    each = " a seed" if seeds > 1 else ""
-    comparable = not diverged["lqt"] and not diverged["adapted"]
+    comparable = any(summary["changed"]) and not (diverged["lqt"] or diverged["adapted"])
     lines = [
-        f"{problem}, {who}: {budget} rollouts{each} in {summary['seconds']:.1f} s",
+        f"{problem}, {who}: {_budget_text(summary['rollouts'])} in {summary['seconds']:.1f} s",
         f"  mean stage cost without control  {cost('none')}",
         f"  mean stage cost with LQT         {cost('lqt')}",
         f"  mean stage cost after adaptation {cost('adapted')}",
     ]
-    if not summary["improved"]:
+    if not any(summary["changed"]):
+        lines.append("  nothing was adapted: the policies are those that the adaptation began with")
+    elif not summary["improved"]:
         lines.append("  the adaptation did not improve on the LQT law for every seed")
     lines.append(f"  results in {folder}")
     return "\n".join(lines)
+
+
+def _budget_text(rollouts: Sequence[Mapping[str, int]]) -> str:
+    """How many rollouts a seed took, and what for."""
+    spent = {name: _range([seed[name] for seed in rollouts]) for name in rollouts[0]}
+    each = " a seed" if len(rollouts) > 1 else ""
+    return (
+        f"{spent['total']} rollouts{each} (exploration {spent['exploration']}, "
+        f"check {spent['check']}, adaptation {spent['adaptation']})"
+    )
+
+
+def _range(counts: Sequence[int]) -> str:
+    low, high = min(counts), max(counts)
+    return str(low) if low == high else f"{low} to {high}"

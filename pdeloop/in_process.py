@@ -132,7 +132,7 @@ def train(training: Training, pair: LocalPair, report: Report, *, max_batch: int
         batch = training.next_batch()
         if training.phase != phase:
             phase = training.phase
-            report({"event": "phase", "phase": phase})
+            report({"event": "phase", "phase": phase, **training.progress})
         if batch is None:
             return
         result = pair.run(batch, max_batch)

@@ -105,6 +105,7 @@ LOOP_ARGUMENTS = (
 """Arguments of loop.launch.py."""
 
 _TRAINING = (
+    "rollouts",
     "iterations",
     "seed",
     "seeds",

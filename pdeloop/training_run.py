@@ -136,6 +136,7 @@ def begin(
 ) -> tuple[Path, dict[str, Any]]:
     """Folder and parameters of a new training, of which nothing has been done yet."""
     values = resolve(problem, options)
+    build_training(values)  # refuses before there is a folder
     folder = out or Path("runs") / f"{values['problem']}-{timestamp()}"
     RunFolder(folder).create(values)
     return folder, values
@@ -143,7 +144,9 @@ def begin(
 
 def reopen(folder: Path) -> dict[str, Any]:
     """The parameters of the unfinished training in `folder`; RunFolderError if there is none."""
-    values = RunFolder(folder).values()
+    run = RunFolder(folder)
+    run.unfinished()
+    values = run.values()
     if (folder / "result.json").exists():
         raise RunFolderError(f"the run in {folder} is complete; there is nothing to continue")
     return values
@@ -171,7 +174,7 @@ def run_again(folder: Path, transport: Transport, as_json: bool = False) -> int:
 
 def _run(folder: Path, values: dict[str, Any], transport: Transport, as_json: bool) -> int:
     stream = sys.stderr if as_json else sys.stdout
-    display = Display(values["iterations"], values["seeds"], stream)
+    display = Display(values["seed"], stream)
     started = time.monotonic()
     try:
         with interruptible() as check:

@@ -12,12 +12,14 @@ from pdeloop.training_run import resolve
 from tuner_node.build import build_training
 from tuner_node.training import Training
 
+_OWN = ("seed", "seeds", "rollouts", "iterations", "start")
+
 SMALL = Path(__file__).parent / "data" / "small.yaml"
 
 
 def parameters(**options: Any) -> dict[str, Any]:
     """The resolved parameters of a training of the small problem; any of them can be replaced."""
-    tuner = {k: v for k, v in options.items() if k in ("seed", "seeds", "iterations", "start")}
+    tuner = {k: v for k, v in options.items() if k in _OWN}
     return {**resolve(str(SMALL), tuner), **options}
 
 

@@ -109,7 +109,9 @@ class _Training:
         # A Gauss-Newton step takes a second to compute, and is computed again after a kill.
         optimizer, share = (("two_point", 1), ("gauss_newton", 10))[seed % 2]
         iterations = max(1, iterations // share)
-        self._options = {"iterations": iterations, "seed": seed, "optimizer": optimizer}
+        budget = {"iterations": iterations} if optimizer == "two_point" else {}
+        budget = budget or {"rollouts": max(20, 2 * iterations)}
+        self._options = {**budget, "seed": seed, "optimizer": optimizer}
         self._problem, self._out, self._report = problem, out, report
         self._log = out.with_suffix(".log")
         self._seen: dict[int, tuple[str, float, float]] = {}

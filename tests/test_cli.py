@@ -59,7 +59,7 @@ def test_unknown_problems_and_missing_arguments_say_what_is_expected(tmp_path, c
     assert "unknown problem 'stokes'; expected one of" in error_of(capsys, "train", "stokes")
     assert "no problem given" in error_of(capsys, "train")
     assert "no problem file at" in error_of(capsys, "train", str(tmp_path / "no.yaml"))
-    assert "'iterations' is 0" in error_of(capsys, "train", "burgers", "--iterations", "0")
+    assert "--iterations is 0" in error_of(capsys, "train", "burgers", "--iterations", "0")
     assert "no run in" in error_of(capsys, "evaluate", str(tmp_path))
     assert "no run in" in error_of(capsys, "train", "--resume", str(tmp_path))
     with pytest.raises(SystemExit) as usage:

@@ -162,16 +162,19 @@ def test_a_controller_waits_answers_grows_stale_and_is_at_rest():
 
 def test_a_tuner_tells_how_far_it_is_who_is_missing_and_what_holds_it():
     loop = Loop(build_training(values()))
-    health = TunerHealth(loop.session, ITERATIONS)
+    health = TunerHealth(loop.session)
     first = health.report(0.0, [])
     assert (first.level, first.message) == (Level.OK, "identify")
     while loop.iterations() < 2:
         loop.episode()
     told = health.report(10.0, [])
-    assert (told.level, told.message) == (Level.OK, f"iteration 2 of {ITERATIONS}")
-    assert told.values["iterations/s"] == pytest.approx(0.2)
+    paid, budget = (sum(counts) for counts in loop.session.training.progress.values())
+    assert budget - paid == 2 * 2 * (ITERATIONS - 2)  # of two seeds
+    where = f"rollout {paid} of {budget}"
+    assert (told.level, told.message) == (Level.OK, where)
+    assert told.values["rollouts/s"] == pytest.approx(paid / 10)
     history = loop.session.training.history
-    assert told.values["iteration cost"] == history[-1]["cost"]
+    assert told.values["adapted cost"] == history[-1]["cost"]
     checked = [row for row in loop.rows if row["event"] == "checked"]
     last = {row["seed"]: row["lqt"] for row in checked}
     assert told.values["cost with LQT"] == pytest.approx(np.mean(list(last.values())))
@@ -187,16 +190,16 @@ def test_a_tuner_tells_how_far_it_is_who_is_missing_and_what_holds_it():
     assert repeated.values["episodes repeated"] == 1
     assert health.report(30.0, []).level is Level.OK
     loop.session.pause()
-    assert health.report(31.0, []).message == f"paused in iteration 2 of {ITERATIONS}"
+    assert health.report(31.0, []).message == f"paused in {where}"
     loop.take(loop.session.resume(31.0))
     loop.session.paused(0, Frame(7, 1, 0, 0.0, np.array([1.0]), 1), 31.0)
-    assert health.report(32.0, []).message == f"the plant is paused in iteration 2 of {ITERATIONS}"
+    assert health.report(32.0, []).message == f"the plant is paused in {where}"
     assert health.report(32.0, []).values["paused plants"] == 1
     assert health.report(50.0, []).values["paused plants"] == 0
     loop.session.stop()
     assert health.report(50.0, []).message.endswith("stopping after it")
     restarted = Loop(build_training(values()), incarnation=3)
-    assert TunerHealth(restarted.session, ITERATIONS).report(0.0, []).values["restarts"] == 3
+    assert TunerHealth(restarted.session).report(0.0, []).values["restarts"] == 3
 
 
 def test_a_recorder_warns_until_it_is_matched_and_once_for_what_it_missed(tmp_path):

@@ -57,7 +57,7 @@ class Plant:
 
 
 def make(plant: Plant, policy: np.ndarray | None = None, **changes: Any) -> GaussNewton:
-    settings: dict[str, Any] = {"seed": 5, "iterations": 16, "context": plant.context()}
+    settings: dict[str, Any] = {"seed": 5, "rollouts": 32, "context": plant.context()}
     return GaussNewton(0.6 * plant.best if policy is None else policy, **(settings | changes))
 
 
@@ -71,7 +71,7 @@ def mean_cost(plant: Plant, policy: np.ndarray) -> float:
 
 def test_converges_to_the_known_optimum_of_a_linear_quadratic_plant() -> None:
     plant = Plant()
-    optimizer = make(plant, iterations=30)
+    optimizer = make(plant, rollouts=60)
     start, best = mean_cost(plant, optimizer.policy), mean_cost(plant, plant.best)
     used = 0
     while not optimizer.done:
@@ -96,7 +96,7 @@ def test_improves_a_plant_that_is_not_linear() -> None:
 
 def test_asks_are_pure_rows_are_json_and_the_budget_is_kept() -> None:
     plant = Plant()
-    optimizer = make(plant, iterations=12)
+    optimizer = make(plant, rollouts=24)
     total, costs = 0, []
     while not optimizer.done:
         first, second = optimizer.ask(), optimizer.ask()
@@ -109,7 +109,6 @@ def test_asks_are_pure_rows_are_json_and_the_budget_is_kept() -> None:
         row = optimizer.tell(measure(plant, second))
         assert json.loads(json.dumps(row, allow_nan=False)) == row
         assert row["rollouts"] == total
-        assert row["iteration"] == optimizer.iteration
         costs.append(row["cost"])
     assert 24 - 3 < total <= 24
     assert optimizer.ask() == []
@@ -216,7 +215,7 @@ def test_a_restored_training_ends_with_the_same_bits(stop: int) -> None:
     def step(optimizer: GaussNewton) -> dict[str, Any]:
         asked = optimizer.ask()
         results = measure(plant, asked)
-        if optimizer.iteration == 4:
+        if optimizer.tells == 4:
             results[0] = diverged(plant, asked[0], "nan")
         return optimizer.tell(results)
 
@@ -263,7 +262,7 @@ def test_needs_sound_trajectories_and_stays_as_it_was_without() -> None:
     ):
         with pytest.raises(ValueError, match=message):
             optimizer.tell([*good[:2], bad])
-    assert optimizer.iteration == 0
+    assert optimizer.tells == 0
     assert len(optimizer.ask()) == 3
     optimizer.tell(good)
     with pytest.raises(ValueError, match="one result per rollout, 1, but got 3"):
@@ -297,7 +296,7 @@ def test_a_target_outside_of_the_basis_leaves_the_constant_part_alone() -> None:
     ("changes", "message"),
     [
         ({"fields": 0}, "fields must be positive"),
-        ({"iterations": 0}, "iterations must be positive"),
+        ({"rollouts": 0}, "rollouts must be positive"),
         ({"modes": 3}, "at least n_s = 4"),
         ({"policy": np.zeros((2, 6))}, "does not fit a basis"),
         ({"policy": np.zeros((3, 8))}, "exploratory trajectory must have"),
@@ -309,7 +308,7 @@ def test_refuses_bad_parameters(changes: dict[str, Any], message: str) -> None:
 
 
 def test_a_reduced_model_larger_than_the_default_number_of_modes_is_adapted() -> None:
-    values = resolve("wave", {"iterations": 10, "optimizer": "gauss_newton"})
+    values = resolve("wave", {"rollouts": 20, "optimizer": "gauss_newton"})
     values |= {"dmdc_rank": 50, "reduced_order": 40, "horizon": 120, "evaluation_fields": 2}
     training = train_here(values)
     assert training.policies().shape == (1, 8, 80)
@@ -319,7 +318,7 @@ def test_a_reduced_model_larger_than_the_default_number_of_modes_is_adapted() ->
 
 def test_small_steps_are_judged_on_more_fields_and_survive_a_checkpoint() -> None:
     plant = Plant()
-    optimizer = make(plant, iterations=20, most_fields=6)
+    optimizer = make(plant, rollouts=40, most_fields=6)
     counts, asked_on = [], set()
     middle = None
     while not optimizer.done:
@@ -335,7 +334,7 @@ def test_small_steps_are_judged_on_more_fields_and_survive_a_checkpoint() -> Non
     assert 3 < counts[-1] <= 6
     assert len(asked_on) >= counts[-1]
     assert middle is not None
-    again = make(plant, iterations=20, most_fields=6)
+    again = make(plant, rollouts=40, most_fields=6)
     again.restore(middle)
     while not again.done:
         again.tell(measure(plant, again.ask()))

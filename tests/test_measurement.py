@@ -210,7 +210,7 @@ def test_sensors_at_every_point_without_delay_are_the_full_state() -> None:
     b = run(full, [1, 2], [0, 0], 0.3)
     assert same_bits(a, b)
     for optimizer in ("two_point", "gauss_newton"):
-        options = {"optimizer": optimizer, "iterations": 6}
+        options = {"optimizer": optimizer, "rollouts": 21}
         first = train_here(parameters(**options))
         second = train_here(parameters(**options, sensors=32, sensor_delays=1))
         assert same_bits(first.policies(), second.policies())
@@ -332,7 +332,7 @@ def test_noisy_trainings_are_the_same_again_and_in_any_batch(optimizer: str) -> 
         "sensors": 10,
         "sensor_delays": 3,
         "optimizer": optimizer,
-        "iterations": 6,
+        "rollouts": 21,
     }
     both = train_here(parameters(seeds=2, **options), max_batch=3)
     for m in range(2):
@@ -344,7 +344,7 @@ def test_noisy_trainings_are_the_same_again_and_in_any_batch(optimizer: str) -> 
 @pytest.mark.parametrize("stop", [1, 3, 5, 8])
 def test_a_noisy_training_goes_on_from_a_checkpoint_with_the_same_noise(stop: int) -> None:
     values = parameters(
-        measurement_noise=0.05, process_noise=0.02, optimizer="gauss_newton", iterations=6
+        measurement_noise=0.05, process_noise=0.02, optimizer="gauss_newton", rollouts=21
     )
     whole = train_here(values)
     first, pair = build_training(values), LocalPair(values)

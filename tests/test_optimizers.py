@@ -25,12 +25,12 @@ def cost(policy: np.ndarray, field_seed: int) -> float:
 
 
 def two_point(**changes: Any) -> TwoPoint:
-    settings: dict[str, Any] = {"seed": 3, "iterations": 12, "learning_rate": 1e-3}
+    settings: dict[str, Any] = {"seed": 3, "rollouts": 24, "learning_rate": 1e-3}
     return TwoPoint(POLICY, **(settings | changes))
 
 
 def directions(**changes: Any) -> Directions:
-    settings: dict[str, Any] = {"seed": 3, "iterations": 12, "learning_rate": 1e-2, "directions": 2}
+    settings: dict[str, Any] = {"seed": 3, "rollouts": 24, "learning_rate": 1e-2, "directions": 2}
     return Directions(POLICY, **(settings | changes))
 
 
@@ -63,7 +63,7 @@ def test_two_point_is_the_papers_iteration() -> None:
 
 @BOTH
 def test_the_cost_falls(make: Make) -> None:
-    optimizer = make(iterations=1000)
+    optimizer = make(rollouts=2000)
     while not optimizer.done:
         optimizer.tell(measure(optimizer))
     assert cost(optimizer.best_policy, 0) - 1.0 < 0.2 * (cost(POLICY, 0) - 1.0)
@@ -81,7 +81,6 @@ def test_ask_is_pure_and_rows_are_json(make: Make) -> None:
         total += len(first)
         row = optimizer.tell(measure(optimizer))
         assert json.loads(json.dumps(row, allow_nan=False)) == row
-        assert row["iteration"] == optimizer.iteration
         assert row["rollouts"] == total
         assert row["updated"] is True
     assert total == 24
@@ -164,7 +163,7 @@ def through_file(optimizer: Optimizer) -> dict[str, np.ndarray]:
 def test_a_restored_training_ends_with_the_same_bits(make: Make, stop: int) -> None:
     def step(optimizer: Optimizer) -> dict[str, Any]:
         results = measure(optimizer)
-        if optimizer.iteration == 2:
+        if optimizer.tells == 2:
             results[0] = RolloutResult(np.nan, diverged=True)
         return optimizer.tell(results)
 
@@ -178,7 +177,7 @@ def test_a_restored_training_ends_with_the_same_bits(make: Make, stop: int) -> N
     first.ask()
     second = make()
     second.restore(through_file(first))
-    assert second.iteration == stop
+    assert second.tells == stop
     assert [step(second) for _ in range(len(rows) - stop)] == rows[stop:]
     assert second.done
     assert np.array_equal(second.policy, whole.policy)
@@ -215,7 +214,7 @@ def test_refuses_the_wrong_number_of_results(make: Make) -> None:
 
 @BOTH
 @pytest.mark.parametrize("value", [0, -1.0, np.nan, np.inf])
-@pytest.mark.parametrize("name", ["learning_rate", "smoothing_radius", "iterations"])
+@pytest.mark.parametrize("name", ["learning_rate", "smoothing_radius", "rollouts"])
 def test_refuses_bad_parameters(make: Make, name: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"{name} must be positive"):
         make(**{name: value})
@@ -223,7 +222,7 @@ def test_refuses_bad_parameters(make: Make, name: str, value: float) -> None:
 
 @pytest.mark.parametrize("cls", [TwoPoint, Directions])
 def test_refuses_bad_policies(cls: Make) -> None:
-    settings: dict[str, Any] = {"seed": 0, "iterations": 8, "learning_rate": 1.0}
+    settings: dict[str, Any] = {"seed": 0, "rollouts": 16, "learning_rate": 1.0}
     for policy in (POLICY[0], POLICY[:, :5], POLICY[:0]):
         with pytest.raises(ValueError, match="must have shape"):
             cls(policy, **settings)
@@ -269,7 +268,7 @@ def test_directions_returns_to_the_best_iterate() -> None:
     [
         ({"directions": 0}, r"1 \.\. 12"),
         ({"directions": 13}, r"1 \.\. 12"),
-        ({"iterations": 3, "directions": 4}, r"1 \.\. 3"),
+        ({"rollouts": 6, "directions": 4}, r"1 \.\. 3"),
         ({"tolerance": 1.0}, "above 1"),
     ],
 )

@@ -40,7 +40,7 @@ def folder(request, tmp_path_factory) -> Path:
     options = ("--seeds", "2", "--out", str(base / "out"))
     command, report = ("reproduce", str(SMALL), "--iterations", "4"), ()
     if request.param == "run":
-        command = ("train", str(SMALL), "--in-process", "--iterations", "12")
+        command = ("train", str(SMALL), "--in-process", "--rollouts", "33")
         command += ("--optimizer", "gauss_newton")
         limits = ("optimum", str(SMALL), "--seeds", "2", "--fields", "2", "--no-checks")
         report = ("--limits", str(base / "limits"))

@@ -79,7 +79,7 @@ class Loop:
             self.take(self.session.model(0, answer(result.models), self.now))
 
     def iterations(self) -> int:
-        return sum(row["event"] == "iteration" for row in self.rows) // 2
+        return sum(row["event"] == "adapted" for row in self.rows) // 2
 
 
 def same(a: Training, b: Training) -> bool:

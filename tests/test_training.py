@@ -152,7 +152,7 @@ def rows_file(path, model, name="model"):
 def test_a_given_model_is_the_warm_start_of_every_seed(tmp_path, optimizer):
     found = train_here(parameters(seed=3, iterations=2, optimizer="two_point")).models
     given = {"model": rows_file(tmp_path / "model.npz", found)}
-    values = parameters(seed=7, seeds=2, iterations=6, optimizer=optimizer, **given)
+    values = parameters(seed=7, seeds=2, rollouts=13, optimizer=optimizer, **given)
     training = build_training(values)
     first = training.next_batch()
     assert first.exploratory == (optimizer == "gauss_newton"), (
@@ -211,7 +211,7 @@ def test_a_model_of_another_plant_is_refused(tmp_path):
 
 @pytest.mark.parametrize("told", [5, 9])
 def test_gauss_newton_continues_from_a_checkpoint_in_the_middle_to_the_same_bits(tmp_path, told):
-    values = parameters(iterations=8, optimizer="gauss_newton")
+    values = parameters(rollouts=25, optimizer="gauss_newton")
     undisturbed = train_here(values)
     first, pair = build_training(values), LocalPair(values)
     for _ in range(told):

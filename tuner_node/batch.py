@@ -61,6 +61,12 @@ class TrainingSettings:
     start: str
     exploration_variance: float
     identification_attempts: int
+    rollouts: int
+    """The budget of a seed before the closing evaluation, explorations and checks among them; 0:
+    `adaptation` besides those."""
+    adaptation: int
+    step: int
+    """Rollouts of the optimiser's first step."""
     state_weight: float
     action_weight: float
     trajectories: bool

@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from loop_interfaces.model_rows import unpack
 from loop_interfaces.parameters import noisy
+from loop_interfaces.spec import ParameterError
 from tuner_node.batch import UNKNOWN_PLANT, TrainingSettings
-from tuner_node.optimizers import NEED_TRAJECTORIES, OPTIMIZERS, Context, Optimizer
-from tuner_node.training import Training
+from tuner_node.optimizers import NEED_TRAJECTORIES, OPTIMIZERS, Context, Optimizer, TwoPoint
+from tuner_node.optimizers.gauss_newton import FIELDS
+from tuner_node.training import CHECK, EXPLORATION, Training
 
 MAX_MODEL_BYTES = 1 << 30
 
@@ -40,6 +42,41 @@ def read_model(path: Path, n_a: int) -> NDArray[np.float64]:
     return model
 
 
+def first_step(values: Mapping[str, Any]) -> int:
+    """Rollouts that the optimiser needs to change the policy once."""
+    # Gauss-Newton measures the policy it begins with, and then the first candidate.
+    steps = {"two_point": 2, "directions": 2 * values["directions"], "gauss_newton": 2 * FIELDS}
+    step: int = steps[values["optimizer"]]
+    return step
+
+
+def check_budget(values: Mapping[str, Any], trajectories: bool, step: int) -> None:
+    """ParameterError unless the budget is given in one way and allows one step of the optimiser."""
+    name, rollouts = values["optimizer"], values["rollouts"]
+    if values["iterations"]:
+        if rollouts:
+            raise ParameterError(
+                "parameters 'rollouts' and 'iterations' both set the budget; give one of them"
+            )
+        if name != TwoPoint.name:
+            raise ParameterError(
+                f"parameter 'iterations' is {values['iterations']}; expected 'rollouts' instead: the "
+                f"optimizer '{name}' counts no iterations"
+            )
+        return
+    parts = {}
+    if trajectories or not values["model"]:
+        parts["for the exploration"] = EXPLORATION
+    if not values["model"] and values["identification_attempts"] > 1:
+        parts["to check the first law"] = CHECK
+    parts[f"for a step of the optimizer '{name}'"] = step
+    if rollouts < sum(parts.values()):
+        why = ", ".join(f"{count} {what}" for what, count in parts.items())
+        raise ParameterError(
+            f"parameter 'rollouts' is {rollouts}; expected at least {sum(parts.values())}: {why}"
+        )
+
+
 def build_training(values: Mapping[str, Any]) -> Training:
     """The training that the tuner's and the problem's parameters describe."""
     from_zero = values["start"] == "zero"
@@ -47,27 +84,30 @@ def build_training(values: Mapping[str, Any]) -> Training:
 
     options: dict[str, Any] = {}
     if values["optimizer"] == "directions":
-        most = min(values["iterations"], 2 * values["n_a"] * values["reduced_order"])
+        most = 2 * values["n_a"] * values["reduced_order"]
         if values["directions"] > most:
             raise ValueError(
                 f"parameter 'directions' is {values['directions']}; expected at most {most}, as "
-                "many as there are iterations and entries of the policy"
+                "many as there are entries of the policy"
             )
         options["directions"] = values["directions"]
 
     def make_optimizer(
-        policy: NDArray[np.float64], seed: int, context: Context | None
+        policy: NDArray[np.float64], seed: int, context: Context | None, rollouts: int
     ) -> Optimizer:
         return OPTIMIZERS[values["optimizer"]](
             policy,
             seed=seed,
-            iterations=values["iterations"],
+            rollouts=rollouts,
             learning_rate=rate,
             smoothing_radius=values["smoothing_radius"],
             context=context,
             **options,
         )
 
+    trajectories = values["optimizer"] in NEED_TRAJECTORIES
+    step = first_step(values)
+    check_budget(values, trajectories, step)
     settings = TrainingSettings(
         n_a=values["n_a"],
         seed=values["seed"],
@@ -77,9 +117,12 @@ def build_training(values: Mapping[str, Any]) -> Training:
         start=values["start"],
         exploration_variance=values["exploration_variance"],
         identification_attempts=values["identification_attempts"],
+        rollouts=values["rollouts"],
+        adaptation=2 * values["iterations"],
+        step=step,
         state_weight=values["state_weight"],
         action_weight=values["action_weight"],
-        trajectories=values["optimizer"] in NEED_TRAJECTORIES,
+        trajectories=trajectories,
         noise=noisy(values),
         action_limit=values["action_limit"],
         model=read_model(Path(values["model"]), values["n_a"]) if values["model"] else None,

@@ -12,10 +12,10 @@ RECENT = 10.0
 
 
 class TunerHealth:
-    """Reports on a session, from one call to the next. iterations: of the whole training."""
+    """Reports on a session, from one call to the next."""
 
-    def __init__(self, session: Session, iterations: int) -> None:
-        self._session, self._iterations = session, iterations
+    def __init__(self, session: Session) -> None:
+        self._session = session
         self._rate = Rate()
         self._repeated = 0
         self._repeated_at = float("-inf")
@@ -28,6 +28,7 @@ class TunerHealth:
         if repeated > self._repeated:
             self._repeated, self._repeated_at = repeated, now
         level, message = self._state(now, absent)
+        paid, budget = (sum(counts) for counts in training.progress.values())
         costs = dispatcher.last_costs
         return Health(
             level,
@@ -36,13 +37,13 @@ class TunerHealth:
                 "run": dispatcher.run,
                 "restarts": dispatcher.incarnation,
                 "phase": training.phase,
-                "iteration": training.iteration,
-                "iterations": self._iterations,
-                "iterations/s": self._rate.per_second(training.iteration, now),
+                "rollouts": paid,
+                "budget": budget,
+                "rollouts/s": self._rate.per_second(paid, now),
                 "episode": dispatcher.newest_episode,
                 "episodes under way": len(dispatcher.episodes()),
                 "last cost": float(np.mean(costs)) if costs is not None and len(costs) else None,
-                "iteration cost": self._last("cost"),
+                "adapted cost": self._last("cost"),
                 "cost without control": session.baseline("none"),
                 "cost with LQT": session.baseline("lqt"),
                 "episodes repeated": repeated,
@@ -60,7 +61,8 @@ class TunerHealth:
         session = self._session
         where = session.training.phase
         if where == "adapt":
-            where = f"iteration {session.training.iteration} of {self._iterations}"
+            paid, budget = (sum(counts) for counts in session.training.progress.values())
+            where = f"rollout {paid} of {budget}"
         if absent:
             return Level.WARN, f"waiting for {' and '.join(absent)}"
         if session.dispatcher.held:

@@ -23,7 +23,7 @@ from std_msgs.msg import String
 
 from loop_interfaces.frames import MAX_ID, Frame
 from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.parameters import PROBLEM, TUNER
+from loop_interfaces.parameters import PROBLEM, TUNER, with_budget
 from loop_interfaces.protocol import STOPPED, ModelFailure
 from loop_interfaces.ros.endpoints import Sender, reader_qos, scoped
 from loop_interfaces.ros.introspection import offer
@@ -66,7 +66,7 @@ def declare_parameters(node: Node, changed: Mapping[str, Any] | None = None) -> 
     changed: live ones as they were set meanwhile, when the network is joined again.
     """
     given = {**given_parameters(node), **(changed or {})}
-    values = declare(node, [*PROBLEM, *TUNER], given)
+    values = with_budget(declare(node, [*PROBLEM, *TUNER], given))
     # The equation's own parameters are the plant's to check; here they only identify the run.
     return values | {name: value for name, value in given.items() if name.startswith("physical.")}
 
@@ -109,7 +109,7 @@ class TunerNode:
         )
         self._news: deque[Mapping[str, Any]] = deque()
         self._session = Session(training, dispatcher, self._news.append)
-        self._health = TunerHealth(self._session, values["iterations"])
+        self._health = TunerHealth(self._session)
         self._pairs = pairs
         self._changed: dict[str, Any] = {}
         self._wire(node, loop)
@@ -144,7 +144,7 @@ class TunerNode:
         if self._failure:
             raise ConfigurationError(self._failure)
         if self._session.stopped:
-            self._log.info("stopped on request after an iteration")
+            self._log.info("stopped on request")
             return STOPPED
         self._log.info(f"stopped by {reason} before the end")
         return 130
@@ -199,8 +199,8 @@ class TunerNode:
         self._guarded(lambda now: self._session.stop())
         if self._session.stopped:
             return "stopping now"
-        return "stopping after this iteration" + (
-            ", which waits for a paused plant"
+        return "stopping after the rollouts under way" + (
+            ", which wait for a paused plant"
             if self._session.dispatcher.paused_pairs(self._loop.now())
             else ""
         )
@@ -339,7 +339,7 @@ class TunerNode:
         )
         if row.get("event") == "repeated":
             self._log.warning(text)
-        elif row.get("event") == "iteration":  # hundreds a second of a small problem
+        elif row.get("event") == "adapted":  # hundreds a second of a small problem
             self._log.info(text, throttle_duration_sec=1.0)
         else:
             self._log.info(text)

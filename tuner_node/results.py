@@ -91,7 +91,7 @@ class RunFolder:
 
     def reopen(self, parameters: Mapping[str, Any]) -> RunIdentity:
         """Continue the training here. RunFolderError if there is none, or with other parameters."""
-        self.parameters()
+        self.unfinished()
         try:
             known = json.loads((self.path / "run.json").read_text())
             self._check_same(known["parameters"], parameters)
@@ -113,6 +113,16 @@ class RunFolder:
             return read_yaml(path)
         except ParameterError as error:
             raise RunFolderError(str(error)) from error
+
+    def unfinished(self) -> dict[str, Any]:
+        """The parameters of a training to continue. RunFolderError if this version cannot."""
+        known = self.parameters()
+        if "rollouts" not in known:
+            raise RunFolderError(
+                f"the run in {self.path} is of an older version, which did not count its rollouts; "
+                "it cannot be continued, start a new one"
+            )
+        return known
 
     def values(self) -> dict[str, Any]:
         """The parameters of the training here, with the present defaults of what is not in its file."""
@@ -199,6 +209,8 @@ def summarise(training: Training) -> dict[str, Any]:
 
     reduction: how far the adapted cost lies below LQT's, as the mean over seeds of the ratios and as
     the ratio of the means over seeds (each cost already a mean over the evaluation fields).
+    rollouts: what those of each seed were for; changed: whether its policy is another one than the
+    one it began with.
     """
     assert training.evaluation is not None and training.ended is not None
     diverged = (training.ended != COMPLETED).sum(axis=(0, 2))
@@ -218,7 +230,8 @@ def summarise(training: Training) -> dict[str, Any]:
         "diverged": dict(zip(CONTROLLERS, diverged.tolist(), strict=True)),
         "seed": training.settings.seed,
         "seeds": training.settings.seeds,
-        "iterations": training.iteration,
+        "rollouts": training.budget.by_purpose(),
+        "changed": (training.policies() != training.starts()).any(axis=(1, 2)).tolist(),
         "history": training.history,
     }
 

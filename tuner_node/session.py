@@ -29,7 +29,7 @@ class Session:
         self.established = False
         """Whether a pair has served this session: then it is the newcomer who has to go."""
         self.stopping = False
-        """Whether an operator asked for the end after this iteration."""
+        """Whether an operator asked for the end after the rollouts under way."""
         self.stopped = False
         """Whether that end has come; the training's state is that of a checkpoint."""
         self._checked: dict[int, Mapping[str, Any]] = {}
@@ -58,9 +58,10 @@ class Session:
         return self._advance(self.dispatcher.resume(now), now)
 
     def stop(self) -> list[Order]:
-        """End when the iteration under way is complete; at once in a pause, where none goes on.
+        """End when the rollouts under way are over; at once in a pause, where none goes on.
 
-        What an unfinished iteration has is dropped, and computed again by who continues, identically.
+        What an unfinished batch of them has is dropped, and computed again by who continues,
+        identically.
         """
         self.stopping = True
         return self._end() if self.dispatcher.held else []
@@ -125,7 +126,7 @@ class Session:
         batch = self.training.next_batch()
         if self.training.phase != self._phase:
             self._phase = self.training.phase
-            self._report({"event": "phase", "phase": self._phase})
+            self._report({"event": "phase", "phase": self._phase, **self.training.progress})
         if batch is None:
             self.done = True
             return self.dispatcher.release()

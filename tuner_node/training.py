@@ -2,9 +2,9 @@
 
 Phases: identify (one exploratory episode a seed, from which the controller designs the warm start),
 check (a warm start that is no better than no control on a few fields is thrown away, and another
-exploratory episode is drawn), adapt (the optimiser's iterations), evaluate (no control, LQT and the
-adapted policy on the same sampled fields). Pure: it knows neither topics nor time, so over topics
-and in one process it is the same training, to the bit.
+exploratory episode is drawn), adapt (the optimiser's rollouts), evaluate (no control, LQT and the
+adapted policy on the same sampled fields). The first three share the budget of a seed. Pure: it
+knows neither topics nor time, so over topics and in one process it is the same training, to the bit.
 
 Source: Zhang, Mowlavi, Benosman, Basar, arXiv:2403.01005, section IV; the check is ours.
 """
@@ -21,20 +21,25 @@ from numpy.typing import NDArray
 
 from loop_interfaces import model_rows
 from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn
+from tuner_node import noise
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, TrainingSettings, batch_of
-from tuner_node.noise import PURPOSES, evaluation_noise, rollout_noise
+from tuner_node.budget import Budget
 from tuner_node.optimizers import Context, Optimizer, Rollout, RolloutResult, Trajectory
 from tuner_node.seeds import Purpose, derive
 
 Array = NDArray[np.float64]
 CHECK_FIELDS = 4
 """Sampled fields on which a warm start must beat no control."""
+EXPLORATION = 1
+"""Rollouts of an exploration."""
+CHECK = 2 * CHECK_FIELDS
+"""Rollouts of a check: no control and the warm start."""
 CONTROLLERS = ("none", "lqt", "adapted")
 """The controllers of the closing evaluation, in the order of its rows."""
 
 
-OptimizerFactory = Callable[[Array, int, Context | None], Optimizer]
-"""(warm-start policy, seed, context where trajectories are asked for) -> optimiser."""
+OptimizerFactory = Callable[[Array, int, Context | None, int], Optimizer]
+"""(warm-start policy, seed, context where trajectories are asked for, rollouts) -> optimiser."""
 
 
 @dataclass
@@ -53,6 +58,7 @@ class Training:
     pending: list[int] = field(default_factory=list)
     optimizers: list[Optimizer] = field(default_factory=list)
     history: list[dict[str, Any]] = field(default_factory=list)
+    budget: Budget = field(init=False)
     evaluation: Array | None = None
     """Mean stage costs of the closing evaluation, (S, controllers, fields)."""
     ended: Array | None = None
@@ -66,6 +72,8 @@ class Training:
         self.pending = list(range(self.settings.seeds))
         self.attempts = [0] * self.settings.seeds
         self.explorations = [None] * self.settings.seeds
+        settings = self.settings
+        self.budget = Budget(settings.seeds, settings.rollouts, settings.adaptation)
         if self.settings.model is not None and not self.settings.trajectories:
             self.models = np.repeat(self.settings.model[np.newaxis], self.settings.seeds, axis=0)
             self._start_adapting()
@@ -129,6 +137,11 @@ class Training:
         assert self.models is not None
         return np.stack([model_rows.unpack(rows, self.settings.n_a).policy for rows in self.models])
 
+    def starts(self) -> Array:
+        """The policies that the adaptation begins with, of the shape of the warm starts."""
+        warm = self.warm_starts()
+        return np.zeros_like(warm) if self.settings.start == "zero" else warm
+
     @property
     def generation(self) -> int:
         """Number of the present models: grows whenever one of them is another one."""
@@ -146,9 +159,9 @@ class Training:
         return self.models is not None and self.phase != "identify"
 
     @property
-    def iteration(self) -> int:
-        """Iterations that every seed has behind it."""
-        return min((optimizer.iteration for optimizer in self.optimizers), default=0)
+    def progress(self) -> dict[str, list[int]]:
+        """Rollouts of each seed: paid so far, and the budget."""
+        return {"rollouts": self.budget.paid.tolist(), "budget": self.budget.total.tolist()}
 
     def state(self) -> dict[str, NDArray[Any]]:
         """Everything a checkpoint must hold, as arrays."""
@@ -158,6 +171,7 @@ class Training:
             "attempts": np.array(self.attempts),
             "pending": np.array(self.pending, dtype=np.int64),
             "history": np.array(json.dumps(self.history)),
+            "budget": self.budget.state(),
         }
         if self.models is not None:
             arrays["models"] = self.models
@@ -176,6 +190,7 @@ class Training:
     def restore(self, arrays: dict[str, NDArray[Any]]) -> None:
         """Continue from `state()`."""
         self.phase = str(arrays["phase"])
+        self.budget.restore(arrays["budget"])
         self.plant = int(arrays["plant"])
         self.attempts = arrays["attempts"].tolist()
         self.pending = arrays["pending"].tolist()
@@ -208,12 +223,12 @@ class Training:
         """The seed of the noise of every row of a batch."""
         settings, counts = self.settings, self.attempts
         if self.phase == "evaluate":
-            fields = evaluation_noise(settings.evaluation_seed, settings.evaluation_fields)
+            fields = noise.evaluation_noise(settings.evaluation_seed, settings.evaluation_fields)
             return fields * (settings.seeds * len(CONTROLLERS))
         if self.phase == "adapt":
-            counts = [optimizer.iteration for optimizer in self.optimizers]
+            counts = [optimizer.tells for optimizer in self.optimizers]
         owners = rows[:, StartColumn.MODEL].astype(int).tolist()
-        return rollout_noise(PURPOSES[self.phase], self._seeds(), owners, counts)
+        return noise.rollout_noise(noise.PURPOSES[self.phase], self._seeds(), owners, counts)
 
     def _identified(self, models: Array) -> list[dict[str, Any]]:
         if self.models is None:
@@ -221,6 +236,7 @@ class Training:
                 raise ValueError(f"expected {self.settings.seeds} models, got {len(models)}")
             self.models = models.copy()
         self.models[self.pending] = models
+        self.budget.count("identify", self.pending)
         rows = []
         for m, own in zip(self.pending, models, strict=True):
             A = model_rows.unpack(own, self.settings.n_a).A
@@ -248,6 +264,7 @@ class Training:
                 f"the given model is of a state of {own - 3 * self.settings.n_a - 1} numbers, the "
                 f"plant's has {size - 3 * self.settings.n_a - 1}; identify one of this plant"
             )
+        self.budget.count("identify", self.pending)
         self.models = np.repeat(self.settings.model[np.newaxis], self.settings.seeds, axis=0)
         self._start_adapting()
         return []
@@ -263,6 +280,7 @@ class Training:
 
     def _checked(self, result: BatchResult) -> list[dict[str, Any]]:
         costs = result.costs.reshape(len(self.pending), 2, CHECK_FIELDS, len(CostColumn))
+        self.budget.count("check", np.repeat(self.pending, CHECK))
         rows: list[dict[str, Any]] = []
         failed = []
         for m, (none, lqt) in zip(self.pending, costs, strict=True):
@@ -278,7 +296,7 @@ class Training:
                     "accepted": good,
                 }
             )
-            again = not good and self.attempts[m] + 1 < self.settings.identification_attempts
+            again = not good and self._can_explore_again(m)
             rows[-1]["again"] = again
             if again:
                 self.attempts[m] += 1
@@ -290,16 +308,25 @@ class Training:
             self._start_adapting()
         return rows
 
+    def _can_explore_again(self, m: int) -> bool:
+        """Whether there are attempts left, and rollouts for another one and a step afterwards."""
+        settings = self.settings
+        return self.attempts[m] + 1 < settings.identification_attempts and self.budget.allows(
+            m, EXPLORATION + CHECK + settings.step
+        )
+
     def _start_adapting(self) -> None:
         self.pending = []
         self._start_optimizers()
         self._leave_adapt_if_done()
 
     def _start_optimizers(self) -> None:
-        zero = self.settings.start == "zero"
+        budgets = self.budget.adaptation.tolist()
         self.optimizers = [
-            self.make_optimizer(np.zeros_like(policy) if zero else policy, seed, self._context(m))
-            for m, (policy, seed) in enumerate(zip(self.warm_starts(), self._seeds(), strict=True))
+            self.make_optimizer(start, seed, self._context(m), rollouts)
+            for m, (start, seed, rollouts) in enumerate(
+                zip(self.starts(), self._seeds(), budgets, strict=True)
+            )
         ]
 
     def _context(self, m: int) -> Context | None:
@@ -321,9 +348,7 @@ class Training:
 
     def _tell(self, result: BatchResult) -> list[dict[str, Any]]:
         rows, first = [], 0
-        for seed, optimizer, asked in zip(
-            self._seeds(), self.optimizers, self._asked(), strict=True
-        ):
+        for m, (optimizer, asked) in enumerate(zip(self.optimizers, self._asked(), strict=True)):
             if not asked:
                 continue
             own = result.costs[first : first + len(asked)]
@@ -341,7 +366,9 @@ class Training:
                     for cost, trajectory in zip(own, seen, strict=True)
                 ]
             )
-            rows.append({"event": "iteration", "seed": seed, **told})
+            self.budget.count("adapt", [m] * len(asked))
+            paid = int(self.budget.paid[m])
+            rows.append({"event": "adapted", "seed": self._seeds()[m], **told, "rollouts": paid})
         self.history += rows
         self._leave_adapt_if_done()
         return rows
@@ -368,6 +395,7 @@ class Training:
         shape = (settings.seeds, len(CONTROLLERS), settings.evaluation_fields)
         self.evaluation = result.costs[:, CostColumn.MEAN].reshape(shape)
         self.ended = result.costs[:, CostColumn.ENDED].reshape(shape)
+        self.budget.count("evaluate", np.repeat(np.arange(settings.seeds), self.ended[0].size))
         self.phase = "done"
         return [
             {

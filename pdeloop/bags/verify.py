@@ -21,7 +21,7 @@ from controller_node.identification import DesignSettings, design
 from controller_node.policy import ProjectedLaw, excitation
 from loop_interfaces import model_rows
 from loop_interfaces.frames import Frame
-from loop_interfaces.parameters import PLANT, table
+from loop_interfaces.parameters import PLANT, table, with_budget
 from loop_interfaces.spec import check, read_yaml
 from loop_interfaces.topics import COMPLETED, VOID, CostColumn, StartColumn, noise_seeds
 from pde_sim_node.build import build_plant, fingerprint
@@ -35,7 +35,7 @@ from tuner_node.training import Training
 from tuner_node.trajectory_collector import cut
 
 Array = NDArray[np.float64]
-_TUNERS = ("seed", "seeds", "iterations", "start", "optimizer")
+_TUNERS = ("seed", "seeds", "rollouts", "iterations", "start", "optimizer")
 SHOWN = 5
 """Differences that are described; the others are only counted."""
 
@@ -141,7 +141,7 @@ class _Run:
             )
             return
         self._given = set(values)
-        self._values = {**check(table(), {}), **values}
+        self._values = with_budget({**check(table(), {}), **values})
         self._plant = build_plant(self._values)
         self._fingerprint = fingerprint(self._values)
         names = [item.name for item in fields(DesignSettings)]
@@ -206,8 +206,9 @@ class _Run:
             seen = None
             if batch.trajectories:
                 if any(key not in self._trajectories for key in keys):
+                    paid = sum(training.progress["rollouts"])
                     report.notes.append(
-                        f"samples of an episode after iteration {training.iteration} are missing, "
+                        f"samples of an episode after rollout {paid} are missing, "
                         "and the optimiser used them, so the training is not followed further"
                     )
                     return
@@ -345,11 +346,11 @@ class _Run:
 
     def _explain(self, batch: Batch, index: int, used: set[bytes], training: Training) -> None:
         """Say why the training wants a rollout that is not in the bag."""
-        report, iteration = self._report, training.iteration
+        report, rollouts = self._report, sum(training.progress["rollouts"])
         left = [(e, i) for key, e, i in self._rows if key not in used]
         if not left:
             report.notes.append(
-                f"the bag ends after iteration {iteration}; up to there the training was followed"
+                f"the bag ends after rollout {rollouts}; up to there the training was followed"
             )
             return
         row, policies = batch.rows[index], batch.policies
@@ -366,19 +367,19 @@ class _Run:
                 report.compare(
                     "policies",
                     f"policy of episode {episode.number}, environment {i}, "
-                    f"after iteration {iteration}",
+                    f"after rollout {rollouts}",
                     episode.policy.values[i],
                     policies[index],
                 )
                 return
         if self._report.incomplete:
             report.notes.append(
-                f"an episode after iteration {iteration} is not in the bag, "
+                f"an episode after rollout {rollouts} is not in the bag, "
                 "so the training is not followed further"
             )
             return
         report.differs(
-            f"after iteration {iteration} the training asks for a rollout from seed "
+            f"after rollout {rollouts} the training asks for a rollout from seed "
             f"{int(row[StartColumn.SEED])} with models number {training.generation}, which is not in "
             f"the bag; episode {left[0][0].number} has another one"
         )

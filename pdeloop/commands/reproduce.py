@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import DEFAULTS, Commands, add_json, command
 
 
@@ -70,6 +71,8 @@ def _reproduce(options: argparse.Namespace) -> int:
     given = {n: getattr(options, n) for n in names if getattr(options, n) is not None}
     for name, value in given.items():
         DEFAULTS[name].check(value)
+    if options.iterations == 0:
+        raise ParameterError("--iterations is 0; expected a whole number of at least 1")
     return reproduce(options.problems, given, options.out, options.processes, options.json)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from loop_interfaces.parameters import INSTRUMENTS
+from loop_interfaces.parameters import INSTRUMENTS, ROLLOUTS
 from loop_interfaces.problem import shipped_problems
 from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import DEFAULTS, Commands, add_json, command
@@ -21,7 +21,7 @@ def add(commands: Commands) -> None:
         description="Train a controller: identify a reduced model, design LQ-tracking gains, adapt "
         "them by policy gradient, evaluate. The plant, the controller and the tuner run as ROS 2 "
         "nodes in processes of their own.",
-        example="pdeloop train burgers --iterations 40 --seed 0",
+        example="pdeloop train burgers --rollouts 80 --seed 0",
     )
     train.add_argument(
         "problem",
@@ -29,7 +29,21 @@ def add(commands: Commands) -> None:
         metavar="PROBLEM",
         help=f"{', '.join(shipped_problems())}, or the path of a problem's YAML file",
     )
-    for name, metavar in (("iterations", "N"), ("seed", "S"), ("seeds", "N")):
+    train.add_argument(
+        "--rollouts",
+        type=int,
+        metavar="N",
+        help="budget of a seed: all rollouts before the closing evaluation, explorations and checks "
+        f"among them [{ROLLOUTS}]",
+    )
+    train.add_argument(
+        "--iterations",
+        type=int,
+        metavar="N",
+        help="instead of --rollouts, for --optimizer two-point: iterations of two rollouts each, "
+        "after exploration and check, as the paper counts",
+    )
+    for name, metavar in (("seed", "S"), ("seeds", "N")):
         spec = DEFAULTS[name]
         train.add_argument(
             f"--{name}", type=int, metavar=metavar, help=f"{spec.description} [{spec.default}]"
@@ -147,7 +161,7 @@ def _train(options: argparse.Namespace) -> int:
         options.view,
         options.spread,
     )
-    names = ["iterations", "seed", "seeds", "start", "optimizer", "directions"]
+    names = ["rollouts", "iterations", "seed", "seeds", "start", "optimizer", "directions"]
     names += [spec.name for spec in INSTRUMENTS]
     given = {n: getattr(options, n) for n in names if getattr(options, n) is not None}
     if (
@@ -155,6 +169,9 @@ def _train(options: argparse.Namespace) -> int:
         and given.setdefault("optimizer", "directions") != "directions"
     ):
         raise ParameterError("--directions goes with --optimizer directions")
+    for name in ("rollouts", "iterations"):
+        if given.get(name) == 0:
+            raise ParameterError(f"--{name} is 0; expected a whole number of at least 1")
     own = {} if options.equation is None else {"equation": allow(options.equation)}
     if options.model is not None:
         given["model"] = str(options.model.resolve())

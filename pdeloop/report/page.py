@@ -70,7 +70,7 @@ def _figures(data: ReportData) -> Iterator[tuple[str, str, Any]]:
         )
     yield (
         "costs",
-        "Mean stage cost of each controller after the last iteration, over the sampled initial "
+        "Mean stage cost of each controller after the adaptation, over the sampled initial "
         f"fields and the seeds, with the standard deviation.{limits}",
         learning.bars(data.problems),
     )

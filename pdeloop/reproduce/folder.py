@@ -122,12 +122,12 @@ class _Curve:
         batch = training.next_batch()
         if batch is None:
             return False
-        before = training.iteration
+        phase = training.phase
         first = not training.optimizers
         result = self._pair.run(batch, self._values["max_batch"])
         training.finish(result)
         self._pair.follow(training)
-        if training.optimizers and (first or training.iteration > before):
+        if training.optimizers and (first or phase == "adapt"):
             policies = training.policies()
             self._policies.append(policies)
             self._costs.append(self._evaluate(policies))

@@ -10,10 +10,10 @@ import pytest
 from pdeloop.bags.verify import verify
 from tests.loop_harness import Processes, until
 from tests.small import SMALL, parameters, train_here
-from tests.topics.test_loop import LIMIT, assert_same_training, iterations_done, tuner_arguments
+from tests.topics.test_loop import LIMIT, adapted, assert_same_training, tuner_arguments
 
 pytestmark = pytest.mark.topics
-ITERATIONS = 12
+ROLLOUTS = 33
 INSTRUMENTS: dict[str, Any] = {
     "measurement_noise": 0.02,
     "process_noise": 0.01,
@@ -32,10 +32,10 @@ def test_a_faulty_line_and_killed_nodes_change_no_noise(loop: Processes, tmp_pat
     running = {name: loop.node(name, *start, "-r", line) for name, line in lines.items()}
     line = ("-p", "loss:=0.002", "-p", "duplicate:=0.2", "-p", "delay:=0.002")
     loop.start("-m", "pdeloop.relay.node", "--ros-args", *line, name="relay")
-    options = {"iterations": ITERATIONS, "optimizer": optimizer, "seeds": 2}
+    options = {"rollouts": ROLLOUTS, "optimizer": optimizer, "seeds": 2}
     tuner = loop.node("tuner_node", *start, *tuner_arguments(out, **options, max_attempts=50))
-    for iteration, victim in ((4, "controller_node"), (8, "pde_sim_node")):
-        until(lambda least=iteration: iterations_done(out) >= least, LIMIT, f"{iteration}")
+    for count, victim in ((4, "controller_node"), (8, "pde_sim_node")):
+        until(lambda least=count: adapted(out) >= least, LIMIT, f"batch {count}")
         running[victim].send_signal(signal.SIGKILL)
         running[victim].wait()
         loop.node(victim, *start, "-r", lines[victim])
@@ -48,10 +48,10 @@ def test_a_recorded_run_is_recomputed_with_its_noise(loop: Processes, tmp_path):
     lines = "".join(f"    {name}: {value}\n" for name, value in INSTRUMENTS.items())
     own.write_text(SMALL.read_text() + lines)
     out = tmp_path / "run"
-    words = ("train", str(own), "--iterations", "6", "--record", "--optimizer", "gauss_newton")
+    words = ("train", str(own), "--rollouts", "21", "--record", "--optimizer", "gauss_newton")
     loop.wait(loop.pdeloop(*words, "--out", str(out)), LIMIT)
     report = verify(out)
     assert (report.count, report.incomplete, report.notes) == (0, [], [])
     assert report.compared["steps"] == 30 * report.compared["costs"]
-    values = parameters(iterations=6, optimizer="gauss_newton", **INSTRUMENTS)
+    values = parameters(rollouts=21, optimizer="gauss_newton", **INSTRUMENTS)
     assert_same_training(out, train_here(values))

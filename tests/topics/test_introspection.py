@@ -26,8 +26,8 @@ VALUES = {
         "plant paused",
     },
     "tuner_node": {
-        *("run", "restarts", "phase", "iteration", "iterations", "iterations/s", "episode"),
-        *("episodes under way", "last cost", "iteration cost", "cost without control"),
+        *("run", "restarts", "phase", "rollouts", "budget", "rollouts/s", "episode"),
+        *("episodes under way", "last cost", "adapted cost", "cost without control"),
         *("cost with LQT", "episodes repeated", "stale messages", "paused", "paused plants"),
         "waiting for",
     },

@@ -139,7 +139,7 @@ def test_what_cannot_be_launched_is_one_sentence_and_a_failure(
 ) -> None:
     for words, sentence in (
         ({"problem": "stokes"}, "unknown problem 'stokes'"),
-        ({"iterations": "0"}, "'iterations' is 0; expected"),
+        ({"rollouts": "3"}, "'rollouts' is 3; expected at least"),
         ({"optimizer": "adam"}, "optimizer"),
     ):
         started = launch(installed, workspace, "train.launch.py", out=tmp_path / "run", **words)
@@ -172,7 +172,7 @@ def progress(run: Path) -> int:
         rows = (run / "progress.jsonl").read_text().splitlines()
     except OSError:
         return 0
-    return sum(json.loads(row).get("event") == "iteration" for row in rows[:-1])
+    return sum(json.loads(row).get("event") == "adapted" for row in rows[:-1])
 
 
 def pids(processes: Processes, executable: str) -> list[int]:

@@ -43,7 +43,8 @@ def assert_same_training(folder: Path, expected: Training) -> None:
 
 
 def tuner_arguments(out: Path, **options: object) -> list[str]:
-    values = {"iterations": 20, "out": out, **options}
+    budget = {} if "rollouts" in options else {"iterations": 20}
+    values = {**budget, "out": out, **options}
     return [word for name, value in values.items() for word in ("-p", f"{name}:={value}")]
 
 
@@ -103,7 +104,13 @@ def test_one_tuner_is_served_by_several_pairs_with_the_same_result(loop: Process
 
 def iterations_done(folder: Path) -> int:
     path = folder / "progress.jsonl"
-    return path.read_text().count('"iteration"') if path.exists() else 0
+    return path.read_text().count('"iteration":') if path.exists() else 0
+
+
+def adapted(folder: Path) -> int:
+    """Batches that the optimisers of the run in `folder` have been told."""
+    path = folder / "progress.jsonl"
+    return path.read_text().count('"event": "adapted"') if path.exists() else 0
 
 
 def test_nodes_restarted_between_and_within_episodes_change_nothing(loop: Processes, tmp_path):
@@ -172,7 +179,11 @@ def test_ctrl_c_ends_everything_and_the_run_continues(loop: Processes, tmp_path,
 
 def test_a_rollout_that_diverges_is_marked_and_the_training_goes_on(loop: Processes, tmp_path):
     # A bound just above the initial fields: what the perturbed policies do exceeds it now and then.
-    values = {k: v for k, v in parameters().items() if k not in ("seed", "seeds", "iterations")}
+    values = {
+        k: v
+        for k, v in parameters().items()
+        if k not in ("seed", "seeds", "rollouts", "iterations")
+    }
     problem = {k: v for k, v in values.items() if k in DIVERGING or k.startswith("physical.")}
     path = tmp_path / "tight.yaml"
     path.write_text(yaml_text({**problem, "divergence_bound": 1.1, "smoothing_radius": 5.0}))
@@ -214,7 +225,7 @@ DIVERGING = {
         ("pde_sim_node", "physical.viscosity:=-1.0", "'physical.viscosity' is -1.0; expected"),
         ("pde_sim_node", "n_zz:=8", "unknown parameter 'n_zz'; did you mean 'n_z'"),
         ("controller_node", "dmdc_rank:=0", "'dmdc_rank' is 0; expected a whole number from 1"),
-        ("tuner_node", "iterations:=0", "'iterations' is 0; expected a whole number from 1"),
+        ("tuner_node", "rollouts:=3", "'rollouts' is 3; expected at least 11"),
         ("tuner_node", "start:=lqg", "'start' is 'lqg'; expected one of lqt, zero"),
         ("tuner_node", "smoothing_radius:=-0.1", "'smoothing_radius' is -0.1; expected"),
     ],

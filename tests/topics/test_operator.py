@@ -109,7 +109,7 @@ def test_a_paused_tuner_begins_no_episode_and_keeps_the_plant(loop: Processes, t
         assert desk.values("pde_sim_node")["episodes"] == episodes
         # The last report of that name may be the refused one's.
         until(
-            lambda: desk.status("tuner_node")[2].startswith("paused in iteration "),
+            lambda: desk.status("tuner_node")[2].startswith("paused in rollout "),
             LIMIT,
             "report of the first tuner",
         )

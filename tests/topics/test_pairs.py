@@ -48,7 +48,7 @@ def test_pairs_on_hosts_with_faults_one_of_them_killed_give_the_same_bits() -> N
 
 
 def test_the_command_line_starts_pairs_and_directions(loop: Processes, tmp_path) -> None:
-    arguments = ("train", str(SMALL), "--iterations", "8", "--directions", "4", "--seeds", "2")
+    arguments = ("train", str(SMALL), "--rollouts", "25", "--directions", "4", "--seeds", "2")
     over = loop.pdeloop(*arguments, "--pairs", "2", "--out", str(tmp_path / "a"))
     loop.wait(over, LIMIT)
     here = loop.pdeloop(*arguments, "--in-process", "--out", str(tmp_path / "b"))

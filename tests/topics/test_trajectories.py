@@ -8,10 +8,10 @@ import pytest
 
 from tests.loop_harness import Processes, until
 from tests.small import SMALL, parameters, train_here
-from tests.topics.test_loop import LIMIT, assert_same_training, iterations_done, tuner_arguments
+from tests.topics.test_loop import LIMIT, adapted, assert_same_training, tuner_arguments
 
 pytestmark = pytest.mark.topics
-ITERATIONS = 12
+ROLLOUTS = 33
 
 
 @pytest.mark.parametrize("faults", [False, True], ids=["quiet", "faults"])
@@ -29,14 +29,14 @@ def test_gauss_newton_ends_with_the_policy_of_one_process(loop: Processes, tmp_p
     if faults:
         relay = ("--ros-args", "-p", "loss:=0.002", "-p", "delay:=0.002")
         loop.start("-m", "pdeloop.relay.node", *relay, name="relay")
-    options = {"iterations": ITERATIONS, "optimizer": "gauss_newton", "seeds": 2}
+    options = {"rollouts": ROLLOUTS, "optimizer": "gauss_newton", "seeds": 2}
     tuner = loop.node("tuner_node", *start, *tuner_arguments(out, **options, max_attempts=50))
     if faults:
-        until(lambda: iterations_done(out) >= 6, LIMIT, "iteration 6")
+        until(lambda: adapted(out) >= 6, LIMIT, "batch 6")
         running["controller_node"].send_signal(signal.SIGKILL)
         running["controller_node"].wait()
         loop.node("controller_node", *start, "-r", "action:=action_sent")
-        until(lambda: iterations_done(out) >= 12, LIMIT, "iteration 12")
+        until(lambda: adapted(out) >= 12, LIMIT, "batch 12")
         tuner.send_signal(signal.SIGKILL)
         tuner.wait()
         arguments = tuner_arguments(out, **options, max_attempts=50, resume="true")

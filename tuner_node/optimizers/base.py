@@ -6,7 +6,7 @@ policy.
         row = optimizer.tell([measure(rollout) for rollout in rollouts])
 
 An optimiser runs no rollout and knows no clock, so the same object serves a loop over topics and a
-loop in one process. Its randomness is a pure function of (seed, iteration), and `state` holds
+loop in one process. Its randomness is a pure function of (seed, tells), and `state` holds
 everything that `restore` needs to go on as if nothing had happened, to the last bit.
 """
 
@@ -108,8 +108,8 @@ class Optimizer(Protocol):
     """The interface of an optimiser.
 
     A history row holds JSON numbers, booleans and strings; a cost that is not finite is left out of
-    it. Every row has `iteration` (counted from 1), `rollouts` (told so far, in total) and
-    `diverged` (how many of this iteration's rollouts did).
+    it. Every row has `rollouts` (told so far, in total) and `diverged` (how many of those told now
+    did).
     """
 
     @property
@@ -133,7 +133,7 @@ class Optimizer(Protocol):
         ...
 
     @property
-    def iteration(self) -> int:
+    def tells(self) -> int:
         """How many times `tell` was called."""
         ...
 

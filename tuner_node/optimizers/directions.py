@@ -1,6 +1,6 @@
 """Descent along several orthonormal directions at once.
 
-Each iteration draws D directions Theta_i, orthonormal in the Frobenius inner product, and one
+Each step draws D directions Theta_i, orthonormal in the Frobenius inner product, and one
 initial field, measures the 2 D rollouts pi +- r Theta_i on it, and steps along the mean of the
 two-point estimates,
 
@@ -54,13 +54,12 @@ class Directions:
         Where to start.
     seed : int
         Determines all directions and fields.
-    iterations : int
-        The budget in two-point iterations: 2 iterations rollouts, spent in floor(iterations /
-        directions) steps.
+    rollouts : int
+        The budget, spent in floor(rollouts / (2 directions)) steps.
     learning_rate, smoothing_radius : float
         eta and r, as for the two-point optimiser.
     directions : int
-        D, at most `iterations` and 2 n_a n_s.
+        D, at most rollouts / 2 and 2 n_a n_s.
     tolerance : float
         Above 1. Initial fields differ in cost, so near 1 a good iterate is undone by an unlucky
         field.
@@ -76,7 +75,7 @@ class Directions:
         policy0: ArrayLike,
         *,
         seed: int,
-        iterations: int,
+        rollouts: int,
         learning_rate: float,
         smoothing_radius: float = 0.1,
         directions: int = 4,
@@ -84,23 +83,24 @@ class Directions:
         context: Context | None = None,
     ) -> None:
         require_positive(
-            iterations=iterations, learning_rate=learning_rate, smoothing_radius=smoothing_radius
+            rollouts=rollouts, learning_rate=learning_rate, smoothing_radius=smoothing_radius
         )
         self._policy = checked_policy(policy0)
-        if not 1 <= directions <= min(iterations, self._policy.size):
+        most = min(rollouts // 2, self._policy.size)
+        if not 1 <= directions <= most:
             raise ValueError(
-                f"directions must lie in 1 .. {min(iterations, self._policy.size)} (the iterations "
-                f"and the entries of the policy allow no more), but it is {directions}."
+                f"directions must lie in 1 .. {most} (half the rollouts and the entries of the policy "
+                f"allow no more), but it is {directions}."
             )
         if not tolerance > 1.0:
             raise ValueError(f"tolerance must be above 1, but it is {tolerance}.")
         self._seed = seed
-        self._steps = iterations // directions
+        self._steps = rollouts // (2 * directions)
         self._learning_rate = learning_rate
         self._radius = smoothing_radius
         self._count = directions
         self._tolerance = tolerance
-        self._iteration = 0
+        self._tells = 0
         self._best_policy = self._policy.copy()
         self._best_cost = np.inf
 
@@ -115,20 +115,20 @@ class Directions:
         return self._best_policy.copy()
 
     @property
-    def iteration(self) -> int:
+    def tells(self) -> int:
         """Steps that are over, 2 D rollouts each."""
-        return self._iteration
+        return self._tells
 
     @property
     def done(self) -> bool:
         """Whether the budget is used."""
-        return self._iteration >= self._steps
+        return self._tells >= self._steps
 
     def ask(self) -> list[Rollout]:
         """The rollouts pi + r Theta_1, pi - r Theta_1, pi + r Theta_2, ... on one field."""
         if self.done:
             return []
-        field = oracle.field_seed(self._seed, self._iteration)
+        field = oracle.field_seed(self._seed, self._tells)
         return [
             Rollout(self._policy + sign * self._radius * direction, field)
             for direction in self._directions()
@@ -140,9 +140,8 @@ class Directions:
         require_results(results, 0 if self.done else 2 * self._count)
         usable = [result.usable for result in results]
         row: Row = {
-            "iteration": self._iteration + 1,
-            "rollouts": 2 * self._count * (self._iteration + 1),
-            "field_seed": oracle.field_seed(self._seed, self._iteration),
+            "rollouts": 2 * self._count * (self._tells + 1),
+            "field_seed": oracle.field_seed(self._seed, self._tells),
             "learning_rate": self._learning_rate,
             "diverged": len(usable) - sum(usable),
         }
@@ -171,16 +170,16 @@ class Directions:
             self._learning_rate *= 0.5
             self._policy = self._best_policy.copy()
         row["updated"] = updated
-        self._iteration += 1
+        self._tells += 1
         return row
 
     def state(self) -> State:
-        """The policies, the iteration and the learning rate, with the parameters they belong to."""
+        """The policies, the steps so far and the learning rate, with the parameters they belong to."""
         return {
             "policy": self._policy.copy(),
             "best_policy": self._best_policy.copy(),
             "best_cost": np.array(self._best_cost),
-            "iteration": np.array(self._iteration),
+            "tells": np.array(self._tells),
             "learning_rate": np.array(self._learning_rate),
             "seed": np.array(self._seed),
             "smoothing_radius": np.array(self._radius),
@@ -193,11 +192,9 @@ class Directions:
         policies = checked_policy(state["policy"]), checked_policy(state["best_policy"])
         self._policy, self._best_policy = policies
         self._best_cost = float(state["best_cost"].item())
-        self._iteration = int(state["iteration"].item())
+        self._tells = int(state["tells"].item())
         self._learning_rate = float(state["learning_rate"].item())
 
     def _directions(self) -> Array:
         n_a, columns = self._policy.shape
-        return oracle.orthonormal_directions(
-            self._seed, self._iteration, (n_a, columns), self._count
-        )
+        return oracle.orthonormal_directions(self._seed, self._tells, (n_a, columns), self._count)

@@ -4,8 +4,8 @@ The cost is a sum of squares of measured quantities; only its sensitivity to the
 model, and that is fitted to the rollouts as they come in. So a model error bends the direction of a
 step, never the cost, and every step is judged by rollouts.
 
-The law is a = K_a s + b with s = U^T z and theta = [K_a b]: K_b acts only through b = K_b s_r. An
-iteration
+The law is a = K_a s + b with s = U^T z and theta = [K_a b]: K_b acts only through b = K_b s_r. A
+step
 
 1. fits local models to the remembered trajectories (`fit`) and keeps those that predict measured
    differences of trajectories (`selection`),
@@ -45,6 +45,8 @@ from tuner_node.optimizers.trajectories import Record, Records
 
 __all__ = ["GaussNewton"]
 
+FIELDS = 3
+"""M, initial fields that judge a policy in the beginning."""
 _DAMPING = (1e-4, 1.0, 100.0)  # smallest, first, largest after a rejection
 _ABORT = 1.05
 _MODES = 32
@@ -55,7 +57,7 @@ _SMALL = 0.02
 _NONE = -1
 # Attributes that a checkpoint holds besides the policies and the records.
 _STAMPS = ("fields", "incumbents", "trials", "others")
-_NUMBERS = ("fall", "damping", "accepted", "proposed", "iteration")
+_NUMBERS = ("fall", "damping", "accepted", "proposed", "tells")
 
 
 class GaussNewton:
@@ -67,8 +69,8 @@ class GaussNewton:
         Where to start, [K_a K_b]; the warm start.
     seed : int
         Determines the initial fields.
-    iterations : int
-        The budget in two-point iterations: 2 iterations rollouts.
+    rollouts : int
+        The budget. A step takes up to M of them, and the start another M.
     context : Context
         Basis, target, weights, horizon and the exploratory trajectory.
     fields : int
@@ -93,22 +95,22 @@ class GaussNewton:
         policy0: ArrayLike,
         *,
         seed: int,
-        iterations: int,
+        rollouts: int,
         context: Context,
-        fields: int = 3,
+        fields: int = FIELDS,
         most_fields: int = 6,
         modes: int | None = None,
         cubic_modes: int = 12,
         learning_rate: float | None = None,
         smoothing_radius: float | None = None,
     ) -> None:
-        require_positive(iterations=iterations, fields=fields)
+        require_positive(rollouts=rollouts, fields=fields)
         n_s = context.U.shape[1]
         self._policy = checked_policy(policy0)
         modes = max(_MODES, n_s) if modes is None else modes
         self._proposer = Proposer(context, self._policy, modes, min(cubic_modes, modes))
         self._seed = seed
-        self._budget = 2 * iterations
+        self._budget = rollouts
         self._field_count, self._most_fields = fields, max(fields, most_fields)
         self._fields = np.arange(fields, dtype=np.int64)
         # Stamps of the records of the incumbent, the candidate, and what the incumbent is compared
@@ -120,7 +122,7 @@ class GaussNewton:
         self._damping = _DAMPING[1]
         self._accepted = True
         self._proposed = False
-        self._iteration = 0
+        self._tells = 0
 
     @property
     def policy(self) -> Array:
@@ -130,9 +132,9 @@ class GaussNewton:
     best_policy = policy
 
     @property
-    def iteration(self) -> int:
+    def tells(self) -> int:
         """How many times `tell` was called."""
-        return self._iteration
+        return self._tells
 
     @property
     def done(self) -> bool:
@@ -155,8 +157,8 @@ class GaussNewton:
         require_results(results, len(self.ask()))
         for result in results:
             self._records.sound(result)
-        self._iteration += 1
-        row: Row = {"iteration": self._iteration, "diverged": sum(not r.usable for r in results)}
+        self._tells += 1
+        row: Row = {"diverged": sum(not r.usable for r in results)}
         missing = np.flatnonzero(self._incumbents == _NONE)
         if missing.size:
             first = self._records.count == 0

@@ -45,8 +45,8 @@ class TwoPoint:
         Where to start: the warm start, or zeros.
     seed : int
         Determines all directions and fields.
-    iterations : int
-        Iterations of two rollouts each.
+    rollouts : int
+        The budget; an iteration takes two.
     learning_rate : float
         eta, for the mean stage cost. Too large: rollouts diverge and it halves itself.
     smoothing_radius : float
@@ -63,17 +63,17 @@ class TwoPoint:
         policy0: ArrayLike,
         *,
         seed: int,
-        iterations: int,
+        rollouts: int,
         learning_rate: float,
         smoothing_radius: float = 0.1,
         context: Context | None = None,
     ) -> None:
         require_positive(
-            iterations=iterations, learning_rate=learning_rate, smoothing_radius=smoothing_radius
+            rollouts=rollouts, learning_rate=learning_rate, smoothing_radius=smoothing_radius
         )
         self._policy = checked_policy(policy0)
         self._seed = seed
-        self._iterations = iterations
+        self._iterations = rollouts // 2
         self._learning_rate = learning_rate
         self._radius = smoothing_radius
         self._iteration = 0
@@ -89,7 +89,7 @@ class TwoPoint:
         return self.policy
 
     @property
-    def iteration(self) -> int:
+    def tells(self) -> int:
         """Iterations that are over."""
         return self._iteration
 
