@@ -27,7 +27,7 @@ def explorations(run: Path) -> list[int]:
 def recorded(loop: Processes, run: Path, problem: str, optimizer: str, *more: int) -> None:
     """Record a training with the small budget of these tests, and verify its bag."""
     seed, seeds = more
-    options = ("--optimizer", optimizer, "--iterations", 4, "--seed", seed, "--seeds", seeds)
+    options = ("--optimizer", optimizer, "--rollouts", 26, "--seed", seed, "--seeds", seeds)
     text = pdeloop(loop, "train", problem, "--record", *options, "--out", run)
     assert f"recorded in {run / 'bag'}" in text
     text = pdeloop(loop, "bag", "verify", run)
