@@ -150,29 +150,37 @@ def test_a_run_of_a_version_with_fewer_parameters_can_be_resumed(tmp_path, capsy
     assert "has other parameters (measurement_noise: 0.0 there, 0.5 now)" in line
 
 
-def test_damaged_run_files_are_one_clear_line(tmp_path, capsys):
+def test_a_run_without_a_usable_checkpoint_begins_again_and_comes_to_the_same_policy(
+    tmp_path, capsys
+):
     out = tmp_path / "run"
     assert train(out) == 0
+    policy = (out / "policy.npz").read_bytes()
     (out / "result.json").unlink()
     for path in (out / "checkpoint", checkpoint.previous(out / "checkpoint")):
         path.write_bytes(path.read_bytes()[:-20])
-    capsys.readouterr()
-    assert "no usable checkpoint" in error_of(capsys, "train", "--resume", str(out), "--in-process")
     (out / "policy.npz").write_bytes(b"PK\3\4nonsense")
+    capsys.readouterr()
     assert "policy.npz cannot be read" in error_of(capsys, "evaluate", str(out))
+    assert main(["train", "--resume", str(out), "--in-process"]) == 0
+    text = capsys.readouterr().out
+    assert text.count("its checksum does not match; beginning again from the start") == 2
+    assert (out / "policy.npz").read_bytes() == policy
 
 
 def test_a_checkpoint_of_another_run_is_not_taken(tmp_path, capsys):
     for name in ("a", "b"):
-        assert train(tmp_path / name) == 0
+        assert train(tmp_path / name, "--seed", str("ab".index(name))) == 0
         (tmp_path / name / "result.json").unlink()
+    policy = (tmp_path / "b" / "policy.npz").read_bytes()
     for file in ("checkpoint", "checkpoint.previous"):
         source = tmp_path / "a" / file
-        if source.exists():
-            (tmp_path / "b" / file).write_bytes(source.read_bytes())
+        (tmp_path / "b" / file).write_bytes(source.read_bytes())
     capsys.readouterr()
-    line = error_of(capsys, "train", "--resume", str(tmp_path / "b"), "--in-process")
-    assert "belongs to another run" in line
+    assert main(["train", "--resume", str(tmp_path / "b"), "--in-process"]) == 0
+    text = capsys.readouterr().out
+    assert text.count("belongs to another run; beginning again from the start") == 2
+    assert (tmp_path / "b" / "policy.npz").read_bytes() == policy
 
 
 def test_a_folder_that_another_process_works_on_is_left_alone(tmp_path, capsys):

@@ -1,8 +1,9 @@
 """What must survive a crash: arrays in a file that is whole or not there.
 
 A checkpoint is one line `pdeloop-checkpoint 1 <sha256>` followed by an npz archive without pickled
-objects. It is written beside its place, flushed to the disk and renamed; the previous one is kept, so
-that a file damaged later can be passed over.
+objects. It is written beside its place, flushed to the disk and renamed; the one before is kept, so
+that a file damaged later can be passed over. Where none is usable, a training begins again from its
+start, and comes to the same result.
 """
 
 from __future__ import annotations
@@ -10,14 +11,15 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
-import os
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from loop_interfaces.files import sync_folder, write_part
 
 MAGIC = b"pdeloop-checkpoint 1 "
 MAX_BYTES = 2**30
@@ -25,29 +27,7 @@ Arrays = Mapping[str, NDArray[Any]]
 
 
 class CheckpointError(ValueError):
-    """No usable checkpoint; the text says which files were tried and what is wrong with each."""
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Replace `path` by `content`, so that a crash at any moment leaves the old or the new file.
-
-    Raises OSError (full disk, no permission) with the old file untouched.
-    """
-    part = path.with_name(path.name + ".part")
-    try:
-        with part.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    except OSError:
-        part.unlink(missing_ok=True)
-        raise
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    """A file that is no usable checkpoint; the text says what is wrong with it."""
 
 
 def previous(path: Path) -> Path:
@@ -56,56 +36,90 @@ def previous(path: Path) -> Path:
 
 
 def save(path: Path, arrays: Arrays) -> None:
-    """Write a checkpoint and keep the one before. Raises OSError with the old ones untouched."""
+    """Write a checkpoint and keep the one before.
+
+    Raises
+    ------
+    OSError
+        A full or broken disk; the one before is then at `path`, or at `previous(path)`.
+    """
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)  # type: ignore[arg-type]
-    body = buffer.getvalue()
-    content = MAGIC + hashlib.sha256(body).hexdigest().encode() + b"\n" + body
-    part = path.with_name(path.name + ".new")
-    write_atomically(part, content)
+    body = buffer.getbuffer()
+    part = write_part(path, MAGIC + hashlib.sha256(body).hexdigest().encode() + b"\n", body)
     if path.exists():
         path.replace(previous(path))
     part.replace(path)
+    sync_folder(path.parent)
 
 
-def load(path: Path, run: int | None = None) -> tuple[dict[str, NDArray[Any]], list[str]]:
-    """The newest good checkpoint at `path` and warnings about what was passed over.
+def restore(path: Path, take: Callable[[dict[str, NDArray[Any]]], None]) -> tuple[bool, list[str]]:
+    """Hand the newest usable checkpoint to `take`.
 
-    run: the run it must belong to, if given. What is damaged or foreign is set aside as
-    `checkpoint*.damaged`, so that the next `save` cannot take it for the checkpoint to keep.
-    Raises CheckpointError when neither the file nor its predecessor is whole.
+    Parameters
+    ----------
+    path : Path
+        The checkpoint; the one before it is tried after it, and an unfinished one is ignored.
+    take : callable
+        Goes on from the arrays, or raises ValueError where it cannot, having changed nothing.
+
+    Returns
+    -------
+    found : bool
+        Whether there was a usable one.
+    passed_over : list of str
+        A sentence for each that was not usable. It is set aside as `NAME.damaged`, so that the next
+        `save` does not take it for the checkpoint to keep.
     """
-    warnings: list[str] = []
-    for candidate in (path.with_name(path.name + ".new"), path, previous(path)):
+    passed_over: list[str] = []
+    for candidate in (path, previous(path)):
         if not candidate.exists():
             continue
         try:
-            arrays = _read(candidate)
-            if run is not None and int(arrays.get("run", np.array(-1))) != run:
-                raise CheckpointError(f"{candidate} belongs to another run")
-            return arrays, warnings
-        except CheckpointError as error:
-            warnings.append(str(error))
+            take(_read(candidate))
+            return True, passed_over
+        except ValueError as error:
+            passed_over.append(f"{candidate} {error}")
             with contextlib.suppress(OSError):
                 candidate.replace(candidate.with_name(candidate.name + ".damaged"))
-    detail = "; ".join(warnings) if warnings else f"{path} does not exist"
-    raise CheckpointError(f"no usable checkpoint: {detail}")
+    return False, passed_over
+
+
+def taken(arrays: Arrays, name: str, kind: str, shape: tuple[int | None, ...]) -> NDArray[Any]:
+    """The array of this name, of this NumPy kind and shape (None: of any length), or a ValueError.
+
+    Floating-point numbers must be finite.
+    """
+    if name not in arrays:
+        raise CheckpointError(f"it has no array '{name}'")
+    array = arrays[name]
+    fits = array.ndim == len(shape) and all(
+        expected in (None, length) for expected, length in zip(shape, array.shape, strict=True)
+    )
+    if array.dtype.kind != kind or not fits:
+        raise CheckpointError(
+            f"expected '{name}' of kind {kind!r} and shape {shape}, "
+            f"got {array.dtype.kind!r} and {array.shape}"
+        )
+    if kind == "f" and not np.isfinite(array).all():
+        raise CheckpointError(f"'{name}' is not finite")
+    return array
 
 
 def _read(path: Path) -> dict[str, NDArray[Any]]:
     try:
         if path.stat().st_size > MAX_BYTES:
-            raise CheckpointError(f"{path} is larger than {MAX_BYTES} bytes")
+            raise CheckpointError(f"is larger than {MAX_BYTES} bytes")
         content = path.read_bytes()
     except OSError as error:
-        raise CheckpointError(f"{path} cannot be read: {error.strerror}") from error
+        raise CheckpointError(f"cannot be read: {error.strerror}") from error
     head, newline, body = content.partition(b"\n")
     if not (head.startswith(MAGIC) and newline):
-        raise CheckpointError(f"{path} is not a checkpoint of pdeloop")
+        raise CheckpointError("is not a checkpoint of pdeloop")
     if hashlib.sha256(body).hexdigest().encode() != head[len(MAGIC) :]:
-        raise CheckpointError(f"{path} is damaged: its checksum does not match")
+        raise CheckpointError("is damaged: its checksum does not match")
     try:
         with np.load(io.BytesIO(body), allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except (ValueError, OSError, zipfile.BadZipFile, KeyError) as error:
-        raise CheckpointError(f"{path} holds no arrays: {error}") from error
+        raise CheckpointError(f"holds no arrays: {error}") from error

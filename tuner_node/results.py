@@ -28,11 +28,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.files import make_folder, write_atomically
 from loop_interfaces.frames import MAX_ID
 from loop_interfaces.parameters import EXECUTION, PLANT, RECORDER, VIEWER, table
 from loop_interfaces.spec import ParameterError, check, read_yaml, yaml_text
 from loop_interfaces.topics import COMPLETED
-from tuner_node import checkpoint
 from tuner_node.training import CONTROLLERS, Training
 
 TRANSIENT = (
@@ -78,13 +78,13 @@ class RunFolder:
                 f"or continue it with: pdeloop train --resume {self.path}"
             )
         try:
-            self.path.mkdir(parents=True, exist_ok=True)
+            make_folder(self.path)
             kept = {k: v for k, v in parameters.items() if k not in ("out", "resume")}
             # parameters.yaml comes last and whole: where it is, there is a run.
             identity = RunIdentity(1 + secrets.randbelow(MAX_ID - 1), 0)
             self._identify(identity, parameters)
             text = yaml_text(kept, "resolved parameters of this run")
-            checkpoint.write_atomically(self.path / "parameters.yaml", text.encode())
+            write_atomically(self.path / "parameters.yaml", text.encode())
             return identity
         except OSError as error:
             raise RunFolderError(f"cannot write to {self.path}: {error.strerror}") from error
@@ -177,9 +177,9 @@ class RunFolder:
         summary = summarise(training) | dict(extra) | {"versions": versions()}
         buffer = BytesIO()
         np.savez(buffer, **policy_arrays(training))  # type: ignore[arg-type]
-        checkpoint.write_atomically(self.path / "policy.npz", buffer.getvalue())
+        write_atomically(self.path / "policy.npz", buffer.getvalue())
         text = json.dumps(summary, indent=1)
-        checkpoint.write_atomically(self.path / "result.json", text.encode())
+        write_atomically(self.path / "result.json", text.encode())
         return summary
 
     def _identify(self, identity: RunIdentity, parameters: Mapping[str, Any]) -> RunIdentity:
@@ -188,7 +188,7 @@ class RunFolder:
             "incarnation": identity.incarnation,
             "parameters": {k: v for k, v in parameters.items() if k not in TRANSIENT},
         }
-        checkpoint.write_atomically(self.path / "run.json", json.dumps(content).encode())
+        write_atomically(self.path / "run.json", json.dumps(content).encode())
         return identity
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tuner_node import checkpoint
 from tuner_node.results import RunFolder, RunIdentity
@@ -80,9 +81,14 @@ class Recorder:
         return self._folder.finish(self._training, {"seconds": seconds, **extra})
 
     def _restore(self) -> None:
-        if not self._folder.checkpoint.exists() and not any(self._folder.path.glob("checkpoint*")):
-            return  # stopped before its first checkpoint: it begins again, identically
-        arrays, warnings = checkpoint.load(self._folder.checkpoint, run=self.identity.run)
-        for warning in warnings:
-            self._warn(f"{warning}; using an older checkpoint")
-        self._training.restore(arrays)
+        """Go on from the newest usable checkpoint, or begin again: both lead to the same result."""
+
+        def take(arrays: dict[str, NDArray[Any]]) -> None:
+            if int(arrays.pop("run", np.array(-1))) != self.identity.run:
+                raise ValueError("belongs to another run")
+            self._training.restore(arrays)
+
+        found, passed_over = checkpoint.restore(self._folder.checkpoint, take)
+        instead = "using an older checkpoint" if found else "beginning again from the start"
+        for sentence in passed_over:
+            self._warn(f"{sentence}; {instead}")

@@ -24,10 +24,12 @@ from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn
 from tuner_node import noise
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, TrainingSettings, batch_of
 from tuner_node.budget import Budget
+from tuner_node.checkpoint import taken
 from tuner_node.optimizers import Context, Optimizer, Rollout, RolloutResult, Trajectory
 from tuner_node.seeds import Purpose, derive
 
 Array = NDArray[np.float64]
+PHASES = ("identify", "check", "adapt", "evaluate", "done")
 CHECK_FIELDS = 4
 """Sampled fields on which a warm start must beat no control."""
 EXPLORATION = 1
@@ -188,19 +190,44 @@ class Training:
         return arrays
 
     def restore(self, arrays: dict[str, NDArray[Any]]) -> None:
-        """Continue from `state()`."""
-        self.phase = str(arrays["phase"])
-        self.budget.restore(arrays["budget"])
-        self.plant = int(arrays["plant"])
-        self.attempts = arrays["attempts"].tolist()
-        self.pending = arrays["pending"].tolist()
-        self.models = arrays.get("models")
-        self.target = arrays.get("target")
-        for m in range(self.settings.seeds):
+        """Continue from `state()`.
+
+        Raises
+        ------
+        ValueError
+            Those are not the arrays of a training with these settings; nothing has changed.
+        """
+        restored = Training(self.settings, self.make_optimizer)
+        try:
+            restored._take(arrays)
+        except (ValueError, LookupError, TypeError, OverflowError) as error:
+            raise ValueError(f"does not fit this training ({error})") from error
+        vars(self).update(vars(restored))
+
+    def _take(self, arrays: dict[str, NDArray[Any]]) -> None:
+        seeds = self.settings.seeds
+        shape = (seeds, len(CONTROLLERS), self.settings.evaluation_fields)
+        self.phase = str(taken(arrays, "phase", "U", ()))
+        self.budget.restore(taken(arrays, "budget", "i", self.budget.state().shape))
+        self.plant = int(taken(arrays, "plant", "i", ()))
+        self.attempts = taken(arrays, "attempts", "i", (seeds,)).tolist()
+        self.pending = taken(arrays, "pending", "i", (None,)).tolist()
+        self.history = json.loads(str(taken(arrays, "history", "U", ())))
+        if "models" in arrays:
+            self.models = taken(arrays, "models", "f", (seeds, None, None))
+            self.warm_starts()
+        if "target" in arrays:
+            self.target = taken(arrays, "target", "f", (None,))
+        for m in range(seeds):
             if f"exploration{m}.states" in arrays:
                 self.explorations[m] = Trajectory(
-                    arrays[f"exploration{m}.states"], arrays[f"exploration{m}.actions"]
+                    taken(arrays, f"exploration{m}.states", "f", (None, None)),
+                    taken(arrays, f"exploration{m}.actions", "f", (None, self.settings.n_a)),
                 )
+        if "evaluation" in arrays:
+            self.evaluation = taken(arrays, "evaluation", "f", shape)
+            self.ended = taken(arrays, "ended", "f", shape)
+        self._check_taken()
         if self.phase in ("adapt", "evaluate", "done"):
             self._start_optimizers()
         for m, optimizer in enumerate(self.optimizers):
@@ -212,9 +239,19 @@ class Training:
                     if key.startswith(prefix)
                 }
             )
-        self.history = json.loads(str(arrays["history"]))
-        self.evaluation = arrays.get("evaluation")
-        self.ended = arrays.get("ended")
+
+    def _check_taken(self) -> None:
+        """A ValueError unless what was taken is a state that a training can be in."""
+        if self.phase not in PHASES:
+            raise ValueError(f"its phase is {self.phase!r}; expected one of {', '.join(PHASES)}")
+        if not set(self.pending) <= set(range(self.settings.seeds)) or min(self.attempts) < 0:
+            raise ValueError("its seeds or attempts are out of range")
+        if not isinstance(self.history, list) or not all(isinstance(r, dict) for r in self.history):
+            raise ValueError("its history is not a list of rows")
+        if self.models is None and self.phase != "identify":
+            raise ValueError("it has no models")
+        if self.evaluation is None and self.phase == "done":
+            raise ValueError("it has no evaluation")
 
     def _seeds(self) -> list[int]:
         return [self.settings.seed + s for s in range(self.settings.seeds)]

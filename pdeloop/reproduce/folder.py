@@ -179,15 +179,18 @@ class _Curve:
             raise RunFolderError(f"cannot write {self._path}: {error.strerror}") from error
 
     def _restore(self) -> None:
-        if not any(self._path.parent.glob(self._path.name + "*")):
-            return
-        arrays, _ = checkpoint.load(self._path)
+        checkpoint.restore(self._path, self._take)
+
+    def _take(self, arrays: dict[str, NDArray[Any]]) -> None:
         prefix = "training."
+        n_a, seeds = int(self._values["n_a"]), int(self._values["seeds"])
+        costs = checkpoint.taken(arrays, "costs", "f", (None, seeds, None))
+        policies = checkpoint.taken(arrays, "policies", "f", (len(costs), seeds, n_a, None))
+        seconds = float(checkpoint.taken(arrays, "seconds", "f", ()))
         self.training.restore(
             {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
         )
-        self._costs, self._policies = list(arrays["costs"]), list(arrays["policies"])
-        self.seconds = float(arrays["seconds"])
+        self._costs, self._policies, self.seconds = list(costs), list(policies), seconds
 
 
 def _single_threaded_pair(values: Mapping[str, Any]) -> LocalPair:

@@ -192,8 +192,11 @@ def require_state(
     state: Mapping[str, NDArray[np.generic]],
     own: Mapping[str, NDArray[np.generic]],
     fixed: Sequence[str],
+    growing: Sequence[str] = (),
 ) -> None:
-    """A ValueError unless `state` has the keys of `own` and agrees with it in the `fixed` ones."""
+    """A ValueError unless `state` has the keys of `own`, with arrays of the same types and shapes, and
+    agrees with it in the `fixed` ones. Of the `growing` ones there may be any number.
+    """
     if set(state) != set(own):
         raise ValueError(
             f"a checkpoint of this optimiser holds {sorted(own)}, but this one holds "
@@ -205,8 +208,15 @@ def require_state(
                 f"the checkpoint was written with {key} = {state[key]}, but this training has "
                 f"{key} = {own[key]}; continue with the same parameters or start anew."
             )
-    if state["policy"].shape != own["policy"].shape:
-        raise ValueError(
-            f"the policy of the checkpoint has shape {state['policy'].shape}, but this training's "
-            f"has {own['policy'].shape}."
-        )
+    for key, array in own.items():
+        free = int(key in growing)
+        given = state[key]
+        if given.dtype.kind != array.dtype.kind or given.ndim != array.ndim:
+            raise ValueError(f"'{key}' of the checkpoint is of another type than this training's.")
+        if given.shape[free:] != array.shape[free:]:
+            raise ValueError(
+                f"'{key}' of the checkpoint has shape {given.shape}, but this training's has "
+                f"{array.shape}."
+            )
+        if given.dtype.kind == "f" and np.isnan(given).any():
+            raise ValueError(f"'{key}' of the checkpoint must be finite, but there is NaN in it.")

@@ -194,6 +194,7 @@ class Directions:
         self._best_cost = float(state["best_cost"].item())
         self._tells = int(state["tells"].item())
         self._learning_rate = float(state["learning_rate"].item())
+        require_positive(learning_rate=self._learning_rate)
 
     def _directions(self) -> Array:
         n_a, columns = self._policy.shape

@@ -41,7 +41,7 @@ from tuner_node.optimizers.base import (
     require_state,
 )
 from tuner_node.optimizers.proposal import Proposer
-from tuner_node.optimizers.trajectories import Record, Records
+from tuner_node.optimizers.trajectories import GROWING, Record, Records
 
 __all__ = ["GaussNewton"]
 
@@ -198,7 +198,9 @@ class GaussNewton:
 
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
         """Continue from a checkpoint with the same seed and number of fields."""
-        require_state(state, self.state(), ("seed", "field_count"))
+        require_state(state, self.state(), ("seed", "field_count"), (*_STAMPS, *GROWING))
+        if len({state[name].shape for name in _STAMPS}) > 1:
+            raise ValueError("the fields of the checkpoint do not add up.")
         self._policy, self._candidate = (
             checked_policy(state[name]) for name in ("policy", "candidate")
         )
@@ -206,7 +208,11 @@ class GaussNewton:
             setattr(self, f"_{name}", state[name].astype(np.int64))
         for name in _NUMBERS:
             setattr(self, f"_{name}", state[name].item())
+        require_positive(damping=self._damping)
         self._records.restore(state)
+        referred = {int(s) for s in (*self._incumbents, *self._trials, *self._others)} - {_NONE}
+        if missing := referred - {record.stamp for record in self._records.all()}:
+            raise ValueError(f"the checkpoint refers to rollouts that it lacks: {sorted(missing)}.")
 
     def _rollout(self, policy: Array, slot: int) -> Rollout:
         return Rollout(policy.copy(), oracle.field_seed(self._seed, int(self._fields[slot])))

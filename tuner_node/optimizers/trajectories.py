@@ -13,6 +13,13 @@ from tuner_node.optimizers.base import Array, RolloutResult, State
 __all__ = ["Record", "Records"]
 
 
+GROWING = (
+    *("record_stamps", "record_costs", "record_policies", "record_lengths"),
+    *("record_states", "record_actions"),
+)
+"""Arrays of a state with a row a rollout, and with a row a sample."""
+
+
 @dataclass(frozen=True, eq=False)
 class Record:
     """A rollout that was measured.
@@ -97,8 +104,17 @@ class Records:
         }
 
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
-        """Remember what a `state` remembers."""
+        """Remember what a `state` remembers; a ValueError if it does not add up."""
         lengths = state["record_lengths"].astype(np.int64)
+        rollouts = {len(state[name]) for name in GROWING[:4]}
+        samples = [len(state["record_states"]), len(state["record_actions"])]
+        if (
+            len(rollouts) > 1
+            or (lengths < 0).any()
+            or not set(lengths[:, 0] - lengths[:, 1]) <= {0, 1}
+            or lengths.sum(axis=0).tolist() != samples
+        ):
+            raise ValueError("the remembered rollouts of the checkpoint do not add up.")
         ends = np.cumsum(lengths, axis=0)
         records = {}
         for i, stamp in enumerate(state["record_stamps"].astype(np.int64)):

@@ -154,6 +154,7 @@ class TwoPoint:
         self._policy = checked_policy(state["policy"])
         self._iteration = int(state["iteration"].item())
         self._learning_rate = float(state["learning_rate"].item())
+        require_positive(learning_rate=self._learning_rate)
 
     @property
     def _shape(self) -> tuple[int, int]:
