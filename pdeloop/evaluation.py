@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import zipfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from loop_interfaces.parameters import noisy, table
-from loop_interfaces.spec import check
+from loop_interfaces.parameters import noisy
 from loop_interfaces.topics import CostColumn
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.in_process import LocalPair
@@ -19,24 +21,58 @@ from tuner_node.results import RunFolder, RunFolderError
 from tuner_node.seeds import Purpose, derive
 from tuner_node.training import CONTROLLERS
 
+Array = NDArray[np.float64]
+AGREE = 0.1
+"""Relative difference of a mean cost that other rounding may explain where the field is chaotic."""
+
 
 def evaluate(folder: Path, *, fields: int, seed: int, mean_field: bool) -> dict[str, Any]:
     """Costs of no control, LQT and the adapted policy of the run in `folder`.
 
+    The built-in plant and law compute them. A run that had others is refused with a RunFolderError:
+    its closing evaluation is computed again for that, for its first seed.
+
     fields, seed: how many initial fields are drawn, from which seed; mean_field: use the mean of the
     initial distribution instead. Returns {controller: (training seeds, fields) nested lists}.
     """
-    given = RunFolder(folder).parameters()
-    values = {**given, **check(table(), given)}
+    values = RunFolder(folder).values()
+    policies, warm, models = _policies(folder)
+    pair = LocalPair(values)
+    try:
+        pair.use_models(models)
+    except ValueError as error:
+        raise RunFolderError(
+            f"the run in {folder} had another plant than the built-in one, so its policies cannot be "
+            f"evaluated here: {error}"
+        ) from error
+    _refuse_another_loop(folder, values, pair, policies[:1], warm[:1])
+    costs = _costs(pair, values, policies, warm, fields, seed, mean_field)
+    return {name: costs[:, i].tolist() for i, name in enumerate(CONTROLLERS)}
+
+
+def _policies(folder: Path) -> tuple[Array, Array, Array]:
+    """Adapted policies, warm starts and models of the run."""
     path = folder / "policy.npz"
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            policies, warm, models = arrays["policy"], arrays["lqt"], arrays["model"]
+            return arrays["policy"], arrays["lqt"], arrays["model"]
     except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
         raise RunFolderError(
             f"{path} cannot be read; is the run finished? "
             f"(continue it with: pdeloop train --resume {folder})"
         ) from error
+
+
+def _costs(
+    pair: LocalPair,
+    values: Mapping[str, Any],
+    policies: Array,
+    warm: Array,
+    fields: int,
+    seed: int,
+    mean_field: bool = False,
+) -> Array:
+    """Mean stage costs (S, controllers, fields)."""
     field_seeds = (
         [-1] if mean_field else [derive(seed, Purpose.EVALUATION_FIELD, i) for i in range(fields)]
     )
@@ -48,11 +84,57 @@ def evaluate(folder: Path, *, fields: int, seed: int, mean_field: bool) -> dict[
             for i, field_seed in enumerate(field_seeds):
                 rows.append((field_seed, -1, 0, m, *noise[i : i + 1]))
                 gains.append(policy)
-    pair = LocalPair(values)
-    pair.use_models(models)
     result = pair.run(Batch(np.array(rows, dtype=np.float64), np.stack(gains)))
-    costs = result.costs[:, CostColumn.MEAN].reshape(len(policies), 3, len(field_seeds))
-    return {name: costs[:, i].tolist() for i, name in enumerate(CONTROLLERS)}
+    shape = len(policies), len(CONTROLLERS), len(field_seeds)
+    costs: Array = result.costs[:, CostColumn.MEAN].reshape(shape)
+    return costs
+
+
+def _refuse_another_loop(
+    folder: Path, values: Mapping[str, Any], pair: LocalPair, policies: Array, warm: Array
+) -> None:
+    """RunFolderError if the run's costs are not those of the built-in plant and law."""
+    try:
+        result = json.loads((folder / "result.json").read_text())
+        there = [np.array(result["costs_by_field"][name][0], dtype=float) for name in CONTROLLERS]
+    except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
+        raise RunFolderError(
+            f"{folder}/result.json cannot be read; is the run finished? "
+            f"(continue it with: pdeloop train --resume {folder})"
+        ) from error
+    seed = int(values["evaluation_seed"])
+    (own,) = _costs(pair, values, policies, warm, len(there[0]), seed)
+    differs = [not _agree(*both) for both in zip(there, own, strict=True)]
+    if not any(differs):
+        return
+    number = differs.index(True)
+    what = ("plant", "control law", "control law")[number]
+    controller = ("no control", "the LQT law", "the adapted policy")[number]
+    nodes = ", ".join(result.get("controller", {}).get("nodes", ())) if number else ""
+    raise RunFolderError(
+        f"the run in {folder} had another {what} than the built-in one"
+        + (f" (its controller: {nodes})" if nodes else "")
+        + f", so its policies cannot be evaluated here: {controller} cost "
+        f"{_text(there[number])} in its closing evaluation, and {_text(own[number])} here"
+    )
+
+
+def _agree(there: Array, here: Array) -> bool:
+    lost = [np.isnan(costs) | (costs >= DIVERGED_COST) for costs in (there, here)]
+    if (lost[0] != lost[1]).any():
+        return False
+    good = ~lost[0]
+    a, b = there[good].sum(), here[good].sum()
+    return bool(abs(a - b) <= AGREE * max(abs(a), abs(b)))
+
+
+def _text(costs: Array) -> str:
+    return "diverged" if (costs >= DIVERGED_COST).any() else f"{costs.mean():.4g}"
+
+
+def all_diverged(costs: Mapping[str, Sequence[Sequence[float]]]) -> list[str]:
+    """The controllers of which no rollout came to its end."""
+    return [name for name, rows in costs.items() if (np.array(rows) >= DIVERGED_COST).all()]
 
 
 def as_text(costs: dict[str, Any]) -> str:

@@ -35,6 +35,8 @@ from tuner_node.build import build_training
 from tuner_node.results import RunFolder, RunFolderError, timestamp
 from tuner_node.run_store import Recorder
 
+BUILT_IN = {"nodes": [], "law": "affine"}
+"""The controller of a training in this process, as result.json has it."""
 POLL = 0.05
 """Seconds between two looks at the nodes."""
 
@@ -222,7 +224,7 @@ def _train_holding(
     # Nothing is saved on the way out of an interruption: it may come in the middle of an update.
     train(training, LocalPair(values), report, max_batch=values["max_batch"])
     try:
-        recorder.finish({"transport": "in-process"})
+        recorder.finish({"transport": "in-process", "controller": BUILT_IN})
     except OSError as error:
         raise RunFolderError(
             f"cannot write the results to {folder}: {error.strerror}; make room and "

@@ -231,3 +231,20 @@ def test_gauss_newton_continues_from_a_checkpoint_in_the_middle_to_the_same_bits
     train(second, LocalPair(values), lambda row: None)
     assert same_bits(second.policies(), undisturbed.policies())
     assert same_bits(second.evaluation, undisturbed.evaluation)
+
+
+@pytest.mark.parametrize("limit", [0.0, 0.05])
+def test_gauss_newton_refuses_actions_that_are_not_those_of_the_law(limit):
+    values = parameters(optimizer="gauss_newton", rollouts=20, action_limit=limit)
+    assert train_here(values).law_seen
+    assert not train_here(parameters(rollouts=11)).law_seen  # two_point sees costs only
+    training, pair = build_training(values), LocalPair(values)
+    while training.phase != "adapt":
+        training.finish(pair.run(training.next_batch()))
+        pair.follow(training)
+    result = pair.run(training.next_batch())
+    bent = [replace(t, actions=np.tanh(t.actions)) for t in result.trajectories]
+    before = training.budget.by_purpose()
+    with pytest.raises(ValueError, match=r"not those of the law .* use the optimizer 'two_point'"):
+        training.finish(replace(result, trajectories=bent))
+    assert training.budget.by_purpose() == before

@@ -344,10 +344,24 @@ class TunerNode:
         else:
             self._log.info(text)
 
+    def _controller(self) -> dict[str, Any]:
+        """Who answered the states, and by which law as far as that was seen."""
+        found = {
+            f"{there.node_namespace.rstrip('/')}/{there.node_name}"
+            for namespace in self._pairs
+            for there in self._node.get_publishers_info_by_topic(
+                self._node.resolve_topic_name(scoped(namespace, ACTION.name))
+            )
+        }
+        seen = self._session.training.law_seen
+        return {"nodes": sorted(found), "law": "affine" if seen else "not seen"}
+
     def _finish(self) -> int:
         if self._recorder:
             try:
-                summary = self._recorder.finish({"transport": "topics"})
+                summary = self._recorder.finish(
+                    {"transport": "topics", "controller": self._controller()}
+                )
             except OSError as error:
                 raise ConfigurationError(f"cannot write the results: {error.strerror}") from error
         else:

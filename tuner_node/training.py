@@ -26,6 +26,7 @@ from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, TrainingSettings
 from tuner_node.budget import Budget
 from tuner_node.checkpoint import taken
 from tuner_node.optimizers import Context, Optimizer, Rollout, RolloutResult, Trajectory
+from tuner_node.published_law import follows
 from tuner_node.seeds import Purpose, derive
 
 Array = NDArray[np.float64]
@@ -61,6 +62,8 @@ class Training:
     optimizers: list[Optimizer] = field(default_factory=list)
     history: list[dict[str, Any]] = field(default_factory=list)
     budget: Budget = field(init=False)
+    law_seen: bool = False
+    """Whether rollouts were seen, all with the actions of the law that the policies are gains of."""
     evaluation: Array | None = None
     """Mean stage costs of the closing evaluation, (S, controllers, fields)."""
     ended: Array | None = None
@@ -174,6 +177,7 @@ class Training:
             "pending": np.array(self.pending, dtype=np.int64),
             "history": np.array(json.dumps(self.history)),
             "budget": self.budget.state(),
+            "law_seen": np.array(self.law_seen),
         }
         if self.models is not None:
             arrays["models"] = self.models
@@ -209,6 +213,7 @@ class Training:
         shape = (seeds, len(CONTROLLERS), self.settings.evaluation_fields)
         self.phase = str(taken(arrays, "phase", "U", ()))
         self.budget.restore(taken(arrays, "budget", "i", self.budget.state().shape))
+        self.law_seen = bool(taken(arrays, "law_seen", "b", ()))
         self.plant = int(taken(arrays, "plant", "i", ()))
         self.attempts = taken(arrays, "attempts", "i", (seeds,)).tolist()
         self.pending = taken(arrays, "pending", "i", (None,)).tolist()
@@ -392,6 +397,7 @@ class Training:
             seen: Sequence[Trajectory | None] = [None] * len(asked)
             if result.trajectories is not None:
                 seen = result.trajectories[first : first + len(asked)]
+                self._check_law(m, asked, result.trajectories[first : first + len(asked)])
             first += len(asked)
             told = optimizer.tell(
                 [
@@ -409,6 +415,22 @@ class Training:
         self.history += rows
         self._leave_adapt_if_done()
         return rows
+
+    def _check_law(self, m: int, asked: Sequence[Rollout], seen: Sequence[Trajectory]) -> None:
+        """ValueError if the actions are not those of the published law."""
+        assert self.models is not None
+        model, limit = (
+            model_rows.unpack(self.models[m], self.settings.n_a),
+            self.settings.action_limit,
+        )
+        for rollout, trajectory in zip(asked, seen, strict=True):
+            if not follows(rollout.policy, model, trajectory, limit):
+                raise ValueError(
+                    "the actions are not those of the law a = K_a U^T z + K_b U^T z_r, which this "
+                    "optimizer needs; with a control law of your own use the optimizer 'two_point' "
+                    "or 'directions'"
+                )
+        self.law_seen = True
 
     def _leave_adapt_if_done(self) -> None:
         done = all(optimizer.done for optimizer in self.optimizers)

@@ -35,7 +35,7 @@ def add(commands: Commands) -> None:
 
 
 def _evaluate(options: argparse.Namespace) -> int:
-    from pdeloop.evaluation import as_text, evaluate
+    from pdeloop.evaluation import all_diverged, as_text, evaluate
 
     spec = DEFAULTS["evaluation_fields"]
     spec.check(options.fields)
@@ -47,4 +47,6 @@ def _evaluate(options: argparse.Namespace) -> int:
         print_json(costs)
     else:
         print(as_text(costs))
+    if lost := all_diverged(costs):
+        raise RuntimeError(f"every rollout diverged of: {', '.join(lost)}")
     return 0

@@ -67,6 +67,11 @@ def test_a_controller_of_ones_own_is_tuned(loop: Processes, tmp_path: Path) -> N
     tuner = loop.node("tuner_node", *ros_arguments(mark, "tuner_node"), "-p", f"out:={out}")
     text = loop.wait(tuner, 10 * LIMIT)  # 15 000 samples: a minute of a free machine at the most
 
+    result = json.loads((out / "result.json").read_text())
+    assert result["controller"] == {"nodes": ["/saturated_controller"], "law": "not seen"}
+    refused = loop.wait(loop.pdeloop("evaluate", str(out)), LIMIT, code=1)
+    assert "had another control law than the built-in one (its controller: /saturated" in refused
+
     with np.load(out / "policy.npz") as arrays:
         first, adapted = arrays["lqt"][0], arrays["policy"][0]
     module = example("saturated_controller")

@@ -1,0 +1,97 @@
+"""`pdeloop evaluate`: costs of the built-in plant and law, and of no other."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pdeloop.cli import main
+from tests.small import SMALL
+
+COSTS = ("none", "lqt", "adapted")
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: Any) -> Path:
+    out: Path = tmp_path_factory.mktemp("evaluated") / "run"
+    words = ["--in-process", "--rollouts", "13", "--seeds", "2", "--out", str(out)]
+    assert main(["train", str(SMALL), *words]) == 0
+    return out
+
+
+@pytest.fixture
+def run(finished: Path, tmp_path: Path) -> Path:
+    """A copy to be changed."""
+    for name in ("parameters.yaml", "policy.npz", "result.json"):
+        (tmp_path / name).write_bytes((finished / name).read_bytes())
+    return tmp_path
+
+
+def test_a_run_says_who_controlled_and_evaluates_to_its_own_costs(finished, capsys):
+    result = json.loads((finished / "result.json").read_text())
+    assert result["controller"] == {"nodes": [], "law": "affine"}
+    assert main(["evaluate", str(finished), "--json"]) == 0
+    costs = json.loads(capsys.readouterr().out)
+    assert costs == result["costs_by_field"]
+
+
+def refused(capsys: Any, run: Path) -> str:
+    assert main(["evaluate", str(run), "--fields", "1"]) == 1
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert shown.err.count("\n") == 1
+    return str(shown.err)
+
+
+@pytest.mark.parametrize(("controller", "value"), [("lqt", 0.5), ("adapted", 1e9)])
+def test_another_control_law_is_refused_and_its_node_named(run, capsys, controller, value):
+    result = json.loads((run / "result.json").read_text())
+    result["controller"] = {"nodes": ["/lab/mine"], "law": "not seen"}
+    result["costs_by_field"][controller] = [[value] * 10] * 2
+    (run / "result.json").write_text(json.dumps(result))
+    said = refused(capsys, run)
+    assert "had another control law than the built-in one (its controller: /lab/mine)" in said
+    assert ("diverged" if value == 1e9 else "0.5") in said
+
+
+def test_another_plant_is_refused(run, capsys):
+    result = json.loads((run / "result.json").read_text())
+    result["costs_by_field"] = {name: [[0.5] * 10] * 2 for name in COSTS}
+    (run / "result.json").write_text(json.dumps(result))
+    assert "had another plant than the built-in one" in refused(capsys, run)
+    with np.load(run / "policy.npz") as arrays:
+        content = {**arrays, "model": np.ones((2, 57, 4))}
+    np.savez(run / "policy.npz", **content)
+    assert "had another plant than the built-in one" in refused(capsys, run)
+
+
+def test_rounding_of_another_machine_is_not_another_plant(run, capsys):
+    result = json.loads((run / "result.json").read_text())
+    for name in COSTS:
+        rows = result["costs_by_field"][name]
+        result["costs_by_field"][name] = [[1.01 * cost for cost in row] for row in rows]
+    (run / "result.json").write_text(json.dumps(result))
+    assert main(["evaluate", str(run), "--fields", "1"]) == 0
+
+
+def test_policies_that_diverge_are_no_success(run, capsys):
+    result = json.loads((run / "result.json").read_text())
+    with np.load(run / "policy.npz") as arrays:
+        content = dict(arrays)
+    content["policy"] = 1e8 * np.abs(content["policy"])
+    np.savez(run / "policy.npz", **content)
+    result["costs_by_field"]["adapted"] = [[1e9] * 10] * 2
+    (run / "result.json").write_text(json.dumps(result))
+    assert main(["evaluate", str(run)]) == 1
+    shown = capsys.readouterr()
+    assert "every rollout diverged of: adapted" in shown.err
+    assert "1e+09" not in shown.out
+
+
+def test_an_unfinished_run_says_how_to_go_on(run, capsys):
+    (run / "result.json").unlink()
+    assert "continue it with: pdeloop train --resume" in refused(capsys, run)
