@@ -16,8 +16,8 @@ from rclpy.node import Node
 from std_msgs.msg import String
 
 from controller_node.diagnostics import ControllerHealth
+from controller_node.fast_path import ControllerFastPath
 from controller_node.identification import DesignSettings
-from controller_node.reflex import Reflex
 from controller_node.responder import Responder
 from loop_interfaces.diagnostics import Health
 from loop_interfaces.frames import Frame
@@ -80,7 +80,6 @@ class ControllerNode:
 
     def join(self, node: Node, loop: NodeLoop) -> None:
         declare(node, CONTROLLER_PARAMETERS, given_parameters(node))
-        self._reflex.forget()
         self._wire(node, loop)
 
     def _wire(self, node: Node, loop: NodeLoop) -> None:
@@ -88,7 +87,6 @@ class ControllerNode:
         self._node, self._loop = node, loop
         self._senders = {topic: loop.sender(topic) for topic in (ACTION, MODEL_IDENTIFIED)}
         self._failed = node.create_publisher(String, MODEL_FAILED, writer_qos(MODEL))
-        self._publish = self._senders[ACTION].publish
         handlers: dict[Topic, Handler] = {
             TARGET: responder.target,
             START: responder.start,
@@ -97,28 +95,18 @@ class ControllerNode:
             COST: responder.cost,
         }
         states = loop.receive(STATE, self._on_state)
-        states.swift = self._swiftly
-        self._reflex = Reflex(responder, states.codec)
-        loop.stream(states, self._senders[ACTION], self._reflex.flow, self._reflex.ear)
+        self._fast_path = ControllerFastPath(responder, states.codec)
+        loop.answer_fast(states, self._senders[ACTION], self._fast_path)
         for topic, handler in handlers.items():
             loop.receive(topic, partial(self._on_other, handler))
         loop.listen(PAUSED, self._on_paused)
         loop.diagnose("responder", self._report)
 
-    def _swiftly(self, raw: bytes) -> bool:
-        message = self._reflex(raw)
-        if message is None:
-            return False
-        self._publish(message)
-        return True
-
     def _on_state(self, frame: Frame) -> None:
-        self._reflex.forget()
         self._perform(self._responder.state(frame))
-        self._reflex.learn(frame)
+        self._fast_path.last_state = frame
 
     def _on_other(self, handler: Handler, frame: Frame) -> None:
-        self._reflex.forget()
         self._perform(handler(frame))
 
     def _perform(self, sends: Sequence[Send | ModelFailure]) -> None:
@@ -132,7 +120,6 @@ class ControllerNode:
                 )
 
     def _report(self, now: float) -> Health:
-        self._reflex.settle()
         self._health.plants = self._node.count_publishers(self._node.resolve_topic_name(STATE.name))
         return self._health.report(now)
 

@@ -72,8 +72,6 @@ class Responder:
         self._served = (-1, -1)
         """Run and plant of the last answer."""
         self._pending: Frame | None = None
-        self.law_in_use: ProjectedLaw | None = None
-        """The law of the last answer, set for its episode; None where it explored."""
         self.tally = Tally()
         self.answered = 0
         self.episode = self.step = -1
@@ -161,7 +159,6 @@ class Responder:
 
     def state(self, frame: Frame) -> list[Send]:
         """The action that answers a state; the state is kept until what it needs has arrived."""
-        self.law_in_use = None
         actions = self._actions(frame)
         if actions is None:
             self._pending = replace(frame, values=frame.values.copy())
@@ -169,15 +166,31 @@ class Responder:
             return []
         self._pending = None
         self._served = (frame.run, frame.plant)
-        self.answered += 1
-        self.episode, self.step = frame.episode, frame.step
+        self.episode = frame.episode
+        self.advance_counters(1, frame.step)
         answer = Frame(frame.run, frame.episode, frame.step, frame.time, actions, frame.plant)
         return [Send(ACTION, answer)]
 
-    def credit(self, answers: int, step: int) -> None:
-        """Count states of the present episode, up to `step`, that were answered by `reflex`."""
+    def advance_counters(self, answers: int, step: int) -> None:
+        """Account for states of the present episode, up to `step`, that were answered."""
         self.answered += answers
         self.step = step
+
+    def law_for(self, state: Frame) -> ProjectedLaw | None:
+        """The law that answers the states of an episode, like one that was answered before.
+
+        None where the controller explores, and while anything has to be looked at first: another
+        state waits, or something has arrived that changes the law.
+        """
+        run = self._runs.get(state.run)
+        start = run.episode_start(state) if run else None
+        if run is None or start is None or self._pending is not None:
+            return None
+        if (state.run, state.plant, state.episode) != (*self._served, self.episode):
+            return None
+        law, episode = run.laws.get(state.plant, (None, -1))
+        explores = start.values[0, StartColumn.EXCITATION] >= 0
+        return None if explores or episode != state.episode else law
 
     def cost(self, frame: Frame) -> list[Send | ModelFailure]:
         """At the end of an exploratory episode: reduce and design."""
@@ -242,7 +255,6 @@ class Responder:
             if law is None:
                 return None
             run.laws[frame.plant] = (law, frame.episode)
-        self.law_in_use = law
         return law.actions(frame.values)
 
     @staticmethod

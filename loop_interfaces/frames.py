@@ -60,8 +60,13 @@ class Frame:
     plant: int = 0
 
     def digest(self) -> int:
-        """A number that tells other values from these, in this process."""
-        return hash(self.values.tobytes())
+        """See `digest`."""
+        return digest(self.values)
+
+
+def digest(values: NDArray[np.float64]) -> int:
+    """A number that tells other values from these, in this process."""
+    return hash(values.tobytes())
 
 
 class Recent:
@@ -114,10 +119,12 @@ class ArrayCodec:
         self._templates: dict[tuple[int, ...], tuple[bytearray, int, NDArray[np.float64]]] = {}
         self._last: _Layout | None = None
 
-    @property
-    def prefix(self) -> bytes | None:
-        """What stands in front of the header in the messages of the peer that was decoded last."""
-        return self._last.prefix if self._last else None
+    def prefix_of(self, shape: tuple[int, ...]) -> bytes | None:
+        """What stands in front of the header in the messages of the peer that was decoded last; None
+        if their values had another shape.
+        """
+        last = self._last
+        return last.prefix if last and last.shape == shape else None
 
     def encode(self, frame: Frame) -> bytes:
         """CDR bytes of `frame`, little-endian. Raises FrameError on a wrong number of axes."""

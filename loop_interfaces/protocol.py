@@ -15,9 +15,6 @@ from loop_interfaces.topics import Topic
 
 STOPPED = 75
 """Exit code of a tuner that an operator stopped (as sysexits' EX_TEMPFAIL)."""
-MORE, QUIET, OTHER, UNABLE = range(4)
-"""Why a flow of messages ends: it has dealt with enough for once, nothing came in for long, something
-came that is not its business (`Line.message`), or there is nothing that it could deal with."""
 
 
 @dataclass(slots=True)

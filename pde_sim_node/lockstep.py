@@ -16,7 +16,7 @@ nothing is given up meanwhile; `episode/paused` tells everybody who waits for th
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -37,7 +37,6 @@ from loop_interfaces.topics import (
 )
 from pde_sim_node.plant import Plant
 from pde_sim_node.real_time import Pace
-from pde_sim_node.solver.step_context import Machine
 
 PAUSED_REPORT = 1.0
 """Seconds between two messages on `episode/paused` while the plant is paused."""
@@ -71,7 +70,7 @@ class Lockstep:
         run_hold: float,
         real_time_factor: float = 0.0,
     ) -> None:
-        self._plant = plant
+        self.plant = plant
         self._fingerprint = fingerprint
         self._sample_time = sample_time
         self._action_timeout = action_timeout
@@ -88,8 +87,6 @@ class Lockstep:
         """The rows of the last `episode/cost`."""
         self._rows = np.empty((0, START_COLUMNS))
         self._active = False
-        self._serial = -1
-        """Episodes begun before this one."""
         self._state = np.empty((0, 0))
         """What was measured last."""
         self._cost: Send | None = None
@@ -124,15 +121,15 @@ class Lockstep:
         return self._stamped(STATE, self._state).frame if self._active else None
 
     @property
-    def flowing(self) -> int:
-        """A number of the episode under way, if all it awaits is its next action; else -1.
+    def awaiting(self) -> Frame | None:
+        """The state that was sent, if its action will advance the plant at once.
 
-        Not at its end, nor while it is paused or paced.
+        None at the end of an episode, and while the plant is paused or kept to the wall clock.
         """
-        plant = self._plant
-        if not self._active or self.paused or self.pace or plant.step_index >= plant.horizon:
-            return -1
-        return self._serial
+        plant = self.plant
+        if self._held or self.paused or self.pace or plant.step_index >= plant.horizon:
+            return None
+        return self.last_state
 
     @property
     def _reply(self) -> Send | None:
@@ -146,16 +143,16 @@ class Lockstep:
 
     @property
     def step(self) -> int:
-        return self._plant.step_index
+        return self.plant.step_index
 
     @property
     def horizon(self) -> int:
-        return self._plant.horizon
+        return self.plant.horizon
 
     @property
     def batch(self) -> int:
         """Environments of the present or last episode."""
-        return self._plant.batch
+        return self.plant.batch
 
     @property
     def stale(self) -> int:
@@ -169,7 +166,7 @@ class Lockstep:
 
     def announcement(self) -> Send:
         """The target z_r, sent once at the start and latched."""
-        return Send(TARGET, Frame(0, 0, 0, 0.0, self._plant.target, self._fingerprint))
+        return Send(TARGET, Frame(0, 0, 0, 0.0, self.plant.target, self._fingerprint))
 
     def paused_report(self) -> Send:
         """Whether the plant is paused, latched."""
@@ -267,9 +264,8 @@ class Lockstep:
             self.tally["starts repeated"] += 1
             reply = self._reply
             return [reply] if reply and not self._held else []
-        states = self._plant.reset(rows[:, StartColumn.SEED].astype(np.int64), noise_seeds(rows))
+        states = self.plant.reset(rows[:, StartColumn.SEED].astype(np.int64), noise_seeds(rows))
         self.episode, self._rows, self._active = frame.episode, rows.copy(), True
-        self._serial += 1
         self._state = states
         self._taken, self.contradiction = [], ""
         self.time = max(self.time, frame.time) + self._sample_time
@@ -283,7 +279,7 @@ class Lockstep:
 
         Raises FrameError when the awaited action has the wrong shape.
         """
-        plant = self._plant
+        plant = self.plant
         if not self._active or frame.run != self.run or frame.episode != self.episode:
             self.tally["actions of another episode"] += 1
             return []
@@ -312,50 +308,27 @@ class Lockstep:
         if plant.step_index == plant.horizon:
             self._tuner_heard = now
             return [self._finish(now, void=False)]
-        self.advance(frame.values, frame.digest(), now)
+        self._state = plant.step(frame.values)
+        self.advance_counters([frame.digest()], now)
         if self.pace and not self.paused:
             self._held = True
             self._deadline = self.pace.next(now)
             return []
         return self._publish_state(now)
 
-    def advance(self, action: np.ndarray, digest: int, now: float) -> np.ndarray:
-        """Apply the awaited action and wait for the next; the states, which are to be sent.
+    def advance_counters(self, digests: Sequence[int], now: float) -> None:
+        """Account for awaited actions, the last of them at `now`, that the plant has taken.
 
-        digest: of the action, see Frame.digest.
+        digests: of the actions, see Frame.digest.
         """
-        self._state = self._plant.step(action)
-        self.time += self._sample_time
-        self._count([digest], now)
-        return self._state
-
-    def _count(self, digests: list[int], now: float) -> None:
-        """Actions were applied, the last one right now."""
         self._tuner_heard = now
         self._taken += digests
-        self.steps_total += len(digests) * self._plant.batch
+        self.steps_total += len(digests) * self.plant.batch
         self.rounds_total += len(digests)
+        for _ in digests:  # rounded as often as they are counted one by one
+            self.time += self._sample_time
         self._repeats = 0
         self._deadline = now + self._action_timeout
-
-    @property
-    def machine(self) -> Machine | None:
-        """What it takes to advance in compiled functions while it is `flowing`; then `credit`."""
-        return self._plant.machine
-
-    def helping(self, machines: np.ndarray) -> AbstractContextManager[None]:
-        """While the machine, one entry of MACHINE, does steps: let other threads help it."""
-        return self._plant.helping(machines)
-
-    def credit(self, actions: np.ndarray, time: float, now: float) -> None:
-        """So many actions, one in each row, were applied by the `machine`, the last one right now.
-
-        time: simulated time in s, which has gone on with every one.
-        """
-        self._plant.credit(len(actions))
-        self._state = self._plant.states
-        self.time = time
-        self._count([hash(action.tobytes()) for action in actions], now)
 
     def tick(self, now: float) -> list[Send]:
         """Send the state again when its answer is overdue; give the episode up after max_repeats.
@@ -401,10 +374,10 @@ class Lockstep:
         self._deadline = now + PAUSED_REPORT if self.paused else None
 
     def _finish(self, now: float, *, void: bool) -> Send:
-        costs = self._plant.episode_costs()
+        costs = self.plant.episode_costs()
         ended = np.where(costs.diverged_step >= 0, costs.diverged_step, COMPLETED)
         if void:
-            ended = np.full(self._plant.batch, VOID)
+            ended = np.full(self.plant.batch, VOID)
             self.tally["episodes void"] += 1
         values = np.column_stack([costs.mean, costs.total, ended.astype(np.float64)])
         self.last_cost = values
@@ -414,7 +387,7 @@ class Lockstep:
         return self._cost
 
     def _stamped(self, topic: Topic, values: np.ndarray) -> Send:
-        step = self._plant.step_index
+        step = self.plant.step_index
         frame = Frame(self.run, self.episode, step, self.time, values, self._fingerprint)
         return Send(topic, frame)
 
@@ -425,7 +398,7 @@ class Lockstep:
                 f"expected rows of {START_COLUMNS} numbers (seed, excitation, variance, model), "
                 f"or one more (noise), got {rows.shape[1]}"
             )
-        if rows.shape[0] * max(self._plant.state_size, self._plant.n_a) > MAX_VALUES:
+        if rows.shape[0] * max(self.plant.state_size, self.plant.n_a) > MAX_VALUES:
             raise FrameError(f"{rows.shape[0]} environments are more than one message can hold")
         seeds = rows[:, StartColumn.SEED]
         if len(rows) and (seeds.min() < -1 or (seeds != np.floor(seeds)).any()):

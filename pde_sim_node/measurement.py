@@ -162,14 +162,14 @@ class InstrumentedPlant(Plant):
     def _force(self) -> None:
         step = self.step_index
         for m, (noise_seed, field_seed) in enumerate(self._seeds):
-            if self._diverged_step[m] >= 0:
+            if self.diverged_step[m] >= 0:
                 continue
             draw = standard_normal(noise_seed, field_seed, step, Noise.PROCESS, self.x.size)
             forced = self.states[m, self._forced] + self._forcing * draw
             if np.abs(forced).max() <= self.divergence_bound:
                 self.states[m, self._forced] = forced
             else:
-                self._diverged_step[m] = step - 1
+                self.diverged_step[m] = step - 1
 
     def _measure(self) -> NDArray[np.float64]:
         """The scaled readings of the sensors now, (M, n_y)."""

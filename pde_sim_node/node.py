@@ -20,7 +20,7 @@ from loop_interfaces.affinity import core_list
 from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.parameters import EXECUTION, PLANT, PROBLEM
-from loop_interfaces.protocol import UNABLE, Send
+from loop_interfaces.protocol import Send
 from loop_interfaces.ros.introspection import offer
 from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.node_main import node_main
@@ -31,8 +31,9 @@ from loop_interfaces.topics import ACTION, COST, PAUSED, START, STATE, TARGET
 from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.diagnostics import PlantHealth
 from pde_sim_node.equations import configured_equation
+from pde_sim_node.fast_path import PlantFastPath
 from pde_sim_node.lockstep import Lockstep
-from pde_sim_node.reflex import Reflex
+from pde_sim_node.plant import Plant
 from pde_sim_node.solver.workers import use_cores
 
 
@@ -115,9 +116,10 @@ class PlantNode:
         self._clock_wanted = False
         loop.receive(START, self._on_start)
         actions = loop.receive(ACTION, self._on_action, bundled=True)
-        actions.swift = self._swiftly
-        self._reflex = Reflex(self._lockstep, actions.codec)
-        loop.stream(actions, self._senders[STATE], self._flow, self._reflex.ear)
+        self._fast_path: PlantFastPath | None = None
+        if type(self._lockstep.plant) is Plant:  # what instruments do to a step is not compiled
+            self._fast_path = PlantFastPath(self._lockstep, actions.codec, self._bundler)
+            loop.answer_fast(actions, self._senders[STATE], self._fast_path)
         loop.diagnose("lock-step", self._health.report)
         offer(node, "~/pause", self._pause)
         offer(node, "~/resume", self._resume)
@@ -162,25 +164,10 @@ class PlantNode:
         if not self._lockstep.run:
             self._report_pace()
 
-    def _swiftly(self, raw: bytes) -> bool:
-        message = self._reflex(raw, self._loop.now())
-        if message is None:
-            return False
-        self._senders[STATE].send_raw(message, self._lockstep.time)
-        if self._clock_wanted:
-            self._tell_time(self._lockstep.time)
-        return True
-
-    def _flow(self, rounds: int, until: int) -> tuple[int, int]:
-        if self._clock_wanted:
-            return 0, UNABLE
-        return self._reflex.flow(self._bundler, rounds, until)
-
     def _on_action(self, frame: Frame) -> None:
         self._send(self._lockstep.action(frame, self._loop.now()))
         if self._paced:
             self._send(self._lockstep.tick(self._loop.now()))
-        self._reflex.learn(frame)
 
     def _report_pace(self) -> None:
         """How well the wall clock was kept, at the end of a run or of this node."""
@@ -211,6 +198,8 @@ class PlantNode:
 
     def _housekeeping(self, now: float) -> None:
         self._clock_wanted = self._clock is not None and self._clock.get_subscription_count() > 0
+        if self._fast_path:
+            self._fast_path.suspended = self._clock_wanted
         if self._lockstep.overdue():
             self._node.get_logger().warning(
                 f"no action for step {self._lockstep.step} of episode {self._lockstep.episode}; "

@@ -2,7 +2,6 @@
 
 import math
 import operator
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +11,7 @@ from pde_sim_node.equations import Equation, LinearEquation
 from pde_sim_node.solver.exact import Propagator
 from pde_sim_node.solver.integrator import Integrator
 from pde_sim_node.solver.kernel import all_finite
-from pde_sim_node.solver.step_context import Machine
+from pde_sim_node.solver.workers import PlanTeam
 from pde_sim_node.supports import indicator_supports
 
 __all__ = ["DIVERGED_COST", "MEAN_FIELD", "EpisodeCosts", "Plant"]
@@ -84,6 +83,16 @@ class Plant:
         Target of what `reset` and `step` return: the same, unless instruments are between.
     supports : (n_x, n_a)
         Phi_j(x_i), entries 0 or 1, on the component ``equation.actuated``.
+    states : (M, n_z)
+        The fields now.
+    actions : (M, n_a)
+        The actions of the last step.
+    totals : (M,)
+        Sums of the stage costs so far.
+    diverged_step : (M,) int64
+        See `EpisodeCosts`.
+    step_index : int
+        k, steps of the episode so far.
     compiled_in_seconds : float
         Time the constructor spent on compiling the kernel; 0.0 if it was compiled before.
 
@@ -137,6 +146,11 @@ class Plant:
         self._allocate(0)
 
     @property
+    def team(self) -> PlanTeam:
+        """The compiled step and the threads that do it."""
+        return self._integrator.team
+
+    @property
     def state_size(self) -> int:
         """Numbers of a published state."""
         return self.n_z
@@ -144,9 +158,9 @@ class Plant:
     def _allocate(self, batch: int) -> None:
         self.batch, self.step_index = batch, 0
         self.states = np.zeros((batch, self.n_z))
-        self._actions = np.zeros((batch, self.n_a))
-        self._total = np.zeros(batch)
-        self._diverged_step = np.full(batch, -1, dtype=np.int64)
+        self.actions = np.zeros((batch, self.n_a))
+        self.totals = np.zeros(batch)
+        self.diverged_step = np.full(batch, -1, dtype=np.int64)
 
     def reset(
         self, seeds: ArrayLike, noise: NDArray[np.int64] | None = None
@@ -185,8 +199,8 @@ class Plant:
         if self.batch != seeds.size:
             self._allocate(seeds.size)
         self.step_index = 0
-        self._total.fill(0.0)
-        self._diverged_step.fill(-1)
+        self.totals.fill(0.0)
+        self.diverged_step.fill(-1)
         for state, seed in zip(self.states, seeds.tolist(), strict=True):
             state[:] = fields[seed]
         return self.states
@@ -233,7 +247,7 @@ class Plant:
             raise RuntimeError(f"the episode is over after {self.horizon} steps: call reset(seeds)")
         self._hold(actions)
         self._integrator.step(
-            self.states, self._actions, self._total, self._diverged_step, self.step_index
+            self.states, self.actions, self.totals, self.diverged_step, self.step_index
         )
         self.step_index += 1
         return self.states
@@ -243,36 +257,9 @@ class Plant:
             raise ValueError(
                 f"actions must have shape {(self.batch, self.n_a)}, got {np.shape(actions)}"
             )
-        self._actions[:] = actions
-        if not all_finite(self._actions):
+        self.actions[:] = actions
+        if not all_finite(self.actions):
             raise ValueError("actions must be finite, got NaN or infinity")
-
-    @property
-    def machine(self) -> Machine | None:
-        """What it takes to do `step` in compiled functions, until the next `reset`; tell it afterwards
-        with `credit`. None where a step is more than that, or better done by several threads.
-        """
-        if type(self).step is not Plant.step:
-            return None
-        code = self._integrator.team.in_machine_code(self.batch)
-        if code is None:
-            return None
-        return Machine(
-            *code,
-            states=self.states.ctypes.data,
-            actions=self._actions.ctypes.data,
-            totals=self._total.ctypes.data,
-            diverged_step=self._diverged_step.ctypes.data,
-            batch=self.batch,
-        )
-
-    def helping(self, machines: NDArray[np.void]) -> AbstractContextManager[None]:
-        """While the machine, one entry of MACHINE, does steps: let other threads help it."""
-        return self._integrator.team.helping(machines)
-
-    def credit(self, steps: int) -> None:
-        """So many steps were done by the `machine`."""
-        self.step_index += steps
 
     def evaluate(
         self, states: NDArray[np.float64], actions: NDArray[np.float64]
@@ -308,10 +295,10 @@ class Plant:
 
     def episode_costs(self) -> EpisodeCosts:
         """The costs of the episode so far."""
-        diverged = self._diverged_step >= 0
-        total = np.where(diverged, DIVERGED_COST * self.horizon, self._total)
-        mean = np.where(diverged, DIVERGED_COST, self._total / max(self.step_index, 1))
-        return EpisodeCosts(mean=mean, total=total, diverged_step=self._diverged_step.copy())
+        diverged = self.diverged_step >= 0
+        total = np.where(diverged, DIVERGED_COST * self.horizon, self.totals)
+        mean = np.where(diverged, DIVERGED_COST, self.totals / max(self.step_index, 1))
+        return EpisodeCosts(mean=mean, total=total, diverged_step=self.diverged_step.copy())
 
 
 def grid_points(equation: Equation, n_z: int) -> int:

@@ -18,8 +18,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-import controller_node.reflex
-import pde_sim_node.reflex
+import controller_node.fast_path
+import pde_sim_node.fast_path
 from loop_interfaces.isolation import NETWORK, PROFILE, loopback_environment
 from loop_interfaces.problem import load_parameters
 from loop_interfaces.spec import ParameterError
@@ -54,8 +54,8 @@ def resolve(problem: str, options: Mapping[str, Any]) -> dict[str, Any]:
     notice.start()
     try:
         build_plant(values)
-        controller_node.reflex.load_compiled()
-        pde_sim_node.reflex.load_compiled()
+        controller_node.fast_path.load_compiled()
+        pde_sim_node.fast_path.load_compiled()
     finally:
         notice.cancel()
     physical = asdict(build_equation(values))

@@ -14,7 +14,6 @@ NODES = ("pde_sim_node", "controller_node", "tuner_node", "recorder_node", "view
 WITH_ROS = {
     "node.py",
     "node_loop.py",
-    "line.py",
     "sample_subscription.py",
     "polling.py",
     "peers.py",

@@ -1,315 +1,343 @@
-"""One subscription and one publisher inside compiled functions, without rclpy in between.
+"""One subscription and one publisher shared by the middleware's thread and the node's own thread.
 
-What rclpy does for a message, a WaitSet, `take` and `publish`, is a call each of rcl, ROS 2's C
-library, which is the same for every middleware. Within an episode a node does nothing else, so a
-compiled function may do it, round after round, and leave the interpreter out. Whatever is unusual
-goes back to rclpy: the message that was taken last is in `Line.message`.
+Only the middleware's thread takes from the subscription, in the callback with which the middleware
+announces a message (rcl_subscription_set_on_new_message_callback; one call at a time). While the
+channel is armed, compiled code answers the message at once. Otherwise it goes into a mailbox for the
+node's own thread::
 
-The thread of the middleware that receives a message deals with it, so that it need not wake another
-one (`attendance`). It and the node's own thread take turns. Four words say whose it is:
+    middleware's thread                            node's own thread
+      on_new_message:                                disarm:
+        while there is a message:                        armed = false
+            lock; take it                                lock; unlock
+            if not (armed and answered):             next_message:
+                armed = false                            lock; remove the oldest; unlock
+                put it into the mailbox              arm:
+                trigger the guard condition              lock
+            unlock                                       while the oldest is answered: remove it
+                                                         armed = the mailbox is empty
+                                                         unlock
 
-PENDING  messages that were announced since somebody last looked. Who counts it up from 0 has the
-         stream until it is 0 again; while the node's own thread has it, it stays above.
-ENDED    why no more messages are wanted, GOING while they are.
-STOP     the node's own thread asks for the stream.
-BACK     it has it.
+While the channel is armed, what the handler works on belongs to the middleware's thread; while it is
+not, to the node's, which arms it before it waits and disarms it when it wakes up. A message that has
+to wait disarms, so that later ones queue up behind it, and the channel is never armed before the
+mailbox is empty. The guard condition stays triggered until the node's thread has waited for it, so
+no message stays in the mailbox.
+
+The lock is a POSIX mutex: locking acquires, unlocking releases, on every architecture. What both
+threads touch is touched under it, but for the store with which `disarm` begins: it orders nothing,
+and sees to it that the node's thread waits for one answer only. `tests/test_channel_model.py`
+explores all interleavings.
+
+The mailbox is bounded. What it cannot hold is dropped and counted; lock-step sends it again.
 """
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import numba
 import numpy as np
-from numba import types
+from numba import carray, types  # type: ignore[attr-defined, unused-ignore]
+from numpy.typing import NDArray
 
-from loop_interfaces.jit.atomics import add, look, set_word
-from loop_interfaces.jit.cache import jit
-from loop_interfaces.jit.native import call_c
-from loop_interfaces.jit.simd import read_word, write_word
-from loop_interfaces.protocol import QUIET
+from loop_interfaces.jit import atomics, cache, native, simd
+from loop_interfaces.jit.atomics import look, set_word
+from loop_interfaces.jit.cache import fingerprint, jit, kept
+from loop_interfaces.jit.native import (
+    CLOCK,
+    MachineCode,
+    MonotonicClock,
+    address_of,
+    call_c,
+    monotonic_ns,
+)
+from loop_interfaces.jit.simd import read_word
+from loop_interfaces.ros.rcl import Allocator, SerializedMessage
 
-if TYPE_CHECKING:
-    from rclpy.node import Node
+__all__ = ["CAPACITY", "RclChannel", "load_compiled"]
 
-__all__ = [
-    "GOING",
-    "LINE",
-    "Doorbell",
-    "Ear",
-    "Line",
-    "announcement",
-    "attendance",
-    "monotonic_ns",
-    "received",
-    "send",
-]
-
-LINE = np.dtype(
+CHANNEL = np.dtype(
     [
-        # Addresses of functions of rcl,
-        ("clear", np.int64),  # rcl_wait_set_clear
-        ("add", np.int64),  # rcl_wait_set_add_subscription
-        ("add_guard", np.int64),  # rcl_wait_set_add_guard_condition
-        ("wait", np.int64),  # rcl_wait
+        # Addresses of functions of rcl and of the POSIX threads,
         ("take", np.int64),  # rcl_take_serialized_message
         ("publish", np.int64),  # rcl_publish_serialized_message
         ("trigger", np.int64),  # rcl_trigger_guard_condition
-        # and of libc,
-        ("gettime", np.int64),  # clock_gettime
-        # of rclpy's objects,
-        ("wait_set", np.int64),
+        ("lock", np.int64),  # pthread_mutex_lock
+        ("unlock", np.int64),  # pthread_mutex_unlock
+        # of the objects that they are called with,
         ("subscription", np.int64),
         ("publisher", np.int64),
         ("guard", np.int64),
-        # and of our own.
-        ("incoming", np.int64),  # an rcl_serialized_message_t
-        ("outgoing", np.int64),
-        ("moment", np.int64),  # a timespec
-        ("turns", np.int64),  # address of the four words
-        ("announces", np.int64),  # whether the middleware calls `announced`
+        ("mutex", np.int64),
+        ("answer", np.int64),  # the rcl_serialized_message_t that is published
+        ("clock", CLOCK),
+        # and of the handler, see RclChannel.
+        ("handle", np.int64),
+        ("plan", np.int64),
+        ("armed", np.int64),  # address of a word: whether the handler may answer
+        # The mailbox, a ring.
+        ("slots", np.int64),  # address of CAPACITY + 1 rcl_serialized_message_t
+        ("first", np.int64),  # slot of the message that has waited longest
+        ("waiting", np.int64),  # how many messages wait
+        ("dropped", np.int64),  # how many it could not hold
+        # What was answered since the channel was armed.
+        ("answered", np.int64),
+        ("answered_at", np.int64),  # the last one; ns on the monotonic clock
     ]
 )
-PENDING, ENDED, STOP, BACK = range(0, 32, 8)
-GOING = -1
-BUFFER, LENGTH = 0, 1
-"""Words of an rcl_serialized_message_t."""
-CLOCK_MONOTONIC = 1
-LONG = 100_000_000
-"""Nanoseconds; longer than a step that compiled functions do by themselves."""
+CAPACITY = 16
+"""Messages that the mailbox holds: twice what the middleware keeps for a reader of its own."""
+SLOTS = CAPACITY + 1
+SLOT_BYTES, BUFFER, LENGTH = 64, 0, 1
+"""Size of an rcl_serialized_message_t, and the two of its words that are used."""
+MUTEX_BYTES = 64
+"""At least sizeof(pthread_mutex_t): 40 on x86-64, 48 on aarch64."""
 
 
 @jit
-def monotonic_ns(line: Any) -> int:
-    """Nanoseconds on the clock of time.monotonic_ns."""
-    call_c(line.gettime, (CLOCK_MONOTONIC, line.moment))
-    nanoseconds: int = 1_000_000_000 * read_word(line.moment, 0) + read_word(line.moment, 1)
-    return nanoseconds
+def slot_after(channel: Any, messages: int) -> int:
+    """Address of the slot so many messages behind the first."""
+    slot: int = channel.slots + SLOT_BYTES * ((channel.first + messages) % SLOTS)
+    return slot
 
 
 @jit
-def take(line: Any) -> bool:
-    return bool(call_c(line.take, (line.subscription, line.incoming, 0, 0)) == 0)
+def lock(channel: Any) -> None:
+    call_c(channel.lock, (channel.mutex,))
 
 
 @jit
-def sleep(line: Any, until: int) -> None:
-    """Wait for the guard condition, and for a message if the middleware does not announce them."""
-    call_c(line.clear, (line.wait_set,))
-    if not line.announces:
-        call_c(line.add, (line.wait_set, line.subscription, 0))
-    call_c(line.add_guard, (line.wait_set, line.guard, 0))
-    # A time below zero would be for ever.
-    call_c(line.wait, (line.wait_set, max(until - monotonic_ns(line), 0)))
+def unlock(channel: Any) -> None:
+    call_c(channel.unlock, (channel.mutex,))
 
 
 @jit
-def wait(line: Any, until: int) -> bool:
-    """Take the next message; False if there is none until then on the clock of monotonic_ns."""
-    sleep(line, until)
-    return take(line)
+def answered(channel: Any, message: int) -> bool:
+    """Let the handler answer the message in a slot, and publish what it says."""
+    raw, length = read_word(message, BUFFER), read_word(message, LENGTH)
+    if call_c(channel.handle, (channel.plan, raw, length)) == 0:
+        return False
+    call_c(channel.publish, (channel.publisher, channel.answer, 0))
+    channel.answered += 1
+    channel.answered_at = monotonic_ns(channel.clock)
+    return True
 
 
 @jit
-def received(line: Any) -> tuple[int, int]:
-    """Address and length of the message that was taken last."""
-    return read_word(line.incoming, BUFFER), read_word(line.incoming, LENGTH)
+def put_into_mailbox(channel: Any) -> None:
+    """The message in the slot behind the last one has to wait."""
+    set_word(channel.armed, 0)
+    if channel.waiting < CAPACITY:
+        channel.waiting += 1
+    else:
+        channel.dropped += 1
+    call_c(channel.trigger, (channel.guard,))
 
 
 @jit
-def send(line: Any, message: int, length: int) -> None:
-    """Publish the serialised message at an address; it may be overwritten afterwards."""
-    write_word(line.outgoing, BUFFER, message)
-    write_word(line.outgoing, LENGTH, length)
-    call_c(line.publish, (line.publisher, line.outgoing, 0))
+def remove_oldest(channel: Any) -> None:
+    channel.first = (channel.first + 1) % SLOTS
+    channel.waiting -= 1
 
 
-def announcement(plan: Any) -> Any:
-    """Signature of machine code that is called with a kind of plan and a number of messages."""
-    plans = types.CPointer(numba.from_dtype(plan))  # type: ignore[no-untyped-call]
-    return types.void(plans, types.intp)
+@jit
+def on_message(channel: Any) -> bool:
+    """Take a message, and answer it or let it wait; False if there is none."""
+    lock(channel)
+    message = slot_after(channel, channel.waiting)
+    found = call_c(channel.take, (channel.subscription, message, 0, 0)) == 0
+    if found and not (look(channel.armed) == 1 and answered(channel, message)):
+        put_into_mailbox(channel)
+    unlock(channel)
+    return bool(found)
 
 
-def attendance(deal: Callable[[Any, Any], int]) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Compiled functions that have messages dealt with: `attend` and `announced`.
+def compile_on_new_message() -> Any:
+    channels_at = types.CPointer(numba.from_dtype(CHANNEL))  # type: ignore[no-untyped-call]
 
-    deal(line, plan): compiled, what to do with the message that was taken; GOING, or why it ends.
+    @numba.cfunc(types.void(channels_at, types.intp), cache=True)
+    def on_new_message(channels: Any, count: int) -> None:
+        SOURCES  # noqa: B018  # part of the key on disk
+        channel = carray(channels, 1)[0]
+        while on_message(channel):
+            pass
+
+    return on_new_message
+
+
+def compile_for_node(sources: str) -> tuple[Any, Any, Any, Any]:
+    """What the node's own thread calls."""
+
+    @kept
+    def disarm(channels: NDArray[np.void]) -> None:
+        sources  # noqa: B018  # closed over to be part of the key on disk
+        channel = channels[0]
+        set_word(channel.armed, 0)  # no answer is begun from here on
+        lock(channel)  # the one under way has been given
+        unlock(channel)
+
+    @kept
+    def arm(channels: NDArray[np.void]) -> bool:
+        """Answer what waits already; whether that was all, and it is armed."""
+        sources  # noqa: B018
+        channel = channels[0]
+        lock(channel)
+        channel.answered = 0
+        while channel.waiting > 0 and answered(channel, slot_after(channel, 0)):
+            remove_oldest(channel)
+        empty = channel.waiting == 0
+        set_word(channel.armed, 1 if empty else 0)
+        unlock(channel)
+        return bool(empty)
+
+    @kept
+    def oldest(channels: NDArray[np.void]) -> int:
+        """Address of the message that has waited longest; 0 if none waits."""
+        sources  # noqa: B018
+        channel = channels[0]
+        lock(channel)
+        message = slot_after(channel, 0) if channel.waiting > 0 else 0
+        unlock(channel)
+        return message
+
+    @kept
+    def pop(channels: NDArray[np.void]) -> None:
+        """The oldest message has been read."""
+        sources  # noqa: B018
+        channel = channels[0]
+        lock(channel)
+        remove_oldest(channel)
+        unlock(channel)
+
+    return disarm, arm, oldest, pop
+
+
+SOURCES = fingerprint(cache, simd, atomics, native)
+on_new_message = MachineCode(compile_on_new_message)
+disarm, arm, oldest, pop = compile_for_node(SOURCES)
+
+
+def load_compiled() -> None:
+    """Load what is compiled, or compile it."""
+    on_new_message()
+    channel = RclChannel(0, 0)
+    channel.arm()
+    channel.disarm()
+    channel.next_message()
+    pop(channel.record)
+
+
+class RclChannel:
+    """A subscription of rclpy that is answered on a publisher of rclpy.
+
+    All methods are for the node's own thread.
+
+    Parameters
+    ----------
+    handle
+        Address of machine code ``int handle(void *plan, const void *message, intptr_t length)``. It
+        fills in the answer and returns 1, or leaves the message alone and returns 0.
+    plan
+        Address that it is called with.
     """
 
-    @jit
-    def deal_with_all(line: Any, plan: Any) -> bool:
-        """As long as there are messages and they are wanted; whether that ends."""
-        turns, seen = line.turns, 1
-        while True:
-            while look(turns + ENDED) == GOING and look(turns + STOP) == 0 and take(line):
-                set_word(turns + ENDED, deal(line, plan))
-            if look(turns + ENDED) != GOING or look(turns + STOP) != 0:
-                return True  # what is pending stays, and so nobody else begins
-            seen = add(turns + PENDING, -seen) - seen
-            if seen == 0:
-                return False
+    def __init__(self, handle: int, plan: int) -> None:
+        self.record = np.zeros(1, CHANNEL)
+        self._channel = channel = self.record[0]
+        self._mutex = np.zeros(MUTEX_BYTES, np.uint8)
+        self._armed = np.zeros(1, np.int64)
+        self._clock = MonotonicClock(channel["clock"])
+        # rcl makes room in the slots, and only reads the answer.
+        self._slots = (SerializedMessage * SLOTS)()
+        self._answer = SerializedMessage()
+        self._held: tuple[Any, ...] = ()
+        self._dropped = 0
+        system = ctypes.CDLL(None)
+        channel["lock"] = address_of(system.pthread_mutex_lock)
+        channel["unlock"] = address_of(system.pthread_mutex_unlock)
+        channel["mutex"] = self._mutex.ctypes.data
+        channel["handle"], channel["plan"] = handle, plan
+        channel["armed"] = self._armed.ctypes.data
+        channel["answer"] = ctypes.addressof(self._answer)
+        channel["slots"] = ctypes.addressof(self._slots)
+        system.pthread_mutex_init.argtypes = [ctypes.c_void_p] * 2
+        system.pthread_mutex_init(self._mutex.ctypes.data, None)
 
-    @jit
-    def announced(line: Any, plan: Any) -> None:
-        """The middleware has a message, and calls in the thread that has received it."""
-        turns = line.turns
-        if add(turns + PENDING, 1) == 0 and deal_with_all(line, plan):
-            set_word(turns + BACK, 1)
-            call_c(line.trigger, (line.guard,))
+    def open(self, subscription: Any, publisher: Any, guard: Any) -> bool:
+        """From now on messages come here, and nobody else may take from the subscription.
 
-    @jit
-    def attend(line: Any, plan: Any, until: int) -> int:
-        """Until then on the clock of monotonic_ns, or as long as it goes; why it ends."""
-        if not line.announces:
-            ended = GOING
-            while ended == GOING:
-                ended = deal(line, plan) if wait(line, until) else QUIET
-            return ended
-        turns = line.turns
-        set_word(turns + ENDED, GOING)
-        set_word(turns + STOP, 0)
-        set_word(turns + BACK, 0)
-        if not deal_with_all(line, plan):
-            while look(turns + BACK) == 0:
-                sleep(line, until)
-                if look(turns + BACK) == 0:  # it is time, or something else has come
-                    set_word(turns + STOP, 1)
-                    if add(turns + PENDING, 1) == 0:
-                        break
-                    until = monotonic_ns(line) + LONG  # the other thread is about to give it back
-        ended = look(turns + ENDED)
-        return QUIET if ended == GOING else ended
+        subscription, publisher, guard: handles of rclpy's objects; the guard condition is triggered
+        when a message has to wait. False where the middleware does not announce messages.
 
-    return attend, announced
-
-
-class Doorbell:
-    """Messages of some subscriptions trigger a guard condition, which ends the waits of a `Line`.
-
-    So it need not wait for these subscriptions, each of which would cost with every wait. It is the
-    middleware that rings, in a thread of its own, with no interpreter. Close it before they are
-    destroyed. works: whether the middleware can do that.
-
-    Raises OSError or AttributeError where rcl is not to be had.
-    """
-
-    def __init__(self, subscriptions: Sequence[Any], guard: Any) -> None:
-        rcl = ctypes.CDLL("librcl.so")
-        self._listen = rcl.rcl_subscription_set_on_new_message_callback
-        self._listen.argtypes = [ctypes.c_void_p] * 3
-        self._subscriptions: Sequence[Any] = ()
-        # It is called with the guard condition and a number, which it does not look at.
-        trigger = address_of(rcl.rcl_trigger_guard_condition)
-        self.works = all(
-            self._listen(subscription.pointer, trigger, guard.pointer) == 0
-            for subscription in subscriptions
-        )
-        self._subscriptions = subscriptions
-
-    def close(self) -> None:
-        """From now on nothing rings."""
-        for subscription in self._subscriptions:
-            self._listen(subscription.pointer, None, None)
-        self._subscriptions = ()
-
-
-class Ear(NamedTuple):
-    """What a line is for.
-
-    line: an entry of LINE, for the line to fill in; announced: address of a function that calls
-    `announced`; plan: what it is called with, an address; and with how many messages there are.
-    """
-
-    line: Any
-    announced: int
-    plan: int
-
-
-class Line:
-    """Reads with one subscription and writes with one publisher of rclpy; a guard condition ends its
-    waits.
-
-    What it fills in is valid as long as this object and the node are. While compiled functions
-    `attend`, nobody else may use that subscription and publisher.
-
-    Raises OSError or AttributeError where rcl is not to be had.
-    """
-
-    def __init__(
-        self,
-        node: Node,
-        subscription: Any,
-        publisher: Any,
-        guard: Any,
-        ear: Ear,
-    ) -> None:
-        # Here, so that what only compares and fills in needs no ROS.
-        from rclpy.impl.implementation_singleton import rclpy_implementation
-
-        from loop_interfaces.ros.rcl import Allocator, SerializedMessage
-
+        Raises OSError or AttributeError where rcl is not to be had.
+        """
         rcl, rcutils = ctypes.CDLL("librcl.so"), ctypes.CDLL("librcutils.so")
         rcutils.rcutils_get_default_allocator.restype = Allocator
-        allocator = rcutils.rcutils_get_default_allocator()
-        # rcl makes room in the one, and only reads the other.
-        self._incoming, self._outgoing = (
-            SerializedMessage(None, 0, 0, allocator) for _ in range(2)
-        )
+        for slot in self._slots:
+            slot.allocator = rcutils.rcutils_get_default_allocator()
         self._free = rcutils.rcutils_uint8_array_fini
-        self._moment = np.zeros(2, np.int64)
-        self._turns = np.array([1, GOING, 0, 1])  # the node's own
-        self._wait_set = rclpy_implementation.WaitSet(1, 1, 0, 0, 0, 0, node.context.handle)
+        channel = self._channel
+        channel["take"] = address_of(rcl.rcl_take_serialized_message)
+        channel["publish"] = address_of(rcl.rcl_publish_serialized_message)
+        channel["trigger"] = address_of(rcl.rcl_trigger_guard_condition)
+        channel["subscription"], channel["publisher"] = subscription.pointer, publisher.pointer
+        channel["guard"] = guard.pointer
         self._held = subscription, publisher, guard
-        self._ear, self._record = ear, ear.line
-        record = self._record
-        for field, name in (
-            ("clear", "rcl_wait_set_clear"),
-            ("add", "rcl_wait_set_add_subscription"),
-            ("add_guard", "rcl_wait_set_add_guard_condition"),
-            ("wait", "rcl_wait"),
-            ("take", "rcl_take_serialized_message"),
-            ("publish", "rcl_publish_serialized_message"),
-            ("trigger", "rcl_trigger_guard_condition"),
-        ):
-            record[field] = address_of(getattr(rcl, name))
-        record["gettime"] = address_of(ctypes.CDLL(None).clock_gettime)
-        record["wait_set"] = self._wait_set.pointer
-        record["subscription"], record["publisher"] = subscription.pointer, publisher.pointer
-        record["guard"] = guard.pointer
-        record["incoming"] = ctypes.addressof(self._incoming)
-        record["outgoing"] = ctypes.addressof(self._outgoing)
-        record["moment"] = self._moment.ctypes.data
-        record["turns"] = self._turns.ctypes.data
         self._announce = rcl.rcl_subscription_set_on_new_message_callback
         self._announce.argtypes = [ctypes.c_void_p] * 3
-
-    def open(self) -> None:
-        """From now on the thread that receives a message deals with it, within `attend`. Close it
-        before the subscription is destroyed.
-        """
-        _, announced, plan = self._ear
-        subscription, *_ = self._held
-        self._record["announces"] = self._announce(subscription.pointer, announced, plan) == 0
+        code, _ = on_new_message()
+        opened: bool = self._announce(subscription.pointer, code, self.record.ctypes.data) == 0
+        if not opened:
+            self._held = ()
+        return opened
 
     def close(self) -> None:
-        """From now on the thread that attends does."""
-        if self._record["announces"]:
+        """No messages come any more. To be called before the subscription is destroyed."""
+        if self._held:
             subscription, *_ = self._held
             self._announce(subscription.pointer, None, None)
-            self._record["announces"] = 0
+            self._held = ()
 
-    def message(self) -> bytes:
-        """The message that was taken last."""
-        return ctypes.string_at(self._incoming.buffer, self._incoming.length)
+    def answer_with(self, begin: int, length: int) -> None:
+        """Where the answer is that the handler fills in. Only while the channel is not armed."""
+        self._answer.buffer, self._answer.length = begin, length
+
+    def arm(self) -> bool:
+        """Answer what waits, and from now on every message at once; False if one cannot be answered:
+        it waits, and the channel is not armed.
+        """
+        return bool(arm(self.record))
+
+    def disarm(self) -> tuple[int, float]:
+        """From now on every message waits. How many were answered since `arm`, and when the last one
+        was, in s on the clock of time.monotonic.
+        """
+        disarm(self.record)
+        return int(self._channel["answered"]), 1e-9 * float(self._channel["answered_at"])
+
+    @property
+    def waits(self) -> bool:
+        """Whether a message waits for the node's thread."""
+        return bool(oldest(self.record) != 0)
+
+    def next_message(self) -> bytes | None:
+        """The message that has waited longest. Only while the channel is not armed."""
+        message = oldest(self.record)
+        if message == 0:
+            return None
+        slot = SerializedMessage.from_address(message)
+        raw = ctypes.string_at(slot.buffer, slot.length)
+        pop(self.record)
+        return raw
+
+    def newly_dropped(self) -> int:
+        """How many messages the mailbox could not hold since the last call."""
+        dropped = int(self._channel["dropped"])
+        new, self._dropped = dropped - self._dropped, dropped
+        return new
 
     def __del__(self) -> None:
         if hasattr(self, "_free"):
-            self._free(ctypes.byref(self._incoming))
-
-
-def address_of(function: Any) -> int:
-    address = ctypes.cast(function, ctypes.c_void_p).value
-    assert address is not None
-    return address
+            for slot in self._slots:
+                self._free(ctypes.byref(slot))

@@ -1,14 +1,25 @@
 """Machine code by its address, inside compiled functions: what a C library or Numba's cfunc offers."""
 
+import ctypes
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from llvmlite import ir
 from numba import types
 
-from loop_interfaces.jit.simd import intrinsic
+from loop_interfaces.jit.cache import jit
+from loop_interfaces.jit.simd import intrinsic, read_word
 
-__all__ = ["MachineCode", "call_c"]
+__all__ = ["CLOCK", "MachineCode", "MonotonicClock", "address_of", "call_c", "monotonic_ns"]
+
+CLOCK = np.dtype(
+    [
+        ("gettime", np.int64),  # address of clock_gettime
+        ("timespec", np.int64),  # address of one
+    ]
+)
+CLOCK_MONOTONIC = 1
 
 WORD = ir.IntType(64)
 STATUS = ir.IntType(32)
@@ -43,3 +54,27 @@ class MachineCode:
             return self._code.address, False
         self._code = self._compile()
         return self._code.address, not self._code.cache_hits
+
+
+def address_of(function: Any) -> int:
+    """Address of a function of a ctypes library."""
+    address = ctypes.cast(function, ctypes.c_void_p).value
+    assert address is not None
+    return address
+
+
+@jit
+def monotonic_ns(clock: Any) -> int:
+    """Nanoseconds on the clock of time.monotonic_ns. clock: an entry of CLOCK."""
+    call_c(clock.gettime, (CLOCK_MONOTONIC, clock.timespec))
+    nanoseconds: int = 1_000_000_000 * read_word(clock.timespec, 0) + read_word(clock.timespec, 1)
+    return nanoseconds
+
+
+class MonotonicClock:
+    """What `monotonic_ns` needs. record: an entry of CLOCK, valid as long as this object."""
+
+    def __init__(self, record: Any) -> None:
+        self._timespec = np.zeros(2, np.int64)
+        record["gettime"] = address_of(ctypes.CDLL(None).clock_gettime)
+        record["timespec"] = self._timespec.ctypes.data

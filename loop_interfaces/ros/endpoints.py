@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from rclpy.callback_groups import CallbackGroup
@@ -28,9 +28,6 @@ from loop_interfaces.topics import (
     WRITER_DEPTH,
     Topic,
 )
-
-if TYPE_CHECKING:  # not every node needs the compiler
-    from loop_interfaces.fast_path.line import Line
 
 KEPT = 16
 """Bundles of samples that their writer keeps for a reader which lost one."""
@@ -217,34 +214,24 @@ class Sender:
         )
 
         # Past rclpy's wrapper, which locks the handle and looks at the type of every message.
-        self.publish: Callable[[bytes | bytearray], None] = self.publisher.handle.publish_raw
-        """Publishes serialised bytes, and nowhere else."""
+        self._publish: Callable[[bytes | bytearray], None] = self.publisher.handle.publish_raw
 
     def encoded(self, frame: Frame) -> bytes:
         """What `send` would publish."""
         return self._codec.encode(frame)
 
     def send(self, frame: Frame) -> None:
-        self.send_raw(self._codec.encode_into_own(frame), frame.time)
-
-    def send_raw(self, raw: bytearray, time: float) -> None:
-        """Send the bytes of a frame; they may be overwritten afterwards. time: of the frame, in s."""
-        self.publish(raw)
+        raw = self._codec.encode_into_own(frame)
+        self._publish(raw)
         bundler = self._bundler
         if bundler is not None and bundler.wanted:
-            bundler.add(STATE_KIND, bytes(raw), time if bundler.timed else NO_TIME)
-
-
-Flow = Callable[[int, int], tuple[int, int]]
-"""Deals with messages as they come in on a line, so many, until a point of time (monotonic ns); how
-many it were, and why it ends (protocol.MORE, ...)."""
+            bundler.add(STATE_KIND, bytes(raw), frame.time if bundler.timed else NO_TIME)
 
 
 class Receiver:
     """Takes frames from one topic and hands them to a callback, and their bytes to the bundler.
 
-    codec: decodes them; swift: is asked first, with the bytes alone, and returns whether it has dealt
-    with them; flow: deals with many of them by itself, on the line (NodeLoop.stream).
+    codec: decodes them.
     """
 
     def __init__(
@@ -257,9 +244,6 @@ class Receiver:
     ) -> None:
         self.callback = callback
         self.bundler = bundler
-        self.swift: Callable[[bytes], bool] | None = None
-        self.flow: Flow | None = None
-        self.line: Line | None = None
         self.codec = ArrayCodec(topic.labels)
         self.decode = self.codec.decode
         self.subscription = raw_subscription(

@@ -2,10 +2,10 @@
 
 The hot path takes serialised bytes from the middleware, decodes them with one `frombuffer`, and
 publishes bytes; it is driven by a WaitSet of the node's array subscriptions alone. Within an episode
-compiled functions do that for many messages in a row (`stream`). Parameter
-services, timers and whatever else the node has are served by an ordinary executor now and then
-(`HOUSEKEEPING`), off the critical path. Array subscriptions sit in a callback group that the
-executor never runs, so both can share one node and ROS tools see one node.
+the messages of one topic can be answered where they arrive, while this thread waits
+(`answer_fast`). Parameter services, timers and whatever else the node has are served by an ordinary
+executor now and then (`HOUSEKEEPING`), off the critical path. Array subscriptions sit in a callback
+group that the executor never runs, so both can share one node and ROS tools see one node.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
@@ -26,8 +26,7 @@ from std_msgs.msg import Float64MultiArray
 from loop_interfaces.affinity import pin_process
 from loop_interfaces.diagnostics import Health
 from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.protocol import MORE, OTHER, UNABLE
-from loop_interfaces.ros.endpoints import Bundler, Flow, Receiver, Sender, reader_qos, scoped
+from loop_interfaces.ros.endpoints import Bundler, Receiver, Sender, reader_qos, scoped
 from loop_interfaces.ros.introspection import Introspection
 from loop_interfaces.ros.sample_subscription import Watcher
 from loop_interfaces.ros.suspend_watchdog import Pulse
@@ -35,7 +34,7 @@ from loop_interfaces.samples import ACTION_KIND, STATE_KIND
 from loop_interfaces.topics import ACTION, SAMPLES, STATE, Topic
 
 if TYPE_CHECKING:  # not every node needs the compiler
-    from loop_interfaces.fast_path.line import Ear
+    from loop_interfaces.fast_path.handler import FastPath
 
 HOUSEKEEPING = 0.05
 """Seconds between two rounds of the executor and of the node's slow duties."""
@@ -43,14 +42,8 @@ BUSY_HOUSEKEEPING = 0.2
 """The same while messages stream through: a round of the executor costs as much as ten of them."""
 BUSY = 20
 """Messages since the last round that make a stream."""
-STREAM = 0.002
-"""Seconds without a message after which a stream of them has ended, where no `Doorbell` tells that
-something else has come. Until then nothing else is waited for: every further subscription in a WaitSet
-costs, and within an episode nothing comes there."""
 STUCK = 0.5
 """Seconds in which the loop goes round at least once, unless it computes."""
-ROUNDS = 1000
-"""Messages of a stream that compiled functions deal with before the node looks around."""
 SUSPENDED = 2.0
 """Seconds without being scheduled after which a process takes its peers to have dropped it.
 
@@ -68,6 +61,14 @@ class _Watched:
     )
 
 
+class _Fast(NamedTuple):
+    """A topic that is answered on another where its messages arrive."""
+
+    receiver: Receiver
+    sender: Sender
+    path: FastPath
+
+
 class NodeLoop:
     """Runs one node until it is told to stop.
 
@@ -82,10 +83,9 @@ class NodeLoop:
         self._bundler: Bundler | None = None
         self._watched: dict[str, _Watched] = {}
         self._stop_reason: str | None = None
-        self._stream: Receiver | None = None
-        """The one whose messages stream in, as long as they do: the only one to wait for."""
+        self._fast: _Fast | None = None
         self._guard = _rclpy.GuardCondition(node.context.handle)
-        """Ends a wait: see `_look_after`."""
+        """Ends a wait: see `_look_after`, and RclChannel."""
         self._turned = time.monotonic()
         """When the loop last went round."""
         self.suspended = False
@@ -122,27 +122,13 @@ class NodeLoop:
         self._receivers.append(receiver)
         return receiver
 
-    def stream(self, receiver: Receiver, sender: Sender, flow: Flow, ear: Ear) -> None:
-        """Let `flow` deal with the messages of `receiver` while they stream in; it answers on `sender`.
+    def answer_fast(self, receiver: Receiver, sender: Sender, path: FastPath) -> None:
+        """Let `path` answer messages of `receiver` on `sender` while this thread waits.
 
-        ear: what it wants of a line to both.
-
-        Where rcl is not to be had, `receiver.swift` goes on alone.
+        Where rcl is not to be had, or the middleware does not announce messages, all of them go the
+        ordinary way.
         """
-        from loop_interfaces.fast_path.line import Line  # not every node needs the compiler
-
-        try:
-            line = Line(
-                self.node,
-                receiver.handle,
-                sender.publisher.handle,
-                self._guard,
-                ear,
-            )
-        except (OSError, AttributeError) as error:
-            self.node.get_logger().warning(f"the loop is slower than it could be: {error}")
-            return
-        receiver.line, receiver.flow = line, flow
+        self._fast = _Fast(receiver, sender, path)
 
     def observe(self, topic: Topic, callback: Callable[[Frame], None], namespace: str = "") -> None:
         """Call `callback` with every state or action, without taking part in the loop.
@@ -223,42 +209,37 @@ class NodeLoop:
         every HOUSEKEEPING seconds, or BUSY_HOUSEKEEPING.
         """
         self._turned = self.now()
-        with Pulse(self._look_after) as pulse, self._doorbell() as told:
-            patience = HOUSEKEEPING if told else STREAM
-            return self._handle_events(pulse, patience, tick, deadline, housekeeping)
+        with Pulse(self._look_after) as pulse, self._fast_path_open() as fast:
+            return self._handle_events(pulse, fast, tick, deadline, housekeeping)
 
     @contextmanager
-    def _doorbell(self) -> Iterator[bool]:
-        """Whether the waits of a stream end with a message of any other subscription."""
-        lines = [receiver.line for receiver in self._receivers if receiver.line]
-        if not lines:
-            yield False
+    def _fast_path_open(self) -> Iterator[_Fast | None]:
+        """The fast path, if there is one and it works here."""
+        fast, opened = self._fast, False
+        if fast is None:
+            yield None
             return
-        from loop_interfaces.fast_path.line import Doorbell
-
-        others = [receiver.handle for receiver in self._receivers if not receiver.line]
-        doorbell = Doorbell(others, self._guard)
-        for line in lines:
-            line.open()
+        channel = fast.path.channel
         try:
-            yield doorbell.works
+            opened = channel.open(fast.receiver.handle, fast.sender.publisher.handle, self._guard)
+        except (OSError, AttributeError) as error:
+            self.node.get_logger().warning(f"the loop is slower than it could be: {error}")
+        try:
+            yield fast if opened else None
         finally:
-            for line in lines:
-                line.close()
-            doorbell.close()
+            channel.close()
 
     def _handle_events(
         self,
         pulse: Pulse,
-        patience: float,
+        fast: _Fast | None,
         tick: Callable[[float], None],
         deadline: Callable[[], float | None],
         housekeeping: Callable[[float], None],
     ) -> str:
         context = self.node.context
         clock = time.monotonic
-        handles, take_from = self._sources()
-        self._stream = None
+        handles, take_from = self._sources(fast)
         wait_set = _rclpy.WaitSet(
             len(handles) + 2 * len(self._watched), 1, 0, 0, 0, 0, context.handle
         )
@@ -274,13 +255,12 @@ class NodeLoop:
                 if pulse.longest() > SUSPENDED:
                     self.suspended = True
                     return "suspended"
-                self._stream = None
                 self._executor.spin_once(timeout_sec=0)
                 if self._bundler is not None:
                     self._bundler.look(now)
                 changed = [watched.watcher.look() for watched in self._watched.values()]
                 if any(changed):
-                    handles, take_from = self._sources()
+                    handles, take_from = self._sources(fast)
                 housekeeping(now)
                 self._report(now)
                 self._introspection.round(now)
@@ -295,25 +275,17 @@ class NodeLoop:
             wake = min(next_round, now + HOUSEKEEPING)
             if due is not None:
                 wake = min(wake, due)
-            stream, self._stream = self._stream, None
-            if stream is not None:
-                wake = min(wake, now + patience)
-                dealt_with = self._flow(stream, wake)
-                if dealt_with is not None:
-                    handled += dealt_with
-                    continue
+            if fast is not None and not fast.path.arm():
+                handled += self._take_waiting(fast)
+                continue
             clear()
             wait_set.add_guard_condition(self._guard)
-            if stream is not None:
-                add(stream.handle)
-                wait(int((wake - now) * 1e9))
-                taken = self._take(stream)
-            else:
-                for handle in handles:
-                    add(handle)
-                wait(int((wake - now) * 1e9))
-                taken = sum(take_from[pointer]() for pointer in ready("subscription"))
-            handled += taken
+            for handle in handles:
+                add(handle)
+            wait(int((wake - now) * 1e9))
+            if fast is not None:
+                handled += fast.path.disarm()
+            handled += sum(take_from[pointer]() for pointer in ready("subscription"))
         return self._stop_reason or "shutdown"
 
     def _look_after(self) -> None:
@@ -327,7 +299,7 @@ class NodeLoop:
             self._introspection.round_while_working(now)
             self._guard.trigger_guard_condition()
 
-    def _sources(self) -> tuple[list[Any], dict[int, Callable[[], int]]]:
+    def _sources(self, fast: _Fast | None) -> tuple[list[Any], dict[int, Callable[[], int]]]:
         """What to wait for, and what takes from it; the watched ones first: a cost comes after
         the samples of its episode, and is to be handled after them.
         """
@@ -336,25 +308,11 @@ class NodeLoop:
             for handle in watched.watcher.handles:
                 found[handle.pointer] = (handle, partial(self._drain, watched))
         for receiver in self._receivers:
+            if fast is not None and receiver is fast.receiver:
+                continue
             found[receiver.handle.pointer] = (receiver.handle, partial(self._take, receiver))
         handles = [handle for handle, _ in found.values()]
         return handles, {pointer: take for pointer, (_, take) in found.items()}
-
-    def _flow(self, stream: Receiver, until: float) -> int | None:
-        """Let a stream flow: how many messages that were; None where it cannot."""
-        if stream.line is None or stream.flow is None:
-            return None
-        count, ended = stream.flow(ROUNDS, int(until * 1e9))
-        if ended == UNABLE:
-            return None
-        if ended == MORE:
-            self._stream = stream
-            return count
-        if ended == OTHER:
-            count += self._handle(stream, stream.line.message())
-        # Where the middleware's thread has taken a message, it believes that one is there until
-        # somebody looks for the next.
-        return count + self._take(stream)
 
     def _take(self, receiver: Receiver) -> int:
         """Handle the next message of `receiver`; how many there were."""
@@ -366,15 +324,20 @@ class NodeLoop:
         bundler = receiver.bundler
         if bundler is not None and bundler.wanted:
             bundler.add(ACTION_KIND, raw)
-        if receiver.swift is not None and receiver.swift(raw):
-            self._stream = receiver
-            return 1
-        self._stream = None
         try:
             receiver.callback(receiver.decode(raw))
         except ValueError as error:
             self._refuse(receiver.name, error)
         return 1
+
+    def _take_waiting(self, fast: _Fast) -> int:
+        """Handle the message that has waited longest; how many there were."""
+        channel = fast.path.channel
+        if dropped := channel.newly_dropped():
+            self._last_reason = f"{fast.receiver.name}: came while too many others waited"
+            self.refused[self._last_reason] += dropped
+        raw = channel.next_message()
+        return 0 if raw is None else self._handle(fast.receiver, raw)
 
     def _drain(self, watched: _Watched) -> int:
         """Handle all samples that have come in; how many."""

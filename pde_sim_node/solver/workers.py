@@ -3,8 +3,8 @@
 import os
 import time
 from _thread import LockType
-from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Collection
+from contextlib import suppress
 from threading import Lock, Thread
 from typing import Any
 
@@ -111,24 +111,24 @@ class PlanTeam:
             return None
         return self._code, self._addresses[0], 0, 1
 
-    @contextmanager
-    def helping(self, machines: NDArray[np.void]) -> Iterator[None]:
-        """Let helpers take pieces of what `step_context.step_together` does meanwhile.
+    def call_helpers(self, machines: NDArray[np.void]) -> None:
+        """From now on helpers take pieces of what `step_context.step_together` does, until they are
+        dismissed.
 
         machines: one entry of MACHINE.
         """
         record = machines[0]
         if not record["board"]:
-            yield
             return
         record["turn"], record["over"] = self._turn, 0
         shut(self._board.ctypes.data, self._turn)
         self._crew.call(
             lambda thread: stand_by(machines, self._addresses[thread]), record["pieces"] - 1
         )
-        try:
-            yield
-        finally:
+
+    def dismiss_helpers(self, machines: NDArray[np.void]) -> None:
+        record = machines[0]
+        if record["board"]:
             record["over"] = 1
             self._crew.dismiss()
             self._turn = int(record["turn"])

@@ -1,4 +1,4 @@
-"""Plant and controller in compiled functions on a line: the same bytes, and their business only."""
+"""The fast paths of plant and controller: the same bytes, and the expected messages only."""
 
 from __future__ import annotations
 
@@ -15,37 +15,40 @@ from tests.topics.test_loop import LIMIT, assert_same_training, in_process, tune
 pytestmark = pytest.mark.topics
 
 
-def test_plant_and_controller_flow_with_the_bytes_of_the_long_way(loop: Processes) -> None:
-    text = loop.wait(loop.start("-m", "tests.flow_program", name="flow"), LIMIT)
+def test_plant_and_controller_answer_with_the_bytes_of_the_ordinary_path(loop: Processes) -> None:
+    text = loop.wait(loop.start("-m", "tests.fast_path_program", name="fast_path"), LIMIT)
     assert text.splitlines()[-1] == "done"  # the first to compile says so before
 
 
 RESTLESS = """
-import gc, sys, time
+import gc, math, sys, time
+from loop_interfaces.fast_path.handler import FastPath
+from loop_interfaces.protocol import Tally
 from loop_interfaces.ros.node_loop import NodeLoop
-from loop_interfaces.protocol import QUIET, Tally
 from {0}.node import main
-from {0}.reflex import Reflex
-taken_back, flow, patient = [], Reflex.flow, NodeLoop._flow
-def restless(self, stream, until):
-    return patient(self, stream, min(until, time.monotonic() + 0.0003))
-def counted(self, *arguments):
-    count, ended = flow(self, *arguments)
-    if count and ended == QUIET:
-        taken_back.append(count)
-    return count, ended
-Reflex.flow, NodeLoop._flow = counted, restless
+interrupted, disarm, run = [], FastPath.disarm, NodeLoop.run
+def restless(self, *, deadline, **others):
+    def soon():
+        due = deadline()
+        return min(math.inf if due is None else due, time.monotonic() + 0.0003)
+    return run(self, deadline=soon, **others)
+def counted(self):
+    count = disarm(self)
+    if count:
+        interrupted.append(count)
+    return count
+FastPath.disarm, NodeLoop.run = counted, restless
 code = main()
 tallies = [found for found in gc.get_objects() if isinstance(found, Tally)]
-print("taken back", len(taken_back), "times,", sum(t["states repeated"] for t in tallies), "repeated")
+print("interrupted", len(interrupted), "times,", sum(t["states repeated"] for t in tallies), "repeated")
 sys.exit(code)
 """
 
 
-def test_a_stream_that_changes_hands_all_the_time_loses_nothing(
+def test_a_protocol_that_changes_hands_all_the_time_loses_nothing(
     loop: Processes, tmp_path: Path
 ) -> None:
-    """The node's own thread takes it back every 0.3 ms, in the middle of whatever the other does."""
+    """The node's own thread wakes up every 0.3 ms, in the middle of whatever the other does."""
     patience = ("-p", "action_timeout:=10.0")  # what is lost is repeated, and seen
     arguments = ("--ros-args", "--params-file", str(SMALL), *patience)
     nodes = [
@@ -58,6 +61,6 @@ def test_a_stream_that_changes_hands_all_the_time_loses_nothing(
     for node in nodes:
         node.send_signal(signal.SIGTERM)
         said = loop.wait(node, 10.0)
-        ((count, repeated),) = re.findall(r"taken back (\d+) times, (\d+) repeated", said)
+        ((count, repeated),) = re.findall(r"interrupted (\d+) times, (\d+) repeated", said)
         assert int(count) > 500
         assert int(repeated) == 0

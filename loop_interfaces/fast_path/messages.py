@@ -1,7 +1,7 @@
-"""Messages of the loop as bytes, inside compiled functions (see `frames` for what is in them).
+"""Serialised messages of the loop inside compiled functions (see `frames` for their format).
 
 Within an episode a peer sends the same prefix and the same run, episode and plant in every message.
-Who knows them can take such a message with a few comparisons, and leaves everything else to
+They are compared with the bytes and numbers that are expected. Whatever differs is left to
 `frames.ArrayCodec`.
 """
 
@@ -12,18 +12,20 @@ import struct
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from loop_interfaces.frames import HEADER, ArrayCodec, Frame
 from loop_interfaces.jit.cache import jit
 from loop_interfaces.jit.simd import (
     WIDTH,
     lane_sum,
+    load,
     peek,
     peek_lanes,
     peek_word,
     poke,
+    poke_lanes,
     poke_word,
+    read,
     splat,
 )
 from loop_interfaces.samples import SAMPLE_HEADER
@@ -34,10 +36,12 @@ __all__ = [
     "FIRST",
     "STEP",
     "TIME",
-    "Expectation",
+    "ExpectedMessage",
     "OwnMessage",
     "append",
     "expected_header",
+    "full",
+    "write_answer",
 ]
 
 RUN, EPISODE, STEP, TIME, PLANT, FIRST = range(HEADER + 1)
@@ -113,45 +117,60 @@ def append(bundle: Any, kind: int, stamp: int, time: float, raw: int, length: in
     bundle.end = at + length
 
 
-class Expectation:
-    """What is expected, learnt from a message that was decoded.
+@jit
+def full(bundle: Any) -> bool:
+    """Whether the bundle should be sent."""
+    return bool(bundle.open and bundle.end >= bundle.limit)
 
-    expected: the record that `expected_header` wants, filled in by `learn`.
-    """
 
-    def __init__(self, expected: np.void) -> None:
-        self._expected = expected
-        self._prefix: NDArray[np.uint8] | None = None
+class ExpectedMessage:
+    """Fills in the record that `expected_header` compares with, an entry of EXPECTED."""
 
-    def learn(self, codec: ArrayCodec, frame: Frame) -> bool:
-        """Expect more of the messages of which `codec` has decoded `frame`; False if it cannot."""
-        prefix = codec.prefix
-        if prefix is None or len(prefix) < 8:
+    def __init__(self, record: np.void) -> None:
+        self._record = record
+        self._prefix = np.zeros(0, np.uint8)
+
+    def set(self, prefix: bytes, like: Frame, shape: tuple[int, ...]) -> bool:
+        """Expect messages with a prefix, the ids of `like` and values of a shape; False if the prefix
+        is none that `expected_header` can compare.
+        """
+        if len(prefix) < 8:
             return False
         self._prefix = np.frombuffer(prefix, np.uint8)
-        expected = self._expected
-        expected["prefix"], expected["start"] = self._prefix.ctypes.data, len(prefix)
-        expected["values"] = frame.values.size
-        expected["run"], expected["episode"] = frame.run, frame.episode
-        expected["plant"] = frame.plant
+        record = self._record
+        record["prefix"], record["start"] = self._prefix.ctypes.data, len(prefix)
+        record["values"] = math.prod(shape)
+        record["run"], record["episode"], record["plant"] = like.run, like.episode, like.plant
         return True
 
 
 class OwnMessage:
     """A message in memory of its own, to be filled in by compiled code and sent again and again.
 
-    raw: its bytes; begin: their address; address: of its header.
+    raw: its bytes; begin: their address; header: address of its header; shape: of its values.
     """
 
     def __init__(self, codec: ArrayCodec, frame: Frame) -> None:
         self.raw = bytearray(codec.encode(frame))
-        start = len(self.raw) - 8 * (HEADER + math.prod(frame.values.shape))
+        self._start = len(self.raw) - 8 * (HEADER + math.prod(frame.values.shape))
         self._held = np.frombuffer(self.raw, np.uint8)
         self.begin = self._held.ctypes.data
-        self.address = self.begin + start
-        self._start, self.shape = start, frame.values.shape
+        self.header = self.begin + self._start
+        self.shape = frame.values.shape
 
     def address_to(self, frame: Frame) -> None:
         """Take over run, episode and plant."""
         struct.pack_into("<2d", self.raw, self._start, frame.run, frame.episode)
         struct.pack_into("<d", self.raw, self._start + 8 * PLANT, frame.plant)
+
+
+@jit
+def write_answer(head: int, step: int, time: float, values: int, count: int) -> None:
+    """Fill in step, time and values, an array at an address, of an own message."""
+    poke(head, STEP, step)
+    poke(head, TIME, time)
+    last = count % WIDTH
+    for i in range(0, count - last, WIDTH):
+        poke_lanes(head, FIRST + i, load(values, i))
+    for i in range(count - last, count):
+        poke(head, FIRST + i, read(values, i))

@@ -1,20 +1,24 @@
-"""The short way from bytes to bytes: the same bytes as the long one, and only where it may."""
+"""The fast path from bytes to bytes: the same bytes as the ordinary one, and only where it may."""
 
 from __future__ import annotations
 
+import ctypes
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from controller_node.fast_path import ControllerFastPath
 from controller_node.identification import DesignSettings
-from controller_node.reflex import Reflex as ControllerReflex
 from controller_node.responder import Responder
 from loop_interfaces import model_rows
 from loop_interfaces.frames import HEADER, ArrayCodec, Frame
 from loop_interfaces.topics import ACTION, COST, STATE, VOID, CostColumn
-from pde_sim_node.reflex import Reflex as PlantReflex
+from pde_sim_node.fast_path import PlantFastPath
 from tests.test_lockstep import PLANT, RUN, plant_protocol
 
 N_Z, N_S, N_A = 37, 5, 3
@@ -27,8 +31,36 @@ def with_number(raw: bytes, values: int, place: int, number: float) -> bytes:
     return raw[:at] + struct.pack("<d", number) + raw[at + 8 :]
 
 
+@contextmanager
+def armed(path: Any, now: float = 0.0) -> Iterator[Any]:
+    """As while the node's thread waits: a function from a message to its answer, or to None.
+
+    now: when it ends.
+    """
+    kind = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_ssize_t)
+    handle, prepared, count = kind(path.handle), path.prepare(), 0
+
+    def answer(raw: bytes) -> bytes | None:
+        nonlocal count
+        if not prepared or not handle(path.plans.ctypes.data, raw, len(raw)):
+            return None
+        count += 1
+        return bytes(path.answer.raw)
+
+    yield answer
+    if prepared:
+        path.synchronise(count, now)
+
+
+def fast(path: Any, raw: bytes, now: float = 0.0) -> bytes | None:
+    """The answer to one message on the fast path; None: it goes the ordinary way."""
+    with armed(path, now) as answer:
+        found: bytes | None = answer(raw)
+        return found
+
+
 class Controller:
-    """A responder in the middle of an episode, with its reflex and the codecs of its peer."""
+    """A responder in the middle of an episode, with its fast path and the codecs of its peer."""
 
     def __init__(self, batch: int, *, limit: float = 0.0) -> None:
         self.settings = DesignSettings(
@@ -64,7 +96,7 @@ class Controller:
             ArrayCodec(STATE.labels),
             ArrayCodec(ACTION.labels),
         )
-        self.reflex = ControllerReflex(self.responder, self.own)
+        self.path = ControllerFastPath(self.responder, self.own)
 
     def begin(self, episode: int) -> None:
         rows = np.zeros((self.batch, 4))
@@ -78,11 +110,10 @@ class Controller:
         values = RNG.standard_normal((self.batch, N_Z))
         return self.peer.encode(Frame(run, episode, step, 0.1 * step, values, PLANT))
 
-    def long_way(self, raw: bytes) -> bytes:
+    def ordinary(self, raw: bytes) -> bytes:
         frame = self.own.decode(raw)
-        self.reflex.forget()
         (send,) = self.responder.state(frame)
-        self.reflex.learn(frame)
+        self.path.last_state = frame
         return self.sent.encode(send.frame)
 
     def expected(self, raw: bytes) -> bytes:
@@ -97,24 +128,24 @@ def test_a_controller_answers_with_the_same_bytes(batch: int, limit: float) -> N
     for episode in (4, 5, 9):
         controller.begin(episode)
         first = controller.state(episode, 0)
-        assert controller.reflex(first) is None
-        assert controller.long_way(first) == controller.expected(first)
+        assert fast(controller.path, first) is None
+        assert controller.ordinary(first) == controller.expected(first)
         for step in range(1, 6):
             raw = controller.state(episode, step)
-            found = controller.reflex(raw)
-            assert found is not None
-            assert bytes(found) == controller.expected(raw)
-            assert controller.reflex(raw) == found  # asked again: answered the same
+            with armed(controller.path) as answer:
+                assert answer(raw) == answer(raw) == controller.expected(raw)
     if limit:
-        assert abs(ArrayCodec(ACTION.labels).decode(bytes(found)).values).max() == limit
+        found = fast(controller.path, raw)
+        assert found is not None
+        assert abs(ArrayCodec(ACTION.labels).decode(found).values).max() == limit
 
 
-def test_a_controller_takes_the_long_way_with_everything_else() -> None:
+def test_a_controller_leaves_everything_else_to_the_responder() -> None:
     controller = Controller(3)
     controller.begin(4)
     good = controller.state(4, 1)
-    controller.long_way(controller.state(4, 0))
-    assert controller.reflex(good)
+    controller.ordinary(controller.state(4, 0))
+    assert fast(controller.path, good)
     RUN_AT, EPISODE_AT, STEP_AT, TIME_AT, PLANT_AT = range(HEADER)
     for place, number in (
         (RUN_AT, RUN + 1.0),
@@ -130,38 +161,60 @@ def test_a_controller_takes_the_long_way_with_everything_else() -> None:
         (HEADER + 50, -np.inf),
         (-1, np.nan),
     ):
-        assert controller.reflex(with_number(good, 3 * N_Z, place, number)) is None, (place, number)
+        assert fast(controller.path, with_number(good, 3 * N_Z, place, number)) is None, place
     others = Controller(4)
     for raw in (b"", good[:-8], good + bytes(8), good[:4], others.state(4, 1)):
-        assert controller.reflex(raw) is None
+        assert fast(controller.path, raw) is None
     # Padding of ordinary message objects is undefined; the labels themselves are not.
-    assert controller.reflex(good.replace(b"env", b"enw", 1)) is None
-    assert controller.reflex(good)
+    assert fast(controller.path, good.replace(b"env", b"enw", 1)) is None
+    assert fast(controller.path, good)
 
 
-def test_a_controller_forgets_with_every_other_message_and_counts_what_it_answered() -> None:
+def test_a_responder_knows_what_was_answered_and_what_it_was_told_since_counts() -> None:
     controller = Controller(2)
     controller.begin(4)
-    controller.long_way(controller.state(4, 0))
-    for step in range(1, 8):
-        assert controller.reflex(controller.state(4, step))
-    assert (controller.responder.answered, controller.responder.step) == (1, 0)
-    controller.reflex.settle()
+    controller.ordinary(controller.state(4, 0))
+    with armed(controller.path) as answer:
+        assert all(answer(controller.state(4, step)) for step in range(1, 8))
+        assert (controller.responder.answered, controller.responder.step) == (1, 0)
     assert (controller.responder.answered, controller.responder.step) == (8, 7)
-    controller.reflex.forget()
-    assert controller.reflex(controller.state(4, 8)) is None
+    # A state that waits for its policy has to be answered first, and new policies taken.
+    controller.begin(5)
+    controller.ordinary(controller.state(5, 0))
+    controller.responder.start(Frame(RUN, 6, 0, 0.0, np.array([[0.0, -1.0, 0.0, 0.0]] * 2)))
+    assert fast(controller.path, controller.state(5, 1)) is None
+    controller.begin(7)
+    controller.ordinary(controller.state(7, 0))
+    policies = RNG.standard_normal((2, N_A, 2 * N_S))
+    for responder in (controller.responder, controller.judge):
+        responder.policy(Frame(RUN, 7, 0, 0.0, policies))
+    assert fast(controller.path, raw := controller.state(7, 1)) is None
+    assert controller.ordinary(raw) == controller.expected(raw)
+    assert fast(controller.path, raw := controller.state(7, 2)) == controller.expected(raw)
     # Where the controller explores there is no law.
     rows = np.array([[0.0, 3.0, 0.1, 0.0]] * 2)
-    controller.responder.start(Frame(RUN, 5, 0, 0.0, rows))
-    controller.long_way(controller.state(5, 0))
-    assert controller.reflex(controller.state(5, 1)) is None
-    assert controller.responder.answered == 9
+    controller.responder.start(Frame(RUN, 8, 0, 0.0, rows))
+    controller.ordinary(controller.state(8, 0))
+    assert fast(controller.path, controller.state(8, 1)) is None
+    assert controller.responder.answered == 13
+
+
+class NoSamples:
+    """Nobody records or looks."""
+
+    timed = False
+
+    def lend(self, records: Any, room: int) -> None:
+        records["open"] = 0
+
+    def settle(self, records: Any, sizes: Any, count: int) -> None:
+        pass
 
 
 class Plant:
-    """A lock-step with its reflex, and one that only goes the long way."""
+    """A lock-step with its fast path, and one that only goes the ordinary way."""
 
-    def __init__(self, **overrides: object) -> None:
+    def __init__(self, bundler: Any = None, **overrides: object) -> None:
         self.now = 0.0
         self.lockstep, self.judge = (plant_protocol(**overrides) for _ in range(2))
         self.peer, self.own, self.sent = (
@@ -169,7 +222,7 @@ class Plant:
             ArrayCodec(ACTION.labels),
             ArrayCodec(STATE.labels),
         )
-        self.reflex = PlantReflex(self.lockstep, self.own)
+        self.path = PlantFastPath(self.lockstep, self.own, bundler or NoSamples())
 
     def begin(self, episode: int, seeds: tuple[int, ...]) -> Frame:
         rows = np.zeros((len(seeds), 4))
@@ -182,10 +235,8 @@ class Plant:
         values = 0.1 * RNG.standard_normal((len(state.values), 4))
         return self.peer.encode(replace(state, values=values))
 
-    def long_way(self, raw: bytes) -> Frame:
-        frame = self.own.decode(raw)
-        (send,) = self.lockstep.action(frame, self.now)
-        self.reflex.learn(frame)
+    def ordinary(self, raw: bytes) -> Frame:
+        (send,) = self.lockstep.action(self.own.decode(raw), self.now)
         return send.frame
 
     def expected(self, raw: bytes) -> tuple[object, Frame]:
@@ -193,39 +244,37 @@ class Plant:
         return send.topic, send.frame
 
 
-@pytest.mark.parametrize(
-    "overrides",
-    [
-        {},
-        {"measurement_noise": 0.1, "process_noise": 0.01, "action_limit": 0.05},
-        {"sensors": 5, "sensor_delays": 3},
-    ],
-)
-def test_a_plant_goes_on_with_the_same_bytes(overrides: dict) -> None:
+@pytest.mark.parametrize("overrides", [{}, {"horizon": 12, "n_z": 48}])
+@pytest.mark.parametrize("at_once", [1, 3])
+def test_a_plant_goes_on_with_the_same_bytes(overrides: dict, at_once: int) -> None:
+    """at_once: actions between two looks of the lock-step."""
     plant = Plant(**overrides)
-    for episode, seeds in ((1, (3, 4)), (2, (5, 6)), (7, (1, 2, 3))):
+    for episode, seeds in ((1, (3, 4)), (2, (5, 6)), (7, (1, 2, 3)), (8, (1, 2, 3))):
         state = plant.begin(episode, seeds)
-        short = 0
-        while True:
+        taken = 0
+        while plant.lockstep.active:
             plant.now += 0.01
-            raw = plant.action(state)
-            topic, expected = plant.expected(raw)
-            found = plant.reflex(raw, plant.now)
-            if topic is COST:
-                assert found is None
-                cost = plant.long_way(raw)
-                assert cost.values.tobytes() == expected.values.tobytes()
-                break
+            with armed(plant.path, plant.now) as answer:
+                for _ in range(at_once):
+                    raw = plant.action(state)
+                    topic, expected = plant.expected(raw)
+                    found = answer(raw)
+                    if found is None:
+                        break
+                    taken += 1
+                    assert found == plant.sent.encode(expected)
+                    state = expected
             if found is None:
-                plant.long_way(raw)
+                sent = plant.ordinary(raw)
+                assert sent.values.tobytes() == expected.values.tobytes()
+                state = expected
             else:
-                short += 1
-                assert bytes(found) == plant.sent.encode(expected)
-            last = plant.lockstep.last_state
-            assert last is not None
-            assert plant.sent.encode(last) == plant.sent.encode(expected)
-            state = expected
-        assert short == plant.lockstep.horizon - 1  # all but the first and the last
+                last = plant.lockstep.last_state
+                assert last is not None
+                assert plant.sent.encode(last) == found
+        assert topic is COST
+        # All but the last, and the first from a peer that has not sent such an action before.
+        assert taken == plant.lockstep.horizon - (episode in (1, 7))
     assert plant.lockstep.tally == plant.judge.tally
     assert (plant.lockstep.steps_total, plant.lockstep.rounds_total, plant.lockstep.time) == (
         plant.judge.steps_total,
@@ -234,11 +283,11 @@ def test_a_plant_goes_on_with_the_same_bytes(overrides: dict) -> None:
     )
 
 
-def test_a_plant_takes_the_long_way_with_everything_else() -> None:
+def test_a_plant_leaves_everything_else_to_the_lockstep() -> None:
     plant = Plant()
     state = plant.begin(1, (3, 4))
-    assert plant.reflex(plant.action(state), 0.0) is None
-    state = plant.long_way(plant.action(state))
+    assert fast(plant.path, plant.action(state)) is None
+    state = plant.ordinary(plant.action(state))
     good = plant.action(state)
     RUN_AT, EPISODE_AT, STEP_AT, TIME_AT, PLANT_AT = range(HEADER)
     for place, number in (
@@ -251,59 +300,70 @@ def test_a_plant_takes_the_long_way_with_everything_else() -> None:
         (HEADER, np.nan),
         (-1, np.inf),
     ):
-        assert plant.reflex(with_number(good, 8, place, number), 0.0) is None, (place, number)
+        assert fast(plant.path, with_number(good, 8, place, number)) is None, (place, number)
     for raw in (b"", good[:-8], good + bytes(8)):
-        assert plant.reflex(raw, 0.0) is None
+        assert fast(plant.path, raw) is None
     assert plant.lockstep.step == 1
     plant.lockstep.pause(0.0)
-    assert plant.reflex(good, 0.0) is None
+    assert fast(plant.path, good) is None
     plant.lockstep.resume(0.0)
-    first = plant.reflex(good, 0.0)
-    assert first is not None
-    assert plant.reflex(good, 0.0) is None  # a duplicate of what was taken
+    plant.path.suspended = True
+    assert fast(plant.path, good) is None
+    plant.path.suspended = False
+    with armed(plant.path) as answer:
+        first = answer(good)
+        assert first is not None
+        assert answer(good) is None  # a duplicate of what was taken
     assert plant.lockstep.step == 2
 
-    # Nor does it learn from what was not taken: an action for another plant, another episode or step.
-    state = ArrayCodec(STATE.labels).decode(bytes(first))
+    # Strangers change nothing of what is awaited: another plant, run, episode or shape.
+    state = ArrayCodec(STATE.labels).decode(first)
     strangers = (
         replace(state, plant=PLANT + 1),
         replace(state, run=RUN + 1),
         replace(state, episode=2),
-        replace(state, step=1),
         replace(state, plant=PLANT + 1, values=state.values[:1]),
     )
     for stranger in strangers:
         raw = plant.peer.encode(replace(stranger, values=np.full((len(stranger.values), 4), 0.5)))
-        frame = plant.own.decode(raw)
-        if stranger.step == 1:
-            continue  # to another answer the plant objects, see below
-        assert plant.lockstep.action(frame, 0.0) == []
-        plant.reflex.learn(frame)
-        assert plant.reflex(raw, 0.0) is None
-        assert plant.reflex(plant.action(state), 0.0) is None
+        assert plant.lockstep.action(plant.own.decode(raw), 0.0) == []
+        assert fast(plant.path, raw) is None
     assert plant.lockstep.step == 2
-    plant.long_way(plant.action(state))
+    plant.ordinary(plant.action(state))
     assert plant.lockstep.step == 3
 
     # Nothing of an episode is taken for one of the next.
     plant.begin(2, (5, 6))
     late = with_number(good, 8, STEP_AT, 0.0)
-    assert plant.reflex(late, 0.0) is None
+    assert fast(plant.path, late) is None
     assert plant.lockstep.step == 0
 
 
-def test_silence_and_contradictions_are_noticed_after_the_short_way() -> None:
+def test_the_fast_path_of_a_plant_ends_where_its_log_does() -> None:
     plant = Plant()
-    state = plant.long_way(plant.action(plant.begin(1, (3, 4))))
+    state = plant.ordinary(plant.action(plant.begin(1, (3, 4))))
+    assert fast(plant.path, plant.action(state)) is not None
+    plant.path._log = plant.path._log[:2].copy()
+    for _ in range(2):
+        with armed(plant.path) as answer:
+            for k in range(3):
+                last = ArrayCodec(STATE.labels).decode(bytes(plant.path.answer.raw))
+                assert (answer(plant.action(last)) is not None) == (k < 2)
+    assert plant.lockstep.step == 6
+
+
+def test_silence_and_contradictions_are_noticed_after_the_fast_path() -> None:
+    plant = Plant()
+    state = plant.ordinary(plant.action(plant.begin(1, (3, 4))))
     for _ in range(3):
         plant.now += 0.05
         raw = plant.action(state)
-        found = plant.reflex(raw, plant.now)
+        found = fast(plant.path, raw, plant.now)
         assert found is not None
-        state = ArrayCodec(STATE.labels).decode(bytes(found))
+        state = ArrayCodec(STATE.labels).decode(found)
     assert plant.lockstep.tick(plant.now + 0.09) == []
     (again,) = plant.lockstep.tick(plant.now + 0.11)
-    assert plant.sent.encode(again.frame) == bytes(found)
+    assert plant.sent.encode(again.frame) == found
 
     # The same answer again is a duplicate, another one to the same state voids the episode.
     assert plant.lockstep.action(plant.own.decode(raw), plant.now) == []

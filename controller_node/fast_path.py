@@ -1,0 +1,98 @@
+"""The controller's fast path: from a serialised state to its serialised action, compiled.
+
+It is `responder`, to the bit, as long as nothing but states of the episode come, and the law answers
+them.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba.extending import register_jitable
+
+from controller_node import law
+from controller_node.law import LAW, act, control
+from controller_node.policy import ProjectedLaw
+from controller_node.responder import Responder
+from loop_interfaces.fast_path import line
+from loop_interfaces.fast_path.handler import FastPath, fast_handler, plan_type
+from loop_interfaces.fast_path.messages import FIRST, STEP, TIME, write_answer
+from loop_interfaces.frames import MAX_ID, ArrayCodec, Frame
+from loop_interfaces.jit.simd import peek
+from loop_interfaces.topics import ACTION
+
+__all__ = ["ControllerFastPath", "load_compiled"]
+
+PLAN = plan_type(
+    ("law", LAW),
+    ("batch", np.int64),
+    ("actions", np.int64),  # address of room for them
+    ("step", np.int64),  # that was answered last
+)
+
+
+@register_jitable  # type: ignore[untyped-decorator, unused-ignore]
+def respond(plan: Any, head: int, message: int, length: int) -> bool:
+    """Fill in the action that the law answers with."""
+    step = peek(head, STEP)
+    if not (0.0 <= step < MAX_ID and step == math.floor(step)):
+        return False
+    act(plan.law, head + 8 * FIRST, plan.actions, plan.batch)
+    plan.step = int(step)
+    numbers = plan.batch * plan.law.n_a
+    write_answer(plan.answer, plan.step, peek(head, TIME), plan.actions, numbers)
+    return True
+
+
+handler = fast_handler(PLAN, respond, law)
+
+
+def load_compiled() -> None:
+    """Load all that the controller has compiled, or compile it."""
+    line.load_compiled()
+    handler()
+    nothing = np.zeros((0, 1))
+    control(np.zeros(1, LAW), nothing, nothing)
+
+
+class ControllerFastPath(FastPath):
+    """Answers states of the episode whose state the responder was given last.
+
+    Parameters
+    ----------
+    responder
+        The protocol.
+    states
+        The codec of the messages that come in.
+    """
+
+    def __init__(self, responder: Responder, states: ArrayCodec) -> None:
+        super().__init__(handler, PLAN, states, ACTION)
+        self._responder = responder
+        self._actions = np.zeros((0, 0))
+        self._law: ProjectedLaw | None = None
+        self.last_state: Frame | None = None
+        """What the responder was given last."""
+        load_compiled()
+
+    def prepare(self) -> bool:
+        """Within an episode that a law answers."""
+        state, plan = self.last_state, self.plan
+        law = self._responder.law_for(state) if state is not None else None
+        if state is None or law is None:
+            return False
+        batch, n_z = state.values.shape
+        if not self.expect(state, (batch, n_z), (batch, law.n_a)):
+            return False
+        if self._actions.shape != (batch, law.n_a):
+            self._actions = np.zeros((batch, law.n_a))
+        self._law = law  # the record has addresses of what it owns
+        plan["law"], plan["batch"] = law.plan, batch
+        plan["actions"] = self._actions.ctypes.data
+        return True
+
+    def synchronise(self, answers: int, last: float) -> None:
+        if answers:
+            self._responder.advance_counters(answers, int(self.plan["step"]))

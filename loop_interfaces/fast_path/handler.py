@@ -1,0 +1,143 @@
+"""What plant and controller share of the fast path, and where they differ: one compiled function each.
+
+A handler takes a serialised message. Within an episode only its step, its time and its values differ
+from the one before, so it compares everything else, lets the compiled function of the node compute
+the answer, and leaves every message that is not the expected one to the node's own thread. The result
+is that of the node's protocol, to the bit.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+import numba
+import numpy as np
+from numba import carray, types  # type: ignore[attr-defined, unused-ignore]
+
+from loop_interfaces.fast_path import messages
+from loop_interfaces.fast_path.line import RclChannel
+from loop_interfaces.fast_path.messages import (
+    EXPECTED,
+    ExpectedMessage,
+    OwnMessage,
+    expected_header,
+)
+from loop_interfaces.frames import ArrayCodec, Frame
+from loop_interfaces.jit import atomics, cache, native, simd
+from loop_interfaces.jit.cache import fingerprint
+from loop_interfaces.jit.native import MachineCode
+from loop_interfaces.topics import Topic
+
+__all__ = ["FastPath", "fast_handler", "plan_type"]
+
+
+def plan_type(*fields: Any) -> np.dtype[np.void]:
+    """The record that a handler works on: what it compares, the answer's header, and own fields."""
+    return np.dtype([("expected", EXPECTED), ("answer", np.int64), *fields])
+
+
+def fast_handler(
+    plan: np.dtype[np.void], answer: Callable[[Any, int, int, int], bool], *sources: ModuleType
+) -> MachineCode:
+    """Machine code that handles the messages of a channel, see `RclChannel`.
+
+    plan: made by `plan_type`. answer(plan, head, message, length): compiled; fills in the answer to
+    the message whose header is at an address, or returns False. sources: all it is made of.
+    """
+    shared = atomics, cache, native, simd, messages
+    return MachineCode(
+        lambda: compile_handler(plan, answer, fingerprint(answer, *shared, *sources))
+    )
+
+
+def compile_handler(plan: np.dtype[np.void], answer: Callable[..., bool], sources: str) -> Any:
+    plans_at = types.CPointer(numba.from_dtype(plan))  # type: ignore[no-untyped-call]
+
+    @numba.cfunc(types.int32(plans_at, types.intp, types.intp), cache=True)
+    def handle(plans: Any, message: int, length: int) -> int:
+        sources  # noqa: B018  # closed over to be part of the key on disk
+        plan = carray(plans, 1)[0]
+        head = expected_header(message, length, plan.expected)
+        return 1 if head != 0 and answer(plan, head, message, length) else 0
+
+    return handle
+
+
+class FastPath(ABC):
+    """Answers the messages of one topic on another in the thread that receives them.
+
+    Before the node's thread waits it calls `arm`, and afterwards `disarm`. In between the protocol
+    belongs to the other thread.
+
+    Parameters
+    ----------
+    handler
+        Made by `fast_handler`.
+    plan
+        The type of its record.
+    incoming
+        The codec that decodes what comes in.
+    outgoing
+        The topic of the answers.
+    """
+
+    def __init__(
+        self,
+        handler: MachineCode,
+        plan: np.dtype[np.void],
+        incoming: ArrayCodec,
+        outgoing: Topic,
+    ) -> None:
+        self.plans = np.zeros(1, plan)
+        self.plan = self.plans[0]
+        self.handle, _ = handler()
+        self.channel = RclChannel(self.handle, self.plans.ctypes.data)
+        self._incoming, self._outgoing = incoming, ArrayCodec(outgoing.labels)
+        self._expected = ExpectedMessage(self.plan["expected"])
+        self.answer = OwnMessage(self._outgoing, Frame(0, 0, 0, 0.0, np.zeros((0, 0))))
+        self._prepared = False
+
+    @abstractmethod
+    def prepare(self) -> bool:
+        """Fill in the plan, if the protocol awaits messages that the handler can answer."""
+
+    @abstractmethod
+    def synchronise(self, answers: int, last: float) -> None:
+        """Bring the protocol up to date: so many messages were answered, the last one at a time (s)."""
+
+    def expect(self, like: Frame, shape: tuple[int, ...], answer: tuple[int, ...]) -> bool:
+        """Expect messages with the ids of `like` and values of a shape, and answer with another.
+
+        False if the peer that was decoded last sends others.
+        """
+        prefix = self._incoming.prefix_of(shape)
+        if prefix is None or not self._expected.set(prefix, like, shape):
+            return False
+        if self.answer.shape != answer:
+            self.answer = OwnMessage(self._outgoing, Frame(0, 0, 0, 0.0, np.zeros(answer)))
+        self.answer.address_to(like)
+        self.plan["answer"] = self.answer.header
+        self.channel.answer_with(self.answer.begin, len(self.answer.raw))
+        return True
+
+    def arm(self) -> bool:
+        """Let messages be answered, if they can be; False if one waits for the node's thread."""
+        self._prepared = self.prepare()
+        if not self._prepared:
+            return not self.channel.waits
+        if self.channel.arm():
+            return True
+        self.disarm()
+        return False
+
+    def disarm(self) -> int:
+        """The node's thread has the protocol again; how many messages were answered."""
+        answers, last = self.channel.disarm()
+        if not self._prepared:
+            return 0
+        self._prepared = False
+        self.synchronise(answers, last)
+        return answers

@@ -1,0 +1,164 @@
+"""The plant's fast path: from a serialised action to the next serialised state, compiled.
+
+It is `lockstep`, to the bit, as long as nothing but the awaited action comes and a step is compiled
+code alone.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numba.extending import register_jitable
+
+from loop_interfaces.fast_path import line
+from loop_interfaces.fast_path.handler import FastPath, fast_handler, plan_type
+from loop_interfaces.fast_path.messages import (
+    BUNDLE,
+    FIRST,
+    STEP,
+    append,
+    full,
+    write_answer,
+)
+from loop_interfaces.frames import ArrayCodec, digest
+from loop_interfaces.jit.cache import jit
+from loop_interfaces.jit.native import CLOCK, MonotonicClock, monotonic_ns
+from loop_interfaces.jit.simd import peek, write
+from loop_interfaces.samples import ACTION_KIND, NO_TIME, SAMPLE_HEADER, STATE_KIND
+from loop_interfaces.topics import STATE
+from pde_sim_node.lockstep import Lockstep
+from pde_sim_node.solver import step_context, work_queue
+from pde_sim_node.solver.step_context import MACHINE, step_together
+
+if TYPE_CHECKING:
+    from loop_interfaces.ros.endpoints import Bundler
+
+__all__ = ["PlantFastPath", "load_compiled"]
+
+PLAN = plan_type(
+    ("machine", MACHINE),
+    ("values", np.int64),  # numbers of all states
+    ("log", np.int64),  # address of room for the actions that were applied
+    ("steps", np.int64),  # done since the log was read
+    ("limit", np.int64),  # how many may be
+    ("time", np.float64),  # simulated, in s
+    ("sample_time", np.float64),
+    ("timed", np.int64),  # whether samples of states tell it
+    ("bundles", BUNDLE, 2),
+    ("begin", np.int64),  # address of the answer, and its length
+    ("length", np.int64),
+    ("clock", CLOCK),
+)
+LOG = 50_000
+"""Numbers in actions that are applied before the lock-step hears of it."""
+
+
+@jit
+def keep(plan: Any, kind: int, time: float, raw: int, length: int) -> None:
+    """For those who record or look."""
+    if plan.bundles[0].open or plan.bundles[1].open:
+        stamp = monotonic_ns(plan.clock)
+        for bundle in plan.bundles:
+            append(bundle, kind, stamp, time, raw, length)
+
+
+@register_jitable  # type: ignore[untyped-decorator, unused-ignore]
+def advance(plan: Any, head: int, message: int, length: int) -> bool:
+    """Apply the awaited action, and fill in the next state."""
+    machine = plan.machine
+    if peek(head, STEP) != machine.step or plan.steps == plan.limit:
+        return False
+    if full(plan.bundles[0]) or full(plan.bundles[1]):
+        return False
+    keep(plan, ACTION_KIND, NO_TIME, message, length)
+    numbers = plan.expected.values
+    for i in range(numbers):
+        number = peek(head, FIRST + i)
+        write(machine.actions, i, number)
+        write(plan.log, plan.steps * numbers + i, number)
+    step_together(machine)
+    plan.steps += 1
+    plan.time += plan.sample_time
+    write_answer(plan.answer, machine.step, plan.time, machine.states, plan.values)
+    keep(plan, STATE_KIND, plan.time if plan.timed else NO_TIME, plan.begin, plan.length)
+    return True
+
+
+handler = fast_handler(PLAN, advance, work_queue, step_context)
+
+
+def load_compiled() -> None:
+    """Load what is compiled, or compile it."""
+    line.load_compiled()
+    handler()
+
+
+class PlantFastPath(FastPath):
+    """Advances a lock-step within an episode.
+
+    Parameters
+    ----------
+    lockstep
+        The protocol.
+    actions
+        The codec of the messages that come in.
+    bundler
+        Takes the samples.
+    """
+
+    def __init__(self, lockstep: Lockstep, actions: ArrayCodec, bundler: Bundler) -> None:
+        super().__init__(handler, PLAN, actions, STATE)
+        self._lockstep, self._plant, self._bundler = lockstep, lockstep.plant, bundler
+        self._clock = MonotonicClock(self.plan["clock"])
+        self._log = np.zeros((0, 0))
+        self.suspended = False
+        """Whether every action is left to the lock-step."""
+        load_compiled()
+
+    def prepare(self) -> bool:
+        """Within an episode of a plant whose step is compiled code alone."""
+        lockstep, plant, plan = self._lockstep, self._plant, self.plan
+        state = lockstep.awaiting
+        code = plant.team.in_machine_code(plant.batch)
+        action = plant.batch, plant.n_a
+        if self.suspended or state is None or code is None:
+            return False
+        if not self.expect(state, action, state.values.shape):
+            return False
+        machine = plan["machine"]
+        for name, value in zip(("code", "plan", "board", "pieces"), code, strict=True):
+            machine[name] = value
+        machine["states"], machine["actions"] = plant.states.ctypes.data, plant.actions.ctypes.data
+        machine["totals"] = plant.totals.ctypes.data
+        machine["diverged_step"] = plant.diverged_step.ctypes.data
+        machine["batch"], machine["step"] = plant.batch, plant.step_index
+        if self._log.shape[1] != plant.actions.size:
+            self._log = np.zeros((max(LOG // plant.actions.size, 1), plant.actions.size))
+        plan["values"], plan["log"] = state.values.size, self._log.ctypes.data
+        plan["steps"], plan["limit"] = 0, min(lockstep.horizon - lockstep.step, len(self._log))
+        plan["time"], plan["sample_time"] = lockstep.time, lockstep.sample_time
+        plan["timed"] = self._bundler.timed
+        plan["begin"], plan["length"] = self.answer.begin, len(self.answer.raw)
+        self._bundler.lend(plan["bundles"], 2 * SAMPLE_HEADER + sum(self._lengths))
+        plant.team.call_helpers(self._machines)
+        return True
+
+    def synchronise(self, answers: int, last: float) -> None:
+        plan = self.plan
+        self._plant.team.dismiss_helpers(self._machines)
+        self._plant.step_index = int(plan["machine"]["step"])
+        if answers:
+            self._lockstep.advance_counters([digest(row) for row in self._log[:answers]], last)
+        self._bundler.settle(plan["bundles"], self._lengths, answers)
+
+    @property
+    def _machines(self) -> np.ndarray:
+        return self.plans["machine"]
+
+    @property
+    def _lengths(self) -> tuple[int, int]:
+        """Bytes of a state and of an action."""
+        expected = self.plan["expected"]
+        numbers = FIRST + int(expected["values"])
+        return len(self.answer.raw), int(expected["start"]) + 8 * numbers

@@ -1,0 +1,261 @@
+"""Fast paths of a plant and a controller on real topics; for topics/test_fast_path.py."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import rclpy
+from std_msgs.msg import Float64MultiArray, UInt8MultiArray
+
+from loop_interfaces.fast_path.line import CAPACITY
+from loop_interfaces.frames import HEADER
+from loop_interfaces.ros.endpoints import raw_subscription, samples_qos
+from loop_interfaces.ros.node_loop import NodeLoop
+from loop_interfaces.ros.sample_subscription import Intake
+from loop_interfaces.samples import ACTION_KIND, NO_TIME, STATE_KIND, unpack
+from loop_interfaces.topics import ACTION, COST, STATE, VOID, CostColumn
+from pde_sim_node.solver import workers
+from tests.test_fast_path import Controller, Plant, with_number
+
+
+class Peer:
+    """Publishes messages of one kind, and reads those of the other."""
+
+    def __init__(self, sends: str, reads: str) -> None:
+        self.node = rclpy.create_node("peer")
+        self._publisher = self.node.create_publisher(Float64MultiArray, sends, 10)
+        self._intake = self._reader(Float64MultiArray, reads, 10)
+
+    def _reader(self, kind: Any, name: str, depth: int) -> Intake:
+        subscription = raw_subscription(self.node, kind, name, samples_qos(depth))
+        return Intake(subscription, kind, depth)
+
+    def watch(self) -> None:
+        self._bundles = self._reader(UInt8MultiArray, "samples", 50)
+
+    def meet(self, *topics: str) -> None:
+        """Wait until everybody knows of everybody."""
+        deadline = time.monotonic() + 20.0
+        while self._publisher.get_subscription_count() < 1 or not all(
+            self.node.count_publishers(topic) for topic in topics
+        ):
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        time.sleep(0.3)
+
+    def say(self, *messages: bytes) -> None:
+        for raw in messages:
+            self._publisher.publish(raw)
+        time.sleep(0.05)  # until they are there
+
+    def heard(self, count: int, intake: Intake | None = None) -> list[bytes]:
+        deadline, got = time.monotonic() + 5.0, []
+        while len(got) < count and time.monotonic() < deadline:
+            got += [bytes(raw) for raw, _ in (intake or self._intake).take()]
+            time.sleep(0.002)
+        return got
+
+    def samples(self) -> list[Any]:
+        time.sleep(0.2)
+        return [s for raw in self.heard(1, self._bundles) for s in unpack(raw)[1]]
+
+
+@contextmanager
+def opened(loop: NodeLoop, receiver: Any, sender: Any, path: Any) -> Iterator[None]:
+    assert path.channel.open(receiver.handle, sender.publisher.handle, loop._guard)
+    try:
+        yield
+    finally:
+        path.channel.close()
+
+
+def answer_for(path: Any, seconds: float = 0.0, messages: int = 0) -> bytes | None:
+    """Be armed until so many messages were answered or one waits, but not longer; the one that waits.
+
+    Without a time: answer what waits already.
+    """
+    if path.arm():
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline and not path.channel.waits:
+            if messages and path.channel.record[0]["answered"] >= messages:
+                break
+            time.sleep(0.002)
+        path.disarm()
+    waiting: bytes | None = path.channel.next_message()
+    return waiting
+
+
+def plant_on_topics(*, timed: bool = False, helped: bool = False, **overrides: object) -> None:
+    node = rclpy.create_node("plant")
+    loop, peer = NodeLoop(node), Peer("action", "state")
+    loop.bundler.timed = timed
+    plant = Plant(loop.bundler, horizon=14, **overrides)
+    path = plant.path
+    receiver = loop.receive(ACTION, lambda frame: None, bundled=True)
+    sender = loop.sender(STATE, bundled=True)
+    with opened(loop, receiver, sender, path):
+        peer.meet("state")
+        state = plant.begin(1, (3, 4))
+        plant.expected(first := plant.action(state))
+        peer.say(first)
+        assert answer_for(path) == first  # nothing is known of the peer's messages yet
+        state = plant.ordinary(first)
+        actions, states = [], []
+
+        def next_action() -> bytes:
+            nonlocal state
+            actions.append(raw := plant.action(state))
+            _, state = plant.expected(raw)
+            states.append(plant.sent.encode(state))
+            return raw
+
+        # Those that wait already, one and several, and one that comes meanwhile.
+        for count in (1, 3):
+            peer.say(*[next_action() for _ in range(count)])
+            assert answer_for(path) is None
+            assert bool(path.plan["machine"]["board"]) == helped
+        assert plant.lockstep.step == plant.judge.step == 5
+        for _ in range(2):
+            assert path.arm()
+            peer.say(next_action())
+            assert path.disarm() == 1
+        assert peer.heard(6) == states
+        assert plant.lockstep.step == plant.judge.step == 7
+
+        # Nothing else is taken, and everything else is left to be handled, in its order.
+        good = plant.action(state)
+        bads = [
+            with_number(good, 8, place, number)
+            for place, number in (
+                (0, 1.0), (1, 2.0), (2, 6.0), (4, 78.0), (HEADER, np.nan), (-1, np.inf),
+            )
+        ]  # fmt: skip
+        for bad in bads:
+            assert path.arm()
+            peer.say(bad, bad[:-8])
+            path.disarm()
+            assert [path.channel.next_message() for _ in range(3)] == [bad, bad[:-8], None]
+        for bad in (good[:-8], good + bytes(8), good.replace(b"env", b"enw", 1)):
+            peer.say(bad)
+            assert answer_for(path, 1.0) == bad
+        peer.say(bad := good + bytes(100_000))
+        assert (answer_for(path, 1.0) or b"")[: len(bad)] == bad
+        assert plant.lockstep.step == 7
+        # The next one, an old one again, and one that comes when the old one waits.
+        _, state = plant.expected(good)
+        later = plant.action(state)
+        assert path.arm()
+        peer.say(good, actions[-1], later)
+        assert path.disarm() == 1
+        assert [path.channel.next_message() for _ in range(3)] == [actions[-1], later, None]
+        assert peer.heard(1) == [plant.sent.encode(state)]
+
+        # For those who record.
+        peer.watch()
+        while not loop.bundler.wanted:
+            loop.bundler.look(loop.now())
+        time.sleep(0.3)
+        sent, told = [], []
+        for _ in range(3):
+            raw = next_action()
+            sent.append((ACTION_KIND, raw, NO_TIME))
+            sent.append((STATE_KIND, states[-1], state.time if timed else NO_TIME))
+            peer.say(raw)
+            before = time.monotonic_ns()
+            assert answer_for(path) is None
+            told.append((before, time.monotonic_ns()))
+        loop.bundler.flush()
+        got = peer.samples()
+        assert [(s.kind, s.raw, s.time) for s in got] == sent
+        for i, (before, after) in enumerate(told):
+            assert before <= got[2 * i].stamp <= got[2 * i + 1].stamp <= after
+        assert peer.heard(3) == states[-3:]
+        # A bundle that should be sent is, before it takes more.
+        path.prepare()
+        path.plan["bundles"]["limit"] = path.plan["bundles"]["end"]
+        path.channel.arm()
+        peer.say(full := plant.action(state))
+        path.channel.disarm()
+        assert path.channel.next_message() == full
+
+        # What the mailbox cannot hold is counted.
+        many = [with_number(good, 8, -1, float(i)) for i in range(CAPACITY + 3)]
+        for raw in many:
+            peer.say(raw)
+        assert path.channel.newly_dropped() == 3
+        assert path.channel.newly_dropped() == 0
+        assert [path.channel.next_message() for _ in range(CAPACITY + 1)] == [
+            *many[:CAPACITY],
+            None,
+        ]
+
+        # Up to the last state, never its answer.
+        while plant.lockstep.step < plant.lockstep.horizon:
+            peer.say(next_action())
+            assert answer_for(path) is None
+        peer.say(last := plant.action(state))
+        assert answer_for(path) == last
+        for name in ("steps_total", "rounds_total", "time", "step", "tally"):
+            assert getattr(plant.lockstep, name) == getattr(plant.judge, name), name
+        (cost,) = plant.lockstep.action(plant.own.decode(last), 0.0)
+        topic, expected = plant.expected(last)
+        assert topic is COST and cost.topic is COST
+        assert cost.frame.values.tobytes() == expected.values.tobytes()
+
+        # What was taken is remembered: another answer to the same state voids the episode.
+        state = plant.begin(2, (5, 6))
+        peer.say(raw := plant.action(state))
+        assert answer_for(path) is None
+        assert plant.lockstep.step == 1
+        assert plant.lockstep.action(plant.own.decode(raw), 0.0) == []
+        other = with_number(raw, 8, -1, 0.123)
+        (void,) = plant.lockstep.action(plant.own.decode(other), 0.0)
+        assert (void.frame.values[:, CostColumn.ENDED] == VOID).all()
+    node.destroy_node()
+    peer.node.destroy_node()
+
+
+def controller_on_topics() -> None:
+    node = rclpy.create_node("controller")
+    loop, controller, peer = NodeLoop(node), Controller(3), Peer("state", "action")
+    path, responder = controller.path, controller.responder
+    receiver = loop.receive(STATE, lambda frame: None)
+    with opened(loop, receiver, loop.sender(ACTION), path):
+        peer.meet("action")
+        controller.begin(4)
+        peer.say(first := controller.state(4, 0))
+        assert answer_for(path) == first
+        controller.ordinary(first)
+        states = [controller.state(4, step) for step in range(1, 6)]
+        peer.say(*states)
+        assert answer_for(path) is None
+        assert peer.heard(5) == [controller.expected(raw) for raw in states]
+        assert (responder.answered, responder.step) == (6, 5)
+        assert path.arm()
+        peer.say(states[2], other := controller.state(5, 0))  # asked again; and another episode
+        assert path.disarm() == 1
+        assert path.channel.next_message() == other
+        assert peer.heard(1) == [controller.expected(states[2])]
+        assert (responder.answered, responder.step) == (7, 3)
+    # Closed, it hears nothing any more.
+    peer.say(controller.state(4, 6))
+    assert path.arm()
+    assert path.disarm() == 0
+    assert not path.channel.waits
+    node.destroy_node()
+    peer.node.destroy_node()
+
+
+if __name__ == "__main__":
+    rclpy.init()
+    controller_on_topics()
+    plant_on_topics()
+    plant_on_topics(timed=True)
+    workers.use_cores(range(2), attentive=True)
+    plant_on_topics(helped=True, integration_time=0.0005)
+    rclpy.shutdown()
+    print("done")
