@@ -16,7 +16,7 @@ from controller_node import law
 from controller_node.law import LAW, act, control
 from controller_node.policy import ProjectedLaw
 from controller_node.responder import Responder
-from loop_interfaces.fast_path import line
+from loop_interfaces.fast_path import channel
 from loop_interfaces.fast_path.handler import FastPath, fast_handler, plan_type
 from loop_interfaces.fast_path.messages import FIRST, STEP, TIME, write_answer
 from loop_interfaces.frames import MAX_ID, ArrayCodec, Frame
@@ -51,7 +51,7 @@ handler = fast_handler(PLAN, respond, law)
 
 def load_compiled() -> None:
     """Load all that the controller has compiled, or compile it."""
-    line.load_compiled()
+    channel.load_compiled()
     handler()
     nothing = np.zeros((0, 1))
     control(np.zeros(1, LAW), nothing, nothing)

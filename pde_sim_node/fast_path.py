@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numba.extending import register_jitable
 
-from loop_interfaces.fast_path import line
+from loop_interfaces.fast_path import channel
 from loop_interfaces.fast_path.handler import FastPath, fast_handler, plan_type
 from loop_interfaces.fast_path.messages import (
     BUNDLE,
@@ -90,7 +90,7 @@ handler = fast_handler(PLAN, advance, work_queue, step_context)
 
 def load_compiled() -> None:
     """Load what is compiled, or compile it."""
-    line.load_compiled()
+    channel.load_compiled()
     handler()
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from numba import carray, types  # type: ignore[attr-defined, unused-ignore]
 
 from loop_interfaces.fast_path import messages
-from loop_interfaces.fast_path.line import RclChannel
+from loop_interfaces.fast_path.channel import RclChannel
 from loop_interfaces.fast_path.messages import (
     EXPECTED,
     ExpectedMessage,
