@@ -11,14 +11,14 @@ import pytest
 
 from loop_interfaces.frames import Frame
 from loop_interfaces.topics import COMPLETED, VOID
-from pdeloop.monitor.attention import Attention
-from pdeloop.monitor.commands import Call
-from pdeloop.monitor.curve import MOST, POINTS, LearningCurve
-from pdeloop.monitor.diagnostics import Endpoint, Health, Rate
-from pdeloop.monitor.episode import COLUMNS, COMPONENTS, ROWS, Episode, rows_of
-from pdeloop.monitor.messages import Cursor
-from pdeloop.monitor.view import View
-from pdeloop.monitor.watched import FAILURE, Watched
+from pdeloop.monitor.read_budget import Attention
+from viewer_node.episode_samples import COLUMNS, COMPONENTS, ROWS, Episode, rows_of
+from viewer_node.learning_curve import MOST, POINTS, LearningCurve
+from viewer_node.loop_nodes import Endpoint, Health, Rate
+from viewer_node.loop_view import FAILURE, Watched
+from viewer_node.web.messages import Cursor
+from viewer_node.web.page import View
+from viewer_node.web.requests import Call
 
 PLANT = 7
 

@@ -11,9 +11,9 @@ import aiohttp
 import numpy as np
 import pytest
 
-from pdeloop.monitor.commands import Call, Commands, Watch
-from pdeloop.monitor.server import FILES, PAGE, TOKEN, Server
-from pdeloop.monitor.view import View
+from viewer_node.web.page import View
+from viewer_node.web.requests import Call, Commands, Watch
+from viewer_node.web.server import FILES, PAGE, TOKEN, Server
 
 
 @contextlib.contextmanager

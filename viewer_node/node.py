@@ -30,9 +30,9 @@ from loop_interfaces.parameters import PROBLEM, VIEWER
 from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.node_main import node_main
 from loop_interfaces.ros.parameters import declare, given_parameters, on_change
-from loop_interfaces.ros.polling import DRAIN, Handler, Reader, Samples, drain
 from loop_interfaces.topics import COST, MODEL, POLICY, START, TARGET
 from viewer_node.diagnostics import ViewerHealth
+from viewer_node.loop_reader import DRAIN, Handler, Reader, Samples, drain
 from viewer_node.view import SCALARS, LoopView
 
 FRAME_ID = "field"

@@ -47,11 +47,11 @@ def add(commands: Commands) -> None:
 
 def _monitor(options: argparse.Namespace) -> int:
     from pdeloop.domain import given_domain
-    from pdeloop.monitor.commands import Commands as Queue
     from pdeloop.monitor.finder import Finder, run_id
     from pdeloop.monitor.node import ConfigurationError, stand_back, watch
-    from pdeloop.monitor.server import Server
-    from pdeloop.monitor.view import View
+    from viewer_node.web.page import View
+    from viewer_node.web.requests import Commands as Queue
+    from viewer_node.web.server import Server
 
     folder, namespace = options.folder, options.namespace
     if not 0 <= options.port < 65536:

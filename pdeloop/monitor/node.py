@@ -28,17 +28,17 @@ from loop_interfaces.ros.introspection import NAMELESS
 from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.node_main import ConfigurationError, ros_node
 from loop_interfaces.ros.parameters import RemoteParameters
-from loop_interfaces.ros.polling import DRAIN, Handler, Reader, Samples, drain
 from loop_interfaces.topics import COST, PAUSED, POLICY, START, TARGET, Topic
 from pde_sim_node.equations import EQUATIONS
 from pdeloop.display import ProgressFile
 from pdeloop.live import Live
-from pdeloop.monitor.attention import Attention
-from pdeloop.monitor.commands import VERBS, Commands, Watch
-from pdeloop.monitor.diagnostics import ROLES, Endpoint
-from pdeloop.monitor.endpoints import ServiceCall
 from pdeloop.monitor.finder import Finder, run_id
-from pdeloop.monitor.view import View
+from pdeloop.monitor.read_budget import Attention
+from pdeloop.monitor.service_call import ServiceCall
+from viewer_node.loop_nodes import ROLES, Endpoint
+from viewer_node.loop_reader import DRAIN, Handler, Reader, Samples, drain
+from viewer_node.web.page import View
+from viewer_node.web.requests import VERBS, Commands, Watch
 
 REFRESH = 0.5
 """Seconds between two looks at rates and at the progress of the run."""

@@ -8,8 +8,8 @@ from typing import Any
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from pdeloop.monitor.commands import Call
-from pdeloop.monitor.view import View
+from viewer_node.web.page import View
+from viewer_node.web.requests import Call
 
 CONNECTION = 5.0
 """Seconds within which the service must be there."""

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from loop_interfaces.frames import Frame, Recent
 from loop_interfaces.topics import VOID, CostColumn, StartColumn
-from pdeloop.monitor.commands import Call
-from pdeloop.monitor.curve import LearningCurve
-from pdeloop.monitor.diagnostics import Health, Rate
-from pdeloop.monitor.episode import Episode, Key, key_of, rows_of
+from viewer_node.episode_samples import Episode, Key, key_of, rows_of
+from viewer_node.learning_curve import LearningCurve
+from viewer_node.loop_nodes import Health, Rate
+from viewer_node.web.requests import Call
 
 JOIN = 0.5
 """Seconds after which an episode is shown of which the beginning was missed."""

@@ -26,9 +26,9 @@ from typing import Any
 from aiohttp import WSMsgType, web
 
 from loop_interfaces.controllers import CONTROLLERS
-from pdeloop.monitor.commands import VERBS, Call, Commands, Watch
-from pdeloop.monitor.messages import Cursor
-from pdeloop.monitor.view import View
+from viewer_node.web.messages import Cursor
+from viewer_node.web.page import View
+from viewer_node.web.requests import VERBS, Call, Commands, Watch
 
 FRAMES = 20.0
 """Pictures a second at the most."""
@@ -37,7 +37,7 @@ MOST_PAGES = 16
 MAX_BODY = 10_000
 HOST = "127.0.0.1"
 TOKEN = "X-Pdeloop-Token"
-PAGE = Path(__file__).parent / "page"
+PAGE = Path(__file__).parent / "static"
 TYPES = {
     ".html": "text/html",
     ".css": "text/css",

@@ -13,12 +13,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from loop_interfaces.frames import Frame
-from pdeloop.monitor.commands import Call
-from pdeloop.monitor.curve import LearningCurve
-from pdeloop.monitor.diagnostics import Endpoint
-from pdeloop.monitor.episode import COMPONENTS
-from pdeloop.monitor.messages import Cursor, sample, target
-from pdeloop.monitor.watched import SILENT, Watched
+from viewer_node.episode_samples import COMPONENTS
+from viewer_node.learning_curve import LearningCurve
+from viewer_node.loop_nodes import Endpoint
+from viewer_node.loop_view import SILENT, Watched
+from viewer_node.web.messages import Cursor, sample, target
+from viewer_node.web.requests import Call
 
 FRESH = 0.5
 """Seconds between two looks at the range of the colours."""

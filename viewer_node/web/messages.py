@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdeloop.monitor.episode import Episode, rows_of
-from pdeloop.monitor.watched import Watched
+from viewer_node.episode_samples import Episode, rows_of
+from viewer_node.loop_view import Watched
 
 _LENGTH = struct.Struct("<I")
 
