@@ -1,10 +1,23 @@
-"""Files that are whole or not there, whatever moment a crash comes at. No ROS import."""
+"""Files that are whole or not there, whatever moment a crash comes at, and no link is followed. No ROS
+import.
+"""
 
 from __future__ import annotations
 
+import errno
+import json
 import os
+import stat
+from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
+
+MAX_JSON_BYTES = 2**27
+"""Of a file in JSON; a training's history takes some 200 bytes a rollout."""
+
+
+class FileError(ValueError):
+    """A file that is not what it should be; the text says which, what was expected and what it is."""
 
 
 def write_atomically(path: Path, *content: bytes | memoryview) -> None:
@@ -61,3 +74,81 @@ def make_folder(path: Path) -> None:
     path.mkdir(parents=True, exist_ok=True)
     for folder in missing:
         sync_folder(folder.parent)
+
+
+def private_folder(path: Path) -> None:
+    """Make `path` a folder that only this user can look into and write to.
+
+    Raises
+    ------
+    FileError
+        Something else is there: a link, a file, or a folder of another user.
+    OSError
+        It cannot be made.
+    """
+    try:
+        path.mkdir(mode=0o700)
+    except FileExistsError:
+        if not is_private(path):
+            raise FileError(
+                f"{path} is not a folder of this user; expected one, because its files are trusted: "
+                "remove it, or set TMPDIR to a folder of your own"
+            ) from None
+        path.chmod(0o700)
+
+
+def is_private(path: Path) -> bool:
+    """Whether `path` is a folder of this user, and no link to one. OSError if nothing is there."""
+    found = path.lstat()
+    return stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid()
+
+
+def open_own(path: Path, flags: int, mode: int = 0o666) -> BinaryIO:
+    """Open or make a file for reading and writing. OSError if it is a link, or no ordinary file.
+
+    flags: further ones of os.open, for instance os.O_APPEND.
+    """
+    flags |= os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    try:
+        descriptor = os.open(path, flags, mode)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise OSError(errno.ELOOP, "it is a symbolic link", str(path)) from error
+        raise
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(errno.EINVAL, "it is no ordinary file", str(path))
+    return os.fdopen(descriptor, "ab+" if flags & os.O_APPEND else "rb+")
+
+
+def open_ordinary(path: Path) -> BufferedReader:
+    """Open a file for reading. OSError if it is not an ordinary one: a pipe would wait for ever."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(errno.EINVAL, "it is no ordinary file", str(path))
+    return os.fdopen(descriptor, "rb")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The object in a JSON file.
+
+    Raises
+    ------
+    FileError
+        It cannot be read, is too large, or holds no JSON object.
+    """
+    try:
+        with open_ordinary(path) as file:
+            text = file.read(MAX_JSON_BYTES + 1)
+    except OSError as error:
+        raise FileError(f"{path} cannot be read: {error.strerror}") from error
+    if len(text) > MAX_JSON_BYTES:
+        raise FileError(f"{path} is larger than {MAX_JSON_BYTES} bytes")
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise FileError(f"{path} is no JSON: {error}") from error
+    if not isinstance(content, dict):
+        raise FileError(f"{path} holds no JSON object")
+    return content

@@ -57,7 +57,12 @@ INSTRUMENTS = (
 """What stands between the field and its controller (docs/robustness.md)."""
 
 PROBLEM = (
-    Spec("problem", "burgers", "name of the problem, used in messages and result folders"),
+    Spec(
+        "problem",
+        "burgers",
+        "name of the problem, used in messages and result folders",
+        file_name=True,
+    ),
     Spec(
         "equation",
         "burgers",

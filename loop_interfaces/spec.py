@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ import yaml
 Value = bool | int | float | str | list[str]
 MAX_YAML_BYTES = 1_000_000
 MAX_PARAMETERS = 10_000
+_FILE_NAME = re.compile(r"[^\W_][\w.-]{,99}")
 
 
 class ParameterError(ValueError):
@@ -28,7 +30,8 @@ class Spec:
     """One parameter. The type is the default's; `required` ones have no usable default.
 
     minimum, maximum: inclusive, unless `positive` (then value > 0). choices: the allowed words.
-    live: it may be changed while the node runs, because no result depends on it.
+    live: it may be changed while the node runs, because no result depends on it. file_name: a text that
+    names files and folders, and therefore holds no path.
     """
 
     name: str
@@ -41,6 +44,7 @@ class Spec:
     positive: bool = False
     multiple_of: int = 1
     live: bool = False
+    file_name: bool = False
 
     @property
     def type(self) -> type:
@@ -51,6 +55,8 @@ class Spec:
         """The allowed values in words."""
         if self.choices:
             return "one of " + ", ".join(self.choices)
+        if self.file_name:
+            return "at most 100 letters, digits, '_', '-' and '.', beginning with a letter or digit"
         words = {int: "a whole number", float: "a number", str: "a text", bool: "true or false"}
         text = words.get(self.type, "a list of texts")
         if self.multiple_of == 2:
@@ -84,6 +90,8 @@ class Spec:
             return value if all(isinstance(item, str) for item in value) else None
         if self.choices:
             return value if value in self.choices else None
+        if self.file_name:
+            return value if _FILE_NAME.fullmatch(str(value)) else None
         if isinstance(value, (int, float)) and not isinstance(value, bool):
             if not math.isfinite(value) or (self.positive and value <= 0):
                 return None

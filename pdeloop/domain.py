@@ -11,6 +11,8 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from loop_interfaces.files import FileError, open_own, private_folder
+
 DOMAINS = range(1, 101)
 """Domains whose ports lie outside the ephemeral range on Linux; 0 is everybody's default."""
 DOMAINS_FOLDER = Path(tempfile.gettempdir()) / f"pdeloop-domains-{os.getuid()}"
@@ -44,9 +46,12 @@ def own_domain() -> Iterator[int]:
     if chosen is not None:
         yield chosen
         return
-    DOMAINS_FOLDER.mkdir(exist_ok=True)
+    try:
+        private_folder(DOMAINS_FOLDER)
+    except (OSError, FileError) as error:
+        raise DomainError(f"no ROS domain can be reserved: {error}") from error
     for domain in random.sample(DOMAINS, len(DOMAINS)):
-        with (DOMAINS_FOLDER / str(domain)).open("w") as lock:
+        with open_own(DOMAINS_FOLDER / str(domain), 0) as lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -36,7 +34,8 @@ def evaluate(folder: Path, *, fields: int, seed: int, mean_field: bool) -> dict[
     initial distribution instead. Returns {controller: (training seeds, fields) nested lists}.
     """
     values = RunFolder(folder).values()
-    policies, warm, models = _policies(folder)
+    arrays = RunFolder(folder).policies()
+    policies, warm, models = arrays["policy"], arrays["lqt"], arrays["model"]
     pair = LocalPair(values)
     try:
         pair.use_models(models)
@@ -48,19 +47,6 @@ def evaluate(folder: Path, *, fields: int, seed: int, mean_field: bool) -> dict[
     _refuse_another_loop(folder, values, pair, policies[:1], warm[:1])
     costs = _costs(pair, values, policies, warm, fields, seed, mean_field)
     return {name: costs[:, i].tolist() for i, name in enumerate(CONTROLLERS)}
-
-
-def _policies(folder: Path) -> tuple[Array, Array, Array]:
-    """Adapted policies, warm starts and models of the run."""
-    path = folder / "policy.npz"
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            return arrays["policy"], arrays["lqt"], arrays["model"]
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
-        raise RunFolderError(
-            f"{path} cannot be read; is the run finished? "
-            f"(continue it with: pdeloop train --resume {folder})"
-        ) from error
 
 
 def _costs(
@@ -94,14 +80,8 @@ def _refuse_another_loop(
     folder: Path, values: Mapping[str, Any], pair: LocalPair, policies: Array, warm: Array
 ) -> None:
     """RunFolderError if the run's costs are not those of the built-in plant and law."""
-    try:
-        result = json.loads((folder / "result.json").read_text())
-        there = [np.array(result["costs_by_field"][name][0], dtype=float) for name in CONTROLLERS]
-    except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
-        raise RunFolderError(
-            f"{folder}/result.json cannot be read; is the run finished? "
-            f"(continue it with: pdeloop train --resume {folder})"
-        ) from error
+    result = RunFolder(folder).result()
+    there = [np.array(result["costs_by_field"][name][0], dtype=float) for name in CONTROLLERS]
     seed = int(values["evaluation_seed"])
     (own,) = _costs(pair, values, policies, warm, len(there[0]), seed)
     differs = [not _agree(*both) for both in zip(there, own, strict=True)]

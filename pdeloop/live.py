@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from loop_interfaces.files import FileError, is_private, open_new, open_ordinary, private_folder
 from pdeloop.domain import DOMAINS_FOLDER
 
 _PREFIX = "live-"
@@ -47,13 +48,14 @@ def announced(domain: int, folder: Path, *, network: bool = False) -> Iterator[N
         "network": network,
     }
     with contextlib.ExitStack() as held:
-        with contextlib.suppress(OSError):
-            DOMAINS_FOLDER.mkdir(exist_ok=True)
+        with contextlib.suppress(OSError, FileError):
+            private_folder(DOMAINS_FOLDER)
             path = DOMAINS_FOLDER / f"{_PREFIX}{os.getpid()}-{domain}"
             new = path.with_name(f"new-{path.name}")
-            file = held.enter_context(new.open("w"))
+            new.unlink(missing_ok=True)  # of an earlier process of this number
+            file = held.enter_context(open_new(new))
             fcntl.flock(file, fcntl.LOCK_EX)
-            file.write(json.dumps(content))
+            file.write(json.dumps(content).encode())
             file.flush()
             held.callback(path.unlink, missing_ok=True)
             new.rename(path)  # under this name it is locked and whole
@@ -64,7 +66,7 @@ def running() -> list[Live]:
     """The loops of this user that run now, the newest first."""
     found = []
     with contextlib.suppress(OSError):
-        if DOMAINS_FOLDER.stat().st_uid != os.getuid():
+        if not is_private(DOMAINS_FOLDER):
             return []
         for path in DOMAINS_FOLDER.glob(f"{_PREFIX}*"):
             with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
@@ -73,7 +75,7 @@ def running() -> list[Live]:
 
 
 def _read(path: Path) -> list[Live]:
-    with path.open() as file:
+    with open_ordinary(path) as file:
         try:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from loop_interfaces.files import open_own
 from loop_interfaces.protocol import STOPPED
 
 STOP_GRACE = 2.0
@@ -148,7 +149,7 @@ class Supervisor:
     def _start(self, child: Child, now: float) -> None:
         if child.before_start is not None:
             child.before_start()
-        with child.log.open("ab") as log:
+        with open_own(child.log, os.O_APPEND) as log:
             child.process = subprocess.Popen(
                 child.arguments,
                 stdin=subprocess.DEVNULL,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import itertools
-import json
 import os
 import signal
 import sys
@@ -193,7 +192,7 @@ def _run(folder: Path, values: dict[str, Any], transport: Transport, as_json: bo
         return 130
     finally:
         display.close()
-    summary = json.loads((folder / "result.json").read_text())
+    summary = RunFolder(folder).result()
     if as_json:
         print_json({"folder": str(folder), **summary})
         return 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.array_files import read_arrays
 from loop_interfaces.model_rows import unpack
 from loop_interfaces.parameters import noisy
 from loop_interfaces.spec import ParameterError
@@ -18,17 +18,12 @@ from tuner_node.optimizers import NEED_TRAJECTORIES, OPTIMIZERS, Context, Optimi
 from tuner_node.optimizers.gauss_newton import FIELDS
 from tuner_node.training import CHECK, EXPLORATION, Training
 
-MAX_MODEL_BYTES = 1 << 30
-
 
 def read_model(path: Path, n_a: int) -> NDArray[np.float64]:
     """The rows of the model that `pdeloop identify --out` wrote. ValueError if there is none."""
     try:
-        if path.stat().st_size > MAX_MODEL_BYTES:
-            raise ValueError(f"{path} is larger than {MAX_MODEL_BYTES} bytes; not a reduced model")
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            rows = np.array(arrays["model"], dtype=np.float64)
-    except (OSError, KeyError, EOFError, zipfile.BadZipFile, TypeError, AttributeError) as error:
+        rows = read_arrays(path)["model"].astype(np.float64)
+    except (KeyError, ValueError, TypeError) as error:
         raise ValueError(
             f"{path} holds no reduced model; expected a file of 'pdeloop identify --out' ({error})"
         ) from error

@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
-import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -19,10 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.files import sync_folder, write_part
+from loop_interfaces.array_files import unpack_arrays
+from loop_interfaces.files import open_ordinary, sync_folder, write_part
 
 MAGIC = b"pdeloop-checkpoint 1 "
-MAX_BYTES = 2**30
 Arrays = Mapping[str, NDArray[Any]]
 
 
@@ -108,18 +107,14 @@ def taken(arrays: Arrays, name: str, kind: str, shape: tuple[int | None, ...]) -
 
 def _read(path: Path) -> dict[str, NDArray[Any]]:
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise CheckpointError(f"is larger than {MAX_BYTES} bytes")
-        content = path.read_bytes()
+        with open_ordinary(path) as file:
+            head = file.readline(len(MAGIC) + 65)
+            if not (head.startswith(MAGIC) and head.endswith(b"\n")):
+                raise CheckpointError("is not a checkpoint of pdeloop")
+            if hashlib.file_digest(file, "sha256").hexdigest().encode() != head[len(MAGIC) : -1]:
+                raise CheckpointError("is damaged: its checksum does not match")
+            body = file.tell() - len(head)
+            file.seek(len(head))
+            return unpack_arrays(file, body)  # they are stored as they are
     except OSError as error:
-        raise CheckpointError(f"cannot be read: {error.strerror}") from error
-    head, newline, body = content.partition(b"\n")
-    if not (head.startswith(MAGIC) and newline):
-        raise CheckpointError("is not a checkpoint of pdeloop")
-    if hashlib.sha256(body).hexdigest().encode() != head[len(MAGIC) :]:
-        raise CheckpointError("is damaged: its checksum does not match")
-    try:
-        with np.load(io.BytesIO(body), allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except (ValueError, OSError, zipfile.BadZipFile, KeyError) as error:
-        raise CheckpointError(f"holds no arrays: {error}") from error
+        raise CheckpointError(f"cannot be read: {error.strerror or error}") from error

@@ -28,11 +28,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.files import make_folder, write_atomically
+from loop_interfaces import model_rows
+from loop_interfaces.array_files import read_arrays
+from loop_interfaces.files import make_folder, open_own, read_json, write_atomically
 from loop_interfaces.frames import MAX_ID
 from loop_interfaces.parameters import EXECUTION, PLANT, RECORDER, VIEWER, table
 from loop_interfaces.spec import ParameterError, check, read_yaml, yaml_text
 from loop_interfaces.topics import COMPLETED
+from tuner_node import checkpoint
 from tuner_node.training import CONTROLLERS, Training
 
 TRANSIENT = (
@@ -93,7 +96,7 @@ class RunFolder:
         """Continue the training here. RunFolderError if there is none, or with other parameters."""
         self.unfinished()
         try:
-            known = json.loads((self.path / "run.json").read_text())
+            known = read_json(self.path / "run.json")
             self._check_same(known["parameters"], parameters)
             identity = RunIdentity(int(known["run"]), int(known["incarnation"]) + 1)
             if not (0 < identity.run < MAX_ID and 0 < identity.incarnation < 2**21):
@@ -101,7 +104,14 @@ class RunFolder:
             return self._identify(identity, known["parameters"])
         except RunFolderError:
             raise
-        except (OSError, KeyError, TypeError, ValueError) as error:
+        except (
+            OSError,
+            LookupError,
+            TypeError,
+            ValueError,
+            OverflowError,
+            AttributeError,
+        ) as error:
             raise RunFolderError(f"{self.path}/run.json cannot be used: {error}") from error
 
     def parameters(self) -> dict[str, Any]:
@@ -152,7 +162,7 @@ class RunFolder:
     def held(self) -> Iterator[None]:
         """Keep other processes from working on the run. RunFolderError if one does."""
         try:
-            file = (self.path / "lock").open("wb")
+            file = open_own(self.path / "lock", 0)
         except OSError as error:
             raise RunFolderError(f"cannot write to {self.path}: {error.strerror}") from error
         with file:
@@ -166,7 +176,7 @@ class RunFolder:
 
     def note(self, row: Mapping[str, Any]) -> None:
         """Append one line to progress.jsonl."""
-        with (self.path / "progress.jsonl").open("ab+") as file:
+        with open_own(self.path / "progress.jsonl", os.O_APPEND) as file:
             end = file.seek(0, os.SEEK_END)
             file.seek(max(0, end - 1))
             torn = end > 0 and file.read(1) != b"\n"  # by a disk that was full
@@ -182,6 +192,59 @@ class RunFolder:
         write_atomically(self.path / "result.json", text.encode())
         return summary
 
+    def policies(self) -> dict[str, NDArray[Any]]:
+        """The arrays of policy.npz: `policy`, `lqt`, `model`.
+
+        Raises
+        ------
+        RunFolderError
+            They cannot be read, or are not those of a run with these parameters.
+        """
+        path = self.path / "policy.npz"
+        if not path.exists():
+            raise RunFolderError(
+                f"no results in {self.path}: the run is not finished; "
+                f"continue it with: pdeloop train --resume {self.path}"
+            )
+        values = self.values()
+        n_a, seeds = values["n_a"], values["seeds"]
+        try:
+            arrays = read_arrays(path)
+            model = checkpoint.taken(arrays, "model", "f", (seeds, None, None))
+            law = (seeds, n_a, 2 * model.shape[2])
+            for rows in model:
+                model_rows.unpack(rows, n_a)
+            return {
+                "policy": checkpoint.taken(arrays, "policy", "f", law),
+                "lqt": checkpoint.taken(arrays, "lqt", "f", law),
+                "model": model,
+            }
+        except ValueError as error:
+            raise RunFolderError(
+                f"{path} cannot be read ({error}); write it anew: delete it and result.json, then "
+                f"pdeloop train --resume {self.path}"
+            ) from error
+
+    def result(self) -> dict[str, Any]:
+        """The content of result.json.
+
+        Raises
+        ------
+        RunFolderError
+            It cannot be read, or is not that of a run with these parameters.
+        """
+        path = self.path / "result.json"
+        values = self.values()
+        try:
+            content = read_json(path)
+            check_result(content, values["seed"], values["seeds"])
+            return content
+        except (ValueError, TypeError) as error:
+            raise RunFolderError(
+                f"{path} cannot be used ({error}); is the run finished? Else delete it, and: "
+                f"pdeloop train --resume {self.path}"
+            ) from error
+
     def _identify(self, identity: RunIdentity, parameters: Mapping[str, Any]) -> RunIdentity:
         content = {
             "run": identity.run,
@@ -190,6 +253,36 @@ class RunFolder:
         }
         write_atomically(self.path / "run.json", json.dumps(content).encode())
         return identity
+
+
+def check_result(content: Mapping[str, Any], seed: int, seeds: int) -> None:
+    """A ValueError unless this is the content of a result.json of these seeds."""
+    if (content.get("seed"), content.get("seeds")) != (seed, seeds):
+        raise ValueError("its seeds are not the run's")
+    costs = content.get("costs_by_field")
+    costs = costs if isinstance(costs, dict) else {}
+    tables = [np.array(costs.get(name), dtype=np.float64) for name in CONTROLLERS]
+    if len({table.shape for table in tables}) > 1 or tables[0].ndim != 2 or len(tables[0]) != seeds:
+        raise ValueError(
+            f"its 'costs_by_field' are not a table of {seeds} seeds for each controller"
+        )
+    if not tables[0].size:
+        raise ValueError("its 'costs_by_field' are empty")
+    history = content.get("history")
+    for row in history if isinstance(history, list) else [None]:
+        if not isinstance(row, dict) or not all(
+            isinstance(value, (int, float, str)) for value in row.values()
+        ):
+            raise ValueError("its 'history' is not a list of rows")
+        if type(row.get("rollouts")) is not int or row.get("seed") not in range(seed, seed + seeds):
+            raise ValueError("its 'history' has a row without 'seed' or 'rollouts'")
+    versions = content.get("versions", {})
+    if not isinstance(versions, dict):
+        raise ValueError("its 'versions' are no table")
+    controller = content.get("controller", {})
+    nodes = controller.get("nodes", []) if isinstance(controller, dict) else None
+    if not isinstance(nodes, list) or not all(isinstance(node, str) for node in nodes):
+        raise ValueError("its 'controller' is no table with a list of nodes")
 
 
 def policy_arrays(training: Training) -> dict[str, NDArray[Any]]:

@@ -257,6 +257,19 @@ class Training:
             raise ValueError("it has no models")
         if self.evaluation is None and self.phase == "done":
             raise ValueError("it has no evaluation")
+        if not self.pending and self.phase in ("identify", "check"):
+            raise ValueError("it has no seed to identify")
+        if self.settings.trajectories and self.phase != "identify":
+            self._check_trajectories()
+
+    def _check_trajectories(self) -> None:
+        assert self.models is not None
+        n_z = len(model_rows.unpack(self.models[0], self.settings.n_a).U)
+        if self.target is None or self.target.shape != (n_z,):
+            raise ValueError(f"it has no target of {n_z} numbers")
+        for known in self.explorations:
+            if known is None or known.states.shape != (len(known.actions) + 1, n_z):
+                raise ValueError(f"it has an exploration without states of {n_z} numbers")
 
     def _seeds(self) -> list[int]:
         return [self.settings.seed + s for s in range(self.settings.seeds)]

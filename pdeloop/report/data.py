@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,8 +13,6 @@ from numpy.typing import NDArray
 from controller_node.policy import ProjectedLaw
 from loop_interfaces import model_rows
 from loop_interfaces.model_rows import ModelRows
-from loop_interfaces.parameters import table
-from loop_interfaces.spec import check
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD, Plant
 from pdeloop.reference import Reference, find
@@ -186,16 +183,12 @@ class _Trained:
     """A finished run folder."""
 
     def __init__(self, folder: Path) -> None:
-        self.values = {**check(table(), {}), **RunFolder(folder).parameters()}
-        try:
-            with np.load(folder / "policy.npz", allow_pickle=False) as arrays:
-                self.policies, self.warm = arrays["policy"], arrays["lqt"]
-                self.models = [model_rows.unpack(m, self.values["n_a"]) for m in arrays["model"]]
-            self.result: dict[str, Any] = json.loads((folder / "result.json").read_text())
-        except (OSError, ValueError, KeyError) as error:
-            raise RunFolderError(
-                f"{folder} cannot be reported; is the run finished? ({error})"
-            ) from error
+        run = RunFolder(folder)
+        self.values = run.values()
+        arrays = run.policies()
+        self.policies, self.warm = arrays["policy"], arrays["lqt"]
+        self.models = [model_rows.unpack(rows, self.values["n_a"]) for rows in arrays["model"]]
+        self.result = run.result()
 
 
 def _problem(

@@ -1,0 +1,53 @@
+"""NumPy's .npz files, read without trusting them. No ROS import."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loop_interfaces.files import FileError, open_ordinary
+
+MAX_ARRAY_BYTES = 2**30
+"""Of all arrays in a file of policies or models."""
+
+
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of the npz file `path`.
+
+    Raises
+    ------
+    FileError
+        It cannot be read, holds no arrays, objects, or more than MAX_ARRAY_BYTES.
+    """
+    try:
+        with open_ordinary(path) as file:
+            return unpack_arrays(file, MAX_ARRAY_BYTES)
+    except OSError as error:
+        raise FileError(f"{path} cannot be read: {error.strerror or error}") from error
+    except FileError as error:
+        raise FileError(f"{path} {error}") from error
+
+
+def unpack_arrays(file: BinaryIO, most: int) -> dict[str, NDArray[Any]]:
+    """The arrays of an npz archive that begins where `file` stands, of at most `most` bytes together.
+
+    What they take is known from the archive's directory before anything is unpacked: no member can
+    unpack to more than is written there.
+    """
+    try:
+        start = file.tell()
+        with zipfile.ZipFile(file) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+        if size > most:
+            raise FileError(f"holds {size} bytes of arrays; expected at most {most}")
+        file.seek(start)
+        with np.load(file, allow_pickle=False) as arrays:
+            return {name: np.asarray(arrays[name]) for name in arrays.files}
+    except FileError:
+        raise
+    except Exception as error:  # zipfile and NumPy raise some twenty kinds on damaged files
+        raise FileError(f"holds no arrays ({type(error).__name__}: {error})") from error
