@@ -10,7 +10,7 @@ import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 
 from loop_interfaces import topics
-from viewer_node.view import SCALARS
+from viewer_node.loop_view import NUMBERS
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Role:
 
 _ARRAYS = tuple(topic.name for topic in topics.ARRAYS)
 _SAMPLED = (topics.STATE.name, topics.ACTION.name)
-VIEWS = tuple(f"view/{name}" for name in ("field", "target", "spacetime", *SCALARS))
+VIEWS = tuple(f"view/{name}" for name in ("field", "target", "spacetime", *NUMBERS))
 """What viewer_node publishes for people's tools."""
 ROLES = (
     Role(
@@ -72,7 +72,7 @@ ROLES = (
         VIEWS,
         (
             *(topics.START.name, topics.POLICY.name, topics.MODEL.name, topics.COST.name),
-            *(topics.TARGET.name, topics.SAMPLES_THROTTLED),
+            *(topics.TARGET.name, topics.PAUSED.name, topics.SAMPLES_THROTTLED),
         ),
         of_others=_SAMPLED,
     ),

@@ -15,6 +15,7 @@ WITH_ROS = {
     "node.py",
     "node_loop.py",
     "sample_subscription.py",
+    "observer.py",
     "loop_reader.py",
     "service_call.py",
     "peers.py",

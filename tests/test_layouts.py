@@ -11,7 +11,7 @@ import yaml
 
 from loop_interfaces.problem import config_folder
 from pdeloop.secure import ROLES
-from viewer_node.view import SCALARS
+from viewer_node.loop_view import NUMBERS
 
 VIEWS = config_folder() / "views"
 FLOAT, MARKER, IMAGE = (
@@ -86,7 +86,7 @@ def named_topics() -> dict[str, str]:
 
 def published() -> dict[str, str]:
     """What viewer_node publishes, by its own table."""
-    own = {f"/view/{name}": FLOAT for name in SCALARS}
+    own = {f"/view/{name}": FLOAT for name in NUMBERS}
     return own | {"/view/field": MARKER, "/view/target": MARKER, "/view/spacetime": IMAGE} | OTHERS
 
 
@@ -98,7 +98,7 @@ def test_every_topic_of_the_layouts_is_published_with_that_type():
 
 def test_every_number_is_plotted():
     curves = {curve.attrib["name"] for curve in plotjuggler().iter("curve")}
-    assert curves == {f"/view/{name}/data" for name in SCALARS}
+    assert curves == {f"/view/{name}/data" for name in NUMBERS}
 
 
 def test_the_plotjuggler_layout_has_its_form():
@@ -120,7 +120,7 @@ def test_the_plotjuggler_layout_has_its_form():
     assert plugin.attrib["ID"] == "ROS2 Topic Subscriber"
     assert root.find("previouslyLoaded_Streamer").attrib["name"] == plugin.attrib["ID"]
     topics = {topic.attrib["name"] for topic in plugin.iter("topic")}
-    assert topics == {f"/view/{name}" for name in SCALARS}
+    assert topics == {f"/view/{name}" for name in NUMBERS}
 
 
 def test_the_foxglove_layout_places_every_panel_once_and_calls_services_that_there_are():

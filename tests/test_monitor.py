@@ -11,14 +11,16 @@ import pytest
 
 from loop_interfaces.frames import Frame
 from loop_interfaces.topics import COMPLETED, VOID
-from pdeloop.monitor.read_budget import Attention
-from viewer_node.episode_samples import COLUMNS, COMPONENTS, ROWS, Episode, rows_of
-from viewer_node.learning_curve import MOST, POINTS, LearningCurve
-from viewer_node.loop_nodes import Endpoint, Health, Rate
-from viewer_node.loop_view import FAILURE, Watched
+from pdeloop.monitor.read_budget import ReadBudget
+from viewer_node.episode_samples import COLUMNS, MAX_COMPONENTS, ROWS, EpisodeSamples, rows_of
+from viewer_node.learning_curve import MAX_POINTS, SENT, LearningCurve
+from viewer_node.loop_nodes import Endpoint, LoopNodes
+from viewer_node.loop_view import SLOW, LoopView
+from viewer_node.operation import FAILURE, Call
+from viewer_node.rollout_costs import RolloutCosts
+from viewer_node.sliding_rate import SlidingRate
 from viewer_node.web.messages import Cursor
-from viewer_node.web.page import View
-from viewer_node.web.requests import Call
+from viewer_node.web.page import Page
 
 PLANT = 7
 
@@ -57,7 +59,7 @@ def unpacked(message: bytes) -> tuple[dict[str, Any], np.ndarray]:
 
 
 def test_an_episode_keeps_every_state_and_action_while_there_is_room():
-    episode = Episode.begin(state(0), 0)
+    episode = EpisodeSamples.begin(state(0))
     for k in range(10):
         episode.state(state(k))
         episode.action(frame([[k, -k], [10 + k, -k]], step=k))
@@ -72,7 +74,7 @@ def test_an_episode_keeps_every_state_and_action_while_there_is_room():
 
 @pytest.mark.parametrize("steps", [COLUMNS, COLUMNS + 1, 3 * COLUMNS + 7, 9 * COLUMNS])
 def test_a_long_episode_is_thinned_evenly_and_each_column_shows_a_step_of_its_own(steps):
-    episode = Episode.begin(state(0), 0)
+    episode = EpisodeSamples.begin(state(0))
     for k in range(steps):
         episode.state(state(k))
     stride = episode.stride
@@ -85,23 +87,23 @@ def test_a_long_episode_is_thinned_evenly_and_each_column_shows_a_step_of_its_ow
 
 
 def test_missed_steps_stay_blank():
-    episode = Episode.begin(state(0), 0)
+    episode = EpisodeSamples.begin(state(0))
     for k in (0, 1, 5):
         episode.state(state(k))
     assert np.isnan(episode.fields[0, 2:5]).all() and not np.isnan(episode.fields[0, 5]).any()
 
 
 def test_of_a_batch_that_is_too_large_only_the_chosen_environment_is_kept():
-    episode = Episode.begin(state(0, batch=500, n_z=300), 321)
+    episode = EpisodeSamples.begin(state(0, batch=500, n_z=300), environment=321)
     episode.state(state(0, batch=500, n_z=300))
     assert episode.environments == [321] and episode.batch == 500
     assert episode.fields.shape == (1, COLUMNS, ROWS)
-    assert episode.fields[0, 0, 0] == 32100 and episode.latest[0, -1] == pytest.approx(32129.9)
+    assert episode.fields[0, 0, 0] == 32100 and episode.z[321, -1] == pytest.approx(32129.9)
     assert episode.row(321) == 0 and episode.row(4) == 0
 
 
 def test_a_state_of_another_batch_or_before_the_first_one_is_left_out():
-    episode = Episode.begin(state(3), 0)
+    episode = EpisodeSamples.begin(state(3))
     episode.state(state(3))
     before = episode.fields.copy()
     episode.state(state(2))
@@ -121,27 +123,28 @@ def test_rows_are_evenly_spaced_from_the_first_point_of_each_component_to_the_la
 
 def test_of_very_many_delayed_measurements_the_first_are_kept():
     measured = Frame(5, 1, 0, 0.0, np.arange(3.0 * 1000)[None], PLANT)
-    episode = Episode.begin(measured, 0, 1000)
+    episode = EpisodeSamples.begin(measured, components=1000)
     episode.state(measured)
-    assert episode.fields.shape == (1, COLUMNS, 3 * COMPONENTS)
+    assert episode.fields.shape == (1, COLUMNS, 3 * MAX_COMPONENTS)
     np.testing.assert_array_equal(episode.fields[0, 0, episode.part(1)], [3, 4, 5])
-    assert episode.part(999) == episode.part(COMPONENTS - 1)
+    assert episode.part(999) == episode.part(MAX_COMPONENTS - 1)
 
 
 def test_one_component_of_the_state_is_shown_at_a_time():
-    view, cursor = View(), Cursor()
-    view.components(["u", "u_t"])
+    page, cursor = Page(), Cursor()
+    view = page.view
+    view.components = ["u", "u_t"]
     view.target(frame([0.0, 0.0, 7.0, 8.0]), 0.0)
     for k in range(3):
         view.state(frame([[k, k, 90, 99]], step=k), 0.0)
-    view.refresh(10.0)
+    page.refresh(10.0)
     for component, values, aim, span in (
         (0, [0, 0, 1, 1, 2, 2, 2, 2], [0, 0], [0, 2]),
         (1, [90, 99] * 4, [7, 8], [7, 99]),
     ):
-        view.choose(component=component)
-        view.refresh(20.0 + component)
-        parts = {h["part"]: (h, n) for h, n in map(unpacked, view.updates(cursor))}
+        page.choose(component=component)
+        page.refresh(20.0 + component)
+        parts = {h["part"]: (h, n) for h, n in map(unpacked, page.updates(cursor, 0.0))}
         assert parts["status"][0]["component"] == component
         np.testing.assert_array_equal(parts["target"][1], aim)
         header, numbers = parts["episode"]
@@ -153,39 +156,39 @@ def test_one_component_of_the_state_is_shown_at_a_time():
 
 
 def test_a_slow_loop_is_read_all_the_time():
-    attention = Attention()
+    budget = ReadBudget()
     for tick in range(10_000):
-        assert attention.decide(0.03 * tick, watched=True, complete=tick % 20 == 0)
-        attention.took(12)
+        assert budget.decide(0.03 * tick, watched=True, complete=tick % 20 == 0)
+        budget.took(12)
 
 
 def test_a_fast_loop_is_read_an_episode_at_a_time_within_the_budget():
-    attention, read, seconds, pauses, before = Attention(), 0, 60.0, 0, True
+    budget, read, seconds, pauses, before = ReadBudget(), 0, 60.0, 0, True
     rate, tick = 10_000, 0.03
     for i in range(int(seconds / tick)):
-        listening = attention.decide(i * tick, watched=True, complete=i % 3 == 0)
+        listening = budget.decide(i * tick, watched=True, complete=i % 3 == 0)
         pauses += before and not listening
         before = listening
         if listening:
-            attention.took(int(rate * tick))
+            budget.took(int(rate * tick))
             read += int(rate * tick)
-    assert read / seconds < 1.2 * attention.budget
-    assert read / seconds > 0.5 * attention.budget
+    assert read / seconds < 1.2 * budget.budget
+    assert read / seconds > 0.5 * budget.budget
     assert pauses > 10
 
 
 def test_nothing_is_read_while_nobody_looks():
-    attention = Attention()
-    assert not attention.decide(0.0, watched=False, complete=False)
-    assert attention.decide(0.1, watched=True, complete=False)
-    assert not attention.decide(0.2, watched=False, complete=False)
+    budget = ReadBudget()
+    assert not budget.decide(0.0, watched=False, complete=False)
+    assert budget.decide(0.1, watched=True, complete=False)
+    assert not budget.decide(0.2, watched=False, complete=False)
 
 
 def test_an_endless_episode_and_large_messages_do_not_escape_the_budget():
-    attention = Attention()
-    assert attention.decide(0.0, watched=True, complete=False)
-    attention.took(100, size=100_000_000)
-    assert not attention.decide(0.01, watched=True, complete=False)
+    budget = ReadBudget()
+    assert budget.decide(0.0, watched=True, complete=False)
+    budget.took(100, size=100_000_000)
+    assert not budget.decide(0.01, watched=True, complete=False)
 
 
 # The curve.
@@ -244,11 +247,11 @@ def test_references_are_those_of_the_check_and_then_of_the_evaluation():
 
 def test_a_long_training_stays_within_bounds():
     curve = LearningCurve()
-    for k in range(1, 3 * MOST):
+    for k in range(1, 3 * MAX_POINTS):
         curve.row(adapted(0, k, 1.0))
     xs = curve.message()["x"]
-    assert len(xs) <= POINTS and xs[-1] == 3 * MOST - 1
-    assert len(curve._points[0]) <= MOST
+    assert len(xs) <= SENT and xs[-1] == 3 * MAX_POINTS - 1
+    assert len(curve._points[0]) <= MAX_POINTS
 
 
 def test_the_time_that_is_left_follows_from_the_rollouts_of_the_last_minute():
@@ -266,62 +269,72 @@ def test_the_time_that_is_left_follows_from_the_rollouts_of_the_last_minute():
 
 
 def test_from_the_topics_alone_policies_are_points_and_a_row_without_control_is_a_reference():
-    curve, acts = LearningCurve(), [[3, -1, 0, 0], [3, -1, 0, 0], [4, -1, 0, 1], [4, -1, 0, 1]]
+    curve, costs = LearningCurve(), RolloutCosts()
+    acts = [[3, -1, 0, 0], [3, -1, 0, 0], [4, -1, 0, 1], [4, -1, 0, 1]]
+
+    def episode(rows: Any, gains: Any, means: list[float], ended: int = COMPLETED) -> None:
+        costs.start(start(rows))
+        costs.policy(frame(gains))
+        curve.episode(costs.cost(cost(means, ended=ended)))
+
     gains = np.ones((4, 2, 3))
-    curve.rollouts(start(acts), frame(gains), cost([1.0, 3.0, 5.0, 7.0]))
+    episode(acts, gains, [1.0, 3.0, 5.0, 7.0])
     assert points(curve) == [(1, 4.0, 2.0, 6.0)]
+    gains = gains.copy()
     gains[:2] = 0.0
-    curve.rollouts(start(acts), frame(gains), cost([8.0, 10.0, 1.0, 1.0]))
+    episode(acts, gains, [8.0, 10.0, 1.0, 1.0])
     assert curve.references == {"none": 9.0} and len(points(curve)) == 1
-    curve.rollouts(start([[3, 17, 0.1, 0]]), None, cost([50.0]))
-    curve.rollouts(start(acts), frame(np.ones((4, 2, 3))), cost([1, 1, 1, 1], ended=VOID))
+    episode([[3, 17, 0.1, 0]], gains, [50.0])
     assert len(points(curve)) == 1 and curve.phase == "identify"
-    curve.rollouts(start(acts), None, cost([1e9, 1e9, 2.0, 2.0], ended=12))
+    episode(acts, np.ones((4, 2, 3)), [1e9, 1e9, 2.0, 2.0], ended=12)
     assert len(points(curve)) == 1 and curve.message()["diverged"] == 4
 
 
 def test_episodes_that_come_in_at_once_are_a_point_each():
-    watched = Watched()
+    view = LoopView()
     for episode in (1, 2, 3):
-        watched.policy(frame(np.ones((2, 2, 3)), episode=episode), 1.0)
+        view.policy(frame(np.ones((2, 2, 3)), episode=episode), 1.0)
     for episode in (1, 2, 3):
-        watched.start(start([[3, -1, 0, 0], [4, -1, 0, 0]], episode=episode), 1.0)
-    watched.start(frame(np.empty((0, 4)), episode=0), 1.0)
+        view.start(start([[3, -1, 0, 0], [4, -1, 0, 0]], episode=episode), 1.0)
+    view.start(frame(np.empty((0, 4)), episode=0), 1.0)
     for episode in (1, 2, 3):
-        watched.cost(cost([episode, episode + 2.0], episode=episode), 1.0)
+        view.cost(cost([episode, episode + 2.0], episode=episode), 1.0)
     three = [(1, 2.0), (2, 3.0), (3, 4.0)]
-    assert [point[:2] for point in points(watched.curve)] == three
-    watched.cost(cost([9.0, 9.0], episode=4), 1.0)  # nobody knows what it was
-    assert len(points(watched.curve)) == 3
+    assert [point[:2] for point in points(view.curve)] == three
+    view.cost(cost([9.0, 9.0], episode=4), 1.0)  # nobody knows what it was
+    view.start(start([[3, -1, 0, 0]], episode=5), 1.0)
+    view.policy(frame(np.ones((1, 2, 3)), episode=5), 1.0)
+    view.cost(cost([9.0], episode=5, ended=VOID), 1.0)
+    assert len(points(view.curve)) == 3
 
 
 # Nodes.
 
 
 def test_a_node_that_comes_again_is_counted_and_one_that_is_only_seen_late_is_not():
-    health = Health()
+    nodes = LoopNodes()
     first, second = Endpoint("/pde_sim_node", b"a"), Endpoint("/pde_sim_node", b"b")
     for found in ([first], [], [first], [first, second], [second]):
-        health.look({"plant": found})
-    (plant, controller, _) = health.told(0.0)
+        nodes.look({"plant": found})
+    (plant, controller, _) = nodes.message(0.0)
     assert plant["restarts"] == 1 and plant["present"] and plant["rivals"] == 0
     assert not controller["present"] and controller["name"] == ""
 
 
 def test_diagnostics_belong_to_the_node_they_name_and_are_forgotten_when_they_stop():
-    health = Health()
-    health.look({"plant": [Endpoint("/lab/pde_sim_node", b"a")]})
+    nodes = LoopNodes()
+    nodes.look({"plant": [Endpoint("/lab/pde_sim_node", b"a")]})
     values = [("paused", "yes"), ("step", "4")]
-    health.diagnosis("lab/pde_sim_node: lock-step", 1, "paused", values, 10.0)
-    health.diagnosis("lab/other: lock-step", 2, "no", [], 10.0)
-    assert health.told(11.0)[0]["message"] == "paused" and health.told(11.0)[0]["level"] == 1
-    assert health.value("plant", "paused", since=9.0) == "yes"
-    assert health.value("plant", "paused", since=10.5) is None
-    assert "message" not in health.told(30.0)[0]
+    nodes.diagnosis("lab/pde_sim_node: lock-step", 1, "paused", values, 10.0)
+    nodes.diagnosis("lab/other: lock-step", 2, "no", [], 10.0)
+    assert nodes.message(11.0)[0]["message"] == "paused" and nodes.message(11.0)[0]["level"] == 1
+    assert nodes.value("plant", "paused", since=9.0) == "yes"
+    assert nodes.value("plant", "paused", since=10.5) is None
+    assert "message" not in nodes.message(30.0)[0]
 
 
 def test_a_rate_is_that_of_the_last_seconds():
-    rate = Rate()
+    rate = SlidingRate()
     for i in range(101):
         rate.add(10, i * 0.1)
     assert rate.per_second(10.0) == pytest.approx(100.0, rel=0.1)
@@ -331,137 +344,142 @@ def test_a_rate_is_that_of_the_last_seconds():
 # What is watched.
 
 
-def test_an_episode_is_shown_from_its_beginning_or_else_after_a_while():
-    watched = Watched()
+def test_the_last_whole_episode_is_shown_until_the_next_has_run_for_a_while():
+    view = LoopView()
     for k in (5, 6):
-        watched.state(state(k, episode=1), 0.0, 0)
-    assert watched.shown is not None and watched.shown.first == 5  # better than nothing
-    watched.state(state(2, episode=2), 0.1, 0)
-    assert watched.shown.key[1] == 1
-    watched.state(state(0, episode=3), 0.2, 0)
-    assert watched.shown.key[1] == 3
-    watched.state(state(7, episode=4), 0.3, 0)
-    watched.join(0.9)  # a plant that is held in the middle of an episode
-    assert watched.shown.key[1] == 4
+        view.state(state(k, episode=1), 0.0)
+    assert view.shown(0.0).first == 5  # better than nothing
+    view.state(state(0, episode=2), 0.1)
+    assert view.shown(0.1).key[1] == 2
+    view.cost(cost([1.0, 1.0], episode=2), 0.2)
+    view.state(state(7, episode=3), 0.3)
+    view.cost(cost([1.0, 1.0], episode=3), 0.4)  # the end alone does not replace a whole one
+    view.state(state(0, episode=4), 0.5)
+    assert view.shown(0.5).key[1] == 2
+    assert view.shown(0.6 + SLOW).key[1] == 4  # a plant that is held in the middle of an episode
 
 
 def test_a_plant_that_begins_the_same_episode_again_is_shown_from_the_beginning():
-    watched = Watched()
+    view = LoopView()
     for k in (0, 0, 1, 2):  # the first is repeated: that is no new beginning
-        watched.state(state(k), 0.0, 0)
-    assert watched.begun == 1
-    watched.state(state(0), 1.0, 0)
-    assert watched.begun == 2 and watched.shown is not None and watched.shown.last == 0
+        view.state(state(k), 0.0)
+    first = view.current
+    assert first is not None and first.last == 2
+    view.state(state(0), 1.0)
+    assert view.current is not first and view.current.last == 0
 
 
 def test_rounds_are_counted_though_only_some_are_seen():
-    watched = Watched()
+    view = LoopView()
     for episode in range(1, 31):
-        watched.start(start([[0, -1, 0, 0]], episode=episode), 0.1 * episode)
-        watched.cost(cost([1.0], episode=episode, step=50), 0.1 * episode)
-        watched.cost(cost([1.0], episode=episode, step=50), 0.1 * episode)  # repeated
-    assert watched.rounds.per_second(3.0) == pytest.approx(500, rel=0.1)
-    assert watched.episodes.per_second(3.0) == pytest.approx(10, rel=0.1)
+        view.start(start([[0, -1, 0, 0]], episode=episode), 0.1 * episode)
+        view.cost(cost([1.0], episode=episode, step=50), 0.1 * episode)
+        view.cost(cost([1.0], episode=episode, step=50), 0.1 * episode)  # repeated
+    assert view.rounds.per_second(3.0) == pytest.approx(500, rel=0.1)
+    assert view.episodes.per_second(3.0) == pytest.approx(10, rel=0.1)
 
 
 def test_only_the_asked_run_is_shown():
-    watched = Watched(only=5)
-    watched.state(state(0, run=6), 0.0, 0)
-    assert watched.shown is None
-    watched.state(state(0, run=5), 0.0, 0)
-    assert watched.shown is not None
+    view = LoopView(only=5)
+    view.state(state(0, run=6), 0.0)
+    assert view.current is None
+    view.state(state(0, run=5), 0.0)
+    assert view.current is not None
 
 
 def test_who_holds_the_loop_is_told_by_the_plant_by_diagnostics_or_by_the_answer():
-    watched = Watched()
+    view = LoopView()
     roles = {"plant": [Endpoint("/p", b"p")], "tuner": [Endpoint("/t", b"t")]}
-    watched.health.look(roles)
-    watched.state(state(0), 0.0, 0)
-    assert watched.doing(0.1) == "running" and watched.doing(9.0) == "silent"
-    watched.paused(frame([1.0]), 1.0)
-    assert watched.held() == ["plant"] and watched.doing(1.0) == "paused"
-    watched.paused(frame([0.0]), 1.0)
-    watched.health.diagnosis("t: training", 1, "", [("paused", "yes")], 2.0)
-    assert watched.held() == ["tuner"]
-    watched.answered(Call("/t", "resume"), 2.5, None)  # what it said before that no longer counts
-    assert watched.held() == []
-    watched.answered(Call("/p", "pause"), 3.0, None)
-    assert watched.held() == ["plant"]
-    watched.state(state(1), 9.0, 0)  # somebody else has resumed it
-    assert watched.held() == []
-    watched.start(frame(np.empty((0, 4))), 9.0)
-    assert watched.doing(9.0) == "ended"
+    view.nodes.look(roles)
+    view.state(state(0), 0.0)
+    assert view.state_of_loop(0.1) == "running" and view.state_of_loop(9.0) == "silent"
+    view.paused(frame([1.0]), 1.0)
+    assert view.operation.paused() == ["plant"] and view.state_of_loop(1.0) == "paused"
+    view.paused(frame([0.0]), 1.0)
+    view.nodes.diagnosis("t: training", 1, "", [("paused", "yes")], 2.0)
+    assert view.operation.paused() == ["tuner"]
+    view.operation.answered(
+        Call("/t", "resume"), 2.5, None
+    )  # what it said before that no longer counts
+    assert view.operation.paused() == []
+    view.operation.answered(Call("/p", "pause"), 3.0, None)
+    assert view.operation.paused() == ["plant"]
+    view.state(state(1), 9.0)  # somebody else has resumed it
+    assert view.operation.paused() == []
+    view.start(frame(np.empty((0, 4))), 9.0)
+    assert view.state_of_loop(9.0) == "ended"
 
 
 def test_what_was_asked_for_is_told_until_it_is_answered_and_a_failure_for_a_while():
-    watched = Watched()
-    watched.health.look({"tuner": [Endpoint("/t", b"t")]})
+    view = LoopView()
+    view.nodes.look({"tuner": [Endpoint("/t", b"t")]})
     pause, stop = Call("/t", "pause"), Call("/t", "stop")
-    watched.asked(pause, 1.0)
+    view.operation.asked(pause, 1.0)
     asked = {"role": "tuner", "verb": "pause", "seconds": 7, "failure": ""}
-    assert watched.requests(8.0) == [asked] and watched.held() == []
-    watched.answered(pause, 8.0, None)
-    assert watched.requests(8.0) == [] and watched.held() == ["tuner"]
-    watched.answered(pause, 9.0, "no")
-    assert [r["failure"] for r in watched.requests(9.0 + FAILURE)] == ["no"]
-    assert watched.requests(9.1 + FAILURE) == []
-    watched.asked(stop, 30.0)
-    assert not watched.stopping
-    watched.answered(stop, 31.0, None)
-    assert watched.stopping and watched.held() == []
-    watched.asked(pause, 32.0)
-    watched.health.look({"tuner": [Endpoint("/t", b"u")]})  # another one, that continues the run
-    assert not watched.stopping
-    watched.health.look({})
-    assert watched.requests(33.0) == []  # nobody is there who could answer
+    assert view.operation.requests(8.0) == [asked] and view.operation.paused() == []
+    view.operation.answered(pause, 8.0, None)
+    assert view.operation.requests(8.0) == [] and view.operation.paused() == ["tuner"]
+    view.operation.answered(pause, 9.0, "no")
+    assert [r["failure"] for r in view.operation.requests(9.0 + FAILURE)] == ["no"]
+    assert view.operation.requests(9.1 + FAILURE) == []
+    view.operation.asked(stop, 30.0)
+    assert not view.operation.stopping
+    view.operation.answered(stop, 31.0, None)
+    assert view.operation.stopping and view.operation.paused() == []
+    view.operation.asked(pause, 32.0)
+    view.nodes.look({"tuner": [Endpoint("/t", b"u")]})  # another one, that continues the run
+    assert not view.operation.stopping
+    view.nodes.look({})
+    assert view.operation.requests(33.0) == []  # nobody is there who could answer
 
 
 def test_an_activity_is_told_with_its_seconds_while_its_node_reports_it():
-    health = Health()
-    health.look({"tuner": [Endpoint("/t", b"t")]})
-    assert health.activity(0.0) is None
+    nodes = LoopNodes()
+    nodes.look({"tuner": [Endpoint("/t", b"t")]})
+    assert nodes.activity(0.0) is None
     values = [("activity", "fitting models"), ("activity for", "5.0")]
-    health.diagnosis("t: training", 0, "fitting models for 5 s", values, 10.0)
+    nodes.diagnosis("t: training", 0, "fitting models for 5 s", values, 10.0)
     told = {"role": "tuner", "what": "fitting models", "seconds": 7}
-    assert health.activity(12.0) == told
-    assert health.activity(20.0) is None
-    health.diagnosis("t: training", 0, "adapt", [("phase", "adapt")], 21.0)
-    assert health.activity(21.0) is None
+    assert nodes.activity(12.0) == told
+    assert nodes.activity(20.0) is None
+    nodes.diagnosis("t: training", 0, "adapt", [("phase", "adapt")], 21.0)
+    assert nodes.activity(21.0) is None
 
 
 def test_a_loop_that_is_gone_without_a_word_has_ended_too():
-    watched = Watched()
-    assert watched.doing(0.0) == "empty"
-    watched.health.look({"plant": [Endpoint("/p", b"p")]})
-    watched.state(state(0), 0.0, 0)
-    assert watched.doing(0.1) == "running"
-    watched.health.look({})
-    assert watched.doing(0.2) == "ended"
-    watched.health.look({"plant": [Endpoint("/p", b"q")]})
-    watched.state(state(1), 0.3, 0)
-    assert watched.doing(0.3) == "running"
+    view = LoopView()
+    assert view.state_of_loop(0.0) == "empty"
+    view.nodes.look({"plant": [Endpoint("/p", b"p")]})
+    view.state(state(0), 0.0)
+    assert view.state_of_loop(0.1) == "running"
+    view.nodes.look({})
+    assert view.state_of_loop(0.2) == "ended"
+    view.nodes.look({"plant": [Endpoint("/p", b"q")]})
+    view.state(state(1), 0.3)
+    assert view.state_of_loop(0.3) == "running"
 
 
 # The messages to a page.
 
 
 def test_a_page_that_puts_the_messages_together_has_the_whole_episode():
-    view, cursor = View(environment=1), Cursor()
+    page, cursor = Page(environment=1), Cursor()
+    view = page.view
     columns: dict[int, np.ndarray] = {}
     actions: dict[int, np.ndarray] = {}
     for k in range(50):
         view.state(state(k), 0.0)
-        for message in view.updates(cursor) if k % 7 == 3 else []:
+        for message in page.updates(cursor, 0.0) if k % 7 == 3 else []:
             take_columns(message, columns, actions)
         if k != 20:  # an action that never comes
             view.action(frame([[k, 0], [100 + k, 0]], step=k), 0.0)
-    for message in view.updates(cursor):
+    for message in page.updates(cursor, 0.0):
         take_columns(message, columns, actions)
     assert sorted(columns) == list(range(50))
     for k in range(50):
         np.testing.assert_allclose(columns[k], 100 + k + np.arange(4) / 10, rtol=1e-6)
         assert np.isnan(actions[k]).all() if k == 20 else actions[k][0] == 100 + k
-    assert view.updates(cursor) == []
+    assert page.updates(cursor, 0.0) == []
 
 
 def take_columns(
@@ -482,32 +500,35 @@ def take_columns(
 
 
 def test_another_environment_and_another_loop_are_told_from_the_beginning():
-    view, cursor = View(), Cursor()
+    page, cursor = Page(), Cursor()
+    view = page.view
     view.target(frame([1.0, 2.0, 3.0, 4.0]), 0.0)
     for k in range(5):
         view.state(state(k), 0.0)
-    parts = {h["part"]: (h, n) for h, n in map(unpacked, view.updates(cursor))}
+    parts = {h["part"]: (h, n) for h, n in map(unpacked, page.updates(cursor, 0.0))}
     np.testing.assert_array_equal(parts["target"][1], [1, 2, 3, 4])
     assert parts["episode"][0]["environment"] == 0
-    view.choose(environment=1)
-    ((header, numbers),) = map(unpacked, view.updates(cursor))
+    page.choose(environment=1)
+    ((header, numbers),) = map(unpacked, page.updates(cursor, 0.0))
     assert header["new"] and header["environment"] == 1 and numbers[0] == 100
-    view.watch({"domain": 3, "namespace": "/"}, run=None, from_topics=True)
-    view.refresh(0.0)
+    view = LoopView()
+    page.show(view, {"domain": 3, "namespace": "/"})
+    page.refresh(0.0)
     view.state(state(0), 0.0)
-    headers = [unpacked(message)[0] for message in view.updates(cursor)]
+    headers = [unpacked(message)[0] for message in page.updates(cursor, 0.0)]
     assert [h["part"] for h in headers] == ["status", "curve", "target", "episode"]
     assert headers[-1]["new"] and headers[0]["place"]["domain"] == 3
 
 
 def test_the_colours_span_the_field_and_the_target_and_do_not_flicker():
-    view, cursor = View(), Cursor()
+    page, cursor = Page(), Cursor()
+    view = page.view
     view.target(frame([-10.0, 0.0, 0.0, 0.0]), 0.0)
 
     def colours(k: int) -> Any:
         view.state(state(k), 0.0)
-        view.refresh(10.0 * k)
-        return unpacked(view.updates(cursor)[-1])[0]["range"]
+        page.refresh(10.0 * k)
+        return unpacked(page.updates(cursor, 0.0)[-1])[0]["range"]
 
     first = colours(0)
     assert first == [-10.0, pytest.approx(0.3, abs=0.01)]

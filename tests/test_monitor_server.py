@@ -11,19 +11,20 @@ import aiohttp
 import numpy as np
 import pytest
 
-from viewer_node.web.page import View
-from viewer_node.web.requests import Call, Commands, Watch
-from viewer_node.web.server import FILES, PAGE, TOKEN, Server
+from viewer_node.operation import Call
+from viewer_node.web.page import Page, Recorded
+from viewer_node.web.requests import Requests, ShowEpisode, Watch
+from viewer_node.web.server import FILES, STATIC, TOKEN, Server
 
 
 @contextlib.contextmanager
-def served() -> Iterator[tuple[Server, Commands, View]]:
-    view, commands = View(), Commands()
-    view.look({}, [{"role": "plant", "node": "/p", "verbs": ["pause"]}])
-    server = Server(view, commands, 0)
+def served() -> Iterator[tuple[Server, Requests, Page]]:
+    page, requests = Page(), Requests()
+    page.controls = [{"role": "plant", "node": "/p", "verbs": ["pause"]}]
+    server = Server(page, requests, 0)
     server.start()
     try:
-        yield server, commands, view
+        yield server, requests, page
     finally:
         server.stop()
 
@@ -52,7 +53,7 @@ async def connected(server: Server, origin: str) -> dict[str, Any]:
 def test_every_file_of_the_page_is_served_and_nothing_else():
     with served() as (server, _, _):
         assert {"index.html", "main.js", "uPlot.iife.min.js"} <= set(FILES)
-        for name, path in {"": PAGE / "index.html", **FILES}.items():
+        for name, path in {"": STATIC / "index.html", **FILES}.items():
             status, text = asyncio.run(ask(server, "GET", f"/{name}"))
             assert status == 200 and text == path.read_text()
         for name in (
@@ -68,7 +69,7 @@ def test_every_file_of_the_page_is_served_and_nothing_else():
 
 
 def test_a_foreign_host_name_or_page_is_refused():
-    with served() as (server, commands, _):
+    with served() as (server, requests, _):
         own = f"http://127.0.0.1:{server.port}"
         token = asyncio.run(connected(server, own))["token"]
         body = {"node": "/p", "verb": "pause"}
@@ -90,21 +91,21 @@ def test_a_foreign_host_name_or_page_is_refused():
         assert asyncio.run(ask(server, "POST", "/api/call", json=body, **without))[0] == 403
         for wrong in ({"Host": "evil.example"}, {"Origin": "http://evil.example"}):
             assert asyncio.run(ask(server, "GET", "/", **wrong))[0] == 403
-        assert commands.empty()
+        assert requests.empty()
         for origin in ("http://evil.example", "null", ""):
             with pytest.raises(aiohttp.WSServerHandshakeError):
                 asyncio.run(connected(server, origin))
 
 
 def test_a_page_of_ours_reaches_the_nodes_and_nothing_but_what_they_offer():
-    with served() as (server, commands, view):
+    with served() as (server, requests, page):
         own = f"http://localhost:{server.port}"
         allowed = {"Origin": own, TOKEN: asyncio.run(connected(server, own))["token"]}
 
         body = {"node": "/p", "verb": "pause"}
         # Confirmed at once, whatever the node is doing.
         assert asyncio.run(ask(server, "POST", "/api/call", json=body, **allowed))[0] == 200
-        assert commands.get(timeout=10) == Call("/p", "pause")
+        assert requests.get(timeout=10) == Call("/p", "pause")
         for body in (
             {"node": "/p", "verb": "stop"},
             {"node": "/q", "verb": "pause"},
@@ -113,7 +114,8 @@ def test_a_page_of_ours_reaches_the_nodes_and_nothing_but_what_they_offer():
             None,
         ):
             assert asyncio.run(ask(server, "POST", "/api/call", json=body, **allowed))[0] == 400
-        view.watch({"domain": 1, "namespaces": ["/", "/lab"]}, run=None, from_topics=True)
+        page.place["namespaces"] = ["/", "/lab"]
+        page.recorded = Recorded(["episode 1", "episode 2"])
         watch = "/api/watch"
         for body, status in (
             ({"namespace": "/lab"}, 200),
@@ -123,9 +125,13 @@ def test_a_page_of_ours_reaches_the_nodes_and_nothing_but_what_they_offer():
             ({"environment": True}, 400),
             ({"component": 1}, 200),
             ({"component": "u"}, 400),
+            ({"episode": 1}, 200),
+            ({"episode": 2}, 400),
+            ({"episode": -1}, 400),
         ):
             assert asyncio.run(ask(server, "POST", watch, json=body, **allowed))[0] == status, body
-        assert commands.get(timeout=10) == Watch("/lab") and commands.empty()
+        assert requests.get(timeout=10) == Watch("/lab")
+        assert requests.get(timeout=10) == ShowEpisode(1) and requests.empty()
 
 
 def test_the_headers_allow_nothing_from_elsewhere_and_no_inline_script():
@@ -153,7 +159,7 @@ def test_the_colour_map_is_that_of_the_report():
 
     from pdeloop.report.figures import FIELD_MAP
 
-    text = "".join((PAGE / "cividis.js").read_text().split('"')[1::2])
+    text = "".join((STATIC / "cividis.js").read_text().split('"')[1::2])
     ours = np.frombuffer(bytes.fromhex(text), np.uint8).reshape(-1, 3)
     theirs = (colormaps[FIELD_MAP](np.arange(256))[:, :3] * 255).round()
     np.testing.assert_array_equal(ours, theirs)

@@ -9,8 +9,9 @@ from loop_interfaces.diagnostics import Level
 from loop_interfaces.frames import Frame
 from loop_interfaces.model_rows import ModelRows, pack
 from viewer_node.diagnostics import ViewerHealth
-from viewer_node.spacetime import MAX_ROWS, UNSEEN, SpaceTime
-from viewer_node.view import SCALARS, LoopView
+from viewer_node.episode_samples import COLUMNS
+from viewer_node.loop_view import NUMBERS, LoopView
+from viewer_node.picture import UNSEEN, diverging
 
 RUN, PLANT, N_Z, N_A, N_S = 5, 9, 8, 2, 3
 RNG = np.random.default_rng(4)
@@ -30,23 +31,23 @@ def frame(values, episode: int = 1, step: int = 0, plant: int = PLANT) -> Frame:
 
 
 def view() -> LoopView:
-    made = LoopView(length=4.0, horizon=10, state_weight=2.0, action_weight=0.5)
-    made.target(frame(TARGET, 0))
+    made = LoopView(horizon=10, weights=(2.0, 0.5))
+    made.target(frame(TARGET, 0), 0.0)
     return made
 
 
 def begin(shown: LoopView, policies, episode: int = 1, noise: tuple[float, ...] = ()) -> None:
     rows = [(i, -1.0, 0.0, 0.0, *noise) for i in range(len(policies))]
-    shown.model(frame(pack(MODEL)[None], 0, step=1))
-    shown.policy(frame(policies, episode, step=1))
-    shown.start(frame(rows, episode, step=1))
+    shown.model(frame(pack(MODEL)[None], 0, step=1), 0.0)
+    shown.policy(frame(policies, episode, step=1), 0.0)
+    shown.start(frame(rows, episode, step=1), 0.0)
 
 
 def test_a_view_of_nothing_has_nothing_to_show():
-    empty = LoopView(length=1.0, horizon=10, state_weight=1.0, action_weight=1.0)
+    empty = LoopView()
     assert empty.numbers() == {}
     assert empty.profile() is None
-    assert empty.picture(0.0) is None
+    assert empty.space_time(0.0) is None
 
 
 def test_the_numbers_of_a_sample_are_those_of_their_definitions():
@@ -54,18 +55,17 @@ def test_the_numbers_of_a_sample_are_those_of_their_definitions():
     z = RNG.normal(size=(2, N_Z))
     a = RNG.normal(size=(2, N_A))
     shown.state(frame(z, step=3), 0.0)
-    shown.action(frame(a, step=3))
+    shown.action(frame(a, step=3), 0.0)
     numbers = shown.numbers()
     error = z[0] - TARGET
     assert numbers["step"] == 3.0
     assert numbers["tracking_error"] == pytest.approx(np.sqrt(np.mean(error**2)))
     assert numbers["action_norm"] == pytest.approx(np.linalg.norm(a[0]))
     assert numbers["stage_cost"] == pytest.approx(2.0 * np.sum(error**2) + 0.5 * np.sum(a[0] ** 2))
-    profile = shown.profile()
-    assert profile.x.tolist() == [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5]
-    assert profile.z.tolist() == z[0].tolist()
-    assert profile.target.tolist() == TARGET.tolist()
-    assert set(numbers) <= set(SCALARS)
+    field, target = shown.profile()
+    assert field.tolist() == z[0].tolist()
+    assert target.tolist() == TARGET.tolist()
+    assert set(numbers) <= set(NUMBERS)
 
 
 def test_the_chosen_environment_is_shown_and_of_a_smaller_episode_the_last():
@@ -74,7 +74,7 @@ def test_the_chosen_environment_is_shown_and_of_a_smaller_episode_the_last():
     for environment, row in ((1, 1), (2, 2), (7, 2)):
         shown.environment = environment
         shown.state(frame(z), 0.0)
-        assert shown.profile().z.tolist() == z[row].tolist()
+        assert shown.profile()[0].tolist() == z[row].tolist()
 
 
 @pytest.mark.parametrize("noise", [(), (3.0,)])  # the column of a plant with noise, or none
@@ -84,7 +84,7 @@ def test_costs_are_told_apart_by_the_gains_that_caused_them(noise):
     adapted = lqt + 0.1
     begin(shown, [np.zeros_like(lqt), lqt, adapted, adapted, adapted], noise=noise)
     costs = [(10.0, 100.0, -1), (5.0, 50.0, -1), (4.0, 40.0, -1), (2.0, 20.0, -1), (1e9, 1e10, 3)]
-    shown.cost(frame(costs))
+    shown.cost(frame(costs), 0.0)
     numbers = shown.numbers()
     assert numbers["cost_no_control"] == 10.0
     assert numbers["cost_lqt"] == 5.0
@@ -95,17 +95,19 @@ def test_costs_are_told_apart_by_the_gains_that_caused_them(noise):
     numbers = shown.numbers()
     assert numbers["gain_norm"] == pytest.approx(np.linalg.norm(adapted))
     assert numbers["gain_change"] == pytest.approx(0.1 * np.sqrt(lqt.size) / np.linalg.norm(lqt))
-    shown.cost(frame([(9.0, 90.0, -2)] * 3, episode=2))  # void: not a cost
+    shown.cost(frame([(9.0, 90.0, -2)] * 3, episode=2), 0.0)  # void: not a cost
     assert shown.numbers()["cost"] == 3.0
 
 
 def test_gains_without_their_model_are_never_taken_for_lqt():
     shown = view()
     lqt = MODEL.policy
-    shown.policy(frame([lqt], 1, step=2))  # another generation of models than the one that came
-    shown.model(frame(pack(MODEL)[None], 0, step=1))
-    shown.start(frame([(0, -1.0, 0.0, 0.0)], 1, step=2))
-    shown.cost(frame([(5.0, 50.0, -1)]))
+    shown.policy(
+        frame([lqt], 1, step=2), 0.0
+    )  # another generation of models than the one that came
+    shown.model(frame(pack(MODEL)[None], 0, step=1), 0.0)
+    shown.start(frame([(0, -1.0, 0.0, 0.0)], 1, step=2), 0.0)
+    shown.cost(frame([(5.0, 50.0, -1)]), 0.0)
     assert "cost_lqt" not in shown.numbers()
     assert shown.numbers()["cost"] == 5.0
 
@@ -114,39 +116,37 @@ def test_a_finished_episode_is_shown_until_the_next_has_run_for_a_while():
     shown = view()
     for k in range(11):
         shown.state(frame([np.full(N_Z, 1.0)], step=k), 0.0)
-    shown.cost(frame([(1.0, 10.0, -1)], step=10))
+    shown.cost(frame([(1.0, 10.0, -1)], step=10), 0.0)
     assert shown.numbers()["final_error"] == pytest.approx(np.sqrt(np.mean((1.0 - TARGET) ** 2)))
     shown.state(frame([np.full(N_Z, -1.0)], episode=2), 5.0)
-    red, white = shown.picture(5.1), shown.picture(7.0)
+    red, white = (diverging(shown.space_time(now)) for now in (5.1, 7.0))
     assert red.shape == (11, N_Z, 3)
     assert (red == [178, 24, 43]).all()
     assert (white[0] == [33, 102, 172]).all()
     assert (white[1:] == UNSEEN).all()
 
 
-@pytest.mark.parametrize("horizon", [1, 399, 400, 5000])
+@pytest.mark.parametrize("horizon", [1, 511, 512, 5000])
 def test_a_picture_has_a_row_for_every_step_or_shares_them(horizon):
-    picture = SpaceTime(4, horizon)
+    shown = LoopView(horizon=horizon)
     for k in range(horizon + 1):
-        picture.put(k, np.full(4, 1.0 if k % 2 else -1.0))
-    colours = picture.colours()
-    assert len(colours) <= MAX_ROWS
-    per_row = -(-(horizon + 1) // len(colours))
-    assert len(colours) == -(-(horizon + 1) // per_row)
-    assert not (colours == UNSEEN).all(axis=(1, 2)).any()
+        shown.state(frame([np.full(4, 1.0)], step=k), 0.0)
+    rows = shown.space_time(0.0)
+    assert len(rows) <= COLUMNS
+    per_row = -(-(horizon + 1) // len(rows))
+    assert len(rows) == -(-(horizon + 1) // per_row)
+    assert not (diverging(rows) == UNSEEN).all(axis=(1, 2)).any()
 
 
-def test_more_steps_than_expected_are_squeezed_in_and_other_widths_are_left_out():
-    picture = SpaceTime(4, 10)
-    picture.put(0, np.full(4, 1.0))
-    picture.put(1500, np.full(4, -1.0))
-    picture.put(3, np.zeros(5))
-    colours = picture.colours()
-    assert len(colours) == MAX_ROWS
-    assert (colours[0] == [178, 24, 43]).all()
-    seen = ~(colours == UNSEEN).all(axis=(1, 2))
-    assert seen.sum() == 2
-    assert (colours[np.flatnonzero(seen)[1]] == [33, 102, 172]).all()
+def test_more_steps_than_expected_are_squeezed_in_and_other_batches_are_left_out():
+    shown = LoopView(horizon=10)
+    shown.state(frame([np.full(4, 1.0)], step=0), 0.0)
+    shown.state(frame([np.full(4, -1.0)], step=1500), 0.0)
+    shown.state(frame(np.zeros((2, 4)), step=3), 0.0)
+    colours = diverging(shown.space_time(0.0))
+    assert len(colours) <= COLUMNS
+    assert (colours[0] == [178, 24, 43]).all() and (colours[-1] == [33, 102, 172]).all()
+    assert (colours[1:-1] == UNSEEN).all()
 
 
 def test_a_viewer_that_sees_nothing_any_more_is_stale():
@@ -165,14 +165,14 @@ def test_a_viewer_that_sees_nothing_any_more_is_stale():
 def test_several_episodes_that_come_in_at_once_are_told_apart():
     shown = view()
     lqt = MODEL.policy
-    shown.model(frame(pack(MODEL)[None], 0, step=1))
+    shown.model(frame(pack(MODEL)[None], 0, step=1), 0.0)
     policies = {1: [np.zeros_like(lqt), lqt], 2: [lqt + 0.1, lqt + 0.1]}
     for episode, gains in policies.items():
-        shown.policy(frame(gains, episode, step=1))
+        shown.policy(frame(gains, episode, step=1), 0.0)
     for episode in policies:
-        shown.start(frame([(i, -1.0, 0.0, 0.0) for i in range(2)], episode, step=1))
-    shown.start(frame(np.empty((0, 4)), 0))  # the end of the run
-    shown.cost(frame([(10.0, 100.0, -1), (5.0, 50.0, -1)], 1))
-    shown.cost(frame([(4.0, 40.0, -1), (2.0, 20.0, -1)], 2))
+        shown.start(frame([(i, -1.0, 0.0, 0.0) for i in range(2)], episode, step=1), 0.0)
+    shown.start(frame(np.empty((0, 4)), 0), 0.0)  # the end of the run
+    shown.cost(frame([(10.0, 100.0, -1), (5.0, 50.0, -1)], 1), 0.0)
+    shown.cost(frame([(4.0, 40.0, -1), (2.0, 20.0, -1)], 2), 0.0)
     numbers = shown.numbers()
     assert [numbers[name] for name in ("cost_no_control", "cost_lqt", "cost")] == [10.0, 5.0, 3.0]

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from loop_interfaces.diagnostics import Health, Level, Rate
-from viewer_node.view import LoopView
-
-SILENT = 5.0
-"""Seconds without a sample after which what is shown is old."""
+from viewer_node.loop_view import SILENT, LoopView
 
 
 class ViewerHealth:
@@ -19,21 +16,21 @@ class ViewerHealth:
 
     def report(self, now: float, subscribers: int) -> Health:
         """Level, sentence and values at time `now` (monotonic s)."""
-        view = self._view
+        view, current = self._view, self._view.current
         if view.samples != self._seen:
             self._seen, self._seen_at = view.samples, now
-        level, message = Level.OK, f"step {view.step} of episode {view.episode}"
-        if not view.samples:
-            message = "nothing seen yet"
-        elif now - self._seen_at > SILENT:
-            level, message = Level.STALE, f"no sample for {now - self._seen_at:.0f} s"
+        level, message = Level.OK, "nothing seen yet"
+        if current is not None:
+            message = f"step {current.last} of episode {current.key[1]}"
+            if now - self._seen_at > SILENT:
+                level, message = Level.STALE, f"no sample for {now - self._seen_at:.0f} s"
         return Health(
             level,
             message,
             {
                 "run": view.run or None,
-                "episode": view.episode if view.episode >= 0 else None,
-                "step": view.step if view.step >= 0 else None,
+                "episode": None if current is None else current.key[1],
+                "step": None if current is None else current.last,
                 "environment": view.environment,
                 "samples": view.samples,
                 "samples/s": self._rate.per_second(view.samples, now),

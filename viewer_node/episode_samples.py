@@ -1,4 +1,4 @@
-"""The samples of one episode in a fixed room, however long it is. Pure.
+"""The states and actions of one episode in a bounded memory, however long it is. Pure.
 
 Columns are steps of the episode; when they run out, every second one is dropped and a column stands
 for twice as many steps. Rows are grid points, or every n-th of them on a fine grid, for one component
@@ -7,7 +7,9 @@ of the state after the other.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +19,13 @@ from loop_interfaces.frames import Frame
 Array = NDArray[np.float32]
 COLUMNS = 512
 ROWS = 256
-LINES = 32
+MAX_ACTIONS = 32
 """Actions that are kept: more lines than that nobody can tell apart."""
-COMPONENTS = 8
+MAX_COMPONENTS = 8
 """Components of the state that are kept: of delayed measurements there may be very many."""
 LATE = 64
 """Columns by which actions may come later than states."""
-ROOM = 32 * 2**20
+MAX_BYTES = 32 * 2**20
 """Bytes of one episode; of a batch that needs more only the chosen environment is kept."""
 
 Key = tuple[int, int, int]
@@ -35,13 +37,14 @@ def key_of(frame: Frame) -> Key:
     return frame.run, frame.episode, frame.plant
 
 
+@lru_cache(maxsize=16)
 def rows_of(n_z: int, components: int = 1) -> NDArray[np.intp]:
-    """Indices into a state of at most ROWS grid points of each of the first COMPONENTS components,
-    evenly spaced.
+    """Indices into a state of at most ROWS grid points of each of the first MAX_COMPONENTS
+    components, evenly spaced.
     """
     n_x = n_z // components
     points = np.linspace(0, n_x - 1, min(n_x, ROWS)).round().astype(np.intp)
-    return (n_x * np.arange(min(components, COMPONENTS))[:, None] + points).ravel()
+    return (n_x * np.arange(min(components, MAX_COMPONENTS))[:, None] + points).ravel()
 
 
 def _empty(*shape: int) -> Array:
@@ -49,12 +52,13 @@ def _empty(*shape: int) -> Array:
 
 
 @dataclass
-class Episode:
+class EpisodeSamples:
     """What was seen of one episode.
 
     first: the step of column 0; stride: steps of one column; last, acted: the newest step of which the
-    state and the action were seen; samples: how many there were of both;
-    environments: those of the batch that are kept, and batch: how many there are.
+    state and the action were seen; z (batch, n_z): the newest state; samples: how many there were of
+    both; environments: those of the batch of which the fields are kept; number: tells it from every
+    other one.
     """
 
     key: Key
@@ -63,34 +67,42 @@ class Episode:
     batch: int
     environments: list[int]
     fields: Array
+    stride: int
     components: int = 1
     actions: Array = field(default_factory=lambda: _empty(0, COLUMNS, 0))
-    stride: int = 1
     last: int = 0
     acted: int = -1
-    latest: Array = field(default_factory=lambda: _empty(0, 0))
+    z: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
     sample_time: float = 0.0
     ended: bool = False
     samples: int = 0
+    number: int = field(default_factory=itertools.count().__next__)
 
     @staticmethod
-    def begin(frame: Frame, chosen: int, components: int = 1) -> Episode:
+    def begin(
+        frame: Frame, *, environment: int = 0, components: int = 1, horizon: int = 0
+    ) -> EpisodeSamples:
         """An episode of which the state in `frame` is the first sample.
 
-        chosen: the environment to keep if not all can be kept; components: of the state.
+        environment: the one to keep if not all can be kept; components: of the state; horizon: steps
+        that are expected, for which the columns then are enough.
         """
         batch, n_z = frame.values.shape
         components = components if components > 0 and n_z % components == 0 else 1
         rows = len(rows_of(n_z, components))
-        fits = batch * COLUMNS * (rows + LINES) * 4 <= ROOM
-        kept = list(range(batch)) if fits else [min(chosen, batch - 1)]
-        return Episode(
+        fits = batch * COLUMNS * (rows + MAX_ACTIONS) * 4 <= MAX_BYTES
+        kept = list(range(batch)) if fits else [min(environment, batch - 1)]
+        stride = 1
+        while horizon >= COLUMNS * stride:
+            stride *= 2
+        return EpisodeSamples(
             key=key_of(frame),
             first=frame.step,
             time=frame.time,
             batch=batch,
             environments=kept,
             fields=_empty(len(kept), COLUMNS, rows),
+            stride=stride,
             components=components,
         )
 
@@ -115,12 +127,12 @@ class Episode:
         if frame.values.shape[0] != self.batch or frame.step < self.first:
             return
         column = self._column(frame.step)
-        values = frame.values[self.environments]
         if frame.step > self.first:
             self.sample_time = (frame.time - self.time) / (frame.step - self.first)
-        self.fields[:, column] = values[:, rows_of(values.shape[1], self.components)]
+        rows = rows_of(frame.values.shape[1], self.components)
+        self.fields[:, column] = frame.values[self.environments][:, rows]
         if frame.step >= self.last:
-            self.last, self.latest = frame.step, values.astype(np.float32)
+            self.last, self.z = frame.step, frame.values
         self.samples += 1
 
     def action(self, frame: Frame) -> None:
@@ -129,20 +141,21 @@ class Episode:
         if batch != self.batch or frame.step < self.first:
             return
         if not self.actions.size:
-            self.actions = _empty(len(self.environments), COLUMNS, min(n_a, LINES))
+            self.actions = _empty(len(self.environments), COLUMNS, min(n_a, MAX_ACTIONS))
         column = self._column(frame.step)
         self.actions[:, column] = frame.values[self.environments][:, : self.actions.shape[2]]
         self.acted = max(self.acted, frame.step)
         self.samples += 1
 
     def row(self, environment: int) -> int:
-        """Where `environment` is kept; the first one if it is not."""
-        known = environment in self.environments
-        return self.environments.index(environment) if known else 0
+        """Where the fields of `environment` are; of a smaller batch those of the last one."""
+        if environment in self.environments:
+            return self.environments.index(environment)
+        return len(self.environments) - 1
 
     def part(self, component: int) -> slice:
         """The rows of one component; of the last one if there are not so many."""
-        kept = min(self.components, COMPONENTS)
+        kept = min(self.components, MAX_COMPONENTS)
         size = self.fields.shape[2] // kept
         component = min(component, kept - 1)
         return slice(component * size, (component + 1) * size)

@@ -13,14 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.frames import Frame
-from loop_interfaces.topics import COMPLETED, VOID, CostColumn, StartColumn
+from viewer_node.rollout_costs import Rollouts
 
-POINTS = 400
+SENT = 400
 """Points that a page is sent: more than its pixels would be wasted."""
-MOST = 4_000
+MAX_POINTS = 4_000
 """Points of one seed that are kept; then every second one goes."""
-MOST_SEEDS = 1024
+MAX_SEEDS = 1024
 RATE_WINDOW = 60.0
 """Seconds over which the speed is taken that the remaining time is estimated with."""
 
@@ -83,7 +82,7 @@ class LearningCurve:
 
     def _adapted(self, row: Mapping[str, Any]) -> None:
         seed, x = int(row["seed"]), int(row["rollouts"])
-        if seed not in self._rollouts and len(self._rollouts) >= MOST_SEEDS:
+        if seed not in self._rollouts and len(self._rollouts) >= MAX_SEEDS:
             return
         self._rollouts[seed] = x
         self._marks.append((float(row.get("time", 0.0)), sum(self._rollouts.values())))
@@ -93,34 +92,27 @@ class LearningCurve:
             made_of = [value for value in pair if math.isfinite(value)] or [cost]
             self._add(seed, CurvePoint(x, cost, min(made_of), max(made_of)))
 
-    def rollouts(self, start: Frame, policy: Frame | None, cost: Frame) -> None:
+    def episode(self, rollouts: Rollouts) -> None:
         """Take an episode that is over, from the topics alone.
 
-        An episode in which a row has no control is a comparison: it gives that reference. Any other
-        one with a policy is a point.
+        One with a rollout without control is a comparison: it gives the references. Any other one
+        with a policy is a point.
         """
-        explores = bool((start.values[:, StartColumn.EXCITATION] >= 0).any())
-        ended = cost.values[:, CostColumn.ENDED]
-        if len(start.values) != len(cost.values) or (ended == VOID).any():
-            return
         self.version += 1
-        self.phase = "identify" if explores else "policy"
-        if explores:
+        self.phase = "identify" if rollouts.explores else "policy"
+        if rollouts.explores:
             return
-        good, mean = ended == COMPLETED, cost.values[:, CostColumn.MEAN]
-        if policy is not None and len(policy.values) == len(mean):
-            none = ~policy.values.any(axis=(1, 2))
-            if none.any():
-                self.phase = "compare"
-                if (none & good).any():
-                    self.references["none"] = float(mean[none & good].mean())
-                return
-        self.diverged += int((~good).sum())
+        if "none" in rollouts.controllers:
+            self.phase = "compare"
+            for name in ("none", "lqt"):
+                if (mean := rollouts.mean_cost(name)) is not None:
+                    self.references[name] = mean
+            return
+        self.diverged += int((~rollouts.completed).sum())
         x = 1 + max(self._rollouts.values(), default=0)
-        models = start.values[:, StartColumn.MODEL]
-        for model in np.unique(models).astype(int).tolist()[:MOST_SEEDS]:
+        for model in np.unique(rollouts.models).tolist()[:MAX_SEEDS]:
             self._rollouts[model] = x
-            own = mean[good & (models == model)]
+            own = rollouts.mean[rollouts.completed & (rollouts.models == model)]
             if own.size:
                 point = CurvePoint(x, float(own.mean()), float(own.min()), float(own.max()))
                 self._add(model, point)
@@ -133,10 +125,10 @@ class LearningCurve:
     def costs(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Rollouts (X,) and the cost of each seed by then (S, X), NaN before its first.
 
-        A seed keeps its cost until its next point. X is at most POINTS.
+        A seed keeps its cost until its next point. X is at most SENT.
         """
         xs = np.unique([point.x for points in self._points.values() for point in points])
-        every = max(1, -(-len(xs) // POINTS))
+        every = max(1, -(-len(xs) // SENT))
         xs = xs[::-every][::-1].astype(np.float64)
         rows = np.full((len(self._points), len(xs)), np.nan)
         for row, seed in zip(rows, sorted(self._points), strict=True):
@@ -195,5 +187,5 @@ class LearningCurve:
         if points and point.x <= points[-1].x:  # repeated by a tuner that began again
             points[:] = [other for other in points if other.x != point.x]
         insort(points, point)
-        if len(points) > MOST:
+        if len(points) > MAX_POINTS:
             del points[1::2]

@@ -1,105 +1,140 @@
-"""What is known of the loop that is watched. Pure.
+"""What is known of one loop: the one core of the ROS views and of the web page. Pure.
 
-`now` is any monotonic time in s.
+Frames of the loop's topics go in; episodes, numbers, learning curve and the state of the nodes come
+out. `now` is any monotonic time in s.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from collections import OrderedDict
+from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.frames import Frame, Recent
+from loop_interfaces.frames import Frame
 from loop_interfaces.topics import VOID, CostColumn, StartColumn
-from viewer_node.episode_samples import Episode, Key, key_of, rows_of
+from viewer_node.episode_samples import EpisodeSamples, Key, key_of, rows_of
 from viewer_node.learning_curve import LearningCurve
-from viewer_node.loop_nodes import Health, Rate
-from viewer_node.web.requests import Call
+from viewer_node.loop_nodes import LoopNodes
+from viewer_node.operation import Operation
+from viewer_node.rollout_costs import RolloutCosts
+from viewer_node.sliding_rate import SlidingRate
 
-JOIN = 0.5
-"""Seconds after which an episode is shown of which the beginning was missed."""
+Array = NDArray[np.float64]
+K = TypeVar("K")
+V = TypeVar("V")
+SLOW = 1.0
+"""Seconds after which an episode is shown while it runs; shorter ones when they are over."""
 SILENT = 5.0
 """Seconds without a message after which a loop is not going."""
 EXTREMES = (0.3, 99.7)
 """Percentiles of the field that the colours span, as in the report."""
 STEADY = 0.15
 """Share of the colours' range by which it must change to be changed: they would only flicker."""
-FAILURE = 15.0
-"""Seconds for which a page says that a request failed."""
-_MOST = 100
+MAX_KEPT = 100
 """Episodes and plants that are remembered."""
 
+NUMBERS = {
+    "cost": "mean stage cost of the last adapted policies (neither zero nor the LQT gains)",
+    "cost_no_control": "mean stage cost of the last rollouts without control",
+    "cost_lqt": "mean stage cost of the last rollouts with the LQT gains",
+    "reduction": "100 (1 - cost / cost_lqt), in percent",
+    "stage_cost": "l_k = q |z_k - z_r|^2 + r |a_k|^2 of the newest sample",
+    "tracking_error": "root of the mean square of z_k - z_r of the newest sample",
+    "final_error": "the same at the last step of the last episode",
+    "action_norm": "|a_k| of the newest sample",
+    "gain_norm": "Frobenius norm of the present gains [K_a K_b]",
+    "gain_change": "Frobenius norm of their difference to the LQT gains, relative to these",
+    "step": "k of the newest sample",
+}
+"""Names of the numbers, published below `view/`, and what they are."""
+_COSTS = {"none": "cost_no_control", "lqt": "cost_lqt", "adapted": "cost"}
 
-@dataclass
-class Request:
-    """A service that a page asked for: since when; why and when it failed."""
 
-    since: float
-    failure: str = ""
-    failed: float | None = None
+class LoopView:
+    """Follows the loop of one plant and controller.
 
-
-class Watched:
-    """One loop: its nodes, the newest episodes, its training.
-
-    only: the run to watch, None for any; from_topics: whether the curve comes from the costs on the
-    topics; begun: counts the episodes that were shown.
+    Parameters
+    ----------
+    only : int, optional
+        The run to follow; any by default.
+    curve_from_topics : bool
+        Whether the learning curve comes from the costs on the topics.
+    horizon : int
+        Steps of an episode, as far as known.
+    weights : (float, float)
+        q and r of the stage cost, as far as known.
+    components : sequence of str
+        Names of the components of the state.
     """
 
-    def __init__(self, *, only: int | None = None, from_topics: bool = True) -> None:
-        self.only, self.from_topics = only, from_topics
-        self.health = Health()
+    def __init__(
+        self,
+        *,
+        only: int | None = None,
+        curve_from_topics: bool = True,
+        horizon: int = 0,
+        weights: tuple[float, float] = (0.0, 0.0),
+        components: Sequence[str] = ("u",),
+    ) -> None:
+        self.only, self.curve_from_topics = only, curve_from_topics
+        self.horizon, self.weights, self.components = horizon, weights, list(components)
+        self.environment = 0
+        """The one that is shown; of a smaller episode the last one is."""
+        self.nodes = LoopNodes()
+        self.operation = Operation(self.nodes)
         self.curve = LearningCurve()
-        self.rounds, self.episodes = Rate(), Rate()
-        self.shown: Episode | None = None
-        self.begun = 0
-        self.targets: dict[int, NDArray[np.float64]] = {}
-        self.parameters: dict[str, Any] = {}
-        self.components = ["u"]
-        self.controls: list[dict[str, Any]] = []
-        self.run = 0
-        self.kinds: dict[tuple[int, int], str] = {}
+        self.rounds, self.episodes = SlidingRate(), SlidingRate()
+        self.current: EpisodeSamples | None = None
+        self.finished: EpisodeSamples | None = None
+        self.targets: OrderedDict[int, Array] = OrderedDict()
+        self.kinds: OrderedDict[tuple[int, int], str] = OrderedDict()
         """What the newest episodes are, by run and number."""
-        self._pending: Episode | None = None
-        self._pending_since = 0.0
-        self._starts, self._policies = Recent(), Recent()
+        self.run = 0
+        self.samples = 0
+        self._costs = RolloutCosts()
+        self._numbers: dict[str, float] = {}
+        self._current_since = 0.0
         self._costs_of: tuple[int, int] | None = None
         self._counted: tuple[Key, int] | None = None
-        self._plant_paused = False
-        self._paused: dict[str, float] = {}
-        self._answered: dict[str, float] = {}
-        self._requests: dict[Call, Request] = {}
-        self._stopping: tuple[str, int] | None = None
         self._heard: float | None = None
         self._ended = False
 
-    def state(self, frame: Frame, now: float, chosen: int) -> None:
-        """Take z_k of all environments; chosen: the one to keep if not all can be kept."""
+    # What comes from the topics.
+
+    def state(self, frame: Frame, now: float) -> None:
+        """Take z_k of all environments."""
         if not self._wanted(frame, now, "plant"):
             return
-        key = key_of(frame)
-        for episode in (self.shown, self._pending):
-            if episode is None or episode.key != key:
-                continue
-            if frame.step or not episode.last:
-                episode.state(frame)
-                break
-        else:  # a new episode, or the same one again from its beginning: the plant was restarted
-            self._pending, self._pending_since = (
-                Episode.begin(frame, chosen, len(self.components)),
-                now,
+        self.samples += 1
+        key, current = key_of(frame), self.current
+        # The same episode again from its beginning: the plant was restarted.
+        if current is None or current.key != key or (frame.step == 0 and current.last):
+            self._current_since = now
+            self.current = current = EpisodeSamples.begin(
+                frame,
+                environment=self.environment,
+                components=len(self.components),
+                horizon=self.horizon,
             )
-            self._pending.state(frame)
-        self.join(now)
+        current.state(frame)
         self._count(key, frame.step, now)
 
     def action(self, frame: Frame, now: float) -> None:
         """Take a_k of all environments."""
-        if self._wanted(frame, now, "controller"):
-            for episode in self._known(key_of(frame)):
-                episode.action(frame)
+        current = self.current
+        if not self._wanted(frame, now, "controller") or current is None:
+            return
+        if current.key != key_of(frame):
+            return
+        current.action(frame)
+        a = frame.values[min(self.environment, len(frame.values) - 1)]
+        self._numbers["action_norm"] = float(np.sqrt(a @ a))
+        if frame.step == current.last and (error := self._error()) is not None:
+            q, r = self.weights
+            self._numbers["stage_cost"] = float(q * error @ error + r * a @ a)
 
     def start(self, frame: Frame, now: float) -> None:
         """Take the start of an episode; without rows it is the end of the run."""
@@ -108,138 +143,130 @@ class Watched:
         self._ended = not len(frame.values)
         if self._ended:
             return
-        before = self._starts.newest
-        if before is not None and before.run != frame.run and self.from_topics:
-            self.curve = LearningCurve()
-        self._starts.add(frame)
         explores = (frame.values[:, StartColumn.EXCITATION] >= 0).any()
-        self.kinds[frame.run, frame.episode] = "exploration" if explores else "policy"
-        if len(self.kinds) > _MOST:
-            del self.kinds[next(iter(self.kinds))]
+        _put(self.kinds, (frame.run, frame.episode), "exploration" if explores else "policy")
+        self._costs.start(frame)
+        self._take_gains()
 
     def policy(self, frame: Frame, now: float) -> None:
         """Take the gains of an episode."""
         if self._wanted(frame, now, "tuner"):
-            self._policies.add(frame)
+            self._costs.policy(frame)
+            self._take_gains()
+
+    def model(self, frame: Frame, now: float) -> None:
+        """Take a run's reduced models, which have the LQT gains in them."""
+        if self._wanted(frame, now, "tuner"):
+            self._costs.model(frame)
+            self._take_gains()
 
     def cost(self, frame: Frame, now: float) -> None:
         """Take the costs of an episode that is over."""
         if not self._wanted(frame, now, "plant"):
             return
-        key, ids = key_of(frame), (frame.run, frame.episode)
-        for episode in self._known(key):
-            episode.ended = True
+        key, ids, current = key_of(frame), (frame.run, frame.episode), self.current
+        if current is not None and current.key == key:
+            current.ended = True
+            if current.whole or self.finished is None:
+                self.finished = current
+            if current.last == frame.step and (error := self._error()) is not None:
+                self._numbers["final_error"] = _rms(error)
         if self._costs_of == ids:
             return  # repeated
         self._costs_of = ids
         self._count(key, frame.step, now)
-        if not (frame.values[:, CostColumn.ENDED] == VOID).any():
-            self.episodes.add(1, now)
-            self.health.heard(now, "controller")
-        start = self._starts.of(frame)
-        if start is not None and self.from_topics:
-            self.curve.rollouts(start, self._policies.of(frame), frame)
+        if (frame.values[:, CostColumn.ENDED] == VOID).any():
+            return
+        self.episodes.add(1, now)
+        self.nodes.heard(now, "controller")
+        rollouts = self._costs.cost(frame)
+        if rollouts is None:
+            return
+        for controller, name in _COSTS.items():
+            if (mean := rollouts.mean_cost(controller)) is not None:
+                self._numbers[name] = mean
+        if self._numbers.get("cost_lqt", 0.0) > 0.0 and "cost" in self._numbers:
+            share = self._numbers["cost"] / self._numbers["cost_lqt"]
+            self._numbers["reduction"] = 100.0 * (1.0 - share)
+        if self.curve_from_topics:
+            self.curve.episode(rollouts)
 
     def target(self, frame: Frame, now: float) -> None:
         """Take z_r of a plant."""
-        self.health.heard(now, "plant")
-        if len(self.targets) > _MOST:
-            self.targets.clear()
-        self.targets[frame.plant] = frame.values
+        self.nodes.heard(now, "plant")
+        _put(self.targets, frame.plant, frame.values)
 
     def paused(self, frame: Frame, now: float) -> None:
         """Take whether an operator holds the plant."""
-        self.health.heard(now, "plant")
-        self._plant_paused = bool(frame.values.any())
+        self.nodes.heard(now, "plant")
+        self.operation.plant_paused = bool(frame.values.any())
 
-    def asked(self, call: Call, now: float) -> None:
-        """A page asks a node for something."""
-        self._requests[call] = Request(now)
+    # What is shown.
 
-    def answered(self, call: Call, now: float, failure: str | None) -> None:
-        """A node did what it was asked to, or not: then why."""
-        if failure is not None:
-            self._requests[call] = Request(now, failure, now)
-            return
-        self._requests.pop(call, None)
-        self._answered[call.node] = now
-        if call.verb == "pause":
-            self._paused[call.node] = now
-        elif call.verb in ("resume", "stop"):
-            self._paused.pop(call.node, None)
-        if call.verb == "stop":
-            self._stopping = call.node, self.health.peers["tuner"].starts
-
-    def requests(self, now: float) -> list[dict[str, Any]]:
-        """What was asked for and is not answered yet, and what has just failed."""
-        for call, request in list(self._requests.items()):
-            if request.failed is not None and now - request.failed > FAILURE:
-                del self._requests[call]
-        roles = {peer.name: role for role, peer in self.health.peers.items() if peer.present}
-        return [
-            {
-                "role": roles[call.node],
-                "verb": call.verb,
-                "seconds": round(now - request.since),
-                "failure": request.failure,
-            }
-            for call, request in self._requests.items()
-            if call.node in roles
-        ]
+    def shown(self, now: float) -> EpisodeSamples | None:
+        """The episode that runs, if it has for longer than SLOW, else the last that is over."""
+        if self.finished is None or now - self._current_since > SLOW:
+            return self.current
+        return self.finished
 
     @property
-    def stopping(self) -> bool:
-        """Whether the tuner has agreed to stop, and is still there."""
-        tuner = self.health.peers["tuner"]
-        return tuner.present and self._stopping == (tuner.name, tuner.starts)
+    def complete(self) -> bool:
+        """Whether the newest episode is over, and was seen from its beginning."""
+        return self.current is not None and self.current.ended and self.current.whole
 
-    def quiet(self, now: float) -> float | None:
-        """Seconds since the last message of the loop; None before the first."""
-        return None if self._heard is None else now - self._heard
-
-    def join(self, now: float) -> None:
-        """Show an episode of which the beginning was seen, or any if there is no better for long."""
-        new = self._pending
-        if new is not None and (
-            new.whole or self.shown is None or now - self._pending_since > JOIN
-        ):
-            self.shown, self._pending = new, None
-            self.begun += 1
-
-    def held(self) -> list[str]:
-        """The roles of the nodes that somebody holds."""
-        found = []
-        for role in ("plant", "tuner"):
-            name = self.health.peers[role].name
-            told = self.health.value(role, "paused", since=self._answered.get(name, 0.0))
-            paused = self._plant_paused and role == "plant"
-            there = self.health.peers[role].present
-            if there and (paused or name in self._paused or told == "yes"):
-                found.append(role)
+    def numbers(self) -> dict[str, float]:
+        """The numbers of NUMBERS that are known by now."""
+        found = dict(self._numbers)
+        if self.current is not None:
+            found["step"] = float(self.current.last)
+        if (error := self._error()) is not None:
+            found["tracking_error"] = _rms(error)
         return found
 
-    def doing(self, now: float) -> str:
+    def profile(self) -> tuple[Array, Array | None] | None:
+        """The newest field (n_z,) of the chosen environment and its target; None before the first."""
+        current = self.current
+        if current is None or not len(current.z):
+            return None
+        z = current.z[min(self.environment, current.batch - 1)]
+        target = self.targets.get(current.key[2])
+        return z, target if target is not None and len(target) == len(z) else None
+
+    def space_time(self, now: float) -> NDArray[np.float32] | None:
+        """The field of the shown episode, (steps, points), to the horizon; NaN where not seen."""
+        shown = self.shown(now)
+        if shown is None:
+            return None
+        rows = min(shown.fields.shape[1], max(shown.columns, self.horizon // shown.stride + 1))
+        return shown.fields[shown.row(self.environment), :rows]
+
+    def state_of_loop(self, now: float) -> str:
         """What goes on, in one word."""
         # The last word of a tuner that was interrupted may be lost: then everybody is gone.
-        nobody = not any(peer.present for peer in self.health.peers.values())
+        nobody = not any(node.present for node in self.nodes.by_role.values())
         if self._ended or (nobody and self._heard is not None):
             return "ended"
         if nobody:
             return "empty"
-        if self.held():
+        if self.operation.paused():
             return "paused"
         if self._heard is None:
             return "waiting"
         return "running" if now - self._heard < SILENT else "silent"
 
+    def quiet(self, now: float) -> float | None:
+        """Seconds since the last message of the loop; None before the first."""
+        return None if self._heard is None else now - self._heard
+
     def colours(
-        self, environment: int, component: int, before: tuple[float, float]
+        self, component: int, before: tuple[float, float], now: float
     ) -> tuple[float, float]:
         """The range of u that the colours span; `before` if it is hardly another one."""
-        if self.shown is None:
+        shown = self.shown(now)
+        if shown is None:
             return before
-        shown, part = self.shown, self.shown.part(component)
-        seen = shown.fields[shown.row(environment), : shown.columns, part]
+        part = shown.part(component)
+        seen = shown.fields[shown.row(self.environment), : shown.columns, part]
         seen = seen[np.isfinite(seen)]
         if not seen.size:
             return before
@@ -255,13 +282,26 @@ class Watched:
         same = abs(low - before[0]) <= size and abs(high - before[1]) <= size
         return before if same else (low, high)
 
-    def _known(self, key: Key) -> list[Episode]:
-        return [e for e in (self.shown, self._pending) if e is not None and e.key == key]
+    def _error(self) -> Array | None:
+        """z - z_r of the newest sample."""
+        found = self.profile()
+        return None if found is None or found[1] is None else found[0] - found[1]
+
+    def _take_gains(self) -> None:
+        known = self._costs.gains(self.environment)
+        if known is None:
+            return
+        gains, lqt = known
+        self._numbers["gain_norm"] = float(np.linalg.norm(gains))
+        if lqt is not None and (size := float(np.linalg.norm(lqt))) > 0.0:
+            self._numbers["gain_change"] = float(np.linalg.norm(gains - lqt)) / size
 
     def _wanted(self, frame: Frame, now: float, role: str) -> bool:
         if self.only is not None and frame.run != self.only:
             return False
-        self.health.heard(now, role)
+        self.nodes.heard(now, role)
+        if self.run and frame.run != self.run and self.curve_from_topics:
+            self.curve = LearningCurve()
         self._heard, self.run = now, frame.run
         return True
 
@@ -270,7 +310,16 @@ class Watched:
         before = self._counted[1] if self._counted and self._counted[0] == key else 0
         if step > before:
             self.rounds.add(step - before, now)
-            plant = self.health.peers["plant"].name
-            if now - self._paused.get(plant, now) > SILENT:  # somebody else resumed it
-                del self._paused[plant]
+            self.operation.plant_stepped(now)
         self._counted = key, max(step, before)
+
+
+def _put(kept: OrderedDict[K, V], key: K, value: V) -> None:
+    """Keep the newest MAX_KEPT."""
+    kept[key] = value
+    if len(kept) > MAX_KEPT:
+        kept.popitem(last=False)
+
+
+def _rms(error: Array) -> float:
+    return float(np.sqrt(np.mean(error**2)))

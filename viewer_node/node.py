@@ -3,7 +3,7 @@
 Subscribes  state, action (or samples_throttled), target, episode/start, policy, model, episode/cost
 Publishes   view/field, view/target (visualization_msgs/Marker), view/spacetime (sensor_msgs/Image),
             view/... (std_msgs/Float64), at view_rate and only what somebody subscribes to
-It takes no part in the loop, and nothing waits for it. What is shown: viewer_node.view, docs/views.md.
+It takes no part in the loop, and nothing waits for it. What is shown: docs/views.md.
 """
 
 from __future__ import annotations
@@ -11,8 +11,6 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -24,17 +22,18 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import ColorRGBA, Float64
 from visualization_msgs.msg import Marker
 
-from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.parameters import PROBLEM, VIEWER
-from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.node_main import node_main
+from loop_interfaces.ros.observer import Observer
 from loop_interfaces.ros.parameters import declare, given_parameters, on_change
-from loop_interfaces.topics import COST, MODEL, POLICY, START, TARGET
 from viewer_node.diagnostics import ViewerHealth
-from viewer_node.loop_reader import DRAIN, Handler, Reader, Samples, drain
-from viewer_node.view import SCALARS, LoopView
+from viewer_node.loop_reader import PERIOD, LoopReader
+from viewer_node.loop_view import NUMBERS, LoopView
+from viewer_node.picture import diverging
 
+LOOK = 0.5
+"""Seconds between two looks at the graph."""
 FRAME_ID = "field"
 """Frame of the markers and the image: x is the place, y the value of the field; no transform needed."""
 LINE_WIDTH = 0.006
@@ -53,65 +52,50 @@ VIEWER_PARAMETERS = (
 
 
 class ViewerNode:
-    """Moves messages from the topics into the view, and what it shows out of it."""
+    """Reads the loop's topics into the view, and publishes what it shows."""
 
-    def __init__(self, node: Node, loop: NodeLoop) -> None:
+    def __init__(self, node: Node, loop: Observer) -> None:
         self._changed: dict[str, Any] = {}
         values = self._declare(node)
         self._length = float(values["length"])
-        self._view = LoopView(
-            length=self._length,
-            horizon=values["horizon"],
-            state_weight=values["state_weight"],
-            action_weight=values["action_weight"],
-        )
+        weights = float(values["state_weight"]), float(values["action_weight"])
+        self._view = LoopView(horizon=values["horizon"], weights=weights, curve_from_topics=False)
         self._health = ViewerHealth(self._view)
         self._due = loop.now()
         self._adjust({spec.name: values[spec.name] for spec in VIEWER})
         self._wire(node, loop)
         node.get_logger().info(f"{values['problem']}: views at {values['view_rate']:g} Hz")
 
-    def join(self, node: Node, loop: NodeLoop) -> None:
+    def join(self, node: Node, loop: Observer) -> None:
         self._declare(node)
         self._wire(node, loop)
 
     def _declare(self, node: Node) -> dict[str, Any]:
         return declare(node, VIEWER_PARAMETERS, {**given_parameters(node), **self._changed})
 
-    def _wire(self, node: Node, loop: NodeLoop) -> None:
+    def _wire(self, node: Node, loop: Observer) -> None:
         self._node, self._loop = node, loop
-        view = self._view
-        self._samples = Samples(node, "", view.state, _whenever(view.action))
-        *self._starts, self._costs = (
-            Reader(node, topic, topic.name, _whenever(take))
-            for topic, take in (
-                (TARGET, view.target),
-                (MODEL, view.model),
-                (POLICY, view.policy),
-                (START, view.start),
-                (COST, view.cost),
-            )
-        )
+        self._reader = LoopReader(node, "", self._view)
+        self._reader.listen(True)
         self._markers = {name: node.create_publisher(Marker, f"view/{name}", 1) for name in COLOURS}
         self._image = node.create_publisher(Image, "view/spacetime", 1)
-        self._scalars = {
-            name: node.create_publisher(Float64, f"view/{name}", 1) for name in SCALARS
+        self._numbers = {
+            name: node.create_publisher(Float64, f"view/{name}", 1) for name in NUMBERS
         }
+        loop.every(PERIOD, self._read)
+        loop.every(LOOK, self._reader.look)
         loop.diagnose("views", lambda now: self._health.report(now, self._subscribers()))
         on_change(node, VIEWER, self._adjust)
 
     def run(self) -> int:
-        self._loop.run(
-            tick=self._tick,
-            deadline=lambda: 0.0,
-            housekeeping=lambda now: self._samples.look(),
-        )
+        self._loop.run()
         return 0
 
-    def _tick(self, now: float) -> None:
-        time.sleep(min(DRAIN, self._period))
-        drain(self._starts, self._samples, [self._costs])
+    def _read(self) -> None:
+        self._reader.read()
+        now = self._loop.now()
         if now >= self._due:
+            self._due = max(self._due + self._period, now + self._period / 2)
             self._show(now)
 
     def _adjust(self, values: dict[str, Any]) -> None:
@@ -120,19 +104,20 @@ class ViewerNode:
         self._view.environment = values["view_environment"]
 
     def _show(self, now: float) -> None:
-        self._due = max(self._due + self._period, now + self._period / 2)
         for name, value in self._view.numbers().items():
-            self._scalars[name].publish(Float64(data=value))
+            self._numbers[name].publish(Float64(data=value))
         profile = self._view.profile()
         if profile is None:
             return
-        for name, values in (("field", profile.z), ("target", profile.target)):
+        z, target = profile
+        x = self._length / len(z) * np.arange(len(z), dtype=np.float64)
+        for name, values in (("field", z), ("target", target)):
             if values is not None and _wanted(self._markers[name]):
-                self._markers[name].publish(self._marker(name, profile.x, values))
+                self._markers[name].publish(self._marker(name, x, values))
         if _wanted(self._image):
-            picture = self._view.picture(now)
-            if picture is not None:
-                self._image.publish(self._picture(picture))
+            fields = self._view.space_time(now)
+            if fields is not None:
+                self._image.publish(self._picture(diverging(fields)))
 
     def _marker(self, name: str, x: NDArray[np.float64], values: NDArray[np.float64]) -> Marker:
         marker = Marker(ns=name, id=list(COLOURS).index(name), type=Marker.LINE_STRIP)
@@ -155,13 +140,8 @@ class ViewerNode:
         return image
 
     def _subscribers(self) -> int:
-        publishers = (*self._markers.values(), self._image, *self._scalars.values())
+        publishers = (*self._markers.values(), self._image, *self._numbers.values())
         return sum(publisher.get_subscription_count() for publisher in publishers)
-
-
-def _whenever(take: Callable[[Frame], None]) -> Handler:
-    """A handler that does not care for the time."""
-    return lambda frame, now: take(frame)
 
 
 def _wanted(publisher: Publisher) -> bool:
@@ -179,7 +159,7 @@ def main(args: list[str] | None = None) -> int:
     """Console script."""
     _stand_back()
     keep_on_this_machine()
-    return node_main("viewer_node", args, ViewerNode)
+    return node_main("viewer_node", args, ViewerNode, Observer)
 
 
 if __name__ == "__main__":

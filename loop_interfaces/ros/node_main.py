@@ -9,7 +9,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator
 from types import FrameType
-from typing import Protocol
+from typing import Any, Protocol
 
 import rclpy
 from rclpy.node import Node
@@ -29,8 +29,13 @@ class ConfigurationError(Exception):
 
 
 @contextlib.contextmanager
-def ros_node(name: str, args: list[str] | None) -> Iterator[tuple[Node, NodeLoop]]:
-    """A node with its loop: initialises ROS, handles SIGINT and SIGTERM, and leaves nothing behind."""
+def ros_node(
+    name: str, args: list[str] | None, make_loop: Callable[[Node], Any] = NodeLoop
+) -> Iterator[tuple[Node, Any]]:
+    """A node with its event loop: initialises ROS, handles SIGINT and SIGTERM, leaves nothing behind.
+
+    make_loop: NodeLoop for a node of the loop, Observer for one that observes it.
+    """
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rcl raises bare RuntimeErrors and its own types
@@ -46,7 +51,7 @@ def ros_node(name: str, args: list[str] | None) -> Iterator[tuple[Node, NodeLoop
                 f"the Fast DDS profile {os.environ[PROFILE]} did not take effect (UDP sockets at "
                 f"{', '.join(outside)}); expected the loopback interface only, or PDELOOP_NETWORK=1"
             )
-        loop = NodeLoop(node)
+        loop = make_loop(node)
 
         def stop(number: int, frame: FrameType | None) -> None:
             loop.stop(signal.Signals(number).name)
@@ -63,14 +68,19 @@ def ros_node(name: str, args: list[str] | None) -> Iterator[tuple[Node, NodeLoop
 class NodeBody(Protocol):
     """What a node does: made with its parameters and topics, then run."""
 
-    def join(self, node: Node, loop: NodeLoop) -> None:
+    def join(self, node: Node, loop: Any) -> None:
         """Declare the parameters and wire the topics on a new `node`; what was learnt stays."""
 
     def run(self) -> int:
         """Work until the loop stops; returns the exit code, of no meaning if it was suspended."""
 
 
-def node_main(name: str, args: list[str] | None, make: Callable[[Node, NodeLoop], NodeBody]) -> int:
+def node_main(
+    name: str,
+    args: list[str] | None,
+    make: Callable[[Node, Any], NodeBody],
+    make_loop: Callable[[Node], Any] = NodeLoop,
+) -> int:
     """The `main` of a node: makes its body, runs it and returns the exit code.
 
     A process that was suspended for long joins again, as a new participant. 1 with one line on
@@ -82,7 +92,7 @@ def node_main(name: str, args: list[str] | None, make: Callable[[Node, NodeLoop]
         release_compiler()  # of what importing it has touched; loading needs little of that
         body: NodeBody | None = None
         while True:
-            with ros_node(name, args) as (node, loop):
+            with ros_node(name, args, make_loop) as (node, loop):
                 try:
                     if body is None:
                         body = make(node, loop)

@@ -49,8 +49,8 @@ def _monitor(options: argparse.Namespace) -> int:
     from pdeloop.domain import given_domain
     from pdeloop.monitor.finder import Finder, run_id
     from pdeloop.monitor.node import ConfigurationError, stand_back, watch
-    from viewer_node.web.page import View
-    from viewer_node.web.requests import Commands as Queue
+    from viewer_node.web.page import Page
+    from viewer_node.web.requests import Requests
     from viewer_node.web.server import Server
 
     folder, namespace = options.folder, options.namespace
@@ -60,11 +60,11 @@ def _monitor(options: argparse.Namespace) -> int:
         raise ParameterError(f"--environment is {options.environment}; expected 0 or more")
     if folder is not None and run_id(folder) is None:
         raise ParameterError(f"no run in {folder}; give the folder of one, or none")
-    view, queue = View(options.environment), Queue()
+    page, requests = Page(options.environment), Requests()
     finder = Finder(folder, given_domain())
     stand_back()
     try:
-        server = Server(view, queue, options.port)
+        server = Server(page, requests, options.port)
     except OSError as error:
         raise ParameterError(
             f"port {options.port} on 127.0.0.1 cannot be had ({os.strerror(error.errno or 0)}); "
@@ -76,9 +76,9 @@ def _monitor(options: argparse.Namespace) -> int:
         webbrowser.open(server.url)
     try:
         watch(
-            view,
+            page,
             finder,
-            queue,
+            requests,
             namespace=None if namespace is None else "/" + namespace.strip("/"),
             watched=server.watched,
             network=options.network,

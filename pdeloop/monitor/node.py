@@ -1,10 +1,10 @@
 """The monitor as a ROS 2 node: reads the loop's topics now and then, calls its services when asked.
 
-Subscribes  episode/start, policy, episode/cost, episode/paused, target, /diagnostics;
+Subscribes  episode/start, policy, model, episode/cost, episode/paused, target, /diagnostics;
             samples (of a plant without them state and action) while somebody looks, and no more of
-            them than monitor.attention allows
+            them than pdeloop.monitor.read_budget allows
 Calls       NODE/pause, resume, step, stop (std_srvs/Trigger) of the loop's nodes
-What it learns goes into monitor.view.
+What it reads goes into the view core (viewer_node.loop_view), and to the page (viewer_node.web).
 """
 
 from __future__ import annotations
@@ -25,21 +25,26 @@ from rclpy.node import Node
 
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.ros.introspection import NAMELESS
-from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.node_main import ConfigurationError, ros_node
+from loop_interfaces.ros.observer import Observer
 from loop_interfaces.ros.parameters import RemoteParameters
-from loop_interfaces.topics import COST, PAUSED, POLICY, START, TARGET, Topic
+from loop_interfaces.topics import Topic
 from pde_sim_node.equations import EQUATIONS
 from pdeloop.display import ProgressFile
 from pdeloop.live import Live
 from pdeloop.monitor.finder import Finder, run_id
-from pdeloop.monitor.read_budget import Attention
+from pdeloop.monitor.read_budget import ReadBudget
 from pdeloop.monitor.service_call import ServiceCall
+from viewer_node.learning_curve import LearningCurve
 from viewer_node.loop_nodes import ROLES, Endpoint
-from viewer_node.loop_reader import DRAIN, Handler, Reader, Samples, drain
-from viewer_node.web.page import View
-from viewer_node.web.requests import VERBS, Commands, Watch
+from viewer_node.loop_reader import PERIOD, LoopReader
+from viewer_node.loop_view import LoopView
+from viewer_node.operation import VERBS, Call
+from viewer_node.web.page import Page
+from viewer_node.web.requests import Requests, Watch
 
+ATTEND = 0.1
+"""Seconds between two looks at what the page asks for, and at what was asked of the nodes."""
 REFRESH = 0.5
 """Seconds between two looks at rates and at the progress of the run."""
 LOOK = 1.0
@@ -56,128 +61,98 @@ class MonitorNode:
     def __init__(
         self,
         node: Node,
-        loop: NodeLoop,
-        view: View,
+        loop: Observer,
+        page: Page,
         live: Live,
         *,
         finder: Finder,
         namespace: str | None,
-        commands: Commands,
+        requests: Requests,
         watched: Callable[[], bool],
     ) -> None:
-        self._node, self._loop, self._view, self._live = node, loop, view, live
-        self._finder, self._commands, self._watched = finder, commands, watched
-        self._namespace = namespace
+        self._node, self._loop, self._page, self._live = node, loop, page, live
+        self._finder, self._requests, self._watched = finder, requests, watched
         self._given = namespace is not None
-        self._attention = Attention()
-        self._latched: list[Reader] = []
-        self._samples: Samples | None = None
+        self._reader: LoopReader | None = None
         self._calls: list[ServiceCall] = []
         self._asked: dict[bytes, RemoteParameters] = {}
-        self._progress: ProgressFile | None = None
         self._out: Path | None = None
-        self._refresh_at = self._look_at = 0.0
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self._begin(namespace)
+        for period, callback in (
+            (PERIOD, self._read),
+            (ATTEND, self._attend),
+            (LOOK, self._look),
+            (REFRESH, self._refresh),
+        ):
+            loop.every(period, callback)
 
     def run(self) -> str:
         """Watch until a signal comes, or another loop is to be watched; the reason."""
-        return self._loop.run(
-            tick=self._tick, deadline=lambda: 0.0, housekeeping=self._housekeeping
-        )
+        return self._loop.run()
 
     def _begin(self, namespace: str | None) -> None:
         """Watch the loop in `namespace`."""
-        for reader in self._latched:
-            reader.close()
-        self._stop_reading()
-        self._latched, self._attention = [], Attention()
-        self._namespace = namespace
+        if self._reader is not None:
+            self._reader.close()
+        self._namespace, self._budget = namespace, ReadBudget()
         folder = self._live.folder
         self._progress = _progress(folder)
         place: dict[str, Any] = {
             "domain": self._live.domain,
-            "folder": None if folder is None else _short(folder),
+            "folder": None if folder is None else short(folder),
             "namespace": namespace,
             "namespaces": [],
         }
-        self._view.watch(place, run=self._finder.only_run, from_topics=self._progress is None)
+        from_topics = self._progress is None
+        self._view = LoopView(only=self._finder.only_run, curve_from_topics=from_topics)
+        self._page.show(self._view, place)
+        self._reader = None
         if namespace is not None:
-            view = self._view
-            handlers: dict[Topic, Handler] = {
-                START: view.start,
-                POLICY: view.policy,
-                PAUSED: view.paused,
-                COST: view.cost,
-                TARGET: view.target,
-            }
-            self._latched = [
-                Reader(self._node, topic, self._name(topic), handle)
-                for topic, handle in handlers.items()
-            ]
+            self._reader = LoopReader(self._node, namespace, self._view)
 
-    def _stop_reading(self) -> None:
-        if self._samples is not None:
-            self._samples.close()
-            self._samples = None
+    def _read(self) -> None:
+        if self._reader is None:
+            return
+        with self._page.lock:
+            self._budget.took(*self._reader.read())
+            complete = self._view.complete
+        now = self._loop.now()
+        self._reader.listen(self._budget.decide(now, watched=self._watched(), complete=complete))
 
-    def _name(self, topic: Topic | str) -> str:
-        name = topic if isinstance(topic, str) else topic.name
-        return f"{(self._namespace or '').rstrip('/')}/{name}"
+    def _attend(self) -> None:
+        with contextlib.suppress(queue.Empty):
+            while True:
+                self._serve(self._requests.get_nowait())
+        with self._page.lock:
+            self._calls = [call for call in self._calls if not call.poll(self._view.operation)]
+            for parameters in self._asked.values():
+                if parameters.values is None:
+                    parameters.poll()
+                    if parameters.values is not None:
+                        self._take_parameters(parameters.values)
 
-    def _tick(self, now: float) -> None:
-        time.sleep(DRAIN)
-        self._attention.took(*drain(self._latched[:3], self._samples, self._latched[3:]))
-        namespace = self._namespace
-        wanted = namespace is not None and self._attention.decide(
-            now, watched=self._watched(), complete=self._view.complete
-        )
-        if not wanted:
-            self._stop_reading()
-        elif self._samples is None and namespace is not None:
-            self._samples = Samples(self._node, namespace, self._view.state, self._view.action)
-
-    def _housekeeping(self, now: float) -> None:
-        self._obey()
-        if self._samples is not None:
-            self._samples.look()
-        self._calls = [call for call in self._calls if not call.poll()]
-        for parameters in self._asked.values():
-            if parameters.values is None:
-                parameters.poll()
-                if parameters.values is not None:
-                    self._learn(parameters.values)
-        if now >= self._look_at:
-            self._look_at = now + LOOK
+    def _serve(self, request: object) -> None:
+        """Do what the page asks for."""
+        if isinstance(request, Watch):
+            self._given = True
+            self._begin(request.namespace)
             self._look()
-            if self._finder.find() != self._live:
-                self._loop.stop("moved")
-        if now >= self._refresh_at:
-            self._refresh_at = now + REFRESH
-            self._follow()
-            if self._progress is not None:
-                self._view.progress(self._progress.rows())
-            self._view.refresh(now)
-
-    def _obey(self) -> None:
-        """Take what the page asks for."""
-        while True:
-            try:
-                command = self._commands.get_nowait()
-            except queue.Empty:
-                return
-            if isinstance(command, Watch):
-                self._given = True
-                self._begin(command.namespace)
-                self._look_at = 0.0
-            else:
-                self._calls.append(ServiceCall(self._node, command, self._view))
+        elif isinstance(request, Call):
+            self._calls.append(ServiceCall(self._node, request))
+            with self._page.lock:
+                self._view.operation.asked(request, self._loop.now())
+            self._page.refresh(self._loop.now())
 
     def _look(self) -> None:
+        """Look who is there, and which loop is to be watched."""
+        if self._finder.find() != self._live:
+            self._loop.stop("moved")
+        if self._reader is not None:
+            self._reader.look()
         found = self._namespaces()
         if not self._given and found and self._namespace not in found:
             self._begin(found[0])
-        self._view.namespaces(found)
         by_role: dict[str, list[Endpoint]] = {}
         for role, topic in ROLES.items():
             by_role[role] = []
@@ -192,7 +167,22 @@ class MonitorNode:
         alive = {endpoint.process for found in by_role.values() for endpoint in found}
         for process in set(self._asked) - alive:
             self._asked.pop(process).close()
-        self._view.look(by_role, self._controls(by_role))
+        with self._page.lock:
+            self._page.place["namespaces"] = found
+            self._view.nodes.look(by_role)
+            self._page.controls = self._controls(by_role)
+
+    def _refresh(self) -> None:
+        with self._page.lock:
+            self._follow()
+            if self._progress is not None:
+                for row in self._progress.rows():
+                    self._view.curve.row(row)
+        self._page.refresh(self._loop.now())
+
+    def _name(self, topic: Topic | str) -> str:
+        name = topic if isinstance(topic, str) else topic.name
+        return f"{(self._namespace or '').rstrip('/')}/{name}"
 
     def _namespaces(self) -> list[str]:
         """Namespaces in which somebody publishes what a node of a loop does."""
@@ -217,14 +207,11 @@ class MonitorNode:
             if name in offered
         ]
 
-    def _learn(self, values: dict[str, Any]) -> None:
+    def _take_parameters(self, values: dict[str, Any]) -> None:
         """Take a node's parameters; the tuner's may say where its run's folder is."""
-        self._view.parameters(values)
-        if values.get("sensors"):
-            count = int(values.get("sensor_delays") or 1)
-            self._view.components(["y", *(f"y {k} ago" for k in range(1, count))])
-        elif values.get("equation") in EQUATIONS:
-            self._view.components(EQUATIONS[values["equation"]].components)
+        self._page.take_parameters(values)
+        if names := component_names(values):
+            self._view.components = names
         out = values.get("out")
         self._out = Path(out) if isinstance(out, str) and out else self._out
 
@@ -234,14 +221,26 @@ class MonitorNode:
             run = self._view.run
             if run and run_id(self._out) == run:
                 self._progress = _progress(self._out)
-                self._view.follow(_short(self._out))
+                self._page.place["folder"] = short(self._out)
+                self._view.curve_from_topics, self._view.curve = False, LearningCurve()
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        now = time.monotonic()
-        for status in message.status:
-            values = [(str(v.key), str(v.value)) for v in status.values]
-            level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
-            self._view.diagnosis(str(status.name), level, str(status.message), values, now)
+        now = self._loop.now()
+        with self._page.lock:
+            for status in message.status:
+                values = [(str(v.key), str(v.value)) for v in status.values]
+                level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
+                name, text = str(status.name), str(status.message)
+                self._view.nodes.diagnosis(name, level, text, values, now)
+
+
+def component_names(values: dict[str, Any]) -> list[str]:
+    """Names of the components that make up a state, from a plant's parameters; empty if unknown."""
+    if values.get("sensors"):
+        count = int(values.get("sensor_delays") or 1)
+        return ["y", *(f"y {k} ago" for k in range(1, count))]
+    equation = EQUATIONS.get(str(values.get("equation")))
+    return [] if equation is None else list(equation.components)
 
 
 def _progress(folder: Path | None) -> ProgressFile | None:
@@ -251,7 +250,8 @@ def _progress(folder: Path | None) -> ProgressFile | None:
     return ProgressFile(folder / "progress.jsonl", past=True)
 
 
-def _short(folder: Path) -> str:
+def short(folder: Path) -> str:
+    """The folder as a person in the working directory writes it."""
     with contextlib.suppress(ValueError):
         return str(folder.resolve().relative_to(Path.cwd()))
     return str(folder)
@@ -265,9 +265,9 @@ def stand_back() -> None:
 
 
 def watch(
-    view: View,
+    page: Page,
     finder: Finder,
-    commands: Commands,
+    requests: Requests,
     *,
     namespace: str | None,
     watched: Callable[[], bool],
@@ -284,25 +284,26 @@ def watch(
             signal.signal(number, on_signal)
         live = finder.find()
         if live is None:
-            view.refresh(time.monotonic())
+            page.refresh(time.monotonic())
             stop.wait(REFRESH)
             continue
         if not (network or live.network):
             keep_on_this_machine()
         os.environ["ROS_DOMAIN_ID"] = str(live.domain)
-        with ros_node("monitor", ["--ros-args", "--disable-external-lib-logs"]) as (node, loop):
+        options = ["--ros-args", "--disable-external-lib-logs"]
+        with ros_node("monitor", options, Observer) as (node, loop):
             body = MonitorNode(
                 node,
                 loop,
-                view,
+                page,
                 live,
                 finder=finder,
                 namespace=namespace,
-                commands=commands,
+                requests=requests,
                 watched=watched,
             )
             if body.run().startswith("SIG"):
                 return
 
 
-__all__ = ["ConfigurationError", "MonitorNode", "stand_back", "watch"]
+__all__ = ["ConfigurationError", "MonitorNode", "component_names", "short", "stand_back", "watch"]

@@ -1,4 +1,4 @@
-"""When the monitor reads states and actions, and when it leaves the loop alone. Pure.
+"""How many states and actions the monitor reads. Pure.
 
 Every sample a reader gets is one more datagram for its writer to send, also one that the reader
 throws away. A loop makes thousands of rounds a second and a person sees a few pictures; so the
@@ -14,7 +14,7 @@ MESSAGE = 4096
 
 
 @dataclass
-class Attention:
+class ReadBudget:
     """A budget of messages: read ones make a debt, time pays it back.
 
     budget: messages a second; burst: debt up to which there is no reason to stop; most: debt at

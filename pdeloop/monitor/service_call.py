@@ -8,8 +8,7 @@ from typing import Any
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-from viewer_node.web.page import View
-from viewer_node.web.requests import Call
+from viewer_node.operation import Call, Operation
 
 CONNECTION = 5.0
 """Seconds within which the service must be there."""
@@ -20,29 +19,24 @@ ANSWER = 300.0
 class ServiceCall:
     """A call of a service that is under way."""
 
-    def __init__(self, node: Node, call: Call, view: View) -> None:
-        self._node, self._call, self._view = node, call, view
+    def __init__(self, node: Node, call: Call) -> None:
+        self._node, self._call = node, call
         self._since = time.monotonic()
         self._client = node.create_client(Trigger, f"{call.node}/{call.verb}")
         self._future: Any = None
-        view.asked(call, self._since)
 
-    def poll(self) -> bool:
-        """Go on; True when it is over."""
+    def poll(self, operation: Operation) -> bool:
+        """Go on; True when it is over, and what came of it is noted."""
         now = time.monotonic()
         if self._future is None and self._client.service_is_ready():
             self._future = self._client.call_async(Trigger.Request())
         if self._future is not None and self._future.done():
             answer = self._future.result()
-            self._view.answered(self._call, now, None if answer.success else str(answer.message))
+            operation.answered(self._call, now, None if answer.success else str(answer.message))
         elif now - self._since > (CONNECTION if self._future is None else ANSWER):
             waited = f"did not answer within {now - self._since:.0f} s"
-            self._view.answered(self._call, now, waited)
+            operation.answered(self._call, now, waited)
         else:
             return False
-        self.close()
-        return True
-
-    def close(self) -> None:
-        """Wait for it no more."""
         self._node.destroy_client(self._client)
+        return True

@@ -1,1 +1,1 @@
-"""The web outlet of the views: a page and its server, on this machine only."""
+"""The web outlet of the view core: a page and its server, on this machine only."""

@@ -1,4 +1,4 @@
-"""The messages to a page, and what it has been told. Pure.
+"""The messages with numbers to a page, and what it has been sent. Pure.
 
 Text is JSON. What has numbers is binary: the length of the header (uint32), the header as JSON
 padded to 4 bytes, float32 numbers, all little-endian.
@@ -15,24 +15,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from viewer_node.episode_samples import Episode, rows_of
-from viewer_node.loop_view import Watched
+from viewer_node.episode_samples import EpisodeSamples, rows_of
 
 _LENGTH = struct.Struct("<I")
 
 
 @dataclass
 class Cursor:
-    """What one page has been told so far."""
+    """What one page has been sent so far."""
 
     status: int = -1
     curve: tuple[int, int] = (-1, -1)
     target: tuple[int, int, int] = (-1, -1, -1)
-    begun: tuple[int, int] = (-1, -1)
-    chosen: tuple[int, int] = (-1, -1)
-    stride: int = 0
+    shown: tuple[int, int, int, int] = (-1, -1, -1, -1)
+    samples: tuple[int, int, bool] = (-1, -1, False)
     column: int = 0
-    shown: tuple[int, int, bool] = (-1, -1, False)
 
 
 def pack(header: Mapping[str, Any], values: NDArray[np.float32]) -> bytes:
@@ -42,38 +39,38 @@ def pack(header: Mapping[str, Any], values: NDArray[np.float32]) -> bytes:
     return _LENGTH.pack(len(text)) + text + values.astype("<f4").tobytes()
 
 
-def target(watched: Watched, shown: Episode, component: int) -> bytes:
+def target_message(
+    values: NDArray[np.float64] | None, shown: EpisodeSamples, component: int
+) -> bytes:
     """The target of the plant whose episode is shown; no numbers if it is not known."""
-    values = watched.targets.get(shown.key[2])
     if values is None:
         return pack({"part": "target"}, np.empty(0, np.float32))
     rows = rows_of(len(values), shown.components)[shown.part(component)]
     return pack({"part": "target"}, values[rows].astype(np.float32))
 
 
-def sample(
-    watched: Watched,
-    shown: Episode,
+def samples_message(
+    shown: EpisodeSamples,
     cursor: Cursor,
     *,
-    generation: int,
-    chosen: tuple[int, int],
+    kind: str,
+    environment: int,
+    component: int,
     colours: tuple[float, float],
+    sample_time: float,
 ) -> bytes | None:
     """The columns of the shown episode that are new since `cursor`, or None.
 
     Its numbers: field (columns, rows), actions (columns, actions), the newest state (rows).
-    generation: of what is watched; chosen: environment and component.
     """
     now = (shown.samples, shown.last, shown.ended)
-    begun = (generation, watched.begun)
-    same = (cursor.begun, cursor.chosen, cursor.stride) == (begun, chosen, shown.stride)
-    if same and cursor.shown == now:
+    what = (shown.number, environment, component, shown.stride)
+    same = cursor.shown == what
+    if same and cursor.samples == now:
         return None
-    row, part = shown.row(chosen[0]), shown.part(chosen[1])
+    row, part = shown.row(environment), shown.part(component)
     first = cursor.column if same else 0
-    cursor.begun, cursor.chosen, cursor.stride = begun, chosen, shown.stride
-    cursor.column, cursor.shown = shown.settled, now
+    cursor.shown, cursor.samples, cursor.column = what, now, shown.settled
     fields = shown.fields[row, first : shown.columns, part]
     actions = shown.actions[row, first : shown.columns] if shown.actions.size else fields[:, :0]
     header = {
@@ -81,7 +78,7 @@ def sample(
         "new": not same,
         "run": shown.key[0],
         "episode": shown.key[1],
-        "kind": watched.kinds.get(shown.key[:2], ""),
+        "kind": kind,
         "environment": shown.environments[row],
         "first": first,
         "columns": len(fields),
@@ -91,8 +88,9 @@ def sample(
         "begin": shown.first,
         "last": shown.last,
         "ended": shown.ended,
-        "sample_time": shown.sample_time or watched.parameters.get("sample_time", 0.0),
+        "sample_time": sample_time,
         "range": colours,
     }
-    latest = shown.latest[row][rows_of(shown.latest.shape[1], shown.components)[part]]
-    return pack(header, np.concatenate([fields.ravel(), actions.ravel(), latest]))
+    z = shown.z[shown.environments[row]]
+    newest = z[rows_of(len(z), shown.components)[part]]
+    return pack(header, np.concatenate([fields.ravel(), actions.ravel(), newest]))

@@ -1,7 +1,7 @@
-"""What the page is told: everything the monitor knows of the loop it watches. Pure.
+"""What a page is sent: the status, the learning curve, and the new samples of the shown episode.
 
-One thread puts in what comes from the topics, another takes out what a page does not have yet; each
-method holds the lock for as long as it runs, which is short. `now` is any monotonic time in s.
+One thread feeds the view, another takes out what a page does not have yet; both hold `Page.lock`
+meanwhile. `now` is any monotonic time in s.
 """
 
 from __future__ import annotations
@@ -9,204 +9,119 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
-from loop_interfaces.frames import Frame
-from viewer_node.episode_samples import COMPONENTS
-from viewer_node.learning_curve import LearningCurve
-from viewer_node.loop_nodes import Endpoint
-from viewer_node.loop_view import SILENT, Watched
-from viewer_node.web.messages import Cursor, sample, target
-from viewer_node.web.requests import Call
+from viewer_node.episode_samples import MAX_COMPONENTS
+from viewer_node.loop_view import SILENT, LoopView
+from viewer_node.web.messages import Cursor, samples_message, target_message
 
 FRESH = 0.5
 """Seconds between two looks at the range of the colours."""
-_PARAMETERS = (
+PARAMETERS = (
     *("problem", "length", "n_z", "n_a", "horizon", "sample_time"),
     *("optimizer", "seeds"),
 )
 """Parameters that the page shows or needs."""
 
 
-class View:
-    """All of it, for the monitor's life.
+@dataclass
+class Recorded:
+    """The recorded episodes of a run that is over: labels, and the one that is shown."""
 
-    environment: index in the batch that is shown.
+    labels: list[str] = field(default_factory=list)
+    chosen: int = 0
+
+
+class Page:
+    """What all pages of a monitor are sent.
+
+    view: of the loop that is shown; place: its domain, folder, namespace and namespaces, for people;
+    parameters, controls: what its nodes have told and what they offer; recorded: if it is a run that
+    is over.
     """
 
     def __init__(self, environment: int = 0) -> None:
-        self._lock = threading.Lock()
-        self._watched = Watched()
+        self.lock = threading.RLock()
+        self.view = LoopView()
+        self.view.environment = environment
+        self.place: dict[str, Any] = {"domain": None, "folder": None, "namespace": None}
+        self.parameters: dict[str, Any] = {}
+        self.controls: list[dict[str, Any]] = []
+        self.recorded: Recorded | None = None
+        self.component = 0
         self._generation = 0
-        self._place: dict[str, Any] = {"domain": None, "folder": None, "namespace": None}
-        self._environment, self._component = environment, 0
         self._status = b"{}"
         self._status_version = -1
         self._colours = (0.0, 1.0)
         self._coloured = float("-inf")
 
-    def watch(self, place: Mapping[str, Any], *, run: int | None, from_topics: bool) -> None:
-        """Begin with another loop.
-
-        place: domain, folder, namespace and namespaces of it, for people; run: the only one to
-        show; from_topics: whether the curve comes from the costs on the topics.
-        """
-        with self._lock:
-            self._watched = Watched(only=run, from_topics=from_topics)
-            self._generation += 1
-            self._place = {**place, "begun": self._generation}
-
-    # From the topics.
-
-    def state(self, frame: Frame, now: float) -> None:
-        """Take z_k of all environments."""
-        with self._lock:
-            self._watched.state(frame, now, self._environment)
-
-    def action(self, frame: Frame, now: float) -> None:
-        """Take a_k of all environments."""
-        with self._lock:
-            self._watched.action(frame, now)
-
-    def start(self, frame: Frame, now: float) -> None:
-        """Take the start of an episode; without rows it is the end of the run."""
-        with self._lock:
-            self._watched.start(frame, now)
-
-    def policy(self, frame: Frame, now: float) -> None:
-        """Take the gains of an episode."""
-        with self._lock:
-            self._watched.policy(frame, now)
-
-    def cost(self, frame: Frame, now: float) -> None:
-        """Take the costs of an episode that is over."""
-        with self._lock:
-            self._watched.cost(frame, now)
-
-    def target(self, frame: Frame, now: float) -> None:
-        """Take z_r of a plant."""
-        with self._lock:
-            self._watched.target(frame, now)
-
-    def paused(self, frame: Frame, now: float) -> None:
-        """Take whether an operator holds the plant."""
-        with self._lock:
-            self._watched.paused(frame, now)
-
-    def diagnosis(
-        self, name: str, level: int, message: str, values: Iterable[tuple[str, str]], now: float
+    def show(
+        self, view: LoopView, place: Mapping[str, Any], recorded: Recorded | None = None
     ) -> None:
-        """Take a status from /diagnostics."""
-        with self._lock:
-            self._watched.health.diagnosis(name, level, message, values, now)
+        """Show another loop, in the environment that was chosen."""
+        with self.lock:
+            view.environment = self.view.environment
+            self.view, self.recorded = view, recorded
+            self._generation += 1
+            self.place = {**place, "begun": self._generation}
+            self.parameters, self.controls = {}, []
 
-    # From the graph, the services and the run's folder.
-
-    def namespaces(self, found: list[str]) -> None:
-        """The loops in this domain, by namespace."""
-        with self._lock:
-            self._place["namespaces"] = found
-
-    def look(self, found: Mapping[str, Iterable[Endpoint]], controls: list[dict[str, Any]]) -> None:
-        """Take who publishes what, by role, and which nodes offer which services."""
-        with self._lock:
-            self._watched.health.look(found)
-            self._watched.controls = controls
-
-    def parameters(self, values: Mapping[str, Any]) -> None:
+    def take_parameters(self, values: Mapping[str, Any]) -> None:
         """Take parameters that a node told."""
-        with self._lock:
-            self._watched.parameters |= {k: values[k] for k in _PARAMETERS if k in values}
-
-    def components(self, names: Sequence[str]) -> None:
-        """Take the names of the components that make up a state, one after the other."""
-        with self._lock:
-            self._watched.components = list(names) or ["u"]
-
-    def follow(self, folder: str) -> None:
-        """The curve comes from the lines of the run in `folder` from now on (`progress`)."""
-        with self._lock:
-            self._place["folder"], self._watched.from_topics = folder, False
-            self._watched.curve = LearningCurve()
-
-    def progress(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        """Take new lines of the run's progress.jsonl."""
-        with self._lock:
-            for row in rows:
-                self._watched.curve.row(row)
-
-    def asked(self, call: Call, now: float) -> None:
-        """A page asks a node for something."""
-        with self._lock:
-            self._watched.asked(call, now)
-        self.refresh(now)
-
-    def answered(self, call: Call, now: float, failure: str | None) -> None:
-        """A node did what it was asked to, or not: then why."""
-        with self._lock:
-            self._watched.answered(call, now, failure)
-        self.refresh(now)
-
-    @property
-    def run(self) -> int:
-        """The run of the newest message; 0 before the first."""
-        with self._lock:
-            return self._watched.run
-
-    @property
-    def complete(self) -> bool:
-        """Whether the episode that is shown is over, and was seen from its beginning."""
-        with self._lock:
-            shown = self._watched.shown
-            return shown is not None and shown.ended and shown.whole
-
-    # From and to the page.
+        self.parameters |= {name: values[name] for name in PARAMETERS if name in values}
+        self.view.horizon = int(self.parameters.get("horizon", 0))
 
     def choose(self, *, environment: int | None = None, component: int | None = None) -> None:
         """Show another environment, or another component of the state."""
-        with self._lock:
-            self._environment = self._environment if environment is None else environment
-            self._component = self._component if component is None else component
+        with self.lock:
+            if environment is not None:
+                self.view.environment = environment
+            self.component = self.component if component is None else component
             self._coloured = float("-inf")
 
     def offers(self, node: str, verb: object) -> bool:
         """Whether `node` is one of this loop's and has the service `verb`."""
-        with self._lock:
-            return any(c["node"] == node and verb in c["verbs"] for c in self._watched.controls)
+        with self.lock:
+            return any(c["node"] == node and verb in c["verbs"] for c in self.controls)
+
+    def has_episode(self, index: int) -> bool:
+        """Whether there is a recorded episode of this index."""
+        with self.lock:
+            return self.recorded is not None and 0 <= index < len(self.recorded.labels)
 
     def known_namespaces(self) -> list[str]:
         """The loops in this domain, by namespace."""
-        with self._lock:
-            return list(self._place.get("namespaces") or [])
+        with self.lock:
+            return list(self.place.get("namespaces") or [])
 
     def refresh(self, now: float) -> None:
         """Put the status together again; call it now and then."""
-        with self._lock:
-            watched, chosen = self._watched, (self._environment, self._component)
-            names = watched.components[:COMPONENTS]
-            watched.join(now)
-            searching = self._place["domain"] is None
-            quiet, remaining = watched.quiet(now), watched.curve.remaining(time.time())
+        with self.lock:
+            view, names = self.view, self.view.components[:MAX_COMPONENTS]
+            quiet, remaining = view.quiet(now), view.curve.remaining(time.time())
+            shown = view.shown(now)
             status = {
                 "part": "status",
-                "place": self._place,
-                "state": "searching" if searching else watched.doing(now),
-                "paused": watched.held(),
-                "stopping": watched.stopping,
-                "requests": watched.requests(now),
-                "activity": watched.health.activity(now),
+                "place": self.place,
+                "state": self._state(now),
+                "paused": view.operation.paused(),
+                "stopping": view.operation.stopping,
+                "requests": view.operation.requests(now),
+                "activity": view.nodes.activity(now),
                 "quiet": None if quiet is None or quiet < SILENT else round(quiet),
                 "remaining": None if remaining is None else round(remaining),
-                "parameters": watched.parameters,
-                "environment": self._environment,
-                "environments": 0 if watched.shown is None else watched.shown.batch,
-                "component": min(self._component, len(names) - 1),
+                "parameters": self.parameters,
+                "environment": view.environment,
+                "environments": 0 if shown is None else shown.batch,
+                "component": min(self.component, len(names) - 1),
                 "components": names,
-                "rounds": round(watched.rounds.per_second(now), 2),
-                "episodes": round(watched.episodes.per_second(now), 2),
-                "nodes": watched.health.told(now),
-                "controls": watched.controls,
+                "rounds": round(view.rounds.per_second(now), 2),
+                "episodes": round(view.episodes.per_second(now), 2),
+                "nodes": view.nodes.message(now),
+                "controls": self.controls,
+                "recorded": None if self.recorded is None else vars(self.recorded),
             }
             text = json.dumps(status).encode()
             if text != self._status:
@@ -214,32 +129,39 @@ class View:
                 self._status_version += 1
             if now - self._coloured > FRESH:
                 self._coloured = now
-                self._colours = watched.colours(*chosen, self._colours)
+                self._colours = view.colours(self.component, self._colours, now)
 
-    def updates(self, cursor: Cursor) -> list[bytes]:
+    def updates(self, cursor: Cursor, now: float) -> list[bytes]:
         """The messages with what is new since `cursor`, which moves on."""
-        with self._lock:
-            watched, generation, found = self._watched, self._generation, []
-            chosen = self._environment, self._component
+        with self.lock:
+            view, found = self.view, []
             if cursor.status != self._status_version:
                 cursor.status = self._status_version
                 found.append(self._status)
-            curve = (watched.curve.number, watched.curve.version)
+            curve = (view.curve.number, view.curve.version)
             if cursor.curve != curve:
                 cursor.curve = curve
-                found.append(json.dumps({"part": "curve", **watched.curve.message()}).encode())
-            if watched.shown is None:
+                found.append(json.dumps({"part": "curve", **view.curve.message()}).encode())
+            shown = view.shown(now)
+            if shown is None:
                 return found
-            aims = (watched.begun, len(watched.targets), self._component)
-            if cursor.target != aims or cursor.begun[0] != generation:
-                cursor.target = aims
-                found.append(target(watched, watched.shown, self._component))
-            message = sample(
-                watched,
-                watched.shown,
+            target = view.targets.get(shown.key[2])
+            aim = (shown.number, id(target), self.component)
+            if cursor.target != aim:
+                cursor.target = aim
+                found.append(target_message(target, shown, self.component))
+            message = samples_message(
+                shown,
                 cursor,
-                generation=generation,
-                chosen=chosen,
+                kind=view.kinds.get(shown.key[:2], ""),
+                environment=view.environment,
+                component=self.component,
                 colours=self._colours,
+                sample_time=shown.sample_time or self.parameters.get("sample_time", 0.0),
             )
             return [*found, message] if message else found
+
+    def _state(self, now: float) -> str:
+        if self.recorded is not None:
+            return "recorded"
+        return "searching" if self.place["domain"] is None else self.view.state_of_loop(now)

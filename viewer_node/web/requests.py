@@ -1,20 +1,11 @@
-"""What the page asks of the loop, handed from the web server's thread to the node's. Pure."""
+"""What a page asks for, handed from the server's thread to the node's. Pure."""
 
 from __future__ import annotations
 
 import queue
 from dataclasses import dataclass
 
-VERBS = ("pause", "resume", "step", "stop")
-"""std_srvs/Trigger services that nodes of a loop may offer under their private names."""
-
-
-@dataclass(frozen=True)
-class Call:
-    """Call the service NODE/VERB."""
-
-    node: str
-    verb: str
+from viewer_node.operation import Call
 
 
 @dataclass(frozen=True)
@@ -24,5 +15,12 @@ class Watch:
     namespace: str
 
 
-Command = Call | Watch
-Commands = queue.SimpleQueue[Command]
+@dataclass(frozen=True)
+class ShowEpisode:
+    """Show the recorded episode of this index."""
+
+    index: int
+
+
+Request = Call | Watch | ShowEpisode
+Requests = queue.SimpleQueue[Request]

@@ -1,9 +1,9 @@
 """The web server of the live page: on 127.0.0.1 only, and for no other page than its own.
 
 GET   /, /NAME     the page and its files, all of them from this package
-GET   /ws          a WebSocket with what is new (monitor.view), at most FRAMES times a second
+GET   /ws          a WebSocket with what is new (viewer_node.web.page), at most FRAMES times a second
 POST  /api/call    {"node", "verb"}: call a service of a node; the status tells what comes of it
-POST  /api/watch   {"namespace"}, {"environment"} or {"component"}: what is shown
+POST  /api/watch   {"namespace"}, {"episode"}, {"environment"} or {"component"}: what is shown
 
 Any page of the web that is open in a browser can send requests to 127.0.0.1. So a request must name
 this server as its host (a foreign name that was made to resolve to 127.0.0.1 does not), one from a
@@ -19,6 +19,7 @@ import json
 import secrets
 import socket
 import threading
+import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -26,9 +27,10 @@ from typing import Any
 from aiohttp import WSMsgType, web
 
 from loop_interfaces.controllers import CONTROLLERS
+from viewer_node.operation import VERBS, Call
 from viewer_node.web.messages import Cursor
-from viewer_node.web.page import View
-from viewer_node.web.requests import VERBS, Call, Commands, Watch
+from viewer_node.web.page import Page
+from viewer_node.web.requests import Requests, ShowEpisode, Watch
 
 FRAMES = 20.0
 """Pictures a second at the most."""
@@ -37,7 +39,7 @@ MOST_PAGES = 16
 MAX_BODY = 10_000
 HOST = "127.0.0.1"
 TOKEN = "X-Pdeloop-Token"
-PAGE = Path(__file__).parent / "static"
+STATIC = Path(__file__).parent / "static"
 TYPES = {
     ".html": "text/html",
     ".css": "text/css",
@@ -46,7 +48,7 @@ TYPES = {
 }
 FILES = {
     path.name: path
-    for folder in (PAGE, PAGE / "vendor")
+    for folder in (STATIC, STATIC / "vendor")
     for path in sorted(folder.iterdir())
     if path.suffix in TYPES
 }
@@ -70,12 +72,12 @@ class Server:
     port: 0 takes a free one. Raises OSError where the port is taken.
     """
 
-    def __init__(self, view: View, commands: Commands, port: int) -> None:
-        self._view, self._commands = view, commands
+    def __init__(self, page: Page, requests: Requests, port: int) -> None:
+        self._page, self._requests = page, requests
         self._token = secrets.token_urlsafe(32)
         self._socket = socket.create_server((HOST, port))
         self.port: int = self._socket.getsockname()[1]
-        self._pages: set[web.WebSocketResponse] = set()
+        self._open: set[web.WebSocketResponse] = set()
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._serve, name="page", daemon=True)
         self._ended = asyncio.Event()
@@ -86,7 +88,7 @@ class Server:
 
     def watched(self) -> bool:
         """Whether a page is open."""
-        return bool(self._pages)
+        return bool(self._open)
 
     def start(self) -> None:
         self._thread.start()
@@ -111,7 +113,7 @@ class Server:
         try:
             await web.SockSite(runner, self._socket).start()
             await self._ended.wait()
-            for page in list(self._pages):
+            for page in list(self._open):
                 with contextlib.suppress(Exception):
                     await asyncio.wait_for(page.close(code=1001), 1.0)
         finally:
@@ -137,18 +139,18 @@ class Server:
         return response
 
     async def _on_page(self, request: web.Request) -> web.WebSocketResponse:
-        if len(self._pages) >= MOST_PAGES:
+        if len(self._open) >= MOST_PAGES:
             raise web.HTTPServiceUnavailable(text=f"{MOST_PAGES} pages look already; close one")
         page = web.WebSocketResponse(heartbeat=10.0, max_msg_size=MAX_BODY, compress=False)
         await page.prepare(request)
-        self._pages.add(page)
+        self._open.add(page)
         telling = asyncio.create_task(self._tell(page))
         try:
             async for message in page:  # a page says nothing; this notices that it has gone
                 if message.type is not WSMsgType.PING:
                     break
         finally:
-            self._pages.discard(page)
+            self._open.discard(page)
             telling.cancel()
             with contextlib.suppress(asyncio.CancelledError, ConnectionError):
                 await telling
@@ -161,7 +163,7 @@ class Server:
         hello = {"part": "hello", "token": self._token, "controllers": CONTROLLERS}
         await page.send_json(hello)
         while not page.closed:
-            for update in self._view.updates(cursor):
+            for update in self._page.updates(cursor, time.monotonic()):
                 if update.startswith(b"{"):
                     await page.send_str(update.decode())
                 else:
@@ -171,26 +173,28 @@ class Server:
     async def _on_call(self, request: web.Request) -> web.Response:
         asked = await _body(request)
         node, verb = asked.get("node"), asked.get("verb")
-        if not isinstance(node, str) or not self._view.offers(node, verb):
+        if not isinstance(node, str) or not self._page.offers(node, verb):
             raise web.HTTPBadRequest(
                 text=f"no node of this loop offers that; expected one of {', '.join(VERBS)}"
             )
-        self._commands.put(Call(node, str(verb)))
+        self._requests.put(Call(node, str(verb)))
         return web.json_response({"success": True})
 
     async def _on_watch(self, request: web.Request) -> web.Response:
         asked = await _body(request)
-        namespace = asked.get("namespace")
+        namespace, episode = asked.get("namespace"), asked.get("episode")
         chosen = {n: asked[n] for n in ("environment", "component") if n in asked}
         if chosen:
             if any(type(i) is not int or not 0 <= i < 2**24 for i in chosen.values()):
                 raise web.HTTPBadRequest(text="expected the index of an environment or component")
-            self._view.choose(**chosen)
-        elif isinstance(namespace, str) and namespace in self._view.known_namespaces():
-            self._commands.put(Watch(namespace))
+            self._page.choose(**chosen)
+        elif isinstance(namespace, str) and namespace in self._page.known_namespaces():
+            self._requests.put(Watch(namespace))
+        elif type(episode) is int and self._page.has_episode(episode):
+            self._requests.put(ShowEpisode(episode))
         else:
             raise web.HTTPBadRequest(
-                text="expected an environment, a component or a known namespace"
+                text="expected an environment, a component, a recorded episode or a known namespace"
             )
         return web.json_response({"success": True})
 

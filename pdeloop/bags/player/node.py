@@ -63,7 +63,7 @@ class PlayerNode:
         while True:
             with ros_node(NAME, ["--ros-args", "--disable-external-lib-logs"]) as (node, loop):
                 self._join(node, loop)
-                reason = loop.run(
+                reason: str = loop.run(
                     tick=self._tick, deadline=lambda: 0.0, housekeeping=self._housekeeping
                 )
                 if not loop.suspended:

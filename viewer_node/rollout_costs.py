@@ -1,0 +1,112 @@
+"""Which controller caused which cost, told by the gains that were published. Pure."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loop_interfaces import model_rows
+from loop_interfaces.frames import Frame, Recent
+from loop_interfaces.topics import COMPLETED, START_COLUMNS, CostColumn, StartColumn
+
+Array = NDArray[np.float64]
+MAX_KEPT = 100
+"""Episodes whose gains are remembered until their costs come."""
+MAX_MODELS = 4
+"""Generations of models."""
+
+
+@dataclass(frozen=True)
+class Rollouts:
+    """The rollouts of an episode that is over, one row an environment.
+
+    controllers: 'none', 'lqt' or 'adapted', the keys of loop_interfaces.controllers; empty if it was
+    an exploration or its policy is not known. mean: mean stage costs (M,); completed (M,); models:
+    index of the reduced model (M,).
+    """
+
+    explores: bool
+    controllers: NDArray[np.str_]
+    mean: Array
+    completed: NDArray[np.bool_]
+    models: NDArray[np.int64]
+
+    def mean_cost(self, controller: str) -> float | None:
+        """Mean over the completed rollouts of one controller; None if there are none."""
+        if not len(self.controllers):
+            return None
+        rows = self.completed & (self.controllers == controller)
+        return float(self.mean[rows].mean()) if rows.any() else None
+
+
+class RolloutCosts:
+    """Joins starts, policies, models and costs, in whatever order they come."""
+
+    def __init__(self) -> None:
+        self._starts, self._policies = Recent(MAX_KEPT), Recent(MAX_KEPT)
+        self._models: OrderedDict[tuple[int, int], Frame] = OrderedDict()
+
+    def start(self, frame: Frame) -> None:
+        """Take the start of an episode."""
+        if frame.values.shape[1] in (START_COLUMNS, len(StartColumn)):
+            self._starts.add(frame)
+
+    def policy(self, frame: Frame) -> None:
+        """Take the gains of an episode."""
+        self._policies.add(frame)
+
+    def model(self, frame: Frame) -> None:
+        """Take a run's reduced models, which have the LQT gains in them."""
+        self._models[frame.run, frame.step] = frame
+        if len(self._models) > MAX_MODELS:
+            self._models.popitem(last=False)
+
+    def cost(self, frame: Frame) -> Rollouts | None:
+        """What the costs of an episode are of; None if its start is not known."""
+        start, policy = self._starts.of(frame), self._policies.of(frame)
+        if start is None or len(start.values) != len(frame.values):
+            return None
+        explores = bool((start.values[:, StartColumn.EXCITATION] >= 0).any())
+        controllers = np.empty(0, dtype=np.str_)
+        if policy is not None and len(policy.values) == len(frame.values) and not explores:
+            zero = ~policy.values.any(axis=(1, 2))
+            lqt = self._lqt(start, policy.values)
+            same = np.zeros_like(zero)
+            if lqt is not None:
+                same = (policy.values == lqt).all(axis=(1, 2))
+            controllers = np.where(zero, "none", np.where(same, "lqt", "adapted"))
+        return Rollouts(
+            explores,
+            controllers,
+            frame.values[:, CostColumn.MEAN],
+            frame.values[:, CostColumn.ENDED] == COMPLETED,
+            start.values[:, StartColumn.MODEL].astype(np.int64),
+        )
+
+    def gains(self, environment: int) -> tuple[Array, Array | None] | None:
+        """Gains of an environment in the newest episode with a policy, and its LQT gains if known."""
+        start = self._starts.newest
+        policy = None if start is None else self._policies.of(start)
+        if start is None or policy is None or len(start.values) != len(policy.values):
+            return None
+        row = min(environment, len(policy.values) - 1)
+        lqt = self._lqt(start, policy.values)
+        return policy.values[row], None if lqt is None else lqt[row]
+
+    def _lqt(self, start: Frame, policy: Array) -> Array | None:
+        """The LQT gains of an episode's environments, if its models are known."""
+        model = self._models.get((start.run, start.step))
+        if model is None:
+            return None
+        which = start.values[:, StartColumn.MODEL].astype(np.int64)
+        if which.min() < 0 or which.max() >= len(model.values):
+            return None
+        try:
+            known = {m: model_rows.unpack(model.values[m], policy.shape[1]) for m in set(which)}
+        except ValueError:
+            return None
+        lqt = np.stack([known[m].policy for m in which])
+        return lqt if lqt.shape == policy.shape else None
