@@ -90,7 +90,11 @@ class Recent:
 
     def of(self, frame: Frame) -> Frame | None:
         """The one of the episode that `frame` is about."""
-        return self._frames.get((frame.run, frame.episode))
+        return self.get(frame.run, frame.episode)
+
+    def get(self, run: int, episode: int) -> Frame | None:
+        """The one of this episode."""
+        return self._frames.get((run, episode))
 
     @property
     def newest(self) -> Frame | None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from pdeloop.live import Live, announced, running
 from pdeloop.monitor.finder import Finder
+from tuner_node.results import RunFolder
 
 
 def test_a_loop_is_found_as_long_as_it_runs(tmp_path, monkeypatch):
@@ -42,6 +43,14 @@ def test_the_finder_stays_with_a_training_until_it_ends_and_takes_the_newest_nex
     assert finder.find() == live(2, "b", 2.0)
     del found[0]
     assert finder.find() == live(2, "b", 2.0)  # what it was stays on the page
+
+
+def test_a_folder_in_a_given_domain_is_watched_while_a_process_works_on_it(tmp_path):
+    (tmp_path / "lock").touch()
+    finder = Finder(tmp_path, 9, list)
+    assert finder.find() is None  # nothing runs: what is there is shown as it was left
+    with RunFolder(tmp_path).held():
+        assert finder.find() == Live(9, tmp_path, 0.0)
 
 
 def test_a_given_folder_or_domain_is_the_only_one():

@@ -196,7 +196,7 @@ def test_an_endless_episode_and_large_messages_do_not_escape_the_budget():
 
 def adapted(seed: int, rollouts: int, cost: float | None, **more: Any) -> dict[str, Any]:
     known = {} if cost is None else {"cost": cost}
-    return {"event": "iteration", "seed": seed, "rollouts": rollouts, "diverged": 0} | known | more
+    return {"event": "adapted", "seed": seed, "rollouts": rollouts, "diverged": 0} | known | more
 
 
 def points(curve: LearningCurve) -> list[tuple[float, ...]]:
@@ -228,7 +228,7 @@ def test_seeds_that_are_at_other_rollouts_keep_their_cost_until_their_next_point
 def test_what_diverged_has_no_point_and_broken_lines_are_left_out():
     curve = LearningCurve()
     curve.row(adapted(0, 2, None, diverged=2))
-    for line in ({}, {"event": "iteration"}, {"event": "iteration", "seed": "x", "rollouts": 1}):
+    for line in ({}, {"event": "adapted"}, {"event": "adapted", "seed": "x", "rollouts": 1}):
         curve.row(line)
     assert points(curve) == [] and curve.message()["diverged"] == 2 and curve.message()["done"] == 2
 

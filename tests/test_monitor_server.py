@@ -115,7 +115,7 @@ def test_a_page_of_ours_reaches_the_nodes_and_nothing_but_what_they_offer():
         ):
             assert asyncio.run(ask(server, "POST", "/api/call", json=body, **allowed))[0] == 400
         page.place["namespaces"] = ["/", "/lab"]
-        page.recorded = Recorded(["episode 1", "episode 2"])
+        page.recorded = Recorded(finished=True, episodes=2)
         watch = "/api/watch"
         for body, status in (
             ({"namespace": "/lab"}, 200),

@@ -40,7 +40,7 @@ class LearningCurve:
 
     axis: what x is; phase: what the training does; budget: the rollouts of a seed, 0 if unknown;
     references: mean stage costs to compare with, by controller; evaluations: those of each seed's
-    closing evaluation; version grows with each change.
+    closing evaluation; paid: rollouts of the seed that has the most; version grows with each change.
     """
 
     axis: str = "episode"
@@ -49,6 +49,7 @@ class LearningCurve:
     references: dict[str, float] = field(default_factory=dict)
     evaluations: dict[int, dict[str, float]] = field(default_factory=dict)
     diverged: int = 0
+    paid: int = 0
     version: int = 0
     number: int = field(default_factory=itertools.count().__next__)
     """Tells one curve from another."""
@@ -64,8 +65,8 @@ class LearningCurve:
             match row.get("event"):
                 case "phase":
                     self.phase = str(row["phase"])[:40]
-                    self.budget = max((int(n) for n in row.get("budget", ())), default=self.budget)
-                case "iteration" | "adapted":
+                    self.budget, self.paid = (max(map(int, row[n])) for n in ("budget", "rollouts"))
+                case "adapted":
                     self._adapted(row)
                 case "checked" if row["accepted"]:
                     self._checked[int(row["seed"])] = float(row["none"]), float(row["lqt"])
@@ -85,6 +86,7 @@ class LearningCurve:
         if seed not in self._rollouts and len(self._rollouts) >= MAX_SEEDS:
             return
         self._rollouts[seed] = x
+        self.paid = max(self.paid, x)
         self._marks.append((float(row.get("time", 0.0)), sum(self._rollouts.values())))
         self.diverged += int(row.get("diverged", 0))
         if "cost" in row and math.isfinite(cost := float(row["cost"])):
@@ -109,7 +111,7 @@ class LearningCurve:
                     self.references[name] = mean
             return
         self.diverged += int((~rollouts.completed).sum())
-        x = 1 + max(self._rollouts.values(), default=0)
+        self.paid = x = self.paid + 1
         for model in np.unique(rollouts.models).tolist()[:MAX_SEEDS]:
             self._rollouts[model] = x
             own = rollouts.mean[rollouts.completed & (rollouts.models == model)]
@@ -169,7 +171,7 @@ class LearningCurve:
             "budget": self.budget,
             "band": "seeds" if several else "rollouts",
             "seeds": self.seeds,
-            "done": max(self._rollouts.values(), default=0),
+            "done": self.paid,
             "diverged": self.diverged,
             "references": self.references,
             "evaluations": self.evaluations,

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.frames import Frame
-from loop_interfaces.topics import VOID, CostColumn, StartColumn
+from loop_interfaces.topics import VOID, CostColumn
 from viewer_node.episode_samples import EpisodeSamples, Key, key_of, rows_of
 from viewer_node.learning_curve import LearningCurve
 from viewer_node.loop_nodes import LoopNodes
@@ -23,8 +22,6 @@ from viewer_node.rollout_costs import RolloutCosts
 from viewer_node.sliding_rate import SlidingRate
 
 Array = NDArray[np.float64]
-K = TypeVar("K")
-V = TypeVar("V")
 SLOW = 1.0
 """Seconds after which an episode is shown while it runs; shorter ones when they are over."""
 SILENT = 5.0
@@ -34,7 +31,7 @@ EXTREMES = (0.3, 99.7)
 STEADY = 0.15
 """Share of the colours' range by which it must change to be changed: they would only flicker."""
 MAX_KEPT = 100
-"""Episodes and plants that are remembered."""
+"""Plants whose targets are remembered."""
 
 NUMBERS = {
     "cost": "mean stage cost of the last adapted policies (neither zero nor the LQT gains)",
@@ -90,8 +87,6 @@ class LoopView:
         self.current: EpisodeSamples | None = None
         self.finished: EpisodeSamples | None = None
         self.targets: OrderedDict[int, Array] = OrderedDict()
-        self.kinds: OrderedDict[tuple[int, int], str] = OrderedDict()
-        """What the newest episodes are, by run and number."""
         self.run = 0
         self.samples = 0
         self._costs = RolloutCosts()
@@ -143,8 +138,6 @@ class LoopView:
         self._ended = not len(frame.values)
         if self._ended:
             return
-        explores = (frame.values[:, StartColumn.EXCITATION] >= 0).any()
-        _put(self.kinds, (frame.run, frame.episode), "exploration" if explores else "policy")
         self._costs.start(frame)
         self._take_gains()
 
@@ -194,7 +187,9 @@ class LoopView:
     def target(self, frame: Frame, now: float) -> None:
         """Take z_r of a plant."""
         self.nodes.heard(now, "plant")
-        _put(self.targets, frame.plant, frame.values)
+        self.targets[frame.plant] = frame.values
+        if len(self.targets) > MAX_KEPT:
+            self.targets.popitem(last=False)
 
     def paused(self, frame: Frame, now: float) -> None:
         """Take whether an operator holds the plant."""
@@ -254,6 +249,11 @@ class LoopView:
             return "waiting"
         return "running" if now - self._heard < SILENT else "silent"
 
+    def controller(self, shown: EpisodeSamples) -> str:
+        """Who acts in the chosen environment: see RolloutCosts.controller."""
+        environment = shown.environments[shown.row(self.environment)]
+        return self._costs.controller(shown.key[0], shown.key[1], environment)
+
     def quiet(self, now: float) -> float | None:
         """Seconds since the last message of the loop; None before the first."""
         return None if self._heard is None else now - self._heard
@@ -312,13 +312,6 @@ class LoopView:
             self.rounds.add(step - before, now)
             self.operation.plant_stepped(now)
         self._counted = key, max(step, before)
-
-
-def _put(kept: OrderedDict[K, V], key: K, value: V) -> None:
-    """Keep the newest MAX_KEPT."""
-    kept[key] = value
-    if len(kept) > MAX_KEPT:
-        kept.popitem(last=False)
 
 
 def _rms(error: Array) -> float:

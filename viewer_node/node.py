@@ -8,8 +8,6 @@ It takes no part in the loop, and nothing waits for it. What is shown: docs/view
 
 from __future__ import annotations
 
-import contextlib
-import os
 import sys
 from typing import Any
 
@@ -31,6 +29,7 @@ from viewer_node.diagnostics import ViewerHealth
 from viewer_node.loop_reader import PERIOD, LoopReader
 from viewer_node.loop_view import NUMBERS, LoopView
 from viewer_node.picture import diverging
+from viewer_node.priority import stand_back
 
 LOOK = 0.5
 """Seconds between two looks at the graph."""
@@ -148,16 +147,9 @@ def _wanted(publisher: Publisher) -> bool:
     return bool(publisher.get_subscription_count())
 
 
-def _stand_back() -> None:
-    """Let the loop's processes go first: what arrives here must not preempt its sender."""
-    with contextlib.suppress(OSError, AttributeError):
-        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
-        os.nice(19)
-
-
 def main(args: list[str] | None = None) -> int:
     """Console script."""
-    _stand_back()
+    stand_back()
     keep_on_this_machine()
     return node_main("viewer_node", args, ViewerNode, Observer)
 

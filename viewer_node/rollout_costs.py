@@ -69,22 +69,25 @@ class RolloutCosts:
         start, policy = self._starts.of(frame), self._policies.of(frame)
         if start is None or len(start.values) != len(frame.values):
             return None
-        explores = bool((start.values[:, StartColumn.EXCITATION] >= 0).any())
-        controllers = np.empty(0, dtype=np.str_)
-        if policy is not None and len(policy.values) == len(frame.values) and not explores:
-            zero = ~policy.values.any(axis=(1, 2))
-            lqt = self._lqt(start, policy.values)
-            same = np.zeros_like(zero)
-            if lqt is not None:
-                same = (policy.values == lqt).all(axis=(1, 2))
-            controllers = np.where(zero, "none", np.where(same, "lqt", "adapted"))
         return Rollouts(
-            explores,
-            controllers,
+            _explores(start),
+            np.empty(0, np.str_) if policy is None else self._controllers(start, policy.values),
             frame.values[:, CostColumn.MEAN],
             frame.values[:, CostColumn.ENDED] == COMPLETED,
             start.values[:, StartColumn.MODEL].astype(np.int64),
         )
+
+    def controller(self, run: int, episode: int, environment: int) -> str:
+        """Who acts in an environment: a key of loop_interfaces.controllers, 'exploration', or empty if
+        it is not known.
+        """
+        start, policy = (kept.get(run, episode) for kept in (self._starts, self._policies))
+        if start is not None and _explores(start):
+            return "exploration"
+        if start is None or policy is None or environment >= len(policy.values):
+            return ""
+        controllers = self._controllers(start, policy.values)
+        return str(controllers[environment]) if len(controllers) else ""
 
     def gains(self, environment: int) -> tuple[Array, Array | None] | None:
         """Gains of an environment in the newest episode with a policy, and its LQT gains if known."""
@@ -95,6 +98,15 @@ class RolloutCosts:
         row = min(environment, len(policy.values) - 1)
         lqt = self._lqt(start, policy.values)
         return policy.values[row], None if lqt is None else lqt[row]
+
+    def _controllers(self, start: Frame, policy: Array) -> NDArray[np.str_]:
+        """The controller of each environment, empty in an exploration."""
+        if _explores(start) or len(policy) != len(start.values):
+            return np.empty(0, dtype=np.str_)
+        zero = ~policy.any(axis=(1, 2))
+        lqt = self._lqt(start, policy)
+        same = np.zeros_like(zero) if lqt is None else (policy == lqt).all(axis=(1, 2))
+        return np.where(zero, "none", np.where(same, "lqt", "adapted"))
 
     def _lqt(self, start: Frame, policy: Array) -> Array | None:
         """The LQT gains of an episode's environments, if its models are known."""
@@ -110,3 +122,7 @@ class RolloutCosts:
             return None
         lqt = np.stack([known[m].policy for m in which])
         return lqt if lqt.shape == policy.shape else None
+
+
+def _explores(start: Frame) -> bool:
+    return bool((start.values[:, StartColumn.EXCITATION] >= 0).any())

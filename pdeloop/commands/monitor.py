@@ -6,9 +6,16 @@ import argparse
 import os
 import webbrowser
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import Commands, command
+
+if TYPE_CHECKING:  # what the other commands do without
+    from pdeloop.monitor.finder import Finder
+    from viewer_node.web.page import Page
+    from viewer_node.web.requests import Requests
+    from viewer_node.web.server import Server
 
 PORT = 8420
 
@@ -19,11 +26,12 @@ def add(commands: Commands) -> None:
         commands,
         "monitor",
         _monitor,
-        help="a page that shows a loop as it runs",
+        help="a page that shows a loop as it runs, or a run that is over",
         description="Serve a page on 127.0.0.1 that shows a loop as it runs: the field, the actions, "
         "the profile against the target, the training curve, the nodes, and buttons to pause. "
         "Without DIR and ROS_DOMAIN_ID it shows the newest training (or played bag) on this machine, "
-        "and the next one when that has ended. Ctrl-C ends it; the loop never waits for it.",
+        "and the next one when that has ended. Of a run in DIR that is over it shows the curve, the "
+        "seeds and the recorded episodes. Ctrl-C ends it; the loop never waits for it.",
         example="pdeloop monitor runs/burgers-20260101-120000-1 --environment 3",
     )
     add = monitor.add_argument
@@ -32,7 +40,7 @@ def add(commands: Commands) -> None:
         nargs="?",
         type=Path,
         metavar="DIR",
-        help="folder of a run: show this one only [the newest that runs]",
+        help="folder of a run, running or over: show this one only [the newest that runs]",
     )
     add("--port", type=int, default=PORT, metavar="N", help=f"0: a free one [{PORT}]")
     add("--namespace", metavar="NS", help="of the pair to show first [the first there is]")
@@ -48,12 +56,13 @@ def add(commands: Commands) -> None:
 def _monitor(options: argparse.Namespace) -> int:
     from pdeloop.domain import given_domain
     from pdeloop.monitor.finder import Finder, run_id
-    from pdeloop.monitor.node import ConfigurationError, stand_back, watch
+    from pdeloop.monitor.replay import replay
+    from viewer_node.priority import stand_back
     from viewer_node.web.page import Page
     from viewer_node.web.requests import Requests
     from viewer_node.web.server import Server
 
-    folder, namespace = options.folder, options.namespace
+    folder = options.folder
     if not 0 <= options.port < 65536:
         raise ParameterError(f"--port is {options.port}; expected a whole number from 0 to 65535")
     if options.environment < 0:
@@ -75,6 +84,21 @@ def _monitor(options: argparse.Namespace) -> int:
     if options.open:
         webbrowser.open(server.url)
     try:
+        if folder is None or finder.find() is not None or replay(folder, finder, page, requests):
+            _watch(options, finder, page, requests, server)
+    finally:
+        server.stop()
+    return 0
+
+
+def _watch(
+    options: argparse.Namespace, finder: Finder, page: Page, requests: Requests, server: Server
+) -> None:
+    """Watch loops that run; needs ROS."""
+    from pdeloop.monitor.node import ConfigurationError, watch
+
+    namespace = options.namespace
+    try:
         watch(
             page,
             finder,
@@ -85,6 +109,3 @@ def _monitor(options: argparse.Namespace) -> int:
         )
     except ConfigurationError as error:
         raise RuntimeError(str(error)) from error
-    finally:
-        server.stop()
-    return 0

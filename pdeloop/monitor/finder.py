@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -39,7 +41,9 @@ class Finder:
             running = [live for live in running if live.folder == self._folder]
         if self._domain is not None:
             running = [live for live in running if live.domain == self._domain]
-            running = running or [Live(self._domain, self._folder, 0.0)]
+            # Nodes that were started by hand tell nobody; but a tuner holds its run's folder.
+            if not running and (self._folder is None or worked_on(self._folder)):
+                running = [Live(self._domain, self._folder, 0.0)]
         if self._found not in running:
             self._found = running[0] if running else self._found
         return self._found
@@ -48,6 +52,16 @@ class Finder:
     def only_run(self) -> int | None:
         """The run to show, when a folder was given and has one."""
         return None if self._folder is None else run_id(self._folder)
+
+
+def worked_on(folder: Path) -> bool:
+    """Whether a process works on the run in `folder` (tuner_node.results.RunFolder.held)."""
+    with contextlib.suppress(OSError), (folder / "lock").open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
 
 
 def run_id(folder: Path) -> int | None:

@@ -29,10 +29,10 @@ from loop_interfaces.ros.node_main import ConfigurationError, ros_node
 from loop_interfaces.ros.observer import Observer
 from loop_interfaces.ros.parameters import RemoteParameters
 from loop_interfaces.topics import Topic
-from pde_sim_node.equations import EQUATIONS
 from pdeloop.display import ProgressFile
 from pdeloop.live import Live
 from pdeloop.monitor.finder import Finder, run_id
+from pdeloop.monitor.names import component_names, short
 from pdeloop.monitor.read_budget import ReadBudget
 from pdeloop.monitor.service_call import ServiceCall
 from viewer_node.learning_curve import LearningCurve
@@ -210,8 +210,8 @@ class MonitorNode:
     def _take_parameters(self, values: dict[str, Any]) -> None:
         """Take a node's parameters; the tuner's may say where its run's folder is."""
         self._page.take_parameters(values)
-        if names := component_names(values):
-            self._view.components = names
+        if "equation" in values:
+            self._view.components = component_names(values)
         out = values.get("out")
         self._out = Path(out) if isinstance(out, str) and out else self._out
 
@@ -234,34 +234,11 @@ class MonitorNode:
                 self._view.nodes.diagnosis(name, level, text, values, now)
 
 
-def component_names(values: dict[str, Any]) -> list[str]:
-    """Names of the components that make up a state, from a plant's parameters; empty if unknown."""
-    if values.get("sensors"):
-        count = int(values.get("sensor_delays") or 1)
-        return ["y", *(f"y {k} ago" for k in range(1, count))]
-    equation = EQUATIONS.get(str(values.get("equation")))
-    return [] if equation is None else list(equation.components)
-
-
 def _progress(folder: Path | None) -> ProgressFile | None:
     """The progress of the run in `folder`, if there is a run."""
     if folder is None or run_id(folder) is None:
         return None
     return ProgressFile(folder / "progress.jsonl", past=True)
-
-
-def short(folder: Path) -> str:
-    """The folder as a person in the working directory writes it."""
-    with contextlib.suppress(ValueError):
-        return str(folder.resolve().relative_to(Path.cwd()))
-    return str(folder)
-
-
-def stand_back() -> None:
-    """Let the loop's processes go first: a message that arrives here must not preempt its sender."""
-    with contextlib.suppress(OSError, AttributeError):
-        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
-        os.nice(19)
 
 
 def watch(
@@ -306,4 +283,4 @@ def watch(
                 return
 
 
-__all__ = ["ConfigurationError", "MonitorNode", "component_names", "short", "stand_back", "watch"]
+__all__ = ["ConfigurationError", "MonitorNode", "watch"]

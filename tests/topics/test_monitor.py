@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import signal
 import subprocess
@@ -9,8 +10,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from pdeloop.bags.reader import Bag
 from tests.browser import Browser, browser
 from tests.loop_harness import Processes, until, without_domain
 from tests.small import SMALL
@@ -253,6 +256,54 @@ def test_a_pair_in_a_namespace_and_an_environment_are_chosen_on_the_page(loop, p
     page.wait_for(lambda: "/pair0/pde_sim_node" in card(page, "plant"), LIMIT, "plant of pair0")
     page.until(f"{STATE} === 'running'", LIMIT)
     page.wait_for(lambda: page.ask(PAINTED % "field") > 250, LIMIT, "picture of the field")
+    assert page.console == []
+
+
+def test_a_run_that_is_over_opens_with_its_curve_its_seeds_and_its_recorded_episodes(
+    loop, page, tmp_path
+):
+    out = tmp_path / "run"
+    options = ("--rollouts", "30", "--seeds", "2", "--optimizer", "two_point", "--record")
+    loop.wait(loop.pdeloop("train", str(SMALL), *options, "--out", str(out)), LIMIT)
+    page.go(address(loop, loop.pdeloop("monitor", str(out), "--port", "0")))
+    page.until(f"{STATE} === 'finished'", LIMIT)
+    result = json.loads((out / "result.json").read_text())
+    rows = page.ask("[...document.querySelectorAll('#seeds tr')].map((row) => row.innerText)")
+    assert len(rows) == 1 + 2 + 1
+    for seed in range(2):
+        number, none, lqt, adapted, _ = rows[1 + seed].split("\t")
+        costs = [result["costs"][name][seed] for name in ("none", "lqt", "adapted")]
+        assert int(number) == seed
+        assert [float(none), float(lqt), float(adapted)] == pytest.approx(costs, rel=1e-3)
+    page.wait_for(lambda: page.ask(PAINTED % "curve") > 20, LIMIT, "picture of the curve")
+
+    bag = Bag(out)
+    target, index = bag.target(), bag.index()
+    move = (
+        "(() => { const s = document.querySelector('%s'); s.value = '%d';"
+        " for (const kind of ['input', 'change']) s.dispatchEvent(new Event(kind)); })()"
+    )
+    for chosen in (len(index) - 1, 1):
+        page.ask(move % ("#recorded", chosen))
+        number = index[chosen]["episode"]
+        page.until(f"{FIELD}.includes('episode {number % 2**32} ')", LIMIT)
+        (episode,) = bag.find(number)
+        for step in (0, 7):
+            page.ask(move % ("#time", step))
+            distance = np.sqrt(np.mean((episode.states[step].values[0] - target) ** 2))
+            said = page.wait_for(
+                lambda step=step: re.search(
+                    rf"t = {0.05 * step:.4g} s, rms distance to the target ([\d.]+)",
+                    page.ask("document.querySelector('#profile-text').textContent"),
+                ),
+                LIMIT,
+                f"profile of step {step}",
+            )
+            assert float(said.group(1)) == pytest.approx(distance, rel=1e-3)
+    page.wait_for(lambda: page.ask(PAINTED % "field") > 250, LIMIT, "picture of the field")
+    assert not page.ask(
+        "[...document.querySelectorAll('#controls button')].some((b) => b.offsetParent)"
+    )
     assert page.console == []
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,7 +53,7 @@ def samples_message(
     shown: EpisodeSamples,
     cursor: Cursor,
     *,
-    kind: str,
+    controller: Callable[[], str],
     environment: int,
     component: int,
     colours: tuple[float, float],
@@ -61,7 +61,8 @@ def samples_message(
 ) -> bytes | None:
     """The columns of the shown episode that are new since `cursor`, or None.
 
-    Its numbers: field (columns, rows), actions (columns, actions), the newest state (rows).
+    controller() tells who acts in the environment. The numbers: field (columns, rows), actions
+    (columns, actions), the newest state (rows).
     """
     now = (shown.samples, shown.last, shown.ended)
     what = (shown.number, environment, component, shown.stride)
@@ -78,7 +79,7 @@ def samples_message(
         "new": not same,
         "run": shown.key[0],
         "episode": shown.key[1],
-        "kind": kind,
+        "controller": controller(),
         "environment": shown.environments[row],
         "first": first,
         "columns": len(fields),

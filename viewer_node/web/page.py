@@ -10,7 +10,8 @@ import json
 import threading
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from viewer_node.episode_samples import MAX_COMPONENTS
@@ -28,10 +29,15 @@ PARAMETERS = (
 
 @dataclass
 class Recorded:
-    """The recorded episodes of a run that is over: labels, and the one that is shown."""
+    """A run that does not run: whether it came to its end, how many episodes of it were recorded, the
+    one that is shown; note: why there are none.
+    """
 
-    labels: list[str] = field(default_factory=list)
+    finished: bool
+    episodes: int = 0
     chosen: int = 0
+    label: str = ""
+    note: str = ""
 
 
 class Page:
@@ -39,7 +45,7 @@ class Page:
 
     view: of the loop that is shown; place: its domain, folder, namespace and namespaces, for people;
     parameters, controls: what its nodes have told and what they offer; recorded: if it is a run that
-    is over.
+    does not run.
     """
 
     def __init__(self, environment: int = 0) -> None:
@@ -89,7 +95,7 @@ class Page:
     def has_episode(self, index: int) -> bool:
         """Whether there is a recorded episode of this index."""
         with self.lock:
-            return self.recorded is not None and 0 <= index < len(self.recorded.labels)
+            return self.recorded is not None and 0 <= index < self.recorded.episodes
 
     def known_namespaces(self) -> list[str]:
         """The loops in this domain, by namespace."""
@@ -153,7 +159,7 @@ class Page:
             message = samples_message(
                 shown,
                 cursor,
-                kind=view.kinds.get(shown.key[:2], ""),
+                controller=partial(view.controller, shown),
                 environment=view.environment,
                 component=self.component,
                 colours=self._colours,

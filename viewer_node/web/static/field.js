@@ -81,7 +81,7 @@ function put(all, part, at) {
   return grown;
 }
 
-export function fieldChart(episode, facts) {
+export function fieldChart(episode, facts, controllers) {
   const picture = document.createElement("canvas");
   const paint = picture.getContext("2d");
 
@@ -193,8 +193,8 @@ export function fieldChart(episode, facts) {
     let [caption, words] = ["no state has come yet", "Field in space and time: nothing yet"];
     if (header) {
       const number = header.episode % 2 ** 32; // the rest counts the restarts of the tuner
-      const kind = header.kind ? ` (${header.kind})` : "";
-      caption = `${facts.name}(x, t), episode ${number}${kind}, step ${header.last}`;
+      const who = header.controller ? ` (${controllers[header.controller] ?? header.controller})` : "";
+      caption = `${facts.name}(x, t), episode ${number}${who}, step ${header.last}`;
       words =
         `Field ${facts.name}(x, t) of episode ${number}, environment ${header.environment}, up to step ` +
         `${header.last}, values from ${text(header.range[0])} to ${text(header.range[1])}`;

@@ -4,6 +4,7 @@ import { actionsChart, curveChart, profileChart } from "./charts.js";
 import { Episode, fieldChart } from "./field.js";
 import { Link } from "./link.js";
 import { Panel } from "./panel.js";
+import { Replay } from "./replay.js";
 
 const EMPTY = {
   ...{ axis: "rollouts", phase: "", budget: 0, band: "seeds", diverged: 0, done: 0 },
@@ -18,11 +19,17 @@ let status = null;
 
 const panel = new Panel(() => link);
 const training = curveChart(curve, controllers);
-const ofEpisode = [fieldChart(episode, facts), actionsChart(episode, facts), profileChart(episode, facts)];
+const ofEpisode = [fieldChart(episode, facts, controllers), actionsChart(episode, facts), profileChart(episode, facts)];
 
 function update(charts) {
   for (const chart of charts) chart.update();
 }
+
+const replay = new Replay(
+  episode,
+  () => update(ofEpisode),
+  (index) => panel.request({ episode: index }),
+);
 
 const take = {
   hello(message) {
@@ -46,11 +53,13 @@ const take = {
       curve.told = EMPTY;
     }
     panel.status(message, curve);
+    replay.status(message.recorded);
     if (changed || moved) update(ofEpisode);
   },
   curve(message) {
     curve.told = message;
     if (status) panel.figures(status, curve);
+    panel.seeds(message, controllers);
     update([training]);
   },
   target(message, numbers) {
@@ -59,6 +68,7 @@ const take = {
   },
   episode(message, numbers) {
     episode.take(message, numbers);
+    if (message.new) replay.begin();
     update(ofEpisode);
   },
 };

@@ -10,6 +10,7 @@ const STATES = {
   silent: ["warn", "nothing heard", ""],
   paused: ["warn", "paused", ""],
   ended: ["", "ended", ""],
+  recorded: ["", "over", ""],
 };
 const BUTTONS = [
   ["plant", "plant", [["pause", "Pause"], ["resume", "Resume"], ["step", "Step"]]],
@@ -57,7 +58,7 @@ export class Panel {
   constructor(link) {
     this.link = link;
     this.buttons = new Map();
-    this.told = { requests: [], activity: null, state: "", stopping: false };
+    this.told = { requests: [], activity: null, state: "", stopping: false, recorded: null };
     this.own = "";
     this.cards = {};
     for (const [role, name, verbs] of BUTTONS) this.group(role, name, verbs);
@@ -101,10 +102,13 @@ export class Panel {
   }
 
   choice(id, request) {
-    find(id).addEventListener("change", async (event) => {
-      const answer = await this.link().post("/api/watch", request(event.target.value));
-      if (!answer.success) this.say(answer.message);
-    });
+    find(id).addEventListener("change", (event) => this.request(request(event.target.value)));
+  }
+
+  // Ask for something else to be shown.
+  async request(what) {
+    const answer = await this.link().post("/api/watch", what);
+    if (!answer.success) this.say(answer.message);
   }
 
   // A notice of the page itself, which goes by itself.
@@ -117,7 +121,7 @@ export class Panel {
 
   // What stands below the title is a function of the newest status, so that nothing old stays.
   notice() {
-    const { requests, activity, state, stopping } = this.told;
+    const { requests, activity, state, stopping, recorded } = this.told;
     const words = requests.map(({ role, verb, seconds, failure }) => {
       const asked = `${VERBS[verb]} ${WHAT[role] ?? role}`;
       if (failure) return `${asked}: ${failure}`;
@@ -126,7 +130,7 @@ export class Panel {
     });
     if (stopping && state !== "ended") words.push("The training ends after the rollouts under way.");
     const hint = STATES[state]?.[2];
-    const all = [this.own, hint, ...words].filter(Boolean).join(" · ");
+    const all = [this.own, hint, recorded?.note, ...words].filter(Boolean).join(" · ");
     put(find("notice"), all);
     find("notice").hidden = !all;
   }
@@ -159,6 +163,8 @@ export class Panel {
     put(find("place"), where.join(" · "));
     this.figures(status, curve);
     this.nodes(status);
+    for (const id of ["controls", "nodes-panel"]) find(id).hidden = Boolean(status.recorded);
+    document.querySelector("main").classList.toggle("curve-only", status.recorded?.episodes === 0);
     for (const [key, button] of this.buttons) {
       const [role, verb] = key.split("/");
       const offer = controls.find((c) => c.role === role && c.verbs.includes(verb));
@@ -179,8 +185,9 @@ export class Panel {
   }
 
   // Class and words of the state: what the nodes compute says more than that they are silent.
-  static doing({ state, paused, activity, quiet, stopping }) {
+  static doing({ state, paused, activity, quiet, stopping, recorded }) {
     const [className, words] = STATES[state] ?? ["", state];
+    if (recorded) return recorded.finished ? ["", "finished"] : ["warn", "not finished; nothing works on it"];
     if (state === "paused") return [className, `${paused.map((r) => WHAT[r] ?? r).join(" and ")} paused`];
     const busy = state === "running" || state === "silent" || state === "waiting";
     if (busy && activity) return ["good", `${activity.what}, ${duration(activity.seconds)}`];
@@ -207,18 +214,20 @@ export class Panel {
 
   figures(status, curve) {
     const { mean, references, budget, axis, phase, seeds, done } = curve.told;
-    const cost = mean.length ? mean[mean.length - 1] : null;
+    const closing = references.adapted; // what the closing evaluation gave counts, once it is there
+    const cost = closing ?? (mean.length ? mean[mean.length - 1] : null);
     const rows = [["phase", phase || "–", ""]];
     rows.push([axis, done ? String(done) : "–", budget ? ` of ${budget}` : ""]);
-    rows.push(["time left", status.remaining === null ? "–" : duration(status.remaining), ""]);
-    rows.push(["cost now", text(cost), ""]);
+    if (!status.recorded) rows.push(["time left", status.remaining === null ? "–" : duration(status.remaining), ""]);
+    rows.push([closing === undefined ? "cost now" : "evaluated cost", text(cost), ""]);
     const lqt = references.lqt;
     const share = lqt && cost !== null ? 100 * (1 - cost / lqt) : null;
     const side = share === null ? "" : share >= 0 ? " % below" : " % above";
     rows.push(["against LQT", share === null ? "–" : Math.abs(share).toFixed(1), side]);
     rows.push(["seeds", seeds.length ? String(seeds.length) : "–", ""]);
-    rows.push(["rounds", text(status.rounds < 10 ? status.rounds : Math.round(status.rounds)), " 1/s"]);
-    rows.push(["episodes", text(status.episodes), " 1/s"]);
+    if (!status.recorded) rows.push(["rounds", text(status.rounds < 10 ? status.rounds : Math.round(status.rounds)), " 1/s"]);
+    if (!status.recorded) rows.push(["episodes", text(status.episodes), " 1/s"]);
+    else rows.push(["recorded episodes", String(status.recorded.episodes), ""]);
     const list = find("figures");
     if (list.children.length !== rows.length) {
       list.replaceChildren(
@@ -237,6 +246,27 @@ export class Panel {
       put(row.lastChild.firstChild, value);
       put(row.lastChild.lastChild, unit);
     });
+  }
+
+  // What the closing evaluation gave, once it has been.
+  seeds({ evaluations, references }, controllers) {
+    const known = Object.entries(evaluations);
+    find("seeds-panel").hidden = !known.length;
+    if (!known.length) return;
+    const names = ["none", "lqt", "adapted"];
+    const below = ({ lqt, adapted }) => `${text(Number((100 * (1 - adapted / lqt)).toFixed(1)))} %`;
+    const row = (cells, tag) => {
+      const made = make("tr");
+      made.append(...cells.map((words) => make(tag, words)));
+      return made;
+    };
+    const line = (name, costs) => [name, ...names.map((n) => text(costs[n])), below(costs)];
+    const head = ["seed", ...names.map((n) => controllers[n] ?? n), `below ${controllers.lqt ?? "LQT"}`];
+    find("seeds").replaceChildren(
+      row(head, "th"),
+      ...known.map(([seed, costs]) => row(line(seed, costs), "td")),
+      ...(known.length > 1 ? [row(line("mean", references), "td")] : []),
+    );
   }
 
   nodes(status) {
