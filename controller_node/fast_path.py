@@ -20,7 +20,7 @@ from loop_interfaces.fast_path import channel
 from loop_interfaces.fast_path.handler import FastPath, fast_handler, plan_type
 from loop_interfaces.fast_path.messages import FIRST, STEP, TIME, write_answer
 from loop_interfaces.frames import MAX_ID, ArrayCodec, Frame
-from loop_interfaces.jit.simd import peek
+from loop_interfaces.jit.simd import load_unaligned
 from loop_interfaces.topics import ACTION
 
 __all__ = ["ControllerFastPath", "load_compiled"]
@@ -36,13 +36,13 @@ PLAN = plan_type(
 @register_jitable  # type: ignore[untyped-decorator, unused-ignore]
 def respond(plan: Any, head: int, message: int, length: int) -> bool:
     """Fill in the action that the law answers with."""
-    step = peek(head, STEP)
+    step = load_unaligned(head, STEP)
     if not (0.0 <= step < MAX_ID and step == math.floor(step)):
         return False
     act(plan.law, head + 8 * FIRST, plan.actions, plan.batch)
     plan.step = int(step)
     numbers = plan.batch * plan.law.n_a
-    write_answer(plan.answer, plan.step, peek(head, TIME), plan.actions, numbers)
+    write_answer(plan.answer, plan.step, load_unaligned(head, TIME), plan.actions, numbers)
     return True
 
 

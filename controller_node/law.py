@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.jit import cache, simd
-from loop_interfaces.jit.cache import fingerprint, jit, kept
+from loop_interfaces.jit.cache import cached_njit, fingerprint, jit
 from loop_interfaces.jit.simd import (
     fma,
     load,
-    peek,
+    load_unaligned,
     read,
     read_word,
     splat,
@@ -74,10 +74,10 @@ def reduce(law: Any, states: int, first: int, batch: int) -> None:
         a0, a1, a2, a3 = splat(0.0), splat(0.0), splat(0.0), splat(0.0)
         k = block
         for i in range(n_z):
-            a0 = fma(load(u0, k), splat(peek(z0, i)), a0)
-            a1 = fma(load(u1, k), splat(peek(z1, i)), a1)
-            a2 = fma(load(u2, k), splat(peek(z2, i)), a2)
-            a3 = fma(load(u3, k), splat(peek(z3, i)), a3)
+            a0 = fma(load(u0, k), splat(load_unaligned(z0, i)), a0)
+            a1 = fma(load(u1, k), splat(load_unaligned(z1, i)), a1)
+            a2 = fma(load(u2, k), splat(load_unaligned(z2, i)), a2)
+            a3 = fma(load(u3, k), splat(load_unaligned(z3, i)), a3)
             k += width
         store(s, block, a0)
         store(s, width + block, a1)
@@ -116,7 +116,7 @@ def act(law: Any, states: int, actions: int, batch: int) -> None:
 
 
 def compile_control(sources: str) -> Any:
-    @kept
+    @cached_njit
     def control(
         laws: NDArray[np.void], states: NDArray[np.float64], actions: NDArray[np.float64]
     ) -> None:

@@ -24,7 +24,7 @@ from loop_interfaces.fast_path.messages import (
 from loop_interfaces.frames import ArrayCodec, digest
 from loop_interfaces.jit.cache import jit
 from loop_interfaces.jit.native import CLOCK, MonotonicClock, monotonic_ns
-from loop_interfaces.jit.simd import peek, write
+from loop_interfaces.jit.simd import load_unaligned, write
 from loop_interfaces.samples import ACTION_KIND, NO_TIME, SAMPLE_HEADER, STATE_KIND
 from loop_interfaces.topics import STATE
 from pde_sim_node.lockstep import Lockstep
@@ -67,14 +67,14 @@ def keep(plan: Any, kind: int, time: float, raw: int, length: int) -> None:
 def advance(plan: Any, head: int, message: int, length: int) -> bool:
     """Apply the awaited action, and fill in the next state."""
     machine = plan.machine
-    if peek(head, STEP) != machine.step or plan.steps == plan.limit:
+    if load_unaligned(head, STEP) != machine.step or plan.steps == plan.limit:
         return False
     if full(plan.bundles[0]) or full(plan.bundles[1]):
         return False
     keep(plan, ACTION_KIND, NO_TIME, message, length)
     numbers = plan.expected.values
     for i in range(numbers):
-        number = peek(head, FIRST + i)
+        number = load_unaligned(head, FIRST + i)
         write(machine.actions, i, number)
         write(plan.log, plan.steps * numbers + i, number)
     step_together(machine)

@@ -42,8 +42,8 @@ from numba import carray, types  # type: ignore[attr-defined, unused-ignore]
 from numpy.typing import NDArray
 
 from loop_interfaces.jit import atomics, cache, native, simd
-from loop_interfaces.jit.atomics import look, set_word
-from loop_interfaces.jit.cache import fingerprint, jit, kept
+from loop_interfaces.jit.atomics import load_acquire, store_release
+from loop_interfaces.jit.cache import cached_njit, fingerprint, jit
 from loop_interfaces.jit.native import (
     CLOCK,
     MachineCode,
@@ -127,7 +127,7 @@ def answered(channel: Any, message: int) -> bool:
 @jit
 def put_into_mailbox(channel: Any) -> None:
     """The message in the slot behind the last one has to wait."""
-    set_word(channel.armed, 0)
+    store_release(channel.armed, 0)
     if channel.waiting < CAPACITY:
         channel.waiting += 1
     else:
@@ -147,7 +147,7 @@ def on_message(channel: Any) -> bool:
     lock(channel)
     message = slot_after(channel, channel.waiting)
     found = call_c(channel.take, (channel.subscription, message, 0, 0)) == 0
-    if found and not (look(channel.armed) == 1 and answered(channel, message)):
+    if found and not (load_acquire(channel.armed) == 1 and answered(channel, message)):
         put_into_mailbox(channel)
     unlock(channel)
     return bool(found)
@@ -169,15 +169,15 @@ def compile_on_new_message() -> Any:
 def compile_for_node(sources: str) -> tuple[Any, Any, Any, Any]:
     """What the node's own thread calls."""
 
-    @kept
+    @cached_njit
     def disarm(channels: NDArray[np.void]) -> None:
         sources  # noqa: B018  # closed over to be part of the key on disk
         channel = channels[0]
-        set_word(channel.armed, 0)  # no answer is begun from here on
+        store_release(channel.armed, 0)  # no answer is begun from here on
         lock(channel)  # the one under way has been given
         unlock(channel)
 
-    @kept
+    @cached_njit
     def arm(channels: NDArray[np.void]) -> bool:
         """Answer what waits already; whether that was all, and it is armed."""
         sources  # noqa: B018
@@ -187,11 +187,11 @@ def compile_for_node(sources: str) -> tuple[Any, Any, Any, Any]:
         while channel.waiting > 0 and answered(channel, slot_after(channel, 0)):
             remove_oldest(channel)
         empty = channel.waiting == 0
-        set_word(channel.armed, 1 if empty else 0)
+        store_release(channel.armed, 1 if empty else 0)
         unlock(channel)
         return bool(empty)
 
-    @kept
+    @cached_njit
     def oldest(channels: NDArray[np.void]) -> int:
         """Address of the message that has waited longest; 0 if none waits."""
         sources  # noqa: B018
@@ -201,7 +201,7 @@ def compile_for_node(sources: str) -> tuple[Any, Any, Any, Any]:
         unlock(channel)
         return message
 
-    @kept
+    @cached_njit
     def pop(channels: NDArray[np.void]) -> None:
         """The oldest message has been read."""
         sources  # noqa: B018

@@ -19,14 +19,14 @@ from loop_interfaces.jit.simd import (
     WIDTH,
     lane_sum,
     load,
-    peek,
-    peek_lanes,
-    peek_word,
-    poke,
-    poke_lanes,
-    poke_word,
+    load_lanes_unaligned,
+    load_unaligned,
+    load_word_unaligned,
     read,
     splat,
+    store_lanes_unaligned,
+    store_unaligned,
+    store_word_unaligned,
 )
 from loop_interfaces.samples import SAMPLE_HEADER
 
@@ -68,24 +68,29 @@ def expected_header(raw: int, length: int, expected: Any) -> int:
     if length != start + 8 * (FIRST + values):
         return 0
     for at in range(0, start - 7, 8):
-        if peek_word(raw + at, 0) != peek_word(expected.prefix + at, 0):
+        if load_word_unaligned(raw + at, 0) != load_word_unaligned(expected.prefix + at, 0):
             return 0
-    if peek_word(raw + start - 8, 0) != peek_word(expected.prefix + start - 8, 0):
+    if load_word_unaligned(raw + start - 8, 0) != load_word_unaligned(
+        expected.prefix + start - 8, 0
+    ):
         return 0
     head = raw + start
-    if peek(head, RUN) != expected.run or peek(head, EPISODE) != expected.episode:
+    if (
+        load_unaligned(head, RUN) != expected.run
+        or load_unaligned(head, EPISODE) != expected.episode
+    ):
         return 0
-    if peek(head, PLANT) != expected.plant:
+    if load_unaligned(head, PLANT) != expected.plant:
         return 0
-    step, time = peek(head, STEP), peek(head, TIME)
+    step, time = load_unaligned(head, STEP), load_unaligned(head, TIME)
     # x - x is 0, and NaN if x is NaN or infinite.
     lanes, last = splat(0.0), values % WIDTH
     for i in range(0, values - last, WIDTH):
-        x = peek_lanes(head, FIRST + i)
+        x = load_lanes_unaligned(head, FIRST + i)
         lanes = lanes + (x - x)
     total = lane_sum(lanes) + (step - step) + (time - time)
     for i in range(values - last, values):
-        total += peek(head, FIRST + i) - peek(head, FIRST + i)
+        total += load_unaligned(head, FIRST + i) - load_unaligned(head, FIRST + i)
     return head if total == 0.0 else 0
 
 
@@ -105,15 +110,15 @@ def append(bundle: Any, kind: int, stamp: int, time: float, raw: int, length: in
     if not bundle.open:
         return
     at = bundle.end
-    poke_word(at, 0, kind | (length << 32))
-    poke_word(at, 1, stamp)
-    poke(at, 2, time)
+    store_word_unaligned(at, 0, kind | (length << 32))
+    store_word_unaligned(at, 1, stamp)
+    store_unaligned(at, 2, time)
     at += SAMPLE_HEADER
     whole = length // 8
     for i in range(whole):
-        poke_word(at, i, peek_word(raw, i))
+        store_word_unaligned(at, i, load_word_unaligned(raw, i))
     if length > 8 * whole:  # bytes up to the last one, some of them again
-        poke_word(at + length - 8, 0, peek_word(raw + length - 8, 0))
+        store_word_unaligned(at + length - 8, 0, load_word_unaligned(raw + length - 8, 0))
     bundle.end = at + length
 
 
@@ -167,10 +172,10 @@ class OwnMessage:
 @jit
 def write_answer(head: int, step: int, time: float, values: int, count: int) -> None:
     """Fill in step, time and values, an array at an address, of an own message."""
-    poke(head, STEP, step)
-    poke(head, TIME, time)
+    store_unaligned(head, STEP, step)
+    store_unaligned(head, TIME, time)
     last = count % WIDTH
     for i in range(0, count - last, WIDTH):
-        poke_lanes(head, FIRST + i, load(values, i))
+        store_lanes_unaligned(head, FIRST + i, load(values, i))
     for i in range(count - last, count):
-        poke(head, FIRST + i, read(values, i))
+        store_unaligned(head, FIRST + i, read(values, i))

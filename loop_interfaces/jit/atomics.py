@@ -7,7 +7,7 @@ from numba import types
 
 from loop_interfaces.jit.simd import intrinsic
 
-__all__ = ["add", "exchange", "look", "set_word"]
+__all__ = ["compare_exchange", "fetch_add", "load_acquire", "store_release"]
 
 WORD = ir.IntType(64)
 
@@ -17,7 +17,7 @@ def place(builder: Any, address: Any) -> Any:
 
 
 @intrinsic
-def look(typing_context: Any, address: Any) -> Any:
+def load_acquire(typing_context: Any, address: Any) -> Any:
     """The word at an address; what was written before it was is seen, too."""
 
     def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -27,7 +27,7 @@ def look(typing_context: Any, address: Any) -> Any:
 
 
 @intrinsic
-def set_word(typing_context: Any, address: Any, word: Any) -> Any:
+def store_release(typing_context: Any, address: Any, word: Any) -> Any:
     """Write the word at an address; who sees it sees what was written before."""
 
     def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -38,7 +38,7 @@ def set_word(typing_context: Any, address: Any, word: Any) -> Any:
 
 
 @intrinsic
-def exchange(typing_context: Any, address: Any, old: Any, new: Any) -> Any:
+def compare_exchange(typing_context: Any, address: Any, old: Any, new: Any) -> Any:
     """Write `new` if the word is `old`; whether it was."""
 
     def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -50,7 +50,7 @@ def exchange(typing_context: Any, address: Any, old: Any, new: Any) -> Any:
 
 
 @intrinsic
-def add(typing_context: Any, address: Any, number: Any) -> Any:
+def fetch_add(typing_context: Any, address: Any, number: Any) -> Any:
     """Add to the word at an address; what it was before."""
 
     def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:

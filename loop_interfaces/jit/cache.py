@@ -14,24 +14,24 @@ from typing import Any, TypeVar
 
 import numba
 
-__all__ = ["cache_misses", "fingerprint", "jit", "kept", "part"]
+__all__ = ["cache_misses", "cached_njit", "fingerprint", "inlined_njit", "jit"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 
 def jit(function: F) -> F:
-    """Compile as a part of a function that is `kept`."""
+    """Compile as a part of a function that is cached."""
     compiled: F = numba.njit(function)
     return compiled
 
 
-def part(function: F) -> F:
+def inlined_njit(function: F) -> F:
     """Compile into every function that calls it, for the constants that it is called with."""
     compiled: F = numba.njit(function, forceinline=True)
     return compiled
 
 
-def kept(function: F) -> F:
+def cached_njit(function: F) -> F:
     """Compile, keep on disk, and run without the interpreter's lock."""
     compiled: F = numba.njit(function, cache=True, nogil=True)
     return compiled

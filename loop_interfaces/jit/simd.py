@@ -27,17 +27,17 @@ __all__ = [
     "fma",
     "lane_sum",
     "load",
+    "load_lanes_unaligned",
+    "load_unaligned",
+    "load_word_unaligned",
     "minus_product",
-    "peek",
-    "peek_lanes",
-    "peek_word",
-    "poke",
-    "poke_lanes",
-    "poke_word",
     "read",
     "read_word",
     "splat",
     "store",
+    "store_lanes_unaligned",
+    "store_unaligned",
+    "store_word_unaligned",
     "transpose",
     "whole_lanes",
     "write",
@@ -119,9 +119,10 @@ read, write = reader(NUMBER, types.float64, 8), writer(NUMBER, types.float64, 8)
 load, store = reader(VECTOR, lanes, 8), writer(VECTOR, lanes, 8)
 read_word, write_word = reader(WORD, types.int64, 8), writer(WORD, types.int64, 8)
 # In a message numbers begin on a multiple of four bytes only.
-peek, poke = reader(NUMBER, types.float64, 1), writer(NUMBER, types.float64, 1)
-peek_lanes, poke_lanes = reader(VECTOR, lanes, 1), writer(VECTOR, lanes, 1)
-peek_word, poke_word = reader(WORD, types.int64, 1), writer(WORD, types.int64, 1)
+load_unaligned, store_unaligned = reader(NUMBER, types.float64, 1), writer(NUMBER, types.float64, 1)
+load_lanes_unaligned, store_lanes_unaligned = reader(VECTOR, lanes, 1), writer(VECTOR, lanes, 1)
+load_word_unaligned = reader(WORD, types.int64, 1)
+store_word_unaligned = writer(WORD, types.int64, 1)
 
 
 @intrinsic

@@ -36,7 +36,7 @@ from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from loop_interfaces.jit import cache, native, simd
-from loop_interfaces.jit.cache import fingerprint, jit, kept
+from loop_interfaces.jit.cache import cached_njit, fingerprint, jit
 from loop_interfaces.jit.native import call_c
 from loop_interfaces.jit.simd import load, read, splat, write
 from pde_sim_node.equations import Equation
@@ -50,12 +50,12 @@ from pde_sim_node.solver.spectra import (
     forward,
     get,
     inverse,
-    joined,
     minus,
     plus,
     product,
     put,
-    split,
+    rfft_pack,
+    rfft_unpack,
     synthesise,
 )
 
@@ -84,7 +84,7 @@ PLAN_AND_TAPE = np.dtype(
 def taped(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> int:
     """As `kernel.nonlinear`, and g'(u) to `tape`."""
     t = plan.fine
-    split(w, plan.x, plan.z1, d, t, c, e)
+    rfft_unpack(w, plan.x, plan.z1, d, t, c, e)
     z = inverse(w, plan.z1, plan.z2, d, t, c, e)
     for j in range(0, t.m, 8):
         put(w, tape + j, d, get(w, z + j, d))
@@ -102,7 +102,7 @@ def integrate_taped(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> Non
     x, next_x, to_b, to_c = plan.x, plan.next, plan.b, plan.c
     z = taped(w, d, plan, c, e, tape)
     for k in range(0, modes, 8):
-        g, v, qf = joined(w, z, d, m, factors, k, c, e), get(w, x + k, d), get(w, plan.qf + k, d)
+        g, v, qf = rfft_pack(w, z, d, m, factors, k, c, e), get(w, x + k, d), get(w, plan.qf + k, d)
         half, qg = plus(product(c, plan.e2 + k, e, v), qf), product(c, plan.qm + k, e, g)
         a = plus(half, qg)
         put(w, x + k, d, a)
@@ -112,18 +112,18 @@ def integrate_taped(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> Non
         put(w, next_x + k, d, plus(whole, product(c, plan.f1m + k, e, g)))
     z = taped(w, d, plan, c, e, tape + m)
     for k in range(0, modes, 8):
-        g = joined(w, z, d, m, factors, k, c, e)
+        g = rfft_pack(w, z, d, m, factors, k, c, e)
         put(w, x + k, d, plus(get(w, to_b + k, d), product(c, plan.qm + k, e, g)))
         put(w, next_x + k, d, plus(get(w, next_x + k, d), product(c, plan.f2m + k, e, g)))
     z = taped(w, d, plan, c, e, tape + 2 * m)
     for k in range(0, modes, 8):
-        g = joined(w, z, d, m, factors, k, c, e)
+        g = rfft_pack(w, z, d, m, factors, k, c, e)
         qg = product(c, plan.qm + k, e, g)
         put(w, x + k, d, plus(get(w, to_c + k, d), plus(qg, qg)))
         put(w, next_x + k, d, plus(get(w, next_x + k, d), product(c, plan.f2m + k, e, g)))
     z = taped(w, d, plan, c, e, tape + 3 * m)
     for k in range(0, modes, 8):
-        g = joined(w, z, d, m, factors, k, c, e)
+        g = rfft_pack(w, z, d, m, factors, k, c, e)
         put(w, x + k, d, plus(get(w, next_x + k, d), product(c, plan.f3m + k, e, g)))
 
 
@@ -138,7 +138,7 @@ def conjugate_product(c: int, at: int, e: int, value: Any) -> Any:
 def transposed(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> int:
     """Where the transform of g'(u) times the field of the spectrum x stands."""
     t = plan.fine
-    split(w, plan.x, plan.z1, d, t, c, e)
+    rfft_unpack(w, plan.x, plan.z1, d, t, c, e)
     z = inverse(w, plan.z1, plan.z2, d, t, c, e)
     for j in range(0, t.m, 8):
         u, g = get(w, z + j, d), get(w, tape + j, d)
@@ -155,21 +155,21 @@ def pull_back_internal(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> 
         put(w, x + k, d, conjugate_product(c, plan.f3m + k, e, get(w, on_v + k, d)))
     z = transposed(w, d, plan, c, e, tape + 3 * m)
     for k in range(0, modes, 8):
-        own = joined(w, z, d, m, factors, k, c, e)
+        own = rfft_pack(w, z, d, m, factors, k, c, e)
         put(w, on_c + k, d, own)
         part = conjugate_product(c, plan.qm + k, e, own)
         through = conjugate_product(c, plan.f2m + k, e, get(w, on_v + k, d))
         put(w, x + k, d, plus(through, plus(part, part)))
     z = transposed(w, d, plan, c, e, tape + 2 * m)
     for k in range(0, modes, 8):
-        own = joined(w, z, d, m, factors, k, c, e)
+        own = rfft_pack(w, z, d, m, factors, k, c, e)
         put(w, on_b + k, d, own)
         through = conjugate_product(c, plan.f2m + k, e, get(w, on_v + k, d))
         put(w, x + k, d, plus(through, conjugate_product(c, plan.qm + k, e, own)))
     z = transposed(w, d, plan, c, e, tape + m)
     for k in range(0, modes, 8):
         b, c_, v = get(w, on_b + k, d), get(w, on_c + k, d), get(w, on_v + k, d)
-        own = joined(w, z, d, m, factors, k, c, e)
+        own = rfft_pack(w, z, d, m, factors, k, c, e)
         a = plus(own, conjugate_product(c, plan.e2 + k, e, c_))
         through = conjugate_product(c, plan.f1m + k, e, v)
         put(w, x + k, d, plus(through, conjugate_product(c, plan.qm + k, e, minus(a, c_))))
@@ -180,11 +180,11 @@ def pull_back_internal(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> 
         put(w, on_v + k, d, plus(linear, conjugate_product(c, plan.e + k, e, v)))
     z = transposed(w, d, plan, c, e, tape)
     for k in range(0, modes, 8):
-        put(w, on_v + k, d, plus(get(w, on_v + k, d), joined(w, z, d, m, factors, k, c, e)))
+        put(w, on_v + k, d, plus(get(w, on_v + k, d), rfft_pack(w, z, d, m, factors, k, c, e)))
 
 
 def compile_pull_back(sources: str) -> Any:
-    @kept
+    @cached_njit
     def pull_back(
         states: Array,
         actions: Array,

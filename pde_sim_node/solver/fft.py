@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.jit.cache import jit, part
+from loop_interfaces.jit.cache import inlined_njit, jit
 from loop_interfaces.jit.simd import WIDTH, fma, load, minus_product, read, splat, store, transpose
 
 __all__ = ["fft", "is_transform_length", "plane_size", "radices_of", "twiddles_of"]
@@ -144,7 +144,7 @@ def first_pass(w: int, x: int, y: int, d: int, b: int, c: int, v: int, e: int) -
             store(w, y + 8 * p + 8 * row + d, i[row])
 
 
-@part
+@inlined_njit
 def pass8(w: int, x: int, y: int, d: int, m: int, s: int, c: int, v: int, e: int) -> int:
     for p in range(m):
         for q in range(0, s, 8):
@@ -163,7 +163,7 @@ def pass8(w: int, x: int, y: int, d: int, m: int, s: int, c: int, v: int, e: int
     return v
 
 
-@part
+@inlined_njit
 def pass4(w: int, x: int, y: int, d: int, m: int, s: int, c: int, v: int, e: int) -> int:
     t = s * m
     for p in range(m):
@@ -185,7 +185,7 @@ def pass4(w: int, x: int, y: int, d: int, m: int, s: int, c: int, v: int, e: int
     return v
 
 
-@part
+@inlined_njit
 def pass3(w: int, x: int, y: int, d: int, m: int, s: int, c: int, v: int, e: int) -> int:
     t = s * m
     half, sine = splat(0.5), splat(SIN_60)
@@ -207,7 +207,7 @@ def pass3(w: int, x: int, y: int, d: int, m: int, s: int, c: int, v: int, e: int
     return v
 
 
-@part
+@inlined_njit
 def pass2(w: int, x: int, y: int, d: int, m: int, s: int, c: int, v: int, e: int) -> int:
     t = s * m
     for p in range(m):
@@ -223,7 +223,7 @@ def pass2(w: int, x: int, y: int, d: int, m: int, s: int, c: int, v: int, e: int
     return v
 
 
-@part
+@inlined_njit
 def one_pass(
     radix: int, w: int, x: int, y: int, d: int, m: int, s: int, c: int, v: int, e: int
 ) -> int:

@@ -19,7 +19,7 @@ from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from loop_interfaces.jit import native, simd
-from loop_interfaces.jit.cache import jit, kept
+from loop_interfaces.jit.cache import cached_njit, jit
 from loop_interfaces.jit.native import call_c
 from loop_interfaces.jit.simd import fma, read, splat
 from pde_sim_node.solver import fft, spectra
@@ -30,13 +30,13 @@ from pde_sim_node.solver.spectra import (
     forward,
     get,
     inverse,
-    joined,
     minus,
     plus,
     plus_product,
     product,
     put,
-    split,
+    rfft_pack,
+    rfft_unpack,
     synthesise,
 )
 
@@ -90,7 +90,7 @@ PLAN = np.dtype(
 def nonlinear(w: int, d: int, plan: Any, c: int, e: int) -> int:
     """Where the transform of g(u) stands, u being the field of the spectrum x on the fine grid."""
     t = plan.fine
-    split(w, plan.x, plan.z1, d, t, c, e)
+    rfft_unpack(w, plan.x, plan.z1, d, t, c, e)
     z = inverse(w, plan.z1, plan.z2, d, t, c, e)
     call_c(plan.pointwise, (w + 8 * z, t.m))
     call_c(plan.pointwise, (w + 8 * (z + d), t.m))
@@ -107,7 +107,7 @@ def integrate(w: int, d: int, plan: Any, c: int, e: int) -> None:
     f1m, f3m, qfs, ffs = plan.f1m, plan.f3m, plan.qf, plan.ff
     z = nonlinear(w, d, plan, c, e)
     for k in range(0, modes, 8):
-        g, v, qf = joined(w, z, d, m, factors, k, c, e), get(w, x + k, d), get(w, qfs + k, d)
+        g, v, qf = rfft_pack(w, z, d, m, factors, k, c, e), get(w, x + k, d), get(w, qfs + k, d)
         half, qg = plus_product(qf, c, e2 + k, e, v), product(c, qm + k, e, g)
         a = plus(half, qg)
         put(w, x + k, d, a)
@@ -117,18 +117,18 @@ def integrate(w: int, d: int, plan: Any, c: int, e: int) -> None:
         put(w, next_x + k, d, plus_product(whole, c, f1m + k, e, g))
     z = nonlinear(w, d, plan, c, e)
     for k in range(0, modes, 8):
-        g = joined(w, z, d, m, factors, k, c, e)
+        g = rfft_pack(w, z, d, m, factors, k, c, e)
         put(w, x + k, d, plus_product(get(w, to_b + k, d), c, qm + k, e, g))
         put(w, next_x + k, d, plus_product(get(w, next_x + k, d), c, f2m + k, e, g))
     z = nonlinear(w, d, plan, c, e)
     for k in range(0, modes, 8):
-        g = joined(w, z, d, m, factors, k, c, e)
+        g = rfft_pack(w, z, d, m, factors, k, c, e)
         qg = product(c, qm + k, e, g)
         put(w, x + k, d, plus(get(w, to_c + k, d), plus(qg, qg)))
         put(w, next_x + k, d, plus_product(get(w, next_x + k, d), c, f2m + k, e, g))
     z = nonlinear(w, d, plan, c, e)
     for k in range(0, modes, 8):
-        g = joined(w, z, d, m, factors, k, c, e)
+        g = rfft_pack(w, z, d, m, factors, k, c, e)
         put(w, x + k, d, plus_product(get(w, next_x + k, d), c, f3m + k, e, g))
 
 
@@ -158,7 +158,7 @@ def advance(state: int, action: int, w: int, d: int, plan: Any, c: int, e: int) 
 environments = environments_of(PLAN, advance, native, simd, fft, spectra)
 
 
-@kept
+@cached_njit
 def all_finite(values: NDArray[np.float64]) -> bool:
     finite = True
     for value in values.flat:

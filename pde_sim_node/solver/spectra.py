@@ -2,8 +2,8 @@
 
 Spectra are those of u(x) = sum_j X_j exp(2 pi i j x / L), j = -n_x/2..n_x/2: the real FFT over the
 number of points. A real sequence of length 2m is transformed as the m complex numbers
-u_2j + i u_2j+1, whose transform Z is `split` from the spectrum X and X `joined` from Z. With
-T_k = -i exp(-pi i k / m),
+u_2j + i u_2j+1. Their transform Z follows from the spectrum X (`rfft_unpack`), and X from Z
+(`rfft_pack`). With T_k = -i exp(-pi i k / m),
 
       Z_k = (X_k + X*_{m-k}) + T*_k (X_k - X*_{m-k})
     4mX_k = (Z_k + Z*_{m-k}) + T_k  (Z_k - Z*_{m-k}).
@@ -26,13 +26,13 @@ __all__ = [
     "forward",
     "get",
     "inverse",
-    "joined",
     "minus",
     "plus",
     "plus_product",
     "product",
     "put",
-    "split",
+    "rfft_pack",
+    "rfft_unpack",
 ]
 
 Complex = Any
@@ -92,7 +92,7 @@ def with_mirror(w: int, x: int, d: int, m: int, k: int) -> tuple[Complex, Comple
 
 
 @jit
-def split(w: int, x: int, z: int, d: int, t: Any, c: int, e: int) -> None:
+def rfft_unpack(w: int, x: int, z: int, d: int, t: Any, c: int, e: int) -> None:
     m, factors = t.m, t.split
     for k in range(0, m, 8):
         (s, r), v = with_mirror(w, x, d, m, k), get(c, factors + k, e)
@@ -108,7 +108,7 @@ def split(w: int, x: int, z: int, d: int, t: Any, c: int, e: int) -> None:
 
 
 @jit
-def joined(w: int, z: int, d: int, m: int, factors: int, k: int, c: int, e: int) -> Complex:
+def rfft_pack(w: int, z: int, d: int, m: int, factors: int, k: int, c: int, e: int) -> Complex:
     """Eight modes of the spectrum, from k on, times 4m."""
     s, r = with_mirror(w, z, d, m, k)
     return plus_product(s, c, factors + k, e, r)
@@ -138,7 +138,7 @@ def analyse(state: int, w: int, d: int, plan: Any, c: int, e: int) -> None:
         z = forward(w, plan.z1, plan.z2, d, t, c, e)
         scale = splat(0.25 / t.m)
         for k in range(0, plan.modes, 8):
-            g = joined(w, z, d, t.m, t.split, k, c, e)
+            g = rfft_pack(w, z, d, t.m, t.split, k, c, e)
             put(w, plan.x + k, d, (scale * g[0], scale * g[1]))
     else:
         for k in range(0, plan.modes, 8):
@@ -161,7 +161,7 @@ def synthesise(state: int, w: int, d: int, plan: Any, c: int, e: int) -> None:
     write(w, plan.x + d, 0.0)
     write(w, plan.x + d + last, 0.0)
     if t.m:
-        split(w, plan.x, plan.z1, d, t, c, e)
+        rfft_unpack(w, plan.x, plan.z1, d, t, c, e)
         z = inverse(w, plan.z1, plan.z2, d, t, c, e)
         for j in range(t.m):
             write(state, 2 * j, read(w, z + j))

@@ -5,7 +5,7 @@ only change in one instruction each, and a ticket of another turn is no ticket: 
 late, when the next step has been put up already, takes nothing of it.
 """
 
-from loop_interfaces.jit.atomics import add, exchange, look, set_word
+from loop_interfaces.jit.atomics import compare_exchange, fetch_add, load_acquire, store_release
 from loop_interfaces.jit.cache import jit
 
 __all__ = ["BOARD", "MAX_TURN", "claim", "close", "look_up", "next_piece", "put_up", "wait"]
@@ -22,20 +22,20 @@ FINISHED = 64
 @jit
 def put_up(board: int, turn: int) -> None:
     """All pieces of a turn, none of them finished. Only when those of the turn before are."""
-    set_word(board + FINISHED, 0)
-    set_word(board, turn << PIECES)
+    store_release(board + FINISHED, 0)
+    store_release(board, turn << PIECES)
 
 
 @jit
 def close(board: int, turn: int) -> None:
     """No pieces until the next turn. Only when those of this one are finished."""
-    set_word(board, (turn << PIECES) | CLOSED)
+    store_release(board, (turn << PIECES) | CLOSED)
 
 
 @jit
 def look_up(board: int) -> int:
     """The turn."""
-    turn: int = look(board) >> PIECES
+    turn: int = load_acquire(board) >> PIECES
     return turn
 
 
@@ -48,11 +48,11 @@ def claim(board: int, turn: int, pieces: int) -> int:
     if board == 0:
         return 0
     while True:
-        ticket = look(board)
+        ticket = load_acquire(board)
         piece: int = ticket - (turn << PIECES)
         if piece < 0 or piece >= pieces:
             return -1
-        if exchange(board, ticket, ticket + 1):
+        if compare_exchange(board, ticket, ticket + 1):
             return piece
 
 
@@ -61,7 +61,7 @@ def next_piece(board: int, turn: int, pieces: int) -> int:
     """The piece after one that is done, and what was written for which is there."""
     if board == 0:
         return -1
-    add(board + FINISHED, 1)
+    fetch_add(board + FINISHED, 1)
     return claim(board, turn, pieces)
 
 
@@ -69,6 +69,6 @@ def next_piece(board: int, turn: int, pieces: int) -> int:
 def wait(board: int, pieces: int, looks: int) -> bool:
     """Whether all pieces are done, looking so many times."""
     looked = 0
-    while looked < looks and look(board + FINISHED) < pieces:
+    while looked < looks and load_acquire(board + FINISHED) < pieces:
         looked += 1
     return looked < looks

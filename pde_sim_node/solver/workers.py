@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from loop_interfaces.affinity import join_solver, usable_cores
 from loop_interfaces.jit import atomics, native
-from loop_interfaces.jit.cache import fingerprint, kept
+from loop_interfaces.jit.cache import cached_njit, fingerprint
 from pde_sim_node.solver import step_context, work_queue
 from pde_sim_node.solver.kernel_memory import Constants, aligned
 from pde_sim_node.solver.step_context import LOOKS, MACHINE, help_out, work
@@ -204,7 +204,7 @@ def compile_board() -> tuple[Any, ...]:
     """What the threads call."""
     sources = fingerprint(work_queue, step_context, atomics, native)
 
-    @kept
+    @cached_njit
     def work_off(
         code: int,
         plan: int,
@@ -226,22 +226,22 @@ def compile_board() -> tuple[Any, ...]:
         c, ended = totals.ctypes.data, diverged_step.ctypes.data
         work(code, plan, z, a, c, ended, k, batch, at, turn, pieces)
 
-    @kept
+    @cached_njit
     def stand_by(machines: NDArray[np.void], plan: int) -> None:
         sources  # noqa: B018
         help_out(machines[0], plan)
 
-    @kept
+    @cached_njit
     def start(address: int, turn: int) -> None:
         sources  # noqa: B018
         put_up(address, turn)
 
-    @kept
+    @cached_njit
     def shut(address: int, turn: int) -> None:
         sources  # noqa: B018
         close(address, turn)
 
-    @kept
+    @cached_njit
     def done(address: int, pieces: int) -> bool:
         sources  # noqa: B018
         return wait(address, pieces, LOOKS)
