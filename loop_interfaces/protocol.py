@@ -15,6 +15,8 @@ from loop_interfaces.topics import Topic
 
 STOPPED = 75
 """Exit code of a tuner that an operator stopped (as sysexits' EX_TEMPFAIL)."""
+NO_CONTROLLER = 65
+"""Exit code of a tuner whose laws diverged (as sysexits' EX_DATAERR); its results are written."""
 
 
 @dataclass(slots=True)

@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as Bar
 
-
-def bar(console: Console, title: str, amount: ProgressColumn) -> Progress:
-    """A bar that leaves no trace: title, bar, how much is done, its `status`, the time left."""
-    return Progress(
-        TextColumn(title),
-        BarColumn(),
-        amount,
-        TextColumn("{task.fields[status]}"),
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-    )
+PERIOD = 5.0
+"""Seconds between two lines at the most, where there is no terminal."""
 
 
 def duration(seconds: float) -> str:
@@ -31,43 +23,92 @@ def duration(seconds: float) -> str:
     return f"{minutes} min" if minutes < 100 else f"{hours:.1f} h"
 
 
-class Share:
-    """Shows the share of a task that is done.
+class Progress:
+    """Shows how much of a task is done.
 
-    On a terminal a bar; elsewhere a line every tenth, with the time left as it seems then.
+    On a terminal a bar, which leaves no trace. Elsewhere a line every tenth and every few seconds,
+    also while nothing is told.
+
+    Parameters
+    ----------
+    console : Console
+    title : str
+        A word for the task.
+    unit : str
+        What is counted; "" for a share from 0 to 1.
+    period : float
+        Seconds between two lines at the most.
     """
 
-    def __init__(self, console: Console, title: str) -> None:
-        self._console, self._title = console, title
-        self._bar: Progress | None = None
+    def __init__(
+        self, console: Console, title: str, unit: str = "", period: float = PERIOD
+    ) -> None:
+        self._console, self._title, self._unit, self._period = console, title, unit, period
+        self._bar: Bar | None = None
         self._task: Any = None
-        self._began = time.monotonic()
+        self._began = self._said = time.monotonic()
         self._first: float | None = None
-        self._told = 0
+        self._done, self._total, self._status = 0.0, 1.0, ""
+        self._lock = threading.Lock()
+        self._over = threading.Event()
+        self._heart: threading.Thread | None = None
 
-    def tell(self, share: float, status: str = "") -> None:
-        """Now `share` (0 to 1) is done; status: a few words on what was done last."""
-        if self._first is None:
-            self._first, self._told = share, int(10 * share)
-        if self._console.is_terminal:
-            self._draw(share, status)
-        elif int(10 * share) > self._told:
-            self._told = int(10 * share)
-            taken = time.monotonic() - self._began
-            left = duration(taken * (1 - share) / (share - self._first))
-            words = [f"{self._title}: {100 * share:.0f} % done", status, f"{left} left"]
-            self._console.print(", ".join(word for word in words if word), markup=False)
+    def tell(self, done: float, total: float = 1.0, status: str = "") -> None:
+        """Now `done` of `total` are done; status: a few words on what was done last."""
+        with self._lock:
+            before = self._done
+            self._done, self._total, self._status = done, total, status
+            if self._first is None:
+                self._first = before = done
+            if self._console.is_terminal:
+                self._draw()
+            elif int(10 * done / total) > int(10 * before / total) and done < total:
+                self._say()
+        if not self._console.is_terminal and self._heart is None:
+            self._heart = threading.Thread(target=self._beat, daemon=True)
+            self._heart.start()
 
     def close(self) -> None:
         """Leave the terminal as it was."""
+        self._over.set()
+        if self._heart is not None:
+            self._heart.join()
         if self._bar is not None:
             self._bar.stop()
             self._bar = None
 
-    def _draw(self, share: float, status: str) -> None:
+    def _beat(self) -> None:
+        while not self._over.wait(self._period / 4):
+            with self._lock:
+                if time.monotonic() - self._said > self._period:
+                    self._say()
+
+    @property
+    def _amount(self) -> str:
+        if not self._unit:
+            return f"{100 * self._done / self._total:.0f} %"
+        return f"{self._done:.0f} of {self._total:.0f} {self._unit}"
+
+    def _say(self) -> None:
+        now = time.monotonic()
+        self._said, gained = now, self._done - (self._first or 0.0)
+        left = ""
+        if gained > 0:
+            left = f"{duration((now - self._began) * (self._total - self._done) / gained)} left"
+        words = [f"{self._title}: {self._amount}", self._status, left]
+        self._console.print(", ".join(word for word in words if word), markup=False)
+
+    def _draw(self) -> None:
         if self._bar is None:
-            amount = TextColumn("{task.percentage:>3.0f} %")
-            self._bar = bar(self._console, self._title, amount)
-            self._task = self._bar.add_task("", total=1.0, status="")
+            self._bar = Bar(
+                TextColumn(self._title),
+                BarColumn(),
+                TextColumn("{task.fields[amount]}"),
+                TextColumn("{task.fields[status]}"),
+                TimeRemainingColumn(),
+                console=self._console,
+                transient=True,
+            )
+            self._task = self._bar.add_task("", total=self._total, amount="", status="")
             self._bar.start()
-        self._bar.update(self._task, completed=share, status=status)
+        self._bar.update(self._task, completed=self._done, amount=self._amount, status=self._status)

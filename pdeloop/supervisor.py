@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from loop_interfaces.files import open_own
-from loop_interfaces.protocol import STOPPED
+from loop_interfaces.protocol import NO_CONTROLLER, STOPPED
 
 STOP_GRACE = 2.0
 """Seconds between SIGINT and SIGKILL when the run ends."""
@@ -115,7 +115,7 @@ class Supervisor:
             code = child.process.poll()
             if code is None:
                 continue
-            if child.name == self.main and code in (0, STOPPED):
+            if child.name == self.main and code in (0, STOPPED, NO_CONTROLLER):
                 self.stopped = code == STOPPED
                 return True
             self._bury(child, code, now)

@@ -23,13 +23,14 @@ from loop_interfaces.isolation import NETWORK, PROFILE, loopback_environment
 from loop_interfaces.problem import load_parameters
 from loop_interfaces.spec import ParameterError
 from pde_sim_node.build import build_equation, build_plant
-from pdeloop.display import Display, ProgressFile, summary_text
+from pdeloop.display import Display, ProgressFile
 from pdeloop.domain import own_domain
 from pdeloop.in_process import LocalPair, train
 from pdeloop.live import announced
 from pdeloop.output import print_json
 from pdeloop.pairs import Layout, Recording, check_pairs, quoted
 from pdeloop.supervisor import Child, NodeError, Supervisor, node_command
+from tuner_node import narration
 from tuner_node.build import build_training
 from tuner_node.results import RunFolder, RunFolderError, timestamp
 from tuner_node.run_store import Recorder
@@ -175,7 +176,7 @@ def run_again(folder: Path, transport: Transport, as_json: bool = False) -> int:
 
 def _run(folder: Path, values: dict[str, Any], transport: Transport, as_json: bool) -> int:
     stream = sys.stderr if as_json else sys.stdout
-    display = Display(values["seed"], stream)
+    display = Display(values["seed"], values["seeds"], stream)
     started = time.monotonic()
     try:
         with interruptible() as check:
@@ -195,10 +196,13 @@ def _run(folder: Path, values: dict[str, Any], transport: Transport, as_json: bo
     summary = RunFolder(folder).result()
     if as_json:
         print_json({"folder": str(folder), **summary})
-        return 0
-    display.line(summary_text(values["problem"], summary, folder))
-    display.line(f"  {time.monotonic() - started:.1f} s with start-up")
-    return 0
+    else:
+        for text in narration.closing_lines(values["problem"], summary, folder):
+            display.line(text)
+        display.line(f"  {time.monotonic() - started:.1f} s with start-up")
+    for text in narration.warnings(summary):
+        display.warn(text)
+    return int(narration.failed(summary))
 
 
 def _train_here(

@@ -27,7 +27,7 @@ import numpy as np
 from rich.console import Console
 
 from pdeloop.in_process import LocalPair, train
-from pdeloop.progress import Share
+from pdeloop.progress import Progress
 from pdeloop.training_run import resolve
 from tuner_node.build import build_training
 
@@ -277,7 +277,7 @@ def run(minutes: float, problem: str, iterations: int, seed: int) -> dict[str, A
     Raises RuntimeError when a training ended with another policy or other costs.
     """
     console = Console(stderr=True, highlight=False, soft_wrap=True)
-    progress = Share(console, "soak")
+    progress = Progress(console, "soak")
 
     def tell(text: str) -> None:
         console.print(text, markup=False)
@@ -289,7 +289,7 @@ def run(minutes: float, problem: str, iterations: int, seed: int) -> dict[str, A
             iterations=iterations,
             seed=seed,
             tell=tell,
-            tick=progress.tell,
+            tick=lambda share, status: progress.tell(share, status=status),
         )
     finally:
         progress.close()

@@ -29,9 +29,8 @@ from loop_interfaces.spec import read_yaml
 from pdeloop import cli
 from pdeloop.cli import main
 from pdeloop.commands import problems
-from pdeloop.display import Display
 from pdeloop.output import print_json
-from pdeloop.progress import Share, duration
+from pdeloop.progress import Progress, duration
 from tests.loop_harness import ROOT
 from tests.small import SMALL
 
@@ -283,7 +282,9 @@ def test_a_terminal_shows_a_bar_with_cost_and_time_left(tmp_path: Path, colour: 
     environment = {"PYTHONPATH": str(ROOT)} | ({} if colour else {"NO_COLOR": "1"})
     with terminal(*PDELOOP, *words, cwd=tmp_path, **environment) as shown:
         assert shown.wait() == 0, shown.plain
-    assert re.search(r"adapt [━╺╸]+ +\d+/809 cost [\d.]+ +\d:\d\d:\d\d", shown.plain), shown.plain
+    assert re.search(
+        r"adapting [━╺╸]+ +\d+ of 809 rollouts cost [\d.]+ +\d:\d\d:\d\d", shown.plain
+    ), shown.plain
     assert bool(COLOUR.search(shown.shown)) == colour
     assert "results in run" in shown.plain
 
@@ -294,7 +295,8 @@ def test_a_pipe_gets_plain_lines(tmp_path: Path) -> None:
         environment={"TERM": "xterm-256color"},
         cwd=tmp_path,
     )
-    assert done.stdout.count(" rollouts: cost ") >= 6
+    assert done.stdout.count(" of 41 rollouts, cost ") >= 6
+    assert re.search(r"^  41 rollouts: cost [\d.]+$", done.stdout, flags=re.MULTILINE)
     assert "\x1b" not in done.stdout
     assert "\r" not in done.stdout
 
@@ -308,22 +310,35 @@ def test_an_interrupted_training_says_how_to_go_on(tmp_path: Path) -> None:
     assert "continue with: pdeloop train --resume run --in-process" in shown.plain
 
 
-def test_shares_become_lines_with_the_time_left() -> None:
+def test_progress_becomes_lines_with_the_time_left() -> None:
     file = io.StringIO()
-    share = Share(Console(file=file, width=80), "soak")
+    progress = Progress(Console(file=file, width=80), "soak")
     for tenth in range(0, 101, 2):
-        share.tell(tenth / 100, f"{tenth} faults")
+        progress.tell(tenth / 100, status=f"{tenth} faults")
+    progress.close()
     lines = file.getvalue().splitlines()
-    assert len(lines) == 10
-    assert re.fullmatch(r"soak: 50 % done, 50 faults, \d+ s left", lines[4])
+    assert len(lines) == 9
+    assert re.fullmatch(r"soak: 50 %, 50 faults, \d+ s left", lines[4])
 
 
-def test_shares_on_a_terminal_are_a_bar_that_leaves_nothing() -> None:
+def test_where_nothing_is_told_for_long_a_line_says_how_far_it_was() -> None:
     file = io.StringIO()
-    share = Share(Console(file=file, width=80, force_terminal=True), "soak")
-    share.tell(0.0)
-    share.tell(0.5, "3 faults")
-    share.close()
+    progress = Progress(Console(file=file, width=80), "adapting", "rollouts", period=0.05)
+    progress.tell(9, 80)
+    progress.tell(12, 80, "cost 1.5")
+    deadline = time.monotonic() + LIMIT
+    while file.getvalue().count("\n") < 3 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    progress.close()
+    assert "adapting: 12 of 80 rollouts, cost 1.5, " in file.getvalue().splitlines()[2]
+
+
+def test_progress_on_a_terminal_is_a_bar_that_leaves_nothing() -> None:
+    file = io.StringIO()
+    progress = Progress(Console(file=file, width=80, force_terminal=True), "soak")
+    progress.tell(0.0)
+    progress.tell(0.5, status="3 faults")
+    progress.close()
     text = CONTROL.sub("", file.getvalue())
     assert re.search(r"soak [━╺]+ +50 % 3 faults", text)
     assert file.getvalue().rstrip().endswith("\x1b[2K")
@@ -334,22 +349,6 @@ def test_shares_on_a_terminal_are_a_bar_that_leaves_nothing() -> None:
 )
 def test_durations_are_in_words(seconds: float, words: str) -> None:
     assert duration(seconds) == words
-
-
-def test_a_row_of_a_training_is_a_line_where_there_is_no_terminal() -> None:
-    file = io.StringIO()
-    display = Display(0, file)
-    display.row({"event": "phase", "phase": "adapt", "rollouts": [9], "budget": [25]})
-    display.row(
-        {
-            "event": "adapted",
-            "seed": 0,
-            "rollouts": 11,
-            "cost": 1.25,
-            "diverged": 0,
-        }
-    )
-    assert file.getvalue() == "adapt\n  seed 0, 11 rollouts: cost 1.25\n"
 
 
 SHELLS = {

@@ -27,7 +27,7 @@ def reproduced(loop: Processes, out, *more: str) -> str:
 
 def test_every_number_is_that_of_the_trainings(loop, tmp_path):
     text = reproduced(loop, tmp_path / "out")
-    assert "100 % done" in text and "LQT-PO below LQT" in text
+    assert "reproduce: 90 %" in text and "LQT-PO below LQT" in text
     (results,) = reproduce.load(tmp_path / "out")
     for start, name in (("lqt", "lqt_po"), ("zero", "pure_po")):
         training = train_here(parameters(seeds=2, iterations=4, start=start))

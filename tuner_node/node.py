@@ -24,7 +24,7 @@ from std_msgs.msg import String
 from loop_interfaces.frames import MAX_ID, Frame
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.parameters import PROBLEM, TUNER, with_budget
-from loop_interfaces.protocol import STOPPED, ModelFailure
+from loop_interfaces.protocol import NO_CONTROLLER, STOPPED, ModelFailure
 from loop_interfaces.ros.endpoints import Sender, reader_qos, scoped
 from loop_interfaces.ros.introspection import offer
 from loop_interfaces.ros.node_loop import NodeLoop
@@ -44,9 +44,11 @@ from loop_interfaces.topics import (
     STATE,
     TARGET,
 )
+from tuner_node import narration
 from tuner_node.build import build_training
 from tuner_node.diagnostics import TunerHealth
 from tuner_node.dispatch import Dispatcher, DispatchError, Order
+from tuner_node.narration import Narration
 from tuner_node.results import RunFolder, RunIdentity, summarise
 from tuner_node.run_store import Recorder
 from tuner_node.session import Session
@@ -56,6 +58,8 @@ RIVAL_GRACE = 6.0
 FAREWELL = 0.5
 """Seconds in which the last messages, and the answer to a request to stop, are taken: when a writer
 is gone, its readers lose what they have not taken yet."""
+PROGRESS_PERIOD = 2.0
+"""Seconds between two lines on how far the adaptation is."""
 ABSENCE_REPORT = 5.0
 """Seconds between two reports of a missing plant or controller."""
 
@@ -108,6 +112,8 @@ class TunerNode:
             plant=training.plant,
         )
         self._news: deque[Mapping[str, Any]] = deque()
+        self._problem, self._out = values["problem"], values["out"]
+        self._narration = Narration(values["seed"], values["seeds"])
         self._session = Session(training, dispatcher, self._news.append)
         self._health = TunerHealth(self._session)
         self._pairs = pairs
@@ -334,15 +340,15 @@ class TunerNode:
     def _report(self, row: Mapping[str, Any]) -> None:
         if self._recorder:
             self._recorder.note(row)
-        text = ", ".join(
-            f"{k} {v:.6g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()
-        )
-        if row.get("event") == "repeated":
-            self._log.warning(text)
-        elif row.get("event") == "adapted":  # hundreds a second of a small problem
-            self._log.info(text, throttle_duration_sec=1.0)
-        else:
-            self._log.info(text)
+        told = self._log.warning if row["event"] == "repeated" else self._log.info
+        for line in self._narration.lines(row):
+            told(line)
+        if row["event"] == "adapted":  # hundreds a second of a small problem
+            known = self._narration
+            self._log.info(
+                f"  {known.done} of {known.budget} rollouts: {known.status}",
+                throttle_duration_sec=PROGRESS_PERIOD,
+            )
 
     def _controller(self) -> dict[str, Any]:
         """Who answered the states, and by which law as far as that was seen."""
@@ -366,12 +372,11 @@ class TunerNode:
                 raise ConfigurationError(f"cannot write the results: {error.strerror}") from error
         else:
             summary = summarise(self._session.training)
-        costs = summary["mean_cost"]
-        self._log.info(
-            f"done: cost {costs['none']:.6g} without control, {costs['lqt']:.6g} with LQT, "
-            f"{costs['adapted']:.6g} adapted"
-        )
-        return 0
+        for line in narration.closing_lines(self._problem, summary, self._out):
+            self._log.info(line)
+        for line in narration.warnings(summary):
+            self._log.warning(line)
+        return NO_CONTROLLER if narration.failed(summary) else 0
 
 
 def main(args: list[str] | None = None) -> int:

@@ -340,14 +340,15 @@ class Training:
         failed = []
         for m, (none, lqt) in zip(self.pending, costs, strict=True):
             none_cost, lqt_cost = (c[:, CostColumn.MEAN].mean() for c in (none, lqt))
-            completed = (lqt[:, CostColumn.ENDED] == COMPLETED).all()
-            good = bool(completed and lqt_cost < none_cost)
+            lost = [int((c[:, CostColumn.ENDED] != COMPLETED).sum()) for c in (none, lqt)]
+            good = bool(not lost[1] and lqt_cost < none_cost)
             rows.append(
                 {
                     "event": "checked",
                     "seed": self._seeds()[m],
                     "none": float(none_cost),
                     "lqt": float(lqt_cost),
+                    "diverged": dict(zip(CONTROLLERS, lost, strict=False)),
                     "accepted": good,
                 }
             )
@@ -474,6 +475,9 @@ class Training:
                 "event": "evaluated",
                 "seed": seed,
                 **dict(zip(CONTROLLERS, costs.mean(axis=-1).tolist(), strict=True)),
+                "diverged": dict(zip(CONTROLLERS, lost.sum(axis=-1).tolist(), strict=True)),
             }
-            for seed, costs in zip(self._seeds(), self.evaluation, strict=True)
+            for seed, costs, lost in zip(
+                self._seeds(), self.evaluation, self.ended != COMPLETED, strict=True
+            )
         ]

@@ -25,7 +25,7 @@ from rich.console import Console
 
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.output import print_json
-from pdeloop.progress import Share
+from pdeloop.progress import Progress
 from pdeloop.reproduce.folder import STARTS, Job, run, work
 from pdeloop.training_run import Interruption, interruptible
 from tuner_node.results import RunFolderError, timestamp, versions
@@ -135,12 +135,12 @@ def reproduce(
     folder = out or Path("runs") / f"reproduce-{timestamp()}"
     jobs = _jobs(folder, problems, options)
     console = Console(stderr=as_json, highlight=False, soft_wrap=True)
-    progress = Share(console, "reproduce")
+    progress = Progress(console, "reproduce")
     started = time.monotonic()
     pool = _Pool(jobs, processes or _cores())
     try:
         with interruptible():
-            pool.run(progress.tell)
+            pool.run(lambda share, status: progress.tell(share, status=status))
     except Interruption as signal_name:
         progress.close()
         console.print(

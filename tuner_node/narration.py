@@ -1,0 +1,208 @@
+"""What a person is told of a training: its events, how far it is, and the closing words. Pure.
+
+The tuner logs these lines, and `pdeloop train` shows them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+Row = Mapping[str, Any]
+_TOGETHER = ("designed", "checked", "evaluated")
+"""Events that every seed has, one after the other."""
+
+
+class Narration:
+    """Sentences for the rows of progress.jsonl.
+
+    Of several seeds mean and range are told, in one line for all of them.
+
+    Parameters
+    ----------
+    seed : int
+        The first of them.
+    seeds : int
+        How many there are.
+    """
+
+    def __init__(self, seed: int, seeds: int) -> None:
+        self._seed, self._seeds = seed, seeds
+        self._phase = ""
+        self._together: list[Row] = []
+        self._rollouts: dict[int, int] = {}
+        self._costs: dict[int, float | None] = {}
+        self.budget = 1
+        """Rollouts of all seeds before the closing evaluation."""
+
+    @property
+    def done(self) -> int:
+        """Rollouts of all seeds so far."""
+        return sum(self._rollouts.values())
+
+    @property
+    def status(self) -> str:
+        """The newest cost of the policies that are being adapted."""
+        costs = list(self._costs.values())
+        return f"cost {_spread(costs)}" if any(cost is not None for cost in costs) else "diverged"
+
+    def lines(self, row: Row) -> list[str]:
+        """What is to be said when this row has come."""
+        event = row.get("event")
+        if event in _TOGETHER and self._seeds > 1:
+            lines = (
+                [] if not self._together or event == self._together[0]["event"] else self._told()
+            )
+            self._together.append(row)
+            return lines
+        lines = self._told()
+        if event == "phase":
+            if self._phase == "adapt" and self._costs:
+                lines.append(f"  {self.done} rollouts: {self.status}")
+            self._phase = str(row["phase"])
+            self._rollouts = dict(enumerate(row["rollouts"]))
+            self.budget = max(1, sum(row["budget"]))
+            lines += [self._phase] if self._phase != "done" else []
+        elif event == "adapted":
+            seed = row["seed"] - self._seed
+            self._rollouts[seed] = row["rollouts"]
+            self._costs[seed] = row.get("cost")
+        elif event == "repeated":
+            lines.append(f"  {row['reason']}")
+        elif event in _TOGETHER:
+            self._together.append(row)
+            lines += self._told()
+        return lines
+
+    def _told(self) -> list[str]:
+        """The line of the rows that are told together."""
+        rows, self._together = self._together, []
+        if not rows:
+            return []
+        event = rows[0]["event"]
+        who = f"seed {rows[0]['seed']}" if self._seeds == 1 else f"{len(rows)} seeds"
+
+        def cost(name: str) -> str:
+            lost = [row.get("diverged", {}).get(name) for row in rows]
+            return _spread([None if n else row[name] for n, row in zip(lost, rows, strict=True)])
+
+        if event == "designed":
+            orders = _range([row["reduced_order"] for row in rows])
+            radii = [row["spectral_radius"] for row in rows]
+            radius = " to ".join(dict.fromkeys(f"{f(radii):.4f}" for f in (min, max)))
+            return [f"  {who}: reduced model of order {orders}, spectral radius {radius}"]
+        if event == "evaluated":
+            costs = f"cost {cost('none')} without control, {cost('lqt')} with LQT, "
+            return [f"  {who}: {costs}{cost('adapted')} adapted"]
+        verdict = f"a rollout costs {cost('none')} without control, {cost('lqt')} with LQT"
+        for again, words in (
+            (True, "exploring again"),
+            (False, "and no other exploration is left: a poor warm start"),
+        ):
+            bad = sum(row["again"] == again and not row["accepted"] for row in rows)
+            count = "" if self._seeds == 1 else f" for {bad} of them"
+            verdict += f"; no better{count}, {words}" if bad else ""
+        return [f"  {who}: {verdict}"]
+
+
+def closing_lines(problem: str, summary: Row, folder: object) -> list[str]:
+    """What came out of a training; summary: the content of result.json."""
+    reduction, seeds = summary["reduction"], summary["seeds"]
+    diverged, rollouts = summary["diverged"], summary["evaluation_rollouts"]
+    comparable = any(summary["changed"]) and not (diverged["lqt"] or diverged["adapted"])
+    who = f"seed {summary['seed']}"
+    if seeds > 1:
+        who = f"seeds {summary['seed']} to {summary['seed'] + seeds - 1}"
+    percent = 100 * reduction["ratio_of_means"]
+    change = f"   ({abs(percent):.1f} % {'below' if percent >= 0 else 'above'} LQT"
+    if seeds > 1:
+        change += f"; mean of the seeds' ratios {100 * reduction['mean_of_ratios']:.1f} %"
+
+    def cost(name: str) -> str:
+        if diverged[name]:
+            return f"diverged in {diverged[name]} of {rollouts} rollouts"
+        return _spread(summary["costs"][name]) + (
+            f"{change})" if comparable and name == "adapted" else ""
+        )
+
+    took = f" in {summary['seconds']:.1f} s" if "seconds" in summary else ""
+    lines = [
+        f"{problem}, {who}: {_budget(summary['rollouts'])}{took}",
+        f"  mean stage cost without control  {cost('none')}",
+        f"  mean stage cost with LQT         {cost('lqt')}",
+        f"  mean stage cost after adaptation {cost('adapted')}",
+    ]
+    if not any(summary["changed"]):
+        lines.append("  nothing was adapted: the policies are those that the adaptation began with")
+    elif not summary["improved"]:
+        lines.append("  the adaptation did not improve on the LQT law for every seed")
+    return [*lines, f"  results in {folder}"] if folder else lines
+
+
+def warnings(summary: Row) -> list[str]:
+    """What is wrong with the outcome of a training, worst first."""
+    lost, rollouts = summary["diverged"], summary["evaluation_rollouts"]
+    costs = summary["costs"]
+    found = []
+    if lost["lqt"] == rollouts:
+        found.append(
+            "every rollout of the first laws diverged; likely causes: an exploration that is too weak "
+            "or too short to identify from (exploration_variance, horizon), an order that leaves out "
+            "unstable modes (reduced_order), actuators that do not reach them, or a controller that "
+            "answers by another law"
+        )
+    if lost["adapted"] == rollouts:
+        found.append("every rollout of the adapted policies diverged")
+        return found
+    worse = [
+        summary["seed"] + m
+        for m, (none, adapted) in enumerate(zip(costs["none"], costs["adapted"], strict=True))
+        if not adapted < none
+    ]
+    if worse:
+        which = (
+            "" if summary["seeds"] == 1 else f" for seed{'s' * (len(worse) > 1)} {_listed(worse)}"
+        )
+        found.append(f"after adaptation the cost is not below that without control{which}")
+    return found
+
+
+def failed(summary: Row) -> bool:
+    """Whether a training has no controller to show: its policies, or all of its laws, diverged."""
+    lost, rollouts = summary["diverged"], summary["evaluation_rollouts"]
+    none, adapted = (sum(summary["costs"][name]) for name in ("none", "adapted"))
+    return lost["adapted"] == rollouts or (lost["lqt"] == rollouts and not adapted < none)
+
+
+def _spread(costs: Sequence[float | None]) -> str:
+    """Mean and range of costs; None: diverged."""
+    known = [cost for cost in costs if cost is not None]
+    lost = len(costs) - len(known)
+    if not known:
+        return "diverged"
+    text = f"{sum(known) / len(known):.4g}"
+    low, high = f"{min(known):.4g}", f"{max(known):.4g}"
+    if low != high:
+        text += f" ({low} to {high})"
+    return text + (f" and {lost} diverged" if lost else "")
+
+
+def _budget(rollouts: Sequence[Mapping[str, int]]) -> str:
+    """How many rollouts a seed took, and what for."""
+    spent = {name: _range([seed[name] for seed in rollouts]) for name in rollouts[0]}
+    each = " a seed" if len(rollouts) > 1 else ""
+    return (
+        f"{spent['total']} rollouts{each} (exploration {spent['exploration']}, "
+        f"check {spent['check']}, adaptation {spent['adaptation']})"
+    )
+
+
+def _range(counts: Sequence[int]) -> str:
+    low, high = min(counts), max(counts)
+    return str(low) if low == high else f"{low} to {high}"
+
+
+def _listed(seeds: Sequence[int]) -> str:
+    """The first few of them."""
+    shown = ", ".join(map(str, seeds[:8]))
+    return f"{shown} and {len(seeds) - 8} others" if len(seeds) > 8 else shown
