@@ -94,4 +94,4 @@ def test_policies_that_diverge_are_no_success(run, capsys):
 
 def test_an_unfinished_run_says_how_to_go_on(run, capsys):
     (run / "result.json").unlink()
-    assert "continue it with: pdeloop train --resume" in refused(capsys, run)
+    assert "pdeloop train --resume" in refused(capsys, run)
