@@ -230,7 +230,11 @@ def test_what_diverged_has_no_point_and_broken_lines_are_left_out():
     curve.row(adapted(0, 2, None, diverged=2))
     for line in ({}, {"event": "adapted"}, {"event": "adapted", "seed": "x", "rollouts": 1}):
         curve.row(line)
-    assert points(curve) == [] and curve.message()["diverged"] == 2 and curve.message()["done"] == 2
+    assert (
+        points(curve) == []
+        and curve.message()["diverged"] == 2
+        and curve.message()["paid"] == [2, 2]
+    )
 
 
 def test_references_are_those_of_the_check_and_then_of_the_evaluation():
@@ -257,14 +261,20 @@ def test_a_long_training_stays_within_bounds():
 def test_the_time_that_is_left_follows_from_the_rollouts_of_the_last_minute():
     curve = LearningCurve()
     assert curve.remaining(0.0) is None
-    curve.row({"event": "phase", "phase": "adapt", "budget": [100, 100], "rollouts": [0, 0]})
+    for seed in (0, 1):
+        curve.row({"event": "designed", "seed": seed})
+    # One seed was explored more often: what it has paid before is no speed.
+    paid = {"budget": [100, 100], "rollouts": [0, 50], "time": 0.0}
+    curve.row({"event": "phase", "phase": "adapt", **paid})
+    assert curve.message()["paid"] == [0, 50] and curve.seeds == [0, 1]
     for k in range(1, 31):  # ten seconds each at first, then one
-        for seed in (0, 1):
-            curve.row(adapted(seed, k, 1.0, time=10.0 * min(k, 10) + max(0, k - 10)))
+        now = 10.0 * min(k, 10) + max(0, k - 10)
+        curve.row(adapted(0, k, 1.0, time=now))
+        curve.row(adapted(1, 50 + k, 1.0, time=now))
     rate = 2 * (30 - 6) / 60.0
-    assert curve.remaining(120.0) == pytest.approx(2 * 70 / rate, rel=0.05)
+    assert curve.remaining(120.0) == pytest.approx((70 + 20) / rate, rel=0.05)
     assert curve.remaining(130.0) == pytest.approx(curve.remaining(120.0) - 10.0)
-    curve.row({"event": "phase", "phase": "evaluate", "budget": [100, 100], "rollouts": [30, 30]})
+    curve.row({"event": "phase", "phase": "evaluate", **paid})
     assert curve.remaining(130.0) is None
 
 

@@ -40,7 +40,7 @@ class LearningCurve:
 
     axis: what x is; phase: what the training does; budget: the rollouts of a seed, 0 if unknown;
     references: mean stage costs to compare with, by controller; evaluations: those of each seed's
-    closing evaluation; paid: rollouts of the seed that has the most; version grows with each change.
+    closing evaluation; version grows with each change.
     """
 
     axis: str = "episode"
@@ -49,12 +49,12 @@ class LearningCurve:
     references: dict[str, float] = field(default_factory=dict)
     evaluations: dict[int, dict[str, float]] = field(default_factory=dict)
     diverged: int = 0
-    paid: int = 0
     version: int = 0
     number: int = field(default_factory=itertools.count().__next__)
     """Tells one curve from another."""
     _points: dict[int, list[CurvePoint]] = field(default_factory=dict)
     _rollouts: dict[int, int] = field(default_factory=dict)
+    _budgets: int = 0
     _checked: dict[int, tuple[float, float]] = field(default_factory=dict)
     _marks: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=2000))
 
@@ -63,9 +63,10 @@ class LearningCurve:
         self.axis = "rollouts"
         try:
             match row.get("event"):
+                case "designed":
+                    self._rollouts.setdefault(int(row["seed"]), 0)
                 case "phase":
-                    self.phase = str(row["phase"])[:40]
-                    self.budget, self.paid = (max(map(int, row[n])) for n in ("budget", "rollouts"))
+                    self._phase(row)
                 case "adapted":
                     self._adapted(row)
                 case "checked" if row["accepted"]:
@@ -81,12 +82,19 @@ class LearningCurve:
             return
         self.version += 1
 
+    def _phase(self, row: Mapping[str, Any]) -> None:
+        self.phase = str(row["phase"])[:40]
+        paid, budget = ([int(n) for n in row[name]] for name in ("rollouts", "budget"))
+        self.budget, self._budgets = max(budget), sum(budget)
+        if len(paid) == len(self._rollouts):  # in the order of the seeds
+            self._rollouts = dict(zip(self.seeds, paid, strict=True))
+            self._marks.append((float(row.get("time", 0.0)), sum(paid)))
+
     def _adapted(self, row: Mapping[str, Any]) -> None:
         seed, x = int(row["seed"]), int(row["rollouts"])
         if seed not in self._rollouts and len(self._rollouts) >= MAX_SEEDS:
             return
         self._rollouts[seed] = x
-        self.paid = max(self.paid, x)
         self._marks.append((float(row.get("time", 0.0)), sum(self._rollouts.values())))
         self.diverged += int(row.get("diverged", 0))
         if "cost" in row and math.isfinite(cost := float(row["cost"])):
@@ -111,7 +119,7 @@ class LearningCurve:
                     self.references[name] = mean
             return
         self.diverged += int((~rollouts.completed).sum())
-        self.paid = x = self.paid + 1
+        x = 1 + max(self._rollouts.values(), default=0)
         for model in np.unique(rollouts.models).tolist()[:MAX_SEEDS]:
             self._rollouts[model] = x
             own = rollouts.mean[rollouts.completed & (rollouts.models == model)]
@@ -149,7 +157,7 @@ class LearningCurve:
             since, before = self._marks[0]
         if done <= before or last <= since:
             return None
-        left = max(0, self.budget * len(self._rollouts) - done)
+        left = max(0, self._budgets - done)
         return max(0.0, left * (last - since) / (done - before) - max(0.0, now - last))
 
     def message(self) -> dict[str, Any]:
@@ -171,7 +179,10 @@ class LearningCurve:
             "budget": self.budget,
             "band": "seeds" if several else "rollouts",
             "seeds": self.seeds,
-            "done": self.paid,
+            "paid": [
+                min(self._rollouts.values(), default=0),
+                max(self._rollouts.values(), default=0),
+            ],
             "diverged": self.diverged,
             "references": self.references,
             "evaluations": self.evaluations,

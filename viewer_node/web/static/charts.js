@@ -67,11 +67,12 @@ export function profileChart(episode, facts) {
     const initial = header?.begin === 0 ? episode.fields.subarray(0, header.rows) : [];
     const length = facts.length || Math.max(1, now.length);
     const lines = [];
-    if (initial.length) lines.push(["initial", initial, { stroke: colour("none"), dash: DOTTED, width: 1.3 }]);
+    if (initial.length) lines.push(["initial", initial, { stroke: colour("muted"), dash: DOTTED, width: 1.3 }]);
     if (target.length === now.length && now.length) {
       lines.push(["target", target, { stroke: colour("text"), dash: DASHED, width: 1.3 }]);
     }
-    if (header) lines.push([facts.name, now, { stroke: colour("adapted"), width: 2 }]);
+    const known = header && colour(header.controller || "accent"); // an exploration has no colour
+    if (header) lines.push([facts.name, now, { stroke: known || colour("accent"), width: 2 }]);
     const [low, high] = extent(...lines.map(([, values]) => values), header?.range ?? []);
     let caption = "";
     if (header) {

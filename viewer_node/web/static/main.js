@@ -7,7 +7,7 @@ import { Panel } from "./panel.js";
 import { Replay } from "./replay.js";
 
 const EMPTY = {
-  ...{ axis: "rollouts", phase: "", budget: 0, band: "seeds", diverged: 0, done: 0 },
+  ...{ axis: "rollouts", phase: "", budget: 0, band: "seeds", diverged: 0, paid: [0, 0] },
   ...{ seeds: [], references: {}, evaluations: {}, x: [], mean: [], low: [], high: [], costs: [] },
 };
 

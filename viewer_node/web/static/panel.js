@@ -213,11 +213,12 @@ export class Panel {
   }
 
   figures(status, curve) {
-    const { mean, references, budget, axis, phase, seeds, done } = curve.told;
+    const { mean, references, budget, axis, phase, seeds, paid } = curve.told;
     const closing = references.adapted; // what the closing evaluation gave counts, once it is there
     const cost = closing ?? (mean.length ? mean[mean.length - 1] : null);
     const rows = [["phase", phase || "–", ""]];
-    rows.push([axis, done ? String(done) : "–", budget ? ` of ${budget}` : ""]);
+    const count = paid[0] === paid[1] ? paid[1] : `${paid[0]} to ${paid[1]}`;
+    rows.push([axis, paid[1] ? String(count) : "–", budget ? ` of ${budget}` : ""]);
     if (!status.recorded) rows.push(["time left", status.remaining === null ? "–" : duration(status.remaining), ""]);
     rows.push([closing === undefined ? "cost now" : "evaluated cost", text(cost), ""]);
     const lqt = references.lqt;
