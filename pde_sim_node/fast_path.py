@@ -29,7 +29,7 @@ from loop_interfaces.samples import ACTION_KIND, NO_TIME, SAMPLE_HEADER, STATE_K
 from loop_interfaces.topics import STATE
 from pde_sim_node.lockstep import Lockstep
 from pde_sim_node.solver import step_context, work_queue
-from pde_sim_node.solver.step_context import MACHINE, step_together
+from pde_sim_node.solver.step_context import STEP_CONTEXT, step_environments
 
 if TYPE_CHECKING:
     from loop_interfaces.ros.endpoints import Bundler
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 __all__ = ["PlantFastPath", "load_compiled"]
 
 PLAN = plan_type(
-    ("machine", MACHINE),
+    ("context", STEP_CONTEXT),
     ("values", np.int64),  # numbers of all states
     ("log", np.int64),  # address of room for the actions that were applied
     ("steps", np.int64),  # done since the log was read
@@ -66,8 +66,8 @@ def keep(plan: Any, kind: int, time: float, raw: int, length: int) -> None:
 @register_jitable  # type: ignore[untyped-decorator, unused-ignore]
 def advance(plan: Any, head: int, message: int, length: int) -> bool:
     """Apply the awaited action, and fill in the next state."""
-    machine = plan.machine
-    if load_unaligned(head, STEP) != machine.step or plan.steps == plan.limit:
+    context = plan.context
+    if load_unaligned(head, STEP) != context.step or plan.steps == plan.limit:
         return False
     if full(plan.bundles[0]) or full(plan.bundles[1]):
         return False
@@ -75,12 +75,12 @@ def advance(plan: Any, head: int, message: int, length: int) -> bool:
     numbers = plan.expected.values
     for i in range(numbers):
         number = load_unaligned(head, FIRST + i)
-        write(machine.actions, i, number)
+        write(context.actions, i, number)
         write(plan.log, plan.steps * numbers + i, number)
-    step_together(machine)
+    step_environments(context)
     plan.steps += 1
     plan.time += plan.sample_time
-    write_answer(plan.answer, machine.step, plan.time, machine.states, plan.values)
+    write_answer(plan.answer, context.step, plan.time, context.states, plan.values)
     keep(plan, STATE_KIND, plan.time if plan.timed else NO_TIME, plan.begin, plan.length)
     return True
 
@@ -120,19 +120,19 @@ class PlantFastPath(FastPath):
         """Within an episode of a plant whose step is compiled code alone."""
         lockstep, plant, plan = self._lockstep, self._plant, self.plan
         state = lockstep.awaiting
-        code = plant.team.in_machine_code(plant.batch)
+        code = plant.parallel.compiled_step(plant.batch)
         action = plant.batch, plant.n_a
         if self.suspended or state is None or code is None:
             return False
         if not self.expect(state, action, state.values.shape):
             return False
-        machine = plan["machine"]
-        for name, value in zip(("code", "plan", "board", "pieces"), code, strict=True):
-            machine[name] = value
-        machine["states"], machine["actions"] = plant.states.ctypes.data, plant.actions.ctypes.data
-        machine["totals"] = plant.totals.ctypes.data
-        machine["diverged_step"] = plant.diverged_step.ctypes.data
-        machine["batch"], machine["step"] = plant.batch, plant.step_index
+        context = plan["context"]
+        for name, value in zip(("code", "plan", "queue", "slices"), code, strict=True):
+            context[name] = value
+        context["states"], context["actions"] = plant.states.ctypes.data, plant.actions.ctypes.data
+        context["totals"] = plant.totals.ctypes.data
+        context["diverged_step"] = plant.diverged_step.ctypes.data
+        context["batch"], context["step"] = plant.batch, plant.step_index
         if self._log.shape[1] != plant.actions.size:
             self._log = np.zeros((max(LOG // plant.actions.size, 1), plant.actions.size))
         plan["values"], plan["log"] = state.values.size, self._log.ctypes.data
@@ -141,20 +141,20 @@ class PlantFastPath(FastPath):
         plan["timed"] = self._bundler.timed
         plan["begin"], plan["length"] = self.answer.begin, len(self.answer.raw)
         self._bundler.lend(plan["bundles"], 2 * SAMPLE_HEADER + sum(self._lengths))
-        plant.team.call_helpers(self._machines)
+        plant.parallel.call_workers(self._contexts)
         return True
 
     def synchronise(self, answers: int, last: float) -> None:
         plan = self.plan
-        self._plant.team.dismiss_helpers(self._machines)
-        self._plant.step_index = int(plan["machine"]["step"])
+        self._plant.parallel.dismiss_workers(self._contexts)
+        self._plant.step_index = int(plan["context"]["step"])
         if answers:
             self._lockstep.advance_counters([digest(row) for row in self._log[:answers]], last)
         self._bundler.settle(plan["bundles"], self._lengths, answers)
 
     @property
-    def _machines(self) -> np.ndarray:
-        return self.plans["machine"]
+    def _contexts(self) -> np.ndarray:
+        return self.plans["context"]
 
     @property
     def _lengths(self) -> tuple[int, int]:

@@ -11,7 +11,7 @@ from pde_sim_node.equations import Equation, LinearEquation
 from pde_sim_node.solver.exact import Propagator
 from pde_sim_node.solver.integrator import Integrator
 from pde_sim_node.solver.kernel import all_finite
-from pde_sim_node.solver.workers import PlanTeam
+from pde_sim_node.solver.workers import ParallelStep
 from pde_sim_node.supports import indicator_supports
 
 __all__ = ["DIVERGED_COST", "MEAN_FIELD", "EpisodeCosts", "Plant"]
@@ -146,9 +146,9 @@ class Plant:
         self._allocate(0)
 
     @property
-    def team(self) -> PlanTeam:
+    def parallel(self) -> ParallelStep:
         """The compiled step and the threads that do it."""
-        return self._integrator.team
+        return self._integrator.parallel
 
     @property
     def state_size(self) -> int:

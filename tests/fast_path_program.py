@@ -117,7 +117,7 @@ def plant_on_topics(*, timed: bool = False, helped: bool = False, **overrides: o
         for count in (1, 3):
             peer.say(*[next_action() for _ in range(count)])
             assert answer_for(path) is None
-            assert bool(path.plan["machine"]["board"]) == helped
+            assert bool(path.plan["context"]["queue"]) == helped
         assert plant.lockstep.step == plant.judge.step == 5
         for _ in range(2):
             assert path.arm()
@@ -255,7 +255,7 @@ if __name__ == "__main__":
     controller_on_topics()
     plant_on_topics()
     plant_on_topics(timed=True)
-    workers.use_cores(range(2), attentive=True)
+    workers.use_cores(range(2), polling=True)
     plant_on_topics(helped=True, integration_time=0.0005)
     rclpy.shutdown()
     print("done")

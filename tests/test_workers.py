@@ -1,4 +1,4 @@
-"""The threads that share a step: who takes which piece, and on which cores they are."""
+"""The threads that share a step: who takes which slice, and on which cores they are."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from loop_interfaces.affinity import core_list, core_text, helps_solver
 from pde_sim_node.equations import Burgers
 from pde_sim_node.plant import Plant
 from pde_sim_node.solver import workers
-from pde_sim_node.solver.workers import TEAMWORK, Crew
+from pde_sim_node.solver.workers import COMPILED, ThreadPool
 
 several = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
 P1 = {
@@ -33,10 +33,10 @@ def rollout(plant: Plant, seeds: range, steps: int = 20) -> bytes:
 
 
 def test_plants_in_several_threads_share_the_helpers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workers, "_CREW", [Crew(range(1))])
+    monkeypatch.setattr(workers, "_POOL", [ThreadPool(range(1))])
     alone = Plant(Burgers(), **P1)
     expected = [rollout(alone, range(first, first + 12)) for first in (0, 50, 100)]
-    monkeypatch.setattr(workers, "_CREW", [Crew(range(4))])
+    monkeypatch.setattr(workers, "_POOL", [ThreadPool(range(4))])
     plants = [Plant(Burgers(), **P1) for _ in expected]
     found: list[list[bytes]] = [[] for _ in expected]
 
@@ -54,21 +54,21 @@ def test_plants_in_several_threads_share_the_helpers(monkeypatch: pytest.MonkeyP
 
 def test_who_comes_late_takes_nothing_of_the_next_step() -> None:
     plant = Plant(Burgers(), **P1)
-    team = plant._integrator._team
+    step = plant.parallel
     plant.reset(np.arange(4))
     before = plant.states.copy()
-    board, (work_off, _, start, _, done) = team._board.ctypes.data, TEAMWORK
+    queue, (advance, _, start, _, done) = step._queue.ctypes.data, COMPILED
     costs, diverged = np.zeros(4), np.full(4, -1)
-    code, plan = team._code, team._addresses[0]
+    code, plan = step._code, step._addresses[0]
     what = code, plan, plant.states, np.zeros((4, 6)), costs, diverged, 0
-    start(board, 8)
+    start(queue, 8)
     for turn in (7, 9):
-        work_off(*what, board, turn, 4)
+        advance(*what, queue, turn, 4)
     assert np.array_equal(plant.states, before)
-    work_off(*what, board, 8, 4)
+    advance(*what, queue, 8, 4)
     assert (plant.states != before).any(axis=1).all()
-    assert done(board, 4)
-    assert not done(board, 5)
+    assert done(queue, 4)
+    assert not done(queue, 5)
 
 
 def test_helpers_exist_from_the_first_large_batch_on_and_hold_no_plant() -> None:
@@ -85,7 +85,7 @@ rollout(plant, range(2))
 assert threading.active_count() == 1
 rollout(plant, range(12))
 assert threading.active_count() == 3
-gone = weakref.ref(plant._integrator._team)
+gone = weakref.ref(plant.parallel)
 del plant
 gc.collect()
 for _ in range(100):

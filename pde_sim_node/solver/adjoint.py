@@ -263,12 +263,12 @@ class Adjoint:
                 f"{plant.equation.name} is advanced by an exact propagator; expected an equation "
                 "that is integrated by ETDRK4"
             )
-        team = integrator._team
-        self._constants = team._constants  # kept alive: the plan has its address
+        step = integrator.parallel
+        self._constants = step._constants  # kept alive: the plan has its address
         self._loop = derivative_loop(plant.equation)
         plan = np.zeros(1, PLAN_AND_TAPE)[0]
         for name in PLAN.names or ():
-            plan[name] = team._plans[0][name]
+            plan[name] = step._plans[0][name]
         offset = int(plan["scratch_apart"])
         sizes = {"tape": 4 * int(plan["steps"]) * int(plan["fine"]["m"])}
         sizes |= dict.fromkeys(("covector", "on_b", "on_c", "on_force"), plan["modes"])

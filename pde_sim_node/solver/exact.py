@@ -12,7 +12,7 @@ from pde_sim_node.solver.exact_kernel import LINEAR_PLAN, propagate
 from pde_sim_node.solver.fft import plane_size
 from pde_sim_node.solver.kernel import all_finite
 from pde_sim_node.solver.kernel_memory import Constants, checked_operator, lay_out
-from pde_sim_node.solver.workers import TEAMWORK, PlanTeam
+from pde_sim_node.solver.workers import COMPILED, ParallelStep
 
 __all__ = ["Propagator", "exact_propagator"]
 
@@ -130,10 +130,12 @@ class Propagator:
                 "state": whole_lanes(components * n_x),
             },
         )
-        functions = all_finite, *TEAMWORK
+        functions = all_finite, *COMPILED
         began, misses = time.perf_counter(), cache_misses(*functions)
         code, code_is_new = propagate()
-        self._team = PlanTeam(code, plan, constants, size, points_per_step=2 * components * n_x)
+        self._parallel = ParallelStep(
+            code, plan, constants, size, points_per_step=2 * components * n_x
+        )
         states, actions = np.zeros((1, components * n_x)), np.zeros((1, n_a))
         all_finite(actions)
         self.step(states, actions, np.zeros(1), np.zeros(1, dtype=np.int64), 0)
@@ -149,9 +151,9 @@ class Propagator:
         k: int,
     ) -> None:
         """Advance all environments in place, see `kernel`; arrays are contiguous and writable."""
-        self._team.step(states, actions, totals, diverged_step, k)
+        self._parallel.step(states, actions, totals, diverged_step, k)
 
     @property
-    def team(self) -> PlanTeam:
-        """The threads that do it."""
-        return self._team
+    def parallel(self) -> ParallelStep:
+        """The compiled step and the threads that do it."""
+        return self._parallel

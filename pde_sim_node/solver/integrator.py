@@ -13,7 +13,7 @@ from pde_sim_node.solver.fft import is_transform_length, plane_size
 from pde_sim_node.solver.kernel import PLAN, all_finite, environments
 from pde_sim_node.solver.kernel_memory import Constants, checked_operator, lay_out
 from pde_sim_node.solver.pointwise import pointwise_loop
-from pde_sim_node.solver.workers import TEAMWORK, PlanTeam
+from pde_sim_node.solver.workers import COMPILED, ParallelStep
 
 __all__ = ["Integrator"]
 
@@ -102,11 +102,11 @@ class Integrator:
             },
         )
 
-        functions = all_finite, *TEAMWORK
+        functions = all_finite, *COMPILED
         began, misses = time.perf_counter(), cache_misses(*functions)
         plan["pointwise"], loop_is_new = pointwise_loop(equation.nonlinearity)
         code, code_is_new = environments()
-        self._team = PlanTeam(code, plan, constants, size, points_per_step=8 * steps * fine)
+        self._parallel = ParallelStep(code, plan, constants, size, points_per_step=8 * steps * fine)
 
         states, actions = np.zeros((1, n_z)), np.zeros((1, n_a))
         all_finite(actions)
@@ -123,12 +123,12 @@ class Integrator:
         k: int,
     ) -> None:
         """Advance all environments in place, see `kernel`; arrays are contiguous and writable."""
-        self._team.step(states, actions, totals, diverged_step, k)
+        self._parallel.step(states, actions, totals, diverged_step, k)
 
     @property
-    def team(self) -> PlanTeam:
-        """The threads that do it."""
-        return self._team
+    def parallel(self) -> ParallelStep:
+        """The compiled step and the threads that do it."""
+        return self._parallel
 
 
 def fine_length(n_z: int) -> int:

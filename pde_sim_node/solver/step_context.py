@@ -1,49 +1,45 @@
-"""A step as machine code alone, inside compiled functions: by one thread, or shared with helpers that
-look for work all the time.
-"""
+"""A step of a plant as compiled code alone: by one thread, or shared with workers that poll a queue."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from loop_interfaces.jit.cache import jit
 from loop_interfaces.jit.native import call_c
-from pde_sim_node.solver.work_queue import MAX_TURN, claim, look_up, next_piece, put_up, wait
+from pde_sim_node.solver.work_queue import (
+    MAX_TURN,
+    begin_turn,
+    claim,
+    current_turn,
+    finish_and_claim,
+    wait_until_done,
+)
 
-__all__ = ["MACHINE", "Machine", "help_out", "step_together", "work"]
+__all__ = ["SPINS", "STEP_CONTEXT", "advance_slices", "help_with_steps", "step_environments"]
 
-LOOKS = 1_000_000
+SPINS = 1_000_000
 
-
-class Machine(NamedTuple):
-    """What it takes. Addresses, but for the numbers of environments and of pieces of work.
-
-    code: see `environments` for what it is called with; board: 0 where nobody helps.
-    """
-
-    code: int
-    plan: int
-    board: int
-    pieces: int
-    states: int
-    actions: int
-    totals: int
-    diverged_step: int
-    batch: int
-
-
-MACHINE = np.dtype(
+STEP_CONTEXT = np.dtype(
     [
-        *((name, np.int64) for name in Machine._fields),
-        ("step", np.int64),
-        ("turn", np.int64),  # of the board
-        ("over", np.int64),  # whether the helpers may go
+        # Addresses, but for the numbers of environments and of slices.
+        ("code", np.int64),  # see batch_step.environments_of for what it is called with
+        ("plan", np.int64),
+        ("queue", np.int64),  # 0 where nobody helps
+        ("slices", np.int64),
+        ("states", np.int64),
+        ("actions", np.int64),
+        ("totals", np.int64),
+        ("diverged_step", np.int64),
+        ("batch", np.int64),
+        ("step", np.int64),  # k, of the states
+        ("turn", np.int64),  # of the queue
+        ("over", np.int64),  # whether the workers may go
     ]
 )
 
 
 @jit
-def work(
+def advance_slices(
     code: int,
     plan: int,
     states: int,
@@ -52,52 +48,52 @@ def work(
     diverged_step: int,
     k: int,
     batch: int,
-    board: int,
+    queue: int,
     turn: int,
-    pieces: int,
+    slices: int,
 ) -> None:
-    """Advance the environments of those pieces of the turn on the board that no other thread has; of
-    the one there is without a board.
+    """Advance the environments of those slices of the turn that no other thread has; of the only one
+    without a queue.
     """
-    piece = claim(board, turn, pieces)
-    while piece >= 0:
-        first, last = batch * piece // pieces, batch * (piece + 1) // pieces
+    index = claim(queue, turn, slices)
+    while index >= 0:
+        first, last = batch * index // slices, batch * (index + 1) // slices
         call_c(code, (plan, states, actions, totals, diverged_step, first, last, k))
-        piece = next_piece(board, turn, pieces)
+        index = finish_and_claim(queue, turn, slices)
 
 
 @jit
-def work_on(machine: Any, plan: int, turn: int) -> None:
-    work(
-        machine.code,
+def advance_turn(context: Any, plan: int, turn: int) -> None:
+    advance_slices(
+        context.code,
         plan,
-        machine.states,
-        machine.actions,
-        machine.totals,
-        machine.diverged_step,
-        machine.step,
-        machine.batch,
-        machine.board,
+        context.states,
+        context.actions,
+        context.totals,
+        context.diverged_step,
+        context.step,
+        context.batch,
+        context.queue,
         turn,
-        machine.pieces,
+        context.slices,
     )
 
 
 @jit
-def step_together(machine: Any) -> None:
-    """Advance all environments from `machine.step` to the next."""
-    board = machine.board
-    if board != 0:
-        machine.turn = (machine.turn + 1) & (MAX_TURN - 1)
-        put_up(board, machine.turn)
-    work_on(machine, machine.plan, machine.turn)
-    while board != 0 and not wait(board, machine.pieces, LOOKS):
+def step_environments(context: Any) -> None:
+    """Advance all environments by one step."""
+    queue = context.queue
+    if queue != 0:
+        context.turn = (context.turn + 1) & (MAX_TURN - 1)
+        begin_turn(queue, context.turn)
+    advance_turn(context, context.plan, context.turn)
+    while queue != 0 and not wait_until_done(queue, context.slices, SPINS):
         pass
-    machine.step += 1
+    context.step += 1
 
 
 @jit
-def help_out(machine: Any, plan: int) -> None:
-    """Take pieces of every step until it is over, with a plan of one's own."""
-    while machine.over == 0:
-        work_on(machine, plan, look_up(machine.board))
+def help_with_steps(context: Any, plan: int) -> None:
+    """Take slices of every step until it is over, with a plan of one's own."""
+    while context.over == 0:
+        advance_turn(context, plan, current_turn(context.queue))

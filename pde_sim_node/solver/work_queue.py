@@ -1,74 +1,82 @@
-"""The pieces of a step on a board, from which the threads take them, inside compiled functions.
+"""The slices of a step in a queue, from which the threads take them, inside compiled functions.
 
-Two words of memory: the ticket, turn * 2^32 + the next piece, and how many pieces are finished. Both
+Two words of memory: the ticket, turn * 2^32 + the next slice, and how many slices are finished. Both
 only change in one instruction each, and a ticket of another turn is no ticket: a thread that wakes up
-late, when the next step has been put up already, takes nothing of it.
+late, when the next step has begun already, takes nothing of it.
 """
 
 from loop_interfaces.jit.atomics import compare_exchange, fetch_add, load_acquire, store_release
 from loop_interfaces.jit.cache import jit
 
-__all__ = ["BOARD", "MAX_TURN", "claim", "close", "look_up", "next_piece", "put_up", "wait"]
+__all__ = [
+    "MAX_TURN",
+    "QUEUE_WORDS",
+    "begin_turn",
+    "claim",
+    "close",
+    "current_turn",
+    "finish_and_claim",
+    "wait_until_done",
+]
 
-BOARD = 16
-"""Words of a board: the two that are used, each on a cache line of its own."""
+QUEUE_WORDS = 16
+"""Words of a queue: the two that are used, each on a cache line of its own."""
 MAX_TURN = 2**31
-PIECES = 32
+SLICE_BITS = 32
 CLOSED = 2**31
 FINISHED = 64
 """Bytes from the ticket to the count."""
 
 
 @jit
-def put_up(board: int, turn: int) -> None:
-    """All pieces of a turn, none of them finished. Only when those of the turn before are."""
-    store_release(board + FINISHED, 0)
-    store_release(board, turn << PIECES)
+def begin_turn(queue: int, turn: int) -> None:
+    """Offer all slices of a turn, none of them finished. Only when those of the turn before are."""
+    store_release(queue + FINISHED, 0)
+    store_release(queue, turn << SLICE_BITS)
 
 
 @jit
-def close(board: int, turn: int) -> None:
-    """No pieces until the next turn. Only when those of this one are finished."""
-    store_release(board, (turn << PIECES) | CLOSED)
+def close(queue: int, turn: int) -> None:
+    """Offer no slices until the next turn. Only when those of this one are finished."""
+    store_release(queue, (turn << SLICE_BITS) | CLOSED)
 
 
 @jit
-def look_up(board: int) -> int:
-    """The turn."""
-    turn: int = load_acquire(board) >> PIECES
+def current_turn(queue: int) -> int:
+    turn: int = load_acquire(queue) >> SLICE_BITS
     return turn
 
 
 @jit
-def claim(board: int, turn: int, pieces: int) -> int:
-    """A piece of the turn that no other thread has; -1 if there is none.
+def claim(queue: int, turn: int, slices: int) -> int:
+    """A slice of the turn that no other thread has; -1 if there is none.
 
-    board 0: there is none, and no other thread.
+    queue 0: there is none, and no other thread.
     """
-    if board == 0:
+    if queue == 0:
         return 0
     while True:
-        ticket = load_acquire(board)
-        piece: int = ticket - (turn << PIECES)
-        if piece < 0 or piece >= pieces:
+        ticket = load_acquire(queue)
+        index: int = ticket - (turn << SLICE_BITS)
+        if index < 0 or index >= slices:
             return -1
-        if compare_exchange(board, ticket, ticket + 1):
-            return piece
+        if compare_exchange(queue, ticket, ticket + 1):
+            return index
 
 
 @jit
-def next_piece(board: int, turn: int, pieces: int) -> int:
-    """The piece after one that is done, and what was written for which is there."""
-    if board == 0:
+def finish_and_claim(queue: int, turn: int, slices: int) -> int:
+    """The slice after one that is finished; what was written for that one is visible."""
+    if queue == 0:
         return -1
-    fetch_add(board + FINISHED, 1)
-    return claim(board, turn, pieces)
+    fetch_add(queue + FINISHED, 1)
+    return claim(queue, turn, slices)
 
 
 @jit
-def wait(board: int, pieces: int, looks: int) -> bool:
-    """Whether all pieces are done, looking so many times."""
-    looked = 0
-    while looked < looks and load_acquire(board + FINISHED) < pieces:
-        looked += 1
-    return looked < looks
+def wait_until_done(queue: int, slices: int, spins: int) -> bool:
+    """Whether all slices are finished, polling so many times."""
+    polled = 0
+    while polled < spins and load_acquire(queue + FINISHED) < slices:
+        polled += 1
+    return polled < spins
