@@ -130,13 +130,9 @@ def design(
         )
     exploration = result.trajectory
     weights = {key: parameters[key] for key in ("state_weight", "action_weight")}
-    settings = DesignSettings(
-        n_a=plant.n_a,
-        dmdc_rank=parameters["dmdc_rank"],
-        reduced_order=parameters["reduced_order"],
-        **weights,
-    )
-    model = identification.design(exploration.states, exploration.actions, plant.target, settings)
+    settings = DesignSettings.of(parameters)
+    pair = exploration.states, exploration.actions
+    model = identification.design([pair], plant.target, settings)
     context = Context(
         U=model.U,
         target=plant.target,
@@ -150,7 +146,7 @@ def design(
 def train(job: Job) -> dict[str, Any]:
     """One training with its evaluations, as JSON-able numbers."""
     options = {} if job.attempts is None else {"identification_attempts": job.attempts}
-    parameters = load_parameters(job.problem, options)
+    parameters = load_parameters(job.problem, {**options, "optimizer": job.optimizer})
     plant = build_plant(parameters)
     policy, context = warm_start(plant, parameters, job.seed)
     optimizer = OPTIMIZERS[job.optimizer](

@@ -1,44 +1,67 @@
-"""From one exploratory trajectory to a reduced model with its LQ-tracking gains."""
+"""From exploratory trajectories to a reduced model with its LQ-tracking gains."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from controller_node import dmdc, lqt
+from controller_node import dmdc, lqt, regression
 from controller_node.policy import ProjectedLaw
+from controller_node.reduced_model import ReducedModel
 from loop_interfaces.model_rows import ModelRows
 
 
 @dataclass(frozen=True)
 class DesignSettings:
-    """Actuators, p and n_s of the DMDc, the weights of the stage cost, and where actions saturate.
+    """How to identify and what to design for.
 
-    The gains are designed without the limit (action_limit, 0: none); only the actions keep it.
+    identification: "regression" of order n_s = reduced_order, or "dmdc" of order dmdc_order (0:
+    reduced_order) and rank p = dmdc_rank (0: n_s + n_a); the weights of the stage cost. The gains are
+    designed without the limit (action_limit, 0: none); only the actions keep it.
     """
 
     n_a: int
-    dmdc_rank: int
     reduced_order: int
     state_weight: float
     action_weight: float
     action_limit: float = 0.0
+    identification: str = "regression"
+    dmdc_rank: int = 0
+    dmdc_order: int = 0
+
+    @staticmethod
+    def of(values: Mapping[str, Any]) -> DesignSettings:
+        """Those among the parameters."""
+        return DesignSettings(**{item.name: values[item.name] for item in fields(DesignSettings)})
+
+
+def identify(
+    trajectories: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]],
+    settings: DesignSettings,
+) -> ReducedModel:
+    """The reduced model from trajectories (states (N+1, n_z), actions (N, n_a)); see `design`."""
+    if settings.identification == "regression":
+        return regression.identify_from(trajectories, n_s=settings.reduced_order)
+    n_s = settings.dmdc_order or settings.reduced_order
+    p = settings.dmdc_rank or n_s + settings.n_a
+    return dmdc.identify_from(trajectories, p=p, n_s=n_s)
 
 
 def design(
-    states: NDArray[np.float64],
-    actions: NDArray[np.float64],
+    trajectories: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]],
     target: NDArray[np.float64],
     settings: DesignSettings,
 ) -> ModelRows:
-    """Reduce and design: DMDc on the trajectory, then the LQ-tracking gains.
+    """Reduce and design: a model from the trajectories, then the LQ-tracking gains.
 
-    states (N+1, n_z), actions (N, n_a), target (n_z,). Raises ValueError with one sentence when the
-    data allow no model of this order or the model no stabilising gains.
+    trajectories: states (N+1, n_z) and actions (N, n_a) of each; target (n_z,). Raises ValueError
+    with one sentence when the data allow no model of this order or the model no stabilising gains.
     """
-    model = dmdc.identify(states, actions, p=settings.dmdc_rank, n_s=settings.reduced_order)
+    model = identify(trajectories, settings)
     gains = lqt.track(
         model, state_weight=settings.state_weight, action_weight=settings.action_weight
     )

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import fields
 from functools import partial
 
 from rclpy.node import Node
@@ -22,7 +23,7 @@ from controller_node.responder import Responder
 from loop_interfaces.diagnostics import Health
 from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.parameters import EXECUTION, PROBLEM
+from loop_interfaces.parameters import EXECUTION, PROBLEM, model_order
 from loop_interfaces.protocol import ModelFailure, Send
 from loop_interfaces.ros.endpoints import writer_qos
 from loop_interfaces.ros.node_loop import NodeLoop
@@ -49,12 +50,7 @@ CONTROLLER_PARAMETERS = (
         if spec.name
         in (
             "problem",
-            "n_a",
-            "dmdc_rank",
-            "reduced_order",
-            "state_weight",
-            "action_weight",
-            "action_limit",
+            *(f.name for f in fields(DesignSettings)),
         )
     ),
     *EXECUTION,
@@ -76,7 +72,7 @@ class ControllerNode:
         self._responder = responder
         self._health = ControllerHealth(responder)
         self._wire(node, loop)
-        node.get_logger().info(f"{values['problem']}: order {values['reduced_order']} tracking law")
+        node.get_logger().info(f"{values['problem']}: order {model_order(values)} tracking law")
 
     def join(self, node: Node, loop: NodeLoop) -> None:
         declare(node, CONTROLLER_PARAMETERS, given_parameters(node))

@@ -326,7 +326,7 @@ class Responder:
             models = []
             for env, how in enumerate(_excitations(start)):
                 actions = np.stack([self._explore(*how, k) for k in steps[:-1]])
-                models.append(design(states[:, env], actions, target, self._settings))
+                models.append(design([(states[:, env], actions)], target, self._settings))
         except ValueError as error:
             return failure(False, str(error))
         rows = np.stack([model_rows.pack(model) for model in models])

@@ -98,8 +98,16 @@ PROBLEM = (
         positive=True,
         maximum=1e6,
     ),
-    Spec("dmdc_rank", 8, "p, rank of the DMDc regression on [Z; A]", 1, 4096),
     Spec("reduced_order", 4, "n_s, order of the reduced model", 1, 1024),
+    Spec(
+        "identification",
+        "regression",
+        "how the reduced model is identified: least squares in reduced coordinates with the inputs "
+        "whole, or the paper's truncated DMDc, which the optimizers that learn from costs begin with",
+        choices=("regression", "dmdc"),
+    ),
+    Spec("dmdc_rank", 0, "p of the identification dmdc, rank of [Z; Y]; 0: n_s + n_a", 0, 4096),
+    Spec("dmdc_order", 0, "n_s of the identification dmdc; 0: reduced_order", 0, 1024),
     Spec(
         "exploration_variance",
         0.1,
@@ -309,6 +317,25 @@ def with_budget(values: Mapping[str, Any]) -> dict[str, Any]:
     """The parameters with the default budget, if they give none."""
     given = values["rollouts"] or values["iterations"]
     return {**values, "rollouts": values["rollouts"] if given else ROLLOUTS}
+
+
+def with_identification(given: Mapping[str, Any]) -> dict[str, Any]:
+    """The given parameters, with the identification of an optimizer that was tuned for the paper's."""
+    learns_from_costs = given.get("optimizer") in ("two_point", "directions")
+    return {**({"identification": "dmdc"} if learns_from_costs else {}), **given}
+
+
+def as_recorded(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Parameters of a run or a bag: one that knows no identification had the only one there was."""
+    old = "dmdc_rank" in values and "identification" not in values
+    return {**values, **({"identification": "dmdc"} if old else {})}
+
+
+def model_order(values: Mapping[str, Any]) -> int:
+    """n_s of the reduced model that these parameters identify."""
+    own = values["dmdc_order"] if values["identification"] == "dmdc" else 0
+    order: int = own or values["reduced_order"]
+    return order
 
 
 def noisy(values: Mapping[str, Any]) -> bool:

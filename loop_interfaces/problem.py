@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from loop_interfaces.parameters import table, with_budget
+from loop_interfaces.parameters import table, with_budget, with_identification
 from loop_interfaces.spec import (
     ParameterError,
     check,
@@ -56,7 +56,7 @@ def load_parameters(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
     relative to the YAML file.
     """
     path = find_problem(name)
-    given = {**read_yaml(path), **options}
+    given = with_identification({**read_yaml(path), **options})
     check_names(given, [spec.name for spec in table()])
     given["equation"] = _equation_path(str(given.get("equation", "")), path)
     return {**with_budget(check(table(), given)), **_physical(given)}

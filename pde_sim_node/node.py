@@ -61,11 +61,8 @@ def declare_parameters(node: Node, changed: Mapping[str, Any] | None = None) -> 
     return {**physical, **values, **declare(node, specs, given)}
 
 
-PLANT_PARAMETERS = tuple(
-    spec
-    for spec in PROBLEM
-    if not spec.name.startswith(("dmdc", "reduced", "exploration", "learning", "smoothing"))
-)
+_OTHERS = ("dmdc", "reduced", "identification", "exploration", "learning", "smoothing")
+PLANT_PARAMETERS = tuple(spec for spec in PROBLEM if not spec.name.startswith(_OTHERS))
 """The problem parameters that concern the plant."""
 
 

@@ -32,14 +32,7 @@ class LocalPair:
     def __init__(self, values: Mapping[str, Any], plant: Plant | None = None) -> None:
         self.plant = plant or build_plant(values)
         self._fingerprint = fingerprint(values)
-        self._settings = DesignSettings(
-            n_a=values["n_a"],
-            dmdc_rank=values["dmdc_rank"],
-            reduced_order=values["reduced_order"],
-            state_weight=values["state_weight"],
-            action_weight=values["action_weight"],
-            action_limit=values["action_limit"],
-        )
+        self._settings = DesignSettings.of(values)
         self._law: ProjectedLaw | None = None
         self._generation = 0
 
@@ -118,7 +111,7 @@ class LocalPair:
             )
         trajectory, applied = np.stack(history), np.stack(actions_taken)
         models = [
-            model_rows.pack(design(trajectory[:, m], applied[:, m], plant.target, settings))
+            model_rows.pack(design([(trajectory[:, m], applied[:, m])], plant.target, settings))
             for m in range(len(excitations))
         ]
         return BatchResult(table, np.stack(models), trajectories=seen)

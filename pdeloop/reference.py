@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.parameters import PROBLEM
+from loop_interfaces.parameters import PROBLEM, as_recorded, model_order
 from loop_interfaces.problem import config_folder
 from pde_sim_node.build import build_equation, build_plant
 from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD
@@ -80,6 +80,8 @@ class Reference:
 def bound_parameters(values: Mapping[str, Any]) -> dict[str, Any]:
     """The parameters that a reference holds for."""
     bound = {spec.name: values.get(spec.name, spec.default) for spec in PROBLEM}
+    bound["reduced_order"] = model_order(bound)
+    del bound["dmdc_order"]
     equation = asdict(build_equation(values))
     bound |= {f"physical.{name}": number for name, number in equation.items() if name != "length"}
     # A file of an equation may stand elsewhere.
@@ -155,7 +157,7 @@ def _costs(rows: Mapping[str, Any], count: int) -> dict[int, Array]:
 
 
 def _fits(content: Mapping[str, Any], values: Mapping[str, Any], none_cost: float | None) -> bool:
-    known, now = content["parameters"], bound_parameters(values)
+    known, now = as_recorded(content["parameters"]), bound_parameters(values)
     # A parameter that did not exist then has to be at its default now.
     defaults = {spec.name: spec.default for spec in PROBLEM}
     if any(known.get(name, defaults.get(name)) != now.get(name) for name in {*known, *now}):

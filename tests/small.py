@@ -12,7 +12,7 @@ from pdeloop.training_run import resolve
 from tuner_node.build import build_training
 from tuner_node.training import Training
 
-_OWN = ("seed", "seeds", "rollouts", "iterations", "start")
+_OWN = ("optimizer", "seed", "seeds", "rollouts", "iterations", "start")
 
 SMALL = Path(__file__).parent / "data" / "small.yaml"
 

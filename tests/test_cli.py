@@ -40,7 +40,7 @@ def train(out: Path, *more: str, problem: Path = SMALL) -> int:
         ("equation: burgers", "equation: stokes", "stokes"),
         ("viscosity: 1.0e-2", "viscosity: -1.0", "viscosity"),
         ("viscosity: 1.0e-2", "density: 1.0", "unknown parameter 'physical.density'"),
-        ("dmdc_rank: 8", "dmdc_rank: 36", "p must be at most"),
+        ("reduced_order: 4", "reduced_order: 400", "needs at least"),
         ("horizon: 30", "horizon: 0", "'horizon' is 0; expected"),
         ("n_a: 4", "n_aa: 4", "did you mean 'n_a'"),
     ],

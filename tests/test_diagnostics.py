@@ -108,9 +108,7 @@ def test_states_that_are_late_for_real_time_are_a_warning_once():
 
 
 def responder() -> Responder:
-    return Responder(
-        DesignSettings(n_a=2, dmdc_rank=4, reduced_order=2, state_weight=1.0, action_weight=1.0)
-    )
+    return Responder(DesignSettings(n_a=2, reduced_order=2, state_weight=1.0, action_weight=1.0))
 
 
 def exploration(episode: int) -> Frame:

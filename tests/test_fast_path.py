@@ -65,7 +65,6 @@ class Controller:
     def __init__(self, batch: int, *, limit: float = 0.0) -> None:
         self.settings = DesignSettings(
             n_a=N_A,
-            dmdc_rank=8,
             reduced_order=N_S,
             state_weight=1.0,
             action_weight=1.0,

@@ -309,7 +309,7 @@ def test_refuses_bad_parameters(changes: dict[str, Any], message: str) -> None:
 
 def test_a_reduced_model_larger_than_the_default_number_of_modes_is_adapted() -> None:
     values = resolve("wave", {"rollouts": 20, "optimizer": "gauss_newton"})
-    values |= {"dmdc_rank": 50, "reduced_order": 40, "horizon": 120, "evaluation_fields": 2}
+    values |= {"reduced_order": 40, "horizon": 120, "evaluation_fields": 2}
     training = train_here(values)
     assert training.policies().shape == (1, 8, 80)
     _, lqt, adapted = training.evaluation.mean(axis=2)[0]

@@ -20,7 +20,6 @@ from tuner_node.batch import Batch
 RUN = 5
 SETTINGS = DesignSettings(
     n_a=4,
-    dmdc_rank=8,
     reduced_order=4,
     state_weight=1.0,
     action_weight=1.0,
@@ -77,11 +76,11 @@ def test_a_lost_sample_asks_for_the_episode_again_and_the_repeat_gives_the_model
 
 
 def test_data_that_allow_no_model_are_a_failure_with_the_reason():
-    responder = Responder(DesignSettings(4, 36, 4, 1.0, 1.0))
+    responder = Responder(DesignSettings(4, 400, 1.0, 1.0))
     responder.target(TARGET)
     (failure,) = explore(responder, 1)
     assert not failure.retry
-    assert "p must be at most" in failure.reason
+    assert "needs at least" in failure.reason
 
 
 def test_the_law_is_answered_whatever_the_order_in_which_its_parts_arrive():

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from loop_interfaces.array_files import read_arrays
 from loop_interfaces.model_rows import unpack
-from loop_interfaces.parameters import noisy
+from loop_interfaces.parameters import model_order, noisy
 from loop_interfaces.spec import ParameterError
 from tuner_node.batch import UNKNOWN_PLANT, TrainingSettings
 from tuner_node.optimizers import NEED_TRAJECTORIES, OPTIMIZERS, Context, Optimizer, TwoPoint
@@ -79,7 +79,7 @@ def build_training(values: Mapping[str, Any]) -> Training:
 
     options: dict[str, Any] = {}
     if values["optimizer"] == "directions":
-        most = 2 * values["n_a"] * values["reduced_order"]
+        most = 2 * values["n_a"] * model_order(values)
         if values["directions"] > most:
             raise ValueError(
                 f"parameter 'directions' is {values['directions']}; expected at most {most}, as "

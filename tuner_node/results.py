@@ -32,7 +32,7 @@ from loop_interfaces import model_rows
 from loop_interfaces.array_files import read_arrays
 from loop_interfaces.files import make_folder, open_own, read_json, write_atomically
 from loop_interfaces.frames import MAX_ID
-from loop_interfaces.parameters import EXECUTION, PLANT, RECORDER, VIEWER, table
+from loop_interfaces.parameters import EXECUTION, PLANT, RECORDER, VIEWER, as_recorded, table
 from loop_interfaces.spec import ParameterError, check, read_yaml, yaml_text
 from loop_interfaces.topics import COMPLETED
 from tuner_node import checkpoint
@@ -136,7 +136,7 @@ class RunFolder:
 
     def values(self) -> dict[str, Any]:
         """The parameters of the training here, with the present defaults of what is not in its file."""
-        given = self.parameters()
+        given = as_recorded(self.parameters())
         return {**given, **check(table(), given)}
 
     def _check_same(self, known: Mapping[str, Any], now: Mapping[str, Any]) -> None:
@@ -146,6 +146,7 @@ class RunFolder:
         always what was done before.
         """
         defaults = {spec.name: spec.default for spec in table()}
+        known = as_recorded(known)
         there = {name: known.get(name, defaults.get(name)) for name in {*known, *now}}
         changes = [
             f"{name}: {there[name]!r} there, {now.get(name)!r} now"

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from controller_node import dmdc, lqt
-from controller_node.policy import ProjectedLaw
+from controller_node.identification import DesignSettings, design
 from loop_interfaces.model_rows import ModelRows, pack
+from loop_interfaces.parameters import as_recorded
 from loop_interfaces.topics import COMPLETED, CostColumn
 from pdeloop.bags.reader import Bag, RecordedEpisode
 from recorder_node.bag import BagError
@@ -68,15 +68,17 @@ class Identified:
 def identify(
     path: Path,
     *,
-    rank: int | None,
     order: int | None,
+    method: str | None = None,
+    rank: int | None = None,
     episode: int | None = None,
     environment: int | None = None,
     weights: tuple[float | None, float | None] = (None, None),
 ) -> Identified:
     """The model from the complete episodes of the bag at `path`.
 
-    rank, order, weights: p, n_s, (q, r); those of the recorded run if not given. episode,
+    order, method, rank, weights: n_s, the identification, p of dmdc, (q, r); those of the recorded
+    run if not given, and least squares where it says nothing. episode,
     environment: only this one; otherwise the exploratory episodes, or all if there are none.
     """
     bag = Bag(path)
@@ -88,8 +90,12 @@ def identify(
         which = "complete episode" if episode is None else f"complete episode {episode}"
         raise BagError(f"{bag.path} holds no {which} to identify from (see pdeloop bag info)")
     known = bag.parameters().get(chosen[-1].key[1], {})
-    p = _parameter("rank", rank, known, "dmdc_rank")
+    recorded_with = as_recorded(known)
+    how = method or recorded_with.get("identification", "regression")
+    if how == "dmdc" and known.get("dmdc_order"):
+        known = {**known, "reduced_order": known["dmdc_order"]}
     n_s = _parameter("order", order, known, "reduced_order")
+    p = rank if rank is not None else int(known.get("dmdc_rank", 0))
     target = bag.target()
     if target is None:
         raise BagError(f"{bag.path} holds no target, without which no gains can be designed")
@@ -104,13 +110,20 @@ def identify(
         raise BagError(f"the chosen episodes have no environment {environment}")
     q = weights[0] if weights[0] is not None else float(known.get("state_weight", 1.0))
     r = weights[1] if weights[1] is not None else float(known.get("action_weight", 1.0))
-    reduced = dmdc.identify_from(trajectories, p=p, n_s=n_s)
-    gains = lqt.track(reduced, state_weight=q, action_weight=r)
-    s_r = ProjectedLaw([reduced.U], target).reduced_targets[0]
-    model = ModelRows(reduced.A, reduced.B, reduced.U, gains.K_a, gains.K_b, s_r)
+    settings = DesignSettings(
+        n_a=trajectories[0][1].shape[1],
+        reduced_order=n_s,
+        state_weight=q,
+        action_weight=r,
+        identification=how,
+        dmdc_rank=p,
+    )
+    model = design(trajectories, target, settings)
     steps = sum(len(actions) for _, actions in trajectories)
-    names = ("dmdc_rank", "reduced_order", "state_weight", "action_weight")
-    as_live = (p, n_s, q, r) == tuple(known.get(name) for name in names)
+    names = ("reduced_order", "state_weight", "action_weight")
+    as_live = (n_s, q, r) == tuple(known.get(name) for name in names)
+    as_live = as_live and how == recorded_with.get("identification")
+    as_live = as_live and (how == "regression" or p == int(known.get("dmdc_rank", 0)))
     live = _same_as_live(model, chosen, sources) if as_live else None
     return Identified(model, sources, steps, live)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from controller_node.identification import DesignSettings, design
 from controller_node.policy import ProjectedLaw, excitation
 from loop_interfaces import model_rows
 from loop_interfaces.frames import Frame
-from loop_interfaces.parameters import PLANT, table, with_budget
+from loop_interfaces.parameters import PLANT, as_recorded, table, with_budget
 from loop_interfaces.spec import check, read_yaml
 from loop_interfaces.topics import COMPLETED, VOID, CostColumn, StartColumn, noise_seeds
 from pde_sim_node.build import build_plant, fingerprint
@@ -141,11 +141,10 @@ class _Run:
             )
             return
         self._given = set(values)
-        self._values = with_budget({**check(table(), {}), **values})
+        self._values = with_budget({**check(table(), {}), **as_recorded(values)})
         self._plant = build_plant(self._values)
         self._fingerprint = fingerprint(self._values)
-        names = [item.name for item in fields(DesignSettings)]
-        self._settings = DesignSettings(**{name: self._values[name] for name in names})
+        self._settings = DesignSettings.of(self._values)
 
     def episode(self, episode: RecordedEpisode) -> None:
         """Check one episode."""
@@ -340,7 +339,7 @@ class _Run:
     def _models(self, episode: RecordedEpisode, where: str, states: Array, actions: Array) -> None:
         assert episode.model is not None
         for env, recorded in enumerate(episode.model.values):
-            own = design(states[:, env], actions[:, env], self._plant.target, self._settings)
+            own = design([(states[:, env], actions[:, env])], self._plant.target, self._settings)
             text = f"model of {where}, environment {env}"
             self._report.compare("rows of models", text, recorded, model_rows.pack(own))
 

@@ -97,14 +97,20 @@ def _add_identify(commands: Commands) -> None:
         "identify",
         _identify,
         help="reduced model from recorded episodes",
-        description="Identify a reduced model by DMDc from the exploratory episodes of a bag (all "
-        "episodes if none is), of this plant or a foreign one, and design LQ-tracking gains.",
-        example="pdeloop identify --bag runs/lab/bag --rank 8 --order 4 --out model.npz",
+        description="Identify a reduced model by least squares in reduced coordinates from the "
+        "exploratory episodes of a bag (all episodes if none is), of this plant or a foreign one, and "
+        "design LQ-tracking gains.",
+        example="pdeloop identify --bag runs/lab/bag --order 8 --out model.npz",
     )
     add = identify.add_argument
     add("--bag", type=Path, metavar="BAG", required=True, help="folder of a bag or of a run")
-    add("--rank", type=int, metavar="P", help="p of the DMDc regression [that of the run]")
     add("--order", type=int, metavar="NS", help="order n_s of the model [that of the run]")
+    add(
+        "--identification",
+        choices=("regression", "dmdc"),
+        help="least squares with the inputs whole, or truncated DMDc [that of the run, or regression]",
+    )
+    add("--rank", type=int, metavar="P", help="p of the identification dmdc [that of the run]")
     add("--episode", type=int, metavar="N", help="only this episode")
     add("--environment", type=int, metavar="M", help="only this environment of each episode")
     add("--state-weight", type=float, metavar="Q", help="q of Q = q I [that of the run, or 1]")
@@ -166,8 +172,9 @@ def _identify(options: argparse.Namespace) -> int:
 
     found = identify(
         options.bag,
-        rank=options.rank,
         order=options.order,
+        method=options.identification,
+        rank=options.rank,
         episode=options.episode,
         environment=options.environment,
         weights=(options.state_weight, options.action_weight),

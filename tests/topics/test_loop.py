@@ -209,7 +209,7 @@ def test_gains_beyond_what_the_topics_take_end_the_same_as_in_one_process(loop, 
 
 DIVERGING = {
     "problem", "equation", "length", "n_z", "n_a", "actuator_width", "sample_time",
-    "integration_time", "horizon", "dmdc_rank", "reduced_order", "exploration_variance",
+    "integration_time", "horizon", "identification", "reduced_order", "exploration_variance",
     "optimizer", "learning_rate",
 }  # fmt: skip
 
@@ -224,7 +224,11 @@ DIVERGING = {
         ("pde_sim_node", "equation:=navier", "navier"),
         ("pde_sim_node", "physical.viscosity:=-1.0", "'physical.viscosity' is -1.0; expected"),
         ("pde_sim_node", "n_zz:=8", "unknown parameter 'n_zz'; did you mean 'n_z'"),
-        ("controller_node", "dmdc_rank:=0", "'dmdc_rank' is 0; expected a whole number from 1"),
+        (
+            "controller_node",
+            "reduced_order:=0",
+            "'reduced_order' is 0; expected a whole number from 1",
+        ),
         ("tuner_node", "rollouts:=3", "'rollouts' is 3; expected at least 11"),
         ("tuner_node", "start:=lqg", "'start' is 'lqg'; expected one of lqt, zero"),
         ("tuner_node", "smoothing_radius:=-0.1", "'smoothing_radius' is -0.1; expected"),
@@ -239,8 +243,8 @@ def test_a_node_refuses_a_bad_parameter_in_one_line(loop: Processes, node, param
 
 def test_a_model_that_cannot_be_designed_stops_the_run_with_the_reason(loop: Processes, tmp_path):
     path = tmp_path / "rank.yaml"
-    path.write_text(SMALL.read_text().replace("dmdc_rank: 8", "dmdc_rank: 36"))
+    path.write_text(SMALL.read_text().replace("reduced_order: 4", "reduced_order: 400"))
     run = loop.pdeloop("train", str(path), "--out", str(tmp_path / "run"))
     text = loop.wait(run, LIMIT, code=1)
-    assert "no reduced model: p must be at most" in text.splitlines()[-1]
+    assert "no reduced model: a model of n_s = 400 modes" in text.splitlines()[-1]
     assert "Traceback" not in text

@@ -148,7 +148,7 @@ def test_the_command_line_informs_verifies_and_identifies(loop, recorded, tmp_pa
     out = tmp_path / "model.npz"
     text = loop.wait(
         loop.pdeloop(
-            *("identify", "--bag", str(recorded), "--environment", "1", "--rank", "8"),
+            *("identify", "--bag", str(recorded), "--environment", "1"),
             *("--order", "4", "--out", str(out)),
         ),
         LIMIT,
@@ -161,10 +161,10 @@ def test_the_command_line_informs_verifies_and_identifies(loop, recorded, tmp_pa
 def test_identify_from_a_bag_equals_the_live_model(recorded):
     with np.load(recorded / "policy.npz") as live:
         for seed in (0, 1):
-            found = identify(recorded / "bag", rank=None, order=None, environment=seed)
+            found = identify(recorded / "bag", order=None, environment=seed)
             assert same_bits(pack(found.model), live["model"][seed])
             assert found.live
-    both = identify(recorded / "bag", rank=8, order=4)
+    both = identify(recorded / "bag", order=4)
     assert both.steps == 2 * STEPS and both.live is None
 
 
@@ -173,11 +173,11 @@ def test_identify_needs_nothing_but_the_topics_of_a_foreign_plant(recorded, tmp_
     shutil.copytree(recorded / "bag", copy)
     (copy / "parameters.json").unlink()
     (copy / "episodes.jsonl").unlink()
-    found = identify(copy, rank=8, order=4, environment=0, weights=(1.0, 1.0))
+    found = identify(copy, order=4, environment=0, weights=(1.0, 1.0))
     with np.load(recorded / "policy.npz") as live:
         assert same_bits(pack(found.model), live["model"][0])
     with pytest.raises(RuntimeError, match="does not say which rank to use; give it with --rank"):
-        identify(copy, rank=None, order=4)
+        identify(copy, order=None)
     report = verify(copy)
     assert "its parameters are not in the bag" in report.notes[0]
     assert verify(copy, parameters=recorded / "parameters.yaml").count == 0

@@ -13,9 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from tuner_node.optimizers.base import Array, Context, Row
+from tuner_node.optimizers.convolution import fit_convolutions
 from tuner_node.optimizers.fit import LocalModel, extended_basis, fit
 from tuner_node.optimizers.selection import KAPPAS, LOCAL, RIDGES, Pair, choices, mismatches
 from tuner_node.optimizers.sensitivity import Path, damped_step
+from tuner_node.optimizers.simulation import Loop, improve, mismatch
 from tuner_node.optimizers.trajectories import Record
 
 __all__ = ["Proposal", "Proposer"]
@@ -25,6 +27,20 @@ _LEAST_FALL = 1e-3
 # Weight of a rollout in the fit: falls with its age, down to a floor, and with its cost.
 _AGEING = 0.9
 _AGEING_FLOOR = 0.3
+# Powers and ridges of the convolution models, and the smallest weight of a rollout in their fit.
+_DEGREES = (2, 3)
+_CONVOLUTION_RIDGES = (1e-7, 1e-6, 1e-5, 1e-4)
+_LEAST_WEIGHT = 0.05
+# A convolution model is used that reproduces the last rollouts up to this share of their error energy.
+_REPRODUCED = 0.05
+_COMPARED = 8
+# Measured initial fields that a law is improved on, the newest, and how far from their mean further
+# ones are. Coordinates of the sensitivities, at least.
+_FIELDS = 8
+_BEYOND = 1.5
+_SENSITIVITY_MODES = 48
+# Trust region of a law that is improved on a model, relative to that of a single step.
+_TRUST = 1e-2
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +57,10 @@ class Proposal:
     kappa : float
         Forgetting.
     mismatch : float
-        Their smallest relative error in predicting measured differences of trajectories.
+        Their smallest relative error in predicting measured differences of trajectories, or that of the
+        convolution model in reproducing the rollouts.
+    kind : str
+        "local" or "convolution".
     """
 
     policy: Array
@@ -49,6 +68,7 @@ class Proposal:
     models: int
     kappa: float
     mismatch: float
+    kind: str = "local"
 
     def row(self) -> Row:
         """What a history row says about it."""
@@ -57,7 +77,18 @@ class Proposal:
             "models": self.models,
             "kappa": self.kappa,
             "mismatch": self.mismatch,
+            "model": self.kind,
         }
+
+
+def _spread(fields: Array) -> Array:
+    """The initial fields, and as many that lie further from their mean.
+
+    A law that is best on a few fields is not on their neighbours; on a model, more of them cost no
+    rollouts.
+    """
+    mean = fields.mean(axis=0)
+    return np.concatenate([fields, mean + _BEYOND * (fields - mean)])
 
 
 class Proposer:
@@ -108,6 +139,7 @@ class Proposer:
         self._s_r_square = float(np.sum(self._s_r * self._s_r))
         # A target outside of U leaves the law without a constant part.
         self._one = 1.0 if self._s_r_square > 1e-20 * float(np.sum(target * target)) else 0.0
+        self._loop = Loop(U, target, self._q, self._r, self._horizon, self._action_limit, self._one)
 
     def theta(self, policy: Array) -> Array:
         """[K_a b] of a policy, (n_a, n_s + 1)."""
@@ -146,6 +178,9 @@ class Proposer:
             Whether the last candidate was accepted.
         """
         data = [record for record in (self._exploration, *records) if len(record.states) > 1]
+        simulated = self._simulated(data, incumbents, damping)
+        if simulated is not None:
+            return simulated
         V = extended_basis(self._U, [record.states for record in data], self._modes)
         models = self._fit(data, V, incumbents)
         policy = incumbents[0].policy
@@ -174,6 +209,44 @@ class Proposer:
             if fall >= least:
                 break
         return proposal
+
+    def _simulated(
+        self, data: Sequence[Record], incumbents: Sequence[Record], damping: float
+    ) -> Proposal | None:
+        """A law that was improved on a convolution model; None if none reproduces the rollouts."""
+        level = self._level(incumbents)
+        z, a, after, weights = [], [], [], []
+        for record in data:
+            length = min(len(record.actions), len(record.states) - 1)
+            weight = min(1.0, level / max(self._mean_cost(record), 1e-300)) ** 2
+            z.append(record.states[:length])
+            a.append(record.actions[:length])
+            after.append(record.states[1 : length + 1])
+            weights.append(np.full(length, max(weight, _LEAST_WEIGHT)))
+        models = fit_convolutions(
+            *(np.concatenate(parts) for parts in (z, a, after, weights)),
+            degrees=_DEGREES,
+            ridges=_CONVOLUTION_RIDGES,
+        )
+        usable = [record for record in data if record.usable][-_COMPARED:]
+        measured = [(self.theta(r.policy), r.states[: len(r.actions)]) for r in usable]
+        errors = [mismatch(self._loop, model, measured) for model in models]
+        best = int(np.argmin(errors))
+        if not (measured and errors[best] <= _REPRODUCED):
+            return None
+        policy = incumbents[0].policy
+        fields = list({record.states[0].tobytes(): record.states[0] for record in data}.values())
+        modes = max(self._modes, min(_SENSITIVITY_MODES, self.n_z))
+        improved = improve(
+            self._loop,
+            models[best],
+            self.theta(policy),
+            _spread(np.stack(fields[-_FIELDS:])),
+            extended_basis(self._U, [record.states for record in data], modes),
+            _TRUST * damping,
+        )
+        candidate = self.moved(policy, improved.theta - self.theta(policy))
+        return Proposal(candidate, improved.fall, 1, 0.0, errors[best], "convolution")
 
     def _fit(
         self, data: Sequence[Record], V: Array, incumbents: Sequence[Record]

@@ -33,12 +33,12 @@ from scipy import linalg
 
 from tuner_node.optimizers.fit import LocalModel
 
-__all__ = ["Expansion", "Path", "damped_step", "expand", "predict_difference"]
+__all__ = ["ISOTROPY", "Expansion", "Path", "damped_step", "expand", "predict_difference"]
 
 Array = NDArray[np.float64]
 
 # Share of the trust region that bounds all gains alike, relative to the one in input energy.
-_ISOTROPY = 0.3
+ISOTROPY = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,7 +228,7 @@ def damped_step(
                 g += share * expansion.gradient
                 H += share * expansion.curvature
             energy += path.features.T @ path.features / (len(path.features) * len(paths))
-        energy[np.diag_indices(n_f)] += _ISOTROPY * np.trace(energy) / n_f
+        energy[np.diag_indices(n_f)] += ISOTROPY * np.trace(energy) / n_f
         matrix = H + damping * 2.0 * action_weight * np.kron(np.eye(n_a), energy)
         matrix[np.diag_indices(p)] += 1e-9 * np.trace(H) / p
         nothing = np.full((n_a, n_f), np.nan), np.nan

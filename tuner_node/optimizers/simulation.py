@@ -1,0 +1,199 @@
+"""Improve a law on a model that reproduces the measured rollouts.
+
+With a model of the whole field (`convolution`) the closed loop can be simulated from every initial
+field that was measured, and the Gauss-Newton step repeated on the simulated trajectories until it gains
+nothing more:
+
+    theta = argmin  mean over fields of J_model(theta) + lambda r tr(d F d^T),    d = theta - theta_0,
+
+where theta_0 is the incumbent and F = mean phi phi^T with the isotropic part of
+`sensitivity.damped_step`: the same trust region in input energy, so that lambda means the same. Only
+the result is rolled out on the plant, which judges it.
+
+References
+----------
+Levenberg, Quart. Appl. Math. 2, 1944; Marquardt, J. SIAM 11, 1963 (the damping of the inner steps).
+Parikh, Boyd, "Proximal algorithms", Foundations and Trends in Optimization 1, 2014 (the outer one).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+
+from tuner_node.optimizers.base import Array
+from tuner_node.optimizers.convolution import ConvolutionModel
+from tuner_node.optimizers.sensitivity import ISOTROPY, Path, expand
+
+__all__ = ["Improvement", "Loop", "Simulation", "improve", "mismatch"]
+
+# Inner steps, and the share of the objective below which a further one is not worth its time.
+_STEPS = 10
+_LEAST_GAIN = 1e-3
+# Damping of the inner steps: first, factor after a fall and after a rise, largest.
+_INNER = (1.0, 0.1, 10.0, 1e4)
+_WORST = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """The closed loop of a law a = K U^T z + b, and its cost.
+
+    U (n_z, n_s), target (n_z,), state_weight q, action_weight r, horizon T, action_limit (0: none);
+    one: 0 where the law has no constant part b, otherwise 1.
+    """
+
+    U: Array
+    target: Array
+    state_weight: float
+    action_weight: float
+    horizon: int
+    action_limit: float
+    one: float
+
+    def simulate(self, model: ConvolutionModel, theta: Array, fields: Array) -> Simulation:
+        """Roll theta = [K b] (n_a, n_s + 1) out on the model from the fields (F, n_z)."""
+        K, b = theta[:, :-1], self.one * theta[:, -1]
+        z = np.empty((self.horizon + 1, *fields.shape))
+        a = np.empty((self.horizon, len(fields), len(theta)))
+        z[0] = fields
+        # A law or a model that is unstable overflows: its cost is then not finite.
+        with np.errstate(over="ignore", invalid="ignore"):
+            for k in range(self.horizon):
+                a[k] = z[k] @ self.U @ K.T + b
+                if self.action_limit:
+                    np.clip(a[k], -self.action_limit, self.action_limit, out=a[k])
+                z[k + 1] = model.step(z[k], a[k])
+            error = z[:-1] - self.target
+            cost = self.state_weight * np.sum(error * error) + self.action_weight * np.sum(a * a)
+        return Simulation(z[:-1], a, float(cost) / (self.horizon * len(fields)))
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """States (T, F, n_z), actions (T, F, n_a), and the mean stage cost over steps and fields."""
+
+    states: Array
+    actions: Array
+    cost: float
+
+
+@dataclass(frozen=True, eq=False)
+class Improvement:
+    """A law [K b] and by how much its cost is lower on the model."""
+
+    theta: Array
+    fall: float
+
+
+def mismatch(loop: Loop, model: ConvolutionModel, measured: Sequence[tuple[Array, Array]]) -> float:
+    """How far simulated rollouts are from the measured ones.
+
+        E = mean over rollouts of min(2, sum_k |z_k^model - z_k|^2 / sum_k |z_k - z_r|^2)
+
+    measured: (theta, states (T, n_z)) of every rollout.
+    """
+    errors = []
+    for theta, states in measured:
+        simulated = loop.simulate(model, theta, states[:1]).states[: len(states), 0]
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = float(np.sum((simulated - states) ** 2))
+        size = max(float(np.sum((states - loop.target) ** 2)), 1e-300)
+        errors.append(min(_WORST, error / size) if np.isfinite(error) else _WORST)
+    return float(np.mean(errors))
+
+
+def improve(
+    loop: Loop,
+    model: ConvolutionModel,
+    theta: Array,
+    fields: Array,
+    V: Array,
+    damping: float,
+) -> Improvement:
+    """Gauss-Newton steps on the model until they gain nothing more.
+
+    Parameters
+    ----------
+    loop : Loop
+        The law's basis, the target and the weights.
+    model : ConvolutionModel
+        One that reproduces the measured rollouts.
+    theta : (n_a, n_s + 1) array
+        Where to start, and what the trust region is about.
+    fields : (F, n_z) array
+        Initial fields.
+    V : (n_z, r) array
+        Orthonormal coordinates of the sensitivities, U first.
+    damping : float
+        lambda.
+    """
+    start, shape = theta, theta.shape
+    now = first = loop.simulate(model, theta, fields)
+    gradient, curvature, region = _expansion(loop, model, theta, now, V)
+    trust = region.copy()
+    inner, fewer, more, most = _INNER
+
+    def objective(simulation: Simulation, at: Array) -> float:
+        moved = at - start
+        return simulation.cost + damping * float(np.sum((moved @ trust) * moved))
+
+    value = objective(now, theta)
+    for _ in range(_STEPS):
+        pull = 2.0 * damping * ((theta - start) @ trust)
+        matrix = curvature + 2.0 * np.kron(np.eye(len(theta)), inner * region + damping * trust)
+        matrix[np.diag_indices(len(matrix))] += 1e-9 * np.trace(curvature) / len(matrix)
+        if not (np.isfinite(matrix).all() and np.isfinite(gradient).all()):
+            break
+        step = linalg.cho_solve(linalg.cho_factor(matrix), -(gradient + pull.reshape(-1)))
+        candidate = theta + step.reshape(shape)
+        simulation = loop.simulate(model, candidate, fields)
+        lower = objective(simulation, candidate)
+        if not lower < value:  # also where it is not finite
+            inner *= more
+            if inner > most:
+                break
+            continue
+        gain, value = value - lower, lower
+        theta, now = candidate, simulation
+        inner *= fewer
+        if gain < _LEAST_GAIN * value:
+            break
+        gradient, curvature, region = _expansion(loop, model, theta, now, V)
+    return Improvement(theta, first.cost - now.cost)
+
+
+def _expansion(
+    loop: Loop, model: ConvolutionModel, theta: Array, simulation: Simulation, V: Array
+) -> tuple[Array, Array, Array]:
+    """Gradient, Gauss-Newton curvature, and r (F + isotropic part), averaged over the fields."""
+    n_f = theta.shape[1]
+    count = simulation.states.shape[1]
+    gradient, curvature = np.zeros(theta.size), np.zeros((theta.size, theta.size))
+    energy = np.zeros((n_f, n_f))
+    B = V.T @ model.B
+    with np.errstate(over="ignore", invalid="ignore"):
+        for i in range(count):
+            states, actions = simulation.states[:, i], simulation.actions[:, i]
+            x = states @ V
+            features = np.hstack([x[:, : n_f - 1], np.full((len(x), 1), loop.one)])
+            free = None
+            if loop.action_limit:
+                free = (np.abs(actions) < loop.action_limit).astype(np.float64)
+            expansion = expand(
+                Path(x, actions, features, theta[:, :-1], free),
+                model.jacobians(states, V),
+                B,
+                target=V.T @ loop.target,
+                state_weight=loop.state_weight,
+                action_weight=loop.action_weight,
+                gamma=1.0,
+            )
+            gradient += expansion.gradient / count
+            curvature += expansion.curvature / count
+            energy += features.T @ features / (len(features) * count)
+    energy[np.diag_indices(n_f)] += ISOTROPY * np.trace(energy) / n_f
+    return gradient, curvature, loop.action_weight * energy
