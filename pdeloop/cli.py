@@ -22,6 +22,9 @@ _EXTRAS = {
     "shtab": "completion",
 }
 """Modules that only some commands need, and the extra that installs them."""
+_ROS = ("rclpy", "rcl_interfaces", "rosgraph_msgs", "rosidl_runtime_py", "builtin_interfaces")
+_MESSAGES = ("_msgs", "_srvs")
+"""Names and endings of the modules of ROS 2."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -43,10 +46,15 @@ def run(
         # and controller's refusals.
         return _failed(str(error))
     except ModuleNotFoundError as error:
-        extra = _EXTRAS.get((error.name or "").split(".")[0])
+        module = (error.name or "").split(".")[0]
+        if module in _ROS or module.endswith(_MESSAGES):
+            return _failed(
+                f"needs {module}: source an installed ROS 2 Jazzy, or pip install 'pdeloop[ros]'"
+            )
+        extra = _EXTRAS.get(module)
         if extra is None:
             return _crashed()
-        return _failed(f"needs {error.name}: pip install 'pdeloop[{extra}]'")
+        return _failed(f"needs {module}: pip install 'pdeloop[{extra}]'")
     except KeyboardInterrupt:
         print("pdeloop: interrupted", file=sys.stderr)
         return INTERRUPTED

@@ -42,7 +42,7 @@ POLL = 0.05
 
 
 class Interruption(BaseException):
-    """SIGINT or SIGTERM reached the command line."""
+    """SIGINT, SIGTERM or SIGHUP (a terminal that was closed) reached the command line."""
 
 
 def resolve(problem: str, options: Mapping[str, Any]) -> dict[str, Any]:
@@ -288,6 +288,10 @@ def _train_over_topics(
                         raise NodeError(f"nothing can be recorded: {recorder.last_words()}")
                     _go_on_unrecorded(children["tuner_node"])
                 time.sleep(0 if done else POLL)
+        except Interruption as signal_name:
+            display.close()
+            display.line(f"{signal_name}: stopping the nodes ...")
+            raise
         finally:
             supervisor.stop()
     if supervisor.stopped:
@@ -321,7 +325,7 @@ def unused(path: Path) -> Path:
 
 @contextmanager
 def interruptible() -> Iterator[Callable[[], None]]:
-    """SIGINT and SIGTERM raise Interruption within the block, once.
+    """SIGINT, SIGTERM and SIGHUP raise Interruption within the block, once.
 
     Yields a function to be called now and then, which raises it, too: an exception that comes in the
     middle of a finalizer or a callback of some library is lost.
@@ -337,7 +341,10 @@ def interruptible() -> Iterator[Callable[[], None]]:
         if caught:
             raise Interruption(caught[0])
 
-    known = {n: signal.signal(n, interrupt) for n in (signal.SIGINT, signal.SIGTERM)}
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # as nohup leaves it
+        numbers.append(signal.SIGHUP)
+    known = {n: signal.signal(n, interrupt) for n in numbers}
     try:
         yield check
     finally:

@@ -310,6 +310,71 @@ def test_an_interrupted_training_says_how_to_go_on(tmp_path: Path) -> None:
     assert "continue with: pdeloop train --resume run --in-process" in shown.plain
 
 
+@pytest.mark.parametrize("nohup", [False, True])
+def test_a_terminal_that_closes_ends_a_training_unless_nohup_was_asked_for(
+    tmp_path: Path, nohup: bool
+) -> None:
+    words = ("train", str(SMALL), "--in-process", "--iterations", "100000", "--out", "run")
+    ignore = "import signal, os, sys; signal.signal(signal.SIGHUP, signal.SIG_IGN); "
+    ignore += "os.execv(sys.argv[1], sys.argv[1:])"
+    prefix = (sys.executable, "-c", ignore) if nohup else ()
+    with terminal(*prefix, *PDELOOP, *words, cwd=tmp_path, PYTHONPATH=str(ROOT)) as shown:
+        shown.until("cost ")
+        os.killpg(shown.process.pid, signal.SIGHUP)
+        if nohup:
+            so_far = len(shown.shown)
+            deadline = time.monotonic() + LIMIT
+            while len(shown.shown) < so_far + 500 and time.monotonic() < deadline:
+                shown.read(0.1)
+            assert shown.process.poll() is None
+            return
+        assert shown.wait() == 130
+    assert "stopped by SIGHUP; continue with: pdeloop train --resume run" in shown.plain
+
+
+def test_the_help_of_train_is_in_groups_and_without_the_tests_own_option() -> None:
+    text = run("train", "--help").stdout
+    groups = ("problem:", "budget and method:", "run:", "recording:", "machine:")
+    assert [line for line in text.splitlines() if line in groups] == list(groups)
+    (options,) = re.findall(r"^options:\n(.*?)\n\n", text, flags=re.MULTILINE | re.DOTALL)
+    assert options.count("--") == 1  # --help
+    assert "--faulty-line" not in text
+
+
+def test_every_optional_part_that_is_not_installed_is_named_in_one_line(tmp_path: Path) -> None:
+    """All optional modules are missing; each command names the extra that it needs."""
+    code = f"""
+import contextlib, io, sys
+for name in ("rclpy", "rosbags", "mcap", "aiohttp", "matplotlib", "shtab", "std_msgs"):
+    sys.modules[name] = None
+from pdeloop.cli import main
+run = {str(tmp_path / "run")!r}
+assert main(["train", {str(SMALL)!r}, "--in-process", "--rollouts", "11", "--out", run]) == 0
+for words in (["monitor"], ["report", run], ["completion", "bash"], ["bag", "info", run],
+              ["bag", "play", run], ["identify", "--bag", run],
+              ["train", {str(SMALL)!r}, "--record", "--out", run + "2"],
+              ["train", {str(SMALL)!r}, "--out", run + "3"]):
+    said = io.StringIO()
+    with contextlib.redirect_stderr(said):
+        code = main(words)
+    print("@", code, " ".join(words[:2]), "|", said.getvalue().replace(chr(10), "|"))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=LIMIT,
+    )
+    assert done.returncode == 0, done.stderr
+    lines = [line for line in done.stdout.splitlines() if line.startswith("@")]
+    assert len(lines) == 8, done.stdout
+    said = r"@ 1 .*\| pdeloop: needs \w+: .*pip install 'pdeloop\[\w+\]'[^|]*\|"
+    for line in lines:
+        assert re.fullmatch(said, line), line
+
+
 def test_progress_becomes_lines_with_the_time_left() -> None:
     file = io.StringIO()
     progress = Progress(Console(file=file, width=80), "soak")

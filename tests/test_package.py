@@ -214,3 +214,17 @@ def test_every_launch_argument_is_described() -> None:
     for argument in (*LOOP_ARGUMENTS, *TRAIN_ARGUMENTS):
         assert len(argument.description) > 10
         assert argument.value(argument.default) in (None, argument.spec.default)
+
+
+def test_the_package_says_who_makes_it_and_where_it_lives() -> None:
+    """REP-149: a maintainer with an address; no placeholder in what a package index shows."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    package = ElementTree.fromstring((ROOT / "package.xml").read_text())
+    assert project["authors"] and {"Repository", "Issues"} <= set(project["urls"])
+    address = package.find("maintainer").get("email", "")
+    assert re.fullmatch(r"[\w.+-]+@([\w-]+\.)+[a-z]{2,}", address)
+    assert not address.endswith((".invalid", ".example", "example.com"))
+    repository = {url.get("type"): url.text for url in package.findall("url")}
+    assert repository["repository"] == project["urls"]["Repository"]
+    assert repository["bugtracker"] == project["urls"]["Issues"]
+    assert package.find("author").text == project["authors"][0]["name"]

@@ -32,7 +32,7 @@ class ConfigurationError(Exception):
 def ros_node(
     name: str, args: list[str] | None, make_loop: Callable[[Node], Any] = NodeLoop
 ) -> Iterator[tuple[Node, Any]]:
-    """A node with its event loop: initialises ROS, handles SIGINT and SIGTERM, leaves nothing behind.
+    """A node with its event loop, which SIGINT, SIGTERM and SIGHUP end; leaves nothing behind.
 
     make_loop: NodeLoop for a node of the loop, Observer for one that observes it.
     """
@@ -56,7 +56,10 @@ def ros_node(
         def stop(number: int, frame: FrameType | None) -> None:
             loop.stop(signal.Signals(number).name)
 
-        for number in (signal.SIGINT, signal.SIGTERM):
+        numbers = [signal.SIGINT, signal.SIGTERM]
+        if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # as nohup leaves it
+            numbers.append(signal.SIGHUP)
+        for number in numbers:
             signal.signal(number, stop)
         yield node, loop
     finally:

@@ -38,6 +38,6 @@ def command(
     return parser
 
 
-def add_json(parser: argparse.ArgumentParser, what: str = "print JSON") -> None:
+def add_json(parser: argparse._ActionsContainer, what: str = "print JSON") -> None:
     """The flag --json: data on stdout, and nothing else there."""
     parser.add_argument("--json", action="store_true", help=what)

@@ -23,20 +23,35 @@ def add(commands: Commands) -> None:
         "nodes in processes of their own.",
         example="pdeloop train burgers --rollouts 80 --seed 0",
     )
-    train.add_argument(
+    add = train.add_argument_group("problem").add_argument
+    add(
         "problem",
         nargs="?",
         metavar="PROBLEM",
         help=f"{', '.join(shipped_problems())}, or the path of a problem's YAML file",
     )
-    train.add_argument(
+    add(
+        "--equation",
+        metavar="NAME",
+        help="the plant's PDE instead of that of the problem; an own one, 'file.py:Class' or "
+        "'package.module:Class', has to be named here, as a problem's file alone runs no code",
+    )
+    for spec in INSTRUMENTS:
+        add(
+            f"--{spec.name.replace('_', '-')}",
+            type=spec.type,
+            metavar="N" if spec.type is int else "X",
+            help=f"{spec.description} [{spec.default}]",
+        )
+    add = train.add_argument_group("budget and method").add_argument
+    add(
         "--rollouts",
         type=int,
         metavar="N",
         help="budget of a seed: all rollouts before the closing evaluation, explorations and checks "
         f"among them [{ROLLOUTS}]",
     )
-    train.add_argument(
+    add(
         "--iterations",
         type=int,
         metavar="N",
@@ -45,98 +60,71 @@ def add(commands: Commands) -> None:
     )
     for name, metavar in (("seed", "S"), ("seeds", "N")):
         spec = DEFAULTS[name]
-        train.add_argument(
-            f"--{name}", type=int, metavar=metavar, help=f"{spec.description} [{spec.default}]"
-        )
+        add(f"--{name}", type=int, metavar=metavar, help=f"{spec.description} [{spec.default}]")
     for name in ("start", "optimizer"):
         spec = DEFAULTS[name]
-        train.add_argument(
+        add(
             f"--{name}",
             type=lambda text: text.replace("-", "_"),  # gauss-newton as well as gauss_newton
             choices=spec.choices,
             help=f"{spec.description} [{spec.default}]",
         )
-    train.add_argument(
-        "--equation",
-        metavar="NAME",
-        help="the plant's PDE instead of that of the problem; an own one, 'file.py:Class' or "
-        "'package.module:Class', has to be named here, as a problem's file alone runs no code",
+    add(
+        "--directions",
+        type=int,
+        metavar="D",
+        help="directions of a step, which takes 2 D rollouts side by side (--optimizer directions)",
     )
-    train.add_argument(
+    add(
         "--model",
         type=Path,
         metavar="FILE",
         help="start from this model of `pdeloop identify --out` instead of identifying one",
     )
-    train.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder of the results [runs/PROBLEM-TIME]"
-    )
-    train.add_argument(
+    run = train.add_argument_group("run")
+    add = run.add_argument
+    add("--out", type=Path, metavar="DIR", help="folder of the results [runs/PROBLEM-TIME]")
+    add("--resume", type=Path, metavar="DIR", help="continue the interrupted run in DIR")
+    add(
         "--in-process",
         action="store_true",
         help="run the same code without ROS; the policy is the same to the bit",
     )
-    train.add_argument(
-        "--network",
-        action="store_true",
-        help="let messages leave this machine (default: loopback interface only)",
-    )
-    train.add_argument(
-        "--faulty-line",
-        metavar="LOSS,DUPLICATION,DELAY",
-        help="for tests: a relay between plant and controller that loses and repeats messages with "
-        "these probabilities and delays them by up to so many seconds",
-    )
-    train.add_argument(
-        "--resume", type=Path, metavar="DIR", help="continue the interrupted run in DIR"
-    )
-    train.add_argument(
-        "--record", action="store_true", help="record all topics to a rosbag2 bag in the folder"
-    )
-    train.add_argument(
-        "--bag-storage", choices=("mcap", "sqlite3"), help="format of the bag [mcap]"
-    )
-    train.add_argument(
-        "--bag-per-episode", action="store_true", help="one bag an episode instead of one"
-    )
-    train.add_argument(
+    add_json(run, "print the result as JSON at the end; progress goes to stderr")
+    add = train.add_argument_group("recording").add_argument
+    add("--record", action="store_true", help="record all topics to a rosbag2 bag in the folder")
+    add(
         "--record-or-stop",
         action="store_true",
         help="as --record, and stop the training if the recording fails",
     )
-    train.add_argument(
-        "--directions",
-        type=int,
-        metavar="D",
-        help="several directions an iteration, 2 D environments a seed (--optimizer directions)",
+    add("--bag-storage", choices=("mcap", "sqlite3"), help="format of the bag [mcap]")
+    add("--bag-per-episode", action="store_true", help="one bag an episode instead of one")
+    add(
+        "--view",
+        action="store_true",
+        help="a viewer_node beside the others, for RViz, Foxglove and PlotJuggler (docs/views.md)",
     )
-    train.add_argument(
-        "--pairs", type=int, default=1, metavar="K", help="plants with a controller each [1]"
+    add = train.add_argument_group("machine").add_argument
+    add(
+        "--network",
+        action="store_true",
+        help="let messages leave this machine (default: loopback interface only)",
     )
-    train.add_argument(
+    add("--pairs", type=int, default=1, metavar="K", help="plants with a controller each [1]")
+    add(
         "--pin",
         action="store_true",
         help="a core of its own for each plant and its controller, and let the plant's helpers on the "
         "others look for work all the time: less time per step, more power",
     )
-    train.add_argument(
+    add(
         "--spread",
         action="store_true",
         help="plant and controller on any cores, instead of one for both (docs/performance.md)",
     )
-    for spec in INSTRUMENTS:
-        train.add_argument(
-            f"--{spec.name.replace('_', '-')}",
-            type=spec.type,
-            metavar="N" if spec.type is int else "X",
-            help=f"{spec.description} [{spec.default}]",
-        )
-    train.add_argument(
-        "--view",
-        action="store_true",
-        help="a viewer_node beside the others, for RViz, Foxglove and PlotJuggler (docs/views.md)",
-    )
-    add_json(train, "print the result as JSON at the end; progress goes to stderr")
+    # A relay between plant and controller, with LOSS,DUPLICATION,DELAY: for tests.
+    add("--faulty-line", help=argparse.SUPPRESS)
 
 
 def _train(options: argparse.Namespace) -> int:
