@@ -27,13 +27,13 @@ from loop_interfaces.frames import FrameError
 
 STATE_KIND, ACTION_KIND = 0, 1
 CLOCK_KIND = 2
-"""For who reads them, of the message on /clock that goes with a state; not in a bundle."""
+"""For who reads them, of the message on /clock that goes with a state; not in a batch."""
 LIMIT = 512 * 1024
-"""Bytes after which a bundle is sent: a few milliseconds of a fast loop."""
+"""Bytes after which a batch is sent: a few milliseconds of a fast loop."""
 NO_TIME = -1.0
 """Where no simulated time belongs to a sample."""
 AGE = 0.1
-"""Seconds after which a bundle is sent that has not reached LIMIT."""
+"""Seconds after which a batch is sent that has not reached LIMIT."""
 MAX_TIME = 2.0**31
 """Simulated time in s up to which /clock, whose seconds are an int32, can tell it."""
 RATE, COUNTED = 600.0, 4096
@@ -75,7 +75,7 @@ class Allowance:
         self._left -= count * max(1.0, size / COUNTED)
 
 
-class Bundle:
+class SampleBatch:
     """Collects samples, one behind the other, as they will be sent."""
 
     def __init__(self) -> None:
@@ -83,7 +83,7 @@ class Bundle:
         self.size = 0
 
     def add(self, kind: int, stamp: int, raw: bytes, time: float) -> bool:
-        """Keep a serialised message; whether the bundle should be sent now."""
+        """Keep a serialised message; whether the batch should be sent now."""
         at = _MESSAGE.size + self.size
         self._make_room(SAMPLE_HEADER + len(raw))
         _SAMPLE.pack_into(self._memory, at, kind, len(raw), stamp, time)
@@ -98,14 +98,14 @@ class Bundle:
         record["end"], record["limit"] = begin + self.size, begin + LIMIT
 
     def settle(self, record: np.void) -> bool:
-        """They are done; whether the bundle should be sent now."""
+        """They are done; whether the batch should be sent now."""
         self.size = int(record["end"] - record["limit"]) + LIMIT
         return self.size >= LIMIT
 
     def take(self, sent: int) -> memoryview:
         """CDR bytes of the message that holds them all, to be released before anything is added.
 
-        The bundle is empty afterwards.
+        The batch is empty afterwards.
         """
         _MESSAGE.pack_into(self._memory, 0, _ENCODING, 0, 0, 8 + self.size, sent)
         whole = memoryview(self._memory)[: _MESSAGE.size + self.size]
@@ -120,7 +120,7 @@ class Bundle:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """A message of the bundle: its kind, ns on the plant's clock, its CDR bytes, simulated time."""
+    """A message of the batch: its kind, ns on the plant's clock, its CDR bytes, simulated time."""
 
     kind: int
     stamp: int
@@ -129,17 +129,17 @@ class Sample:
 
 
 def unpack(message: bytes) -> tuple[int, Iterator[Sample]]:
-    """When the bundle was sent (ns on the plant's clock) and what is in it.
+    """When the batch was sent (ns on the plant's clock) and what is in it.
 
-    Raises FrameError, also while the samples are read, for bytes that are no bundle.
+    Raises FrameError, also while the samples are read, for bytes that are no batch.
     """
     if len(message) < _MESSAGE.size:
-        raise FrameError(f"expected a bundle of samples, got {len(message)} bytes")
+        raise FrameError(f"expected a batch of samples, got {len(message)} bytes")
     encoding, dims, offset, count, sent = _MESSAGE.unpack_from(message)
     end = _MESSAGE.size - 8 + count
     # RTPS rounds a payload up to four bytes.
     if encoding != _ENCODING or dims or offset or not 0 <= len(message) - end < 4 or count < 8:
-        raise FrameError("expected a bundle of samples, got another layout")
+        raise FrameError("expected a batch of samples, got another layout")
     return sent, _samples(message, end)
 
 
@@ -148,11 +148,11 @@ def _samples(message: bytes, end: int) -> Iterator[Sample]:
     while position < end:
         start = position + _SAMPLE.size
         if start > end:
-            raise FrameError("a bundle of samples ends within a sample")
+            raise FrameError("a batch of samples ends within a sample")
         kind, length, stamp, time = _SAMPLE.unpack_from(message, position)
         position = start + length
         if kind > ACTION_KIND or position > end:
-            raise FrameError("a bundle of samples holds something that is no state or action")
+            raise FrameError("a batch of samples holds something that is no state or action")
         yield Sample(kind, stamp, message[start:position], time)
 
 
@@ -176,7 +176,7 @@ class ClockOffset:
         self._began = self._clocks = 0
 
     def update(self, sent: int, source: int, received: int) -> int:
-        """The offset in ns to add to a stamp, after a bundle.
+        """The offset in ns to add to a stamp, after a batch.
 
         sent: when, on the clock of the stamps; source: the same on the sender's clock of day, as the
         middleware tells it; received: when, on the reader's.

@@ -23,11 +23,11 @@ class PlantHealth:
         level, message = self._state()
         costs = lockstep.last_cost
         completed = costs is not None and not (costs[:, CostColumn.ENDED] == VOID).any()
-        pace = lockstep.pace
-        if pace and pace.missed > self._missed and level is Level.OK:
+        pacer = lockstep.pacer
+        if pacer and pacer.missed > self._missed and level is Level.OK:
             level = Level.WARN
-            message += f"; {pace.missed - self._missed} states too late for real time"
-        self._missed = pace.missed if pace else 0
+            message += f"; {pacer.missed - self._missed} states too late for real time"
+        self._missed = pacer.missed if pacer else 0
         return Health(
             level,
             message,
@@ -49,8 +49,8 @@ class PlantHealth:
                 "simulated time": lockstep.time,
                 "states repeated": lockstep.tally["states repeated"],
                 "stale messages": lockstep.stale,
-                "missed deadlines": pace.missed if pace else None,
-                "jitter p99 (us)": 1e6 * pace.quantile(0.99) if pace else None,
+                "missed deadlines": pacer.missed if pacer else None,
+                "jitter p99 (us)": 1e6 * pacer.quantile(0.99) if pacer else None,
             },
         )
 

@@ -14,8 +14,8 @@ from numba.extending import register_jitable
 from loop_interfaces.fast_path import channel
 from loop_interfaces.fast_path.handler import FastPath, fast_handler, plan_type
 from loop_interfaces.fast_path.messages import (
-    BUNDLE,
     FIRST,
+    SAMPLE_BATCH,
     STEP,
     append,
     full,
@@ -32,7 +32,7 @@ from pde_sim_node.solver import step_context, work_queue
 from pde_sim_node.solver.step_context import STEP_CONTEXT, step_environments
 
 if TYPE_CHECKING:
-    from loop_interfaces.ros.endpoints import Bundler
+    from loop_interfaces.ros.endpoints import SampleBatcher
 
 __all__ = ["PlantFastPath", "load_compiled"]
 
@@ -45,7 +45,7 @@ PLAN = plan_type(
     ("time", np.float64),  # simulated, in s
     ("sample_time", np.float64),
     ("timed", np.int64),  # whether samples of states tell it
-    ("bundles", BUNDLE, 2),
+    ("batches", SAMPLE_BATCH, 2),
     ("begin", np.int64),  # address of the answer, and its length
     ("length", np.int64),
     ("clock", CLOCK),
@@ -57,10 +57,10 @@ LOG = 50_000
 @jit
 def keep(plan: Any, kind: int, time: float, raw: int, length: int) -> None:
     """For those who record or look."""
-    if plan.bundles[0].open or plan.bundles[1].open:
+    if plan.batches[0].open or plan.batches[1].open:
         stamp = monotonic_ns(plan.clock)
-        for bundle in plan.bundles:
-            append(bundle, kind, stamp, time, raw, length)
+        for batch in plan.batches:
+            append(batch, kind, stamp, time, raw, length)
 
 
 @register_jitable  # type: ignore[untyped-decorator, unused-ignore]
@@ -69,7 +69,7 @@ def advance(plan: Any, head: int, message: int, length: int) -> bool:
     context = plan.context
     if load_unaligned(head, STEP) != context.step or plan.steps == plan.limit:
         return False
-    if full(plan.bundles[0]) or full(plan.bundles[1]):
+    if full(plan.batches[0]) or full(plan.batches[1]):
         return False
     keep(plan, ACTION_KIND, NO_TIME, message, length)
     numbers = plan.expected.values
@@ -103,13 +103,13 @@ class PlantFastPath(FastPath):
         The protocol.
     actions
         The codec of the messages that come in.
-    bundler
+    batcher
         Takes the samples.
     """
 
-    def __init__(self, lockstep: Lockstep, actions: ArrayCodec, bundler: Bundler) -> None:
+    def __init__(self, lockstep: Lockstep, actions: ArrayCodec, batcher: SampleBatcher) -> None:
         super().__init__(handler, PLAN, actions, STATE)
-        self._lockstep, self._plant, self._bundler = lockstep, lockstep.plant, bundler
+        self._lockstep, self._plant, self._batcher = lockstep, lockstep.plant, batcher
         self._clock = MonotonicClock(self.plan["clock"])
         self._log = np.zeros((0, 0))
         self.suspended = False
@@ -138,9 +138,9 @@ class PlantFastPath(FastPath):
         plan["values"], plan["log"] = state.values.size, self._log.ctypes.data
         plan["steps"], plan["limit"] = 0, min(lockstep.horizon - lockstep.step, len(self._log))
         plan["time"], plan["sample_time"] = lockstep.time, lockstep.sample_time
-        plan["timed"] = self._bundler.timed
+        plan["timed"] = self._batcher.timed
         plan["begin"], plan["length"] = self.answer.begin, len(self.answer.raw)
-        self._bundler.lend(plan["bundles"], 2 * SAMPLE_HEADER + sum(self._lengths))
+        self._batcher.lend(plan["batches"], 2 * SAMPLE_HEADER + sum(self._lengths))
         plant.parallel.call_workers(self._contexts)
         return True
 
@@ -150,7 +150,7 @@ class PlantFastPath(FastPath):
         self._plant.step_index = int(plan["context"]["step"])
         if answers:
             self._lockstep.advance_counters([digest(row) for row in self._log[:answers]], last)
-        self._bundler.settle(plan["bundles"], self._lengths, answers)
+        self._batcher.settle(plan["batches"], self._lengths, answers)
 
     @property
     def _contexts(self) -> np.ndarray:

@@ -36,7 +36,7 @@ from loop_interfaces.topics import (
     noise_seeds,
 )
 from pde_sim_node.plant import Plant
-from pde_sim_node.real_time import Pace
+from pde_sim_node.real_time import RealTimePacer
 
 PAUSED_REPORT = 1.0
 """Seconds between two messages on `episode/paused` while the plant is paused."""
@@ -100,7 +100,7 @@ class Lockstep:
         self._deadline: float | None = None
         self._held = False
         """Whether the next state is ready and waits for its instant, or for the end of a pause."""
-        self.pace = Pace(sample_time / real_time_factor) if real_time_factor else None
+        self.pacer = RealTimePacer(sample_time / real_time_factor) if real_time_factor else None
         self.paused = False
         self._stepping = False
         """Whether a paused plant waits for the one action that it may still take."""
@@ -127,7 +127,7 @@ class Lockstep:
         None at the end of an episode, and while the plant is paused or kept to the wall clock.
         """
         plant = self.plant
-        if self._held or self.paused or self.pace or plant.step_index >= plant.horizon:
+        if self._held or self.paused or self.pacer or plant.step_index >= plant.horizon:
             return None
         return self.last_state
 
@@ -191,8 +191,8 @@ class Lockstep:
         if not self._active:
             self._held = False
             return report
-        if self.pace:
-            self.pace.begin(now)
+        if self.pacer:
+            self.pacer.begin(now)
         return report + self._send_state(now)
 
     def adjust(
@@ -208,11 +208,11 @@ class Lockstep:
         self._action_timeout, self._max_repeats = action_timeout, max_repeats
         self._run_hold = run_hold
         period = self._sample_time / real_time_factor if real_time_factor else None
-        if period == (self.pace.period if self.pace else None):
+        if period == (self.pacer.period if self.pacer else None):
             return []
-        self.pace = Pace(period) if period else None
-        if self.pace:
-            self.pace.begin(now)
+        self.pacer = RealTimePacer(period) if period else None
+        if self.pacer:
+            self.pacer.begin(now)
         if self.paused or not self._held:
             return []
         return self._send_state(now)  # it waited for an instant of the former pace
@@ -270,8 +270,8 @@ class Lockstep:
         self._taken, self.contradiction = [], ""
         self.time = max(self.time, frame.time) + self._sample_time
         self._stepping = False
-        if self.pace:
-            self.pace.begin(now)
+        if self.pacer:
+            self.pacer.begin(now)
         return self._publish_state(now)
 
     def action(self, frame: Frame, now: float) -> list[Send]:
@@ -310,9 +310,9 @@ class Lockstep:
             return [self._finish(now, void=False)]
         self._state = plant.step(frame.values)
         self.advance_counters([frame.digest()], now)
-        if self.pace and not self.paused:
+        if self.pacer and not self.paused:
             self._held = True
-            self._deadline = self.pace.next(now)
+            self._deadline = self.pacer.next(now)
             return []
         return self._publish_state(now)
 
@@ -338,7 +338,7 @@ class Lockstep:
         """
         if self.paused and not self._stepping:
             return self._still_paused(now)
-        if self._held and self.pace and self.pace.ready(now):
+        if self._held and self.pacer and self.pacer.ready(now):
             return self._send_state(now)
         if not self._active or self._deadline is None or now < self._deadline:
             return []

@@ -87,7 +87,7 @@ class PlantNode:
             real_time_factor=values["real_time_factor"],
         )
         self._health = PlantHealth(self._lockstep)
-        self._paced = self._lockstep.pace is not None
+        self._paced = self._lockstep.pacer is not None
         self._changed: dict[str, Any] = {}
         self._wire(node, loop, publish_clock=values["publish_clock"])
         node.get_logger().info(
@@ -101,21 +101,21 @@ class PlantNode:
 
     def _wire(self, node: Node, loop: NodeLoop, *, publish_clock: bool) -> None:
         self._node, self._loop = node, loop
-        self._bundler = loop.bundler
+        self._batcher = loop.batcher
         self._senders = {
-            STATE: loop.sender(STATE, bundled=True),
+            STATE: loop.sender(STATE, sampled=True),
             COST: loop.sender(COST),
             TARGET: loop.sender(TARGET),
             PAUSED: loop.sender(PAUSED),
         }
         self._clock = node.create_publisher(Clock, "/clock", 1) if publish_clock else None
-        self._bundler.timed = publish_clock
+        self._batcher.timed = publish_clock
         self._clock_wanted = False
         loop.receive(START, self._on_start)
-        actions = loop.receive(ACTION, self._on_action, bundled=True)
+        actions = loop.receive(ACTION, self._on_action, sampled=True)
         self._fast_path: PlantFastPath | None = None
         if type(self._lockstep.plant) is Plant:  # what instruments do to a step is not compiled
-            self._fast_path = PlantFastPath(self._lockstep, actions.codec, self._bundler)
+            self._fast_path = PlantFastPath(self._lockstep, actions.codec, self._batcher)
             loop.answer_fast(actions, self._senders[STATE], self._fast_path)
         loop.diagnose("lock-step", self._health.report)
         offer(node, "~/pause", self._pause)
@@ -138,7 +138,7 @@ class PlantNode:
     def _pause(self) -> str:
         self._send(self._lockstep.pause(self._loop.now()))
         last = self._lockstep.last_state
-        self._bundler.show(self._senders[STATE].encoded(last) if last else None)
+        self._batcher.show(self._senders[STATE].encoded(last) if last else None)
         return f"paused at step {self._lockstep.step}; an answer on its way is still taken"
 
     def _resume(self) -> str:
@@ -154,7 +154,7 @@ class PlantNode:
         self._report_pace()
         self._changed = values
         self._send(self._lockstep.adjust(self._loop.now(), **values))
-        self._paced = self._lockstep.pace is not None
+        self._paced = self._lockstep.pacer is not None
 
     def _on_start(self, frame: Frame) -> None:
         self._send(self._lockstep.start(frame, self._loop.now()))
@@ -168,15 +168,15 @@ class PlantNode:
 
     def _report_pace(self) -> None:
         """How well the wall clock was kept, at the end of a run or of this node."""
-        pace = self._lockstep.pace
-        if pace and pace.count:
-            self._node.get_logger().info(f"real time: {pace.summary()}")
-            pace.clear()
+        pacer = self._lockstep.pacer
+        if pacer and pacer.count:
+            self._node.get_logger().info(f"real time: {pacer.summary()}")
+            pacer.clear()
 
     def _send(self, sends: list[Send]) -> None:
         for send in sends:
             if send.topic is STATE and send.frame.step == 0:
-                self._bundler.begin(self._loop.now())
+                self._batcher.begin(self._loop.now())
             elif send.topic is COST and self._lockstep.contradiction:
                 self._node.get_logger().error(
                     f"episode is void: {self._lockstep.contradiction}",
@@ -184,7 +184,7 @@ class PlantNode:
                 )
             self._senders[send.topic].send(send.frame)
             if send.topic is COST:
-                self._bundler.flush()  # after it: most who wait for the cost need no samples
+                self._batcher.flush()  # after it: most who wait for the cost need no samples
             if self._clock_wanted and send.topic is STATE:
                 self._tell_time(send.frame.time)
 

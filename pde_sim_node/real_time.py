@@ -15,7 +15,7 @@ _EDGES = np.geomspace(1e-7, 100.0, 1801)
 """Classes of lateness in s, 1.2 % wide, so that a long life needs no more memory than a short one."""
 
 
-class Pace:
+class RealTimePacer:
     """The instants of the states of one episode after the other.
 
     period (s): wall time from one state to the next. `now` is any monotonic time in s.

@@ -35,7 +35,7 @@ class Peer:
         return Intake(subscription, kind, depth)
 
     def watch(self) -> None:
-        self._bundles = self._reader(UInt8MultiArray, "samples", 50)
+        self._batches = self._reader(UInt8MultiArray, "samples", 50)
 
     def meet(self, *topics: str) -> None:
         """Wait until everybody knows of everybody."""
@@ -61,7 +61,7 @@ class Peer:
 
     def samples(self) -> list[Any]:
         time.sleep(0.2)
-        return [s for raw in self.heard(1, self._bundles) for s in unpack(raw)[1]]
+        return [s for raw in self.heard(1, self._batches) for s in unpack(raw)[1]]
 
 
 @contextmanager
@@ -92,11 +92,11 @@ def answer_for(path: Any, seconds: float = 0.0, messages: int = 0) -> bytes | No
 def plant_on_topics(*, timed: bool = False, helped: bool = False, **overrides: object) -> None:
     node = rclpy.create_node("plant")
     loop, peer = NodeLoop(node), Peer("action", "state")
-    loop.bundler.timed = timed
-    plant = Plant(loop.bundler, horizon=14, **overrides)
+    loop.batcher.timed = timed
+    plant = Plant(loop.batcher, horizon=14, **overrides)
     path = plant.path
-    receiver = loop.receive(ACTION, lambda frame: None, bundled=True)
-    sender = loop.sender(STATE, bundled=True)
+    receiver = loop.receive(ACTION, lambda frame: None, sampled=True)
+    sender = loop.sender(STATE, sampled=True)
     with opened(loop, receiver, sender, path):
         peer.meet("state")
         state = plant.begin(1, (3, 4))
@@ -156,8 +156,8 @@ def plant_on_topics(*, timed: bool = False, helped: bool = False, **overrides: o
 
         # For those who record.
         peer.watch()
-        while not loop.bundler.wanted:
-            loop.bundler.look(loop.now())
+        while not loop.batcher.wanted:
+            loop.batcher.look(loop.now())
         time.sleep(0.3)
         sent, told = [], []
         for _ in range(3):
@@ -168,15 +168,15 @@ def plant_on_topics(*, timed: bool = False, helped: bool = False, **overrides: o
             before = time.monotonic_ns()
             assert answer_for(path) is None
             told.append((before, time.monotonic_ns()))
-        loop.bundler.flush()
+        loop.batcher.flush()
         got = peer.samples()
         assert [(s.kind, s.raw, s.time) for s in got] == sent
         for i, (before, after) in enumerate(told):
             assert before <= got[2 * i].stamp <= got[2 * i + 1].stamp <= after
         assert peer.heard(3) == states[-3:]
-        # A bundle that should be sent is, before it takes more.
+        # A batch that should be sent is, before it takes more.
         path.prepare()
-        path.plan["bundles"]["limit"] = path.plan["bundles"]["end"]
+        path.plan["batches"]["limit"] = path.plan["batches"]["end"]
         path.channel.arm()
         peer.say(full := plant.action(state))
         path.channel.disarm()

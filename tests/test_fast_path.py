@@ -213,7 +213,7 @@ class NoSamples:
 class Plant:
     """A lock-step with its fast path, and one that only goes the ordinary way."""
 
-    def __init__(self, bundler: Any = None, **overrides: object) -> None:
+    def __init__(self, batcher: Any = None, **overrides: object) -> None:
         self.now = 0.0
         self.lockstep, self.judge = (plant_protocol(**overrides) for _ in range(2))
         self.peer, self.own, self.sent = (
@@ -221,7 +221,7 @@ class Plant:
             ArrayCodec(ACTION.labels),
             ArrayCodec(STATE.labels),
         )
-        self.path = PlantFastPath(self.lockstep, self.own, bundler or NoSamples())
+        self.path = PlantFastPath(self.lockstep, self.own, batcher or NoSamples())
 
     def begin(self, episode: int, seeds: tuple[int, ...]) -> Frame:
         rows = np.zeros((len(seeds), 4))

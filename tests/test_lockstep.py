@@ -323,7 +323,7 @@ def test_pace_and_times_may_change_within_an_episode_and_change_no_number():
 
     protocol = plant_protocol()
     assert outcome(paced(protocol, 1, change)) == outcome(quiet)
-    assert protocol.pace is None
+    assert protocol.pacer is None
 
 
 def test_a_pause_moves_the_instants_of_a_paced_plant():
@@ -354,4 +354,4 @@ def test_a_pause_moves_the_instants_of_a_paced_plant():
     assert gaps[10] > 1.0
     assert np.delete(gaps, 10).max() < 0.06
     assert np.delete(gaps, 10).min() > 0.04
-    assert protocol.pace.missed == 0
+    assert protocol.pacer.missed == 0

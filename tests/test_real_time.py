@@ -9,50 +9,50 @@ from loop_interfaces.frames import Frame
 from loop_interfaces.topics import STATE
 from pde_sim_node.build import build_plant
 from pde_sim_node.lockstep import Lockstep
-from pde_sim_node.real_time import Pace
+from pde_sim_node.real_time import RealTimePacer
 from tests.small import parameters, same_bits
 
 
 def test_states_on_time_keep_the_grid_of_the_first_one() -> None:
-    pace = Pace(0.05)
-    pace.begin(10.0)
+    pacer = RealTimePacer(0.05)
+    pacer.begin(10.0)
     for k in range(1, 100):
-        due = pace.next(10.0 + 0.05 * (k - 1) + 0.01)
+        due = pacer.next(10.0 + 0.05 * (k - 1) + 0.01)
         assert due == pytest.approx(10.0 + 0.05 * k)
-        assert not pace.ready(due - 0.02)
-        assert pace.ready(due + 1e-4)
-    assert (pace.count, pace.missed) == (99, 0)
-    assert pace.largest == pytest.approx(1e-4)
+        assert not pacer.ready(due - 0.02)
+        assert pacer.ready(due + 1e-4)
+    assert (pacer.count, pacer.missed) == (99, 0)
+    assert pacer.largest == pytest.approx(1e-4)
 
 
 def test_a_late_answer_and_a_slow_step_are_missed_deadlines_and_move_the_grid() -> None:
-    pace = Pace(0.05)
-    pace.begin(0.0)
-    pace.next(0.06)  # the answer came 10 ms late
-    assert pace.ready(0.061)
-    assert pace.next(0.07) == pytest.approx(0.111)
-    assert pace.ready(0.2)  # the step took so long that nobody asked before the instant
-    assert (pace.count, pace.missed) == (2, 2)
-    assert pace.next(0.21) == pytest.approx(0.25)
-    assert not pace.ready(0.22)
-    assert pace.ready(0.3)  # ready in time, woken late: jitter, not a missed deadline
-    assert (pace.count, pace.missed) == (3, 2)
+    pacer = RealTimePacer(0.05)
+    pacer.begin(0.0)
+    pacer.next(0.06)  # the answer came 10 ms late
+    assert pacer.ready(0.061)
+    assert pacer.next(0.07) == pytest.approx(0.111)
+    assert pacer.ready(0.2)  # the step took so long that nobody asked before the instant
+    assert (pacer.count, pacer.missed) == (2, 2)
+    assert pacer.next(0.21) == pytest.approx(0.25)
+    assert not pacer.ready(0.22)
+    assert pacer.ready(0.3)  # ready in time, woken late: jitter, not a missed deadline
+    assert (pacer.count, pacer.missed) == (3, 2)
 
 
 def test_quantiles_are_those_of_the_sorted_lateness_to_a_class() -> None:
     rng = np.random.default_rng(1)
     lateness = rng.lognormal(np.log(1e-4), 1.0, 2000)
-    pace = Pace(1.0)
-    pace.begin(0.0)
+    pacer = RealTimePacer(1.0)
+    pacer.begin(0.0)
     for late in lateness:
-        due = pace.next(0.0)
-        pace.ready(due - 0.5)
-        pace.ready(due + late)
+        due = pacer.next(0.0)
+        pacer.ready(due - 0.5)
+        pacer.ready(due + late)
     for share in (0.5, 0.99):
         expected = np.quantile(lateness, share, method="inverted_cdf")
-        assert pace.quantile(share) == pytest.approx(expected, rel=0.03)
-    assert pace.quantile(1.0) == pytest.approx(lateness.max(), rel=1e-6)
-    assert "2000 states every 1000 ms, 0 missed deadlines" in pace.summary()
+        assert pacer.quantile(share) == pytest.approx(expected, rel=0.03)
+    assert pacer.quantile(1.0) == pytest.approx(lateness.max(), rel=1e-6)
+    assert "2000 states every 1000 ms, 0 missed deadlines" in pacer.summary()
 
 
 def test_a_paced_plant_sends_each_state_at_its_instant_and_steps_before_it() -> None:
@@ -86,8 +86,8 @@ def test_a_paced_plant_sends_each_state_at_its_instant_and_steps_before_it() -> 
     (again,) = lockstep.tick(1.0 + period + 0.06)  # no answer: repeated as ever
     assert (again.topic, again.frame.step) == (STATE, 1)
     assert same_bits(again.frame.values, second.frame.values)
-    assert lockstep.pace is not None
-    assert (lockstep.pace.count, lockstep.pace.missed) == (1, 0)
+    assert lockstep.pacer is not None
+    assert (lockstep.pacer.count, lockstep.pacer.missed) == (1, 0)
 
 
 def test_the_end_of_a_run_drops_a_state_that_waits_for_its_instant() -> None:

@@ -1,4 +1,4 @@
-"""Bundles of serialised messages, and the clock they are stamped with."""
+"""Batches of serialised messages, and the clock they are stamped with."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from loop_interfaces.samples import (
     NO_TIME,
     STATE_KIND,
     Allowance,
-    Bundle,
     ClockOffset,
     Sample,
+    SampleBatch,
     clock_message,
     unpack,
 )
 
 
 def bundled(*samples: Sample, sent: int = 99) -> bytes:
-    bundle = Bundle()
+    batch = SampleBatch()
     for sample in samples:
-        bundle.add(sample.kind, sample.stamp, sample.raw, sample.time)
-    with bundle.take(sent) as message:
+        batch.add(sample.kind, sample.stamp, sample.raw, sample.time)
+    with batch.take(sent) as message:
         return bytes(message)
 
 
@@ -52,13 +52,13 @@ def test_a_bundle_is_an_ordinary_uint8_array():
 
 
 def test_it_asks_to_be_sent_when_it_is_large_and_is_empty_afterwards():
-    bundle, count = Bundle(), 1
-    while not bundle.add(STATE_KIND, 0, bytes(1000), NO_TIME):
+    batch, count = SampleBatch(), 1
+    while not batch.add(STATE_KIND, 0, bytes(1000), NO_TIME):
         count += 1
     assert LIMIT // 1024 <= count <= LIMIT // 1024 + 1
-    bundle.take(0).release()
-    assert bundle.size == 0
-    assert list(unpack(bytes(bundle.take(0)))[1]) == []
+    batch.take(0).release()
+    assert batch.size == 0
+    assert list(unpack(bytes(batch.take(0)))[1]) == []
 
 
 @pytest.mark.parametrize(
@@ -132,7 +132,7 @@ def test_stamps_are_put_on_the_readers_clock():
     clock = ClockOffset()
     day, second = 7_000, 10**9  # the sender's other clock is ahead by 7 us
     assert clock.update(1_000, day + 1_000, received=5_000) == 4_000
-    assert clock.update(2_000, day + 2_000, received=9_000) == 4_000  # a bundle that took longer
+    assert clock.update(2_000, day + 2_000, received=9_000) == 4_000  # a batch that took longer
     assert clock.update(3_000, day + 3_000, received=6_500) == 3_500  # one that was faster
     assert clock.update(4_000, day + 4_000, received=second) == 3_500  # the reader was held up
     later = 3_600 * second

@@ -14,13 +14,13 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 PROGRAM = """
 import sys, time
-from loop_interfaces.ros.suspend_watchdog import Pulse
-with Pulse() as pulse:
+from loop_interfaces.ros.suspend_watchdog import SuspendWatchdog
+with SuspendWatchdog() as watchdog:
     print("ready", flush=True)
     end = time.monotonic() + float(sys.argv[1])
     while time.monotonic() < end:
         {work}
-    print(pulse.longest())
+    print(watchdog.longest())
 """
 WORK = {"idle": "time.sleep(0.01)", "busy": "sum(range(10_000))"}
 

@@ -31,9 +31,9 @@ from loop_interfaces.jit.simd import (
 from loop_interfaces.samples import SAMPLE_HEADER
 
 __all__ = [
-    "BUNDLE",
     "EXPECTED",
     "FIRST",
+    "SAMPLE_BATCH",
     "STEP",
     "TIME",
     "ExpectedMessage",
@@ -94,22 +94,22 @@ def expected_header(raw: int, length: int, expected: Any) -> int:
     return head if total == 0.0 else 0
 
 
-BUNDLE = np.dtype(
+SAMPLE_BATCH = np.dtype(
     [
         ("end", np.int64),  # address behind the last sample
-        ("limit", np.int64),  # the address from which on the bundle should be sent
+        ("limit", np.int64),  # the address from which on the batch should be sent
         ("open", np.int64),  # whether it takes samples
     ]
 )
-"""A bundle (samples.Bundle) inside compiled functions."""
+"""A batch (samples.SampleBatch) inside compiled functions."""
 
 
 @jit
-def append(bundle: Any, kind: int, stamp: int, time: float, raw: int, length: int) -> None:
-    """Keep the serialised message at an address, if the bundle is open; there must be room."""
-    if not bundle.open:
+def append(batch: Any, kind: int, stamp: int, time: float, raw: int, length: int) -> None:
+    """Keep the serialised message at an address, if the batch is open; there must be room."""
+    if not batch.open:
         return
-    at = bundle.end
+    at = batch.end
     store_word_unaligned(at, 0, kind | (length << 32))
     store_word_unaligned(at, 1, stamp)
     store_unaligned(at, 2, time)
@@ -119,13 +119,13 @@ def append(bundle: Any, kind: int, stamp: int, time: float, raw: int, length: in
         store_word_unaligned(at, i, load_word_unaligned(raw, i))
     if length > 8 * whole:  # bytes up to the last one, some of them again
         store_word_unaligned(at + length - 8, 0, load_word_unaligned(raw + length - 8, 0))
-    bundle.end = at + length
+    batch.end = at + length
 
 
 @jit
-def full(bundle: Any) -> bool:
-    """Whether the bundle should be sent."""
-    return bool(bundle.open and bundle.end >= bundle.limit)
+def full(batch: Any) -> bool:
+    """Whether the batch should be sent."""
+    return bool(batch.open and batch.end >= batch.limit)
 
 
 class ExpectedMessage:

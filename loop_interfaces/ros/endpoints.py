@@ -20,7 +20,7 @@ from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.ros.rcl import publishes_where_it_is
-from loop_interfaces.samples import AGE, NO_TIME, STATE_KIND, Allowance, Bundle
+from loop_interfaces.samples import AGE, NO_TIME, STATE_KIND, Allowance, SampleBatch
 from loop_interfaces.topics import (
     READER_DEPTH,
     SAMPLES,
@@ -30,7 +30,7 @@ from loop_interfaces.topics import (
 )
 
 KEPT = 16
-"""Bundles of samples that their writer keeps for a reader which lost one."""
+"""Batches of samples that their writer keeps for a reader which lost one."""
 
 
 class OutsideExecutor(CallbackGroup):
@@ -101,17 +101,17 @@ def scoped(namespace: str, name: str) -> str:
 
 
 class _Outlet:
-    """A topic of bundles."""
+    """A topic of batches."""
 
     def __init__(self, node: Node, name: str) -> None:
         self._publisher = node.create_publisher(UInt8MultiArray, name, samples_qos(KEPT))
         self._publish = publishes_where_it_is(self._publisher)
-        self.bundle = Bundle()
+        self.batch = SampleBatch()
         self._began = 0.0
 
     def flush(self) -> None:
-        if self.bundle.size:
-            with self.bundle.take(time.monotonic_ns()) as message:
+        if self.batch.size:
+            with self.batch.take(time.monotonic_ns()) as message:
                 self._publish(message)
         self._began = time.monotonic()
 
@@ -122,7 +122,7 @@ class _Outlet:
         return self._publisher.get_subscription_count() > 0
 
 
-class Bundler:
+class SampleBatcher:
     """Publishes `samples` for those who record or learn, and some episodes on `samples_throttled`
     for those who look; nothing is kept while there are none.
 
@@ -144,37 +144,38 @@ class Bundler:
     def show(self, raw: bytes | None) -> None:
         """From now on show the episode in any case, beginning with the state `raw`."""
         if raw is not None and self._looked_at and not self._shown:
-            self._some.bundle.add(STATE_KIND, time.monotonic_ns(), raw, NO_TIME)
+            self._some.batch.add(STATE_KIND, time.monotonic_ns(), raw, NO_TIME)
         self._shown = self._looked_at
         self.wanted = self._read or self._shown
 
     def add(self, kind: int, raw: bytes, simulated: float = NO_TIME) -> None:
-        """Keep a message for the next bundle. Call it only while `wanted`.
+        """Keep a message for the next batch. Call it only while `wanted`.
 
         simulated: the time of a state in s.
         """
         stamp = time.monotonic_ns()
-        if self._read and self._all.bundle.add(kind, stamp, raw, simulated):
+        if self._read and self._all.batch.add(kind, stamp, raw, simulated):
             self._all.flush()
         if self._shown:
             self._allowance.use(len(raw))
-            if self._some.bundle.add(kind, stamp, raw, simulated):
+            if self._some.batch.add(kind, stamp, raw, simulated):
                 self._some.flush()
 
     def lend(self, records: np.ndarray, room: int) -> None:
-        """Let compiled functions add to both bundles, to be settled afterwards.
+        """Let compiled functions add to both batches, to be settled afterwards.
 
-        records: two of wire.BUNDLE; room: bytes that they may add when a bundle should be sent.
+        records: two of messages.SAMPLE_BATCH; room: bytes that they may add when a batch should
+        be sent.
         """
         for record, outlet, wanted in zip(records, self._outlets, self._open, strict=True):
             record["open"] = wanted
             if wanted:
-                outlet.bundle.lend(record, room)
+                outlet.batch.lend(record, room)
 
     def settle(self, records: np.ndarray, sizes: Sequence[int], count: int) -> None:
         """They are done, and have added `count` messages of each of the sizes."""
         for record, outlet, wanted in zip(records, self._outlets, self._open, strict=True):
-            if wanted and outlet.bundle.settle(record):
+            if wanted and outlet.batch.settle(record):
                 outlet.flush()
         if self._shown:
             for size in sizes:
@@ -194,7 +195,7 @@ class Bundler:
         self._some.flush()
 
     def look(self, now: float) -> None:
-        """Now and then: whether somebody listens, and whether a bundle has waited for long."""
+        """Now and then: whether somebody listens, and whether a batch has waited for long."""
         before = self._looked_at
         self._read, self._looked_at = self._all.look(now), self._some.look(now)
         self._shown = self._looked_at and (self._shown or not before)
@@ -202,12 +203,12 @@ class Bundler:
 
 
 class Sender:
-    """Publishes frames on one topic; what it sends goes to the bundler, too."""
+    """Publishes frames on one topic; what it sends goes to the batcher, too."""
 
     def __init__(
-        self, node: Node, topic: Topic, namespace: str = "", bundler: Bundler | None = None
+        self, node: Node, topic: Topic, namespace: str = "", batcher: SampleBatcher | None = None
     ) -> None:
-        self._bundler = bundler
+        self._batcher = batcher
         self._codec = ArrayCodec(topic.labels)
         self.publisher: Publisher = node.create_publisher(
             Float64MultiArray, scoped(namespace, topic.name), writer_qos(topic)
@@ -223,13 +224,13 @@ class Sender:
     def send(self, frame: Frame) -> None:
         raw = self._codec.encode_into_own(frame)
         self._publish(raw)
-        bundler = self._bundler
-        if bundler is not None and bundler.wanted:
-            bundler.add(STATE_KIND, bytes(raw), frame.time if bundler.timed else NO_TIME)
+        batcher = self._batcher
+        if batcher is not None and batcher.wanted:
+            batcher.add(STATE_KIND, bytes(raw), frame.time if batcher.timed else NO_TIME)
 
 
 class Receiver:
-    """Takes frames from one topic and hands them to a callback, and their bytes to the bundler.
+    """Takes frames from one topic and hands them to a callback, and their bytes to the batcher.
 
     codec: decodes them.
     """
@@ -240,10 +241,10 @@ class Receiver:
         topic: Topic,
         callback: Callable[[Frame], None],
         namespace: str = "",
-        bundler: Bundler | None = None,
+        batcher: SampleBatcher | None = None,
     ) -> None:
         self.callback = callback
-        self.bundler = bundler
+        self.batcher = batcher
         self.codec = ArrayCodec(topic.labels)
         self.decode = self.codec.decode
         self.subscription = raw_subscription(

@@ -26,10 +26,10 @@ from std_msgs.msg import Float64MultiArray
 from loop_interfaces.affinity import pin_process
 from loop_interfaces.diagnostics import Health
 from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.ros.endpoints import Bundler, Receiver, Sender, reader_qos, scoped
+from loop_interfaces.ros.endpoints import Receiver, SampleBatcher, Sender, reader_qos, scoped
 from loop_interfaces.ros.introspection import Introspection
 from loop_interfaces.ros.sample_subscription import Watcher
-from loop_interfaces.ros.suspend_watchdog import Pulse
+from loop_interfaces.ros.suspend_watchdog import SuspendWatchdog
 from loop_interfaces.samples import ACTION_KIND, STATE_KIND
 from loop_interfaces.topics import ACTION, SAMPLES, STATE, Topic
 
@@ -80,7 +80,7 @@ class NodeLoop:
         self.node = node
         self.refused: Counter[str] = Counter()
         self._receivers: list[Receiver] = []
-        self._bundler: Bundler | None = None
+        self._batcher: SampleBatcher | None = None
         self._watched: dict[str, _Watched] = {}
         self._stop_reason: str | None = None
         self._fast: _Fast | None = None
@@ -101,9 +101,9 @@ class NodeLoop:
             topics=lambda: [receiver.name for receiver in self._receivers],
         )
 
-    def sender(self, topic: Topic, namespace: str = "", *, bundled: bool = False) -> Sender:
-        """A publisher of frames on `topic`; bundled: they go out on `samples`, too."""
-        return Sender(self.node, topic, namespace, self.bundler if bundled else None)
+    def sender(self, topic: Topic, namespace: str = "", *, sampled: bool = False) -> Sender:
+        """A publisher of frames on `topic`; sampled: they go out on `samples`, too."""
+        return Sender(self.node, topic, namespace, self.batcher if sampled else None)
 
     def receive(
         self,
@@ -111,14 +111,14 @@ class NodeLoop:
         callback: Callable[[Frame], None],
         namespace: str = "",
         *,
-        bundled: bool = False,
+        sampled: bool = False,
     ) -> Receiver:
         """Call `callback` with every frame of `topic`; a ValueError it raises refuses the message.
 
-        bundled: what has come in goes out on `samples`, too.
+        sampled: what has come in goes out on `samples`, too.
         """
-        bundler = self.bundler if bundled else None
-        receiver = Receiver(self.node, topic, callback, namespace, bundler)
+        batcher = self.batcher if sampled else None
+        receiver = Receiver(self.node, topic, callback, namespace, batcher)
         self._receivers.append(receiver)
         return receiver
 
@@ -143,11 +143,11 @@ class NodeLoop:
         watched.callbacks[kind] = (ArrayCodec(topic.labels).decode, callback)
 
     @property
-    def bundler(self) -> Bundler:
+    def batcher(self) -> SampleBatcher:
         """Publishes `samples`; made when it is first asked for."""
-        if self._bundler is None:
-            self._bundler = Bundler(self.node)
-        return self._bundler
+        if self._batcher is None:
+            self._batcher = SampleBatcher(self.node)
+        return self._batcher
 
     def listen(self, topic: Topic, callback: Callable[[Frame], None], namespace: str = "") -> None:
         """Like `receive`, for what is rare and not urgent: served with the housekeeping.
@@ -209,8 +209,8 @@ class NodeLoop:
         every HOUSEKEEPING seconds, or BUSY_HOUSEKEEPING.
         """
         self._turned = self.now()
-        with Pulse(self._look_after) as pulse, self._fast_path_open() as fast:
-            return self._handle_events(pulse, fast, tick, deadline, housekeeping)
+        with SuspendWatchdog(self._look_after) as watchdog, self._fast_path_open() as fast:
+            return self._handle_events(watchdog, fast, tick, deadline, housekeeping)
 
     @contextmanager
     def _fast_path_open(self) -> Iterator[_Fast | None]:
@@ -231,7 +231,7 @@ class NodeLoop:
 
     def _handle_events(
         self,
-        pulse: Pulse,
+        watchdog: SuspendWatchdog,
         fast: _Fast | None,
         tick: Callable[[float], None],
         deadline: Callable[[], float | None],
@@ -252,12 +252,12 @@ class NodeLoop:
             if now >= next_round:
                 if not context.ok():
                     break
-                if pulse.longest() > SUSPENDED:
+                if watchdog.longest() > SUSPENDED:
                     self.suspended = True
                     return "suspended"
                 self._executor.spin_once(timeout_sec=0)
-                if self._bundler is not None:
-                    self._bundler.look(now)
+                if self._batcher is not None:
+                    self._batcher.look(now)
                 changed = [watched.watcher.look() for watched in self._watched.values()]
                 if any(changed):
                     handles, take_from = self._sources(fast)
@@ -321,9 +321,9 @@ class NodeLoop:
 
     def _handle(self, receiver: Receiver, raw: bytes) -> int:
         """Handle a message of `receiver`; 1."""
-        bundler = receiver.bundler
-        if bundler is not None and bundler.wanted:
-            bundler.add(ACTION_KIND, raw)
+        batcher = receiver.batcher
+        if batcher is not None and batcher.wanted:
+            batcher.add(ACTION_KIND, raw)
         try:
             receiver.callback(receiver.decode(raw))
         except ValueError as error:

@@ -18,7 +18,7 @@ from rclpy.node import Node
 from loop_interfaces.diagnostics import Health
 from loop_interfaces.ros.introspection import PERIOD, Introspection
 from loop_interfaces.ros.node_loop import STUCK, SUSPENDED
-from loop_interfaces.ros.suspend_watchdog import Pulse
+from loop_interfaces.ros.suspend_watchdog import SuspendWatchdog
 
 WAIT = 0.1
 """Seconds of one wait at most: a wait does not end by a signal."""
@@ -59,11 +59,11 @@ class Observer:
     def run(self) -> str:
         """Serve timers, subscriptions and services until `stop` or a signal; returns the reason."""
         self._turned = self.now()
-        with Pulse(self._wake_if_stuck) as pulse:
+        with SuspendWatchdog(self._wake_if_stuck) as watchdog:
             while self._stop_reason is None and self.node.context.ok():
                 self._executor.spin_once(timeout_sec=WAIT)
                 self._turned = self.now()
-                if pulse.longest() > SUSPENDED:
+                if watchdog.longest() > SUSPENDED:
                     self.suspended = True
                     return "suspended"
         return self._stop_reason or "shutdown"

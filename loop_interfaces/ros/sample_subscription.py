@@ -28,7 +28,7 @@ from loop_interfaces.topics import ACTION, SAMPLES, SAMPLES_THROTTLED, STATE
 SAMPLE_DEPTH = 4000
 """Single states or actions that wait for a reader: most of a second of the fastest loop."""
 BUNDLE_DEPTH = 512
-"""Bundles that wait for a reader: seconds of the fastest loop, for a bundle is not repeated."""
+"""Batches that wait for a reader: seconds of the fastest loop, for a batch is not repeated."""
 _SINGLES: dict[int, tuple[Any, str]] = {
     STATE_KIND: (Float64MultiArray, STATE.name),
     ACTION_KIND: (Float64MultiArray, ACTION.name),
@@ -75,7 +75,7 @@ class Intake:
 class Watcher:
     """The states and actions of one pair, as serialised messages with the time of their arrival.
 
-    clock: also the times that go with the states of a bundle; single_clock: also those on /clock
+    clock: also the times that go with the states of a batch; single_clock: also those on /clock
     where nothing is bundled (once is enough for several pairs); throttled: of some episodes only, as
     many as people can see, where the plant offers that. `handles` are the subscriptions to wait for;
     they may change with `look`.
@@ -95,14 +95,14 @@ class Watcher:
         self._offset = ClockOffset()
         name = SAMPLES_THROTTLED if throttled else SAMPLES
         depth = BUNDLE_DEPTH
-        self._bundles = self._subscribe(UInt8MultiArray, name, samples_qos(depth), depth)
+        self._batches = self._subscribe(UInt8MultiArray, name, samples_qos(depth), depth)
         self._singles: dict[int, Intake] = {}
         self._state_topic = node.resolve_topic_name(scoped(namespace, STATE.name))
-        self.handles: list[Any] = [self._bundles.subscription.handle]
+        self.handles: list[Any] = [self._batches.subscription.handle]
 
     def look(self) -> bool:
         """Look at the graph, and read single samples if they are not bundled; whether that changed."""
-        bundled = self._node.count_publishers(self._bundles.subscription.topic_name) > 0
+        bundled = self._node.count_publishers(self._batches.subscription.topic_name) > 0
         wanted = not bundled and self._node.count_publishers(self._state_topic) > 0
         if wanted == bool(self._singles):
             return False
@@ -115,18 +115,18 @@ class Watcher:
             for intake in self._singles.values():
                 self._node.destroy_subscription(intake.subscription)
             self._singles = {}
-        intakes = (self._bundles, *self._singles.values())
+        intakes = (self._batches, *self._singles.values())
         self.handles = [intake.subscription.handle for intake in intakes]
         return True
 
     def drain(self, until: int | None = None) -> Iterator[tuple[int, int, bytes]]:
         """Kind, time of arrival (ns since the epoch) and CDR bytes of everything that has come in.
 
-        until: as of Intake.take. Raises FrameError, after which it can be called again, for a bundle
+        until: as of Intake.take. Raises FrameError, after which it can be called again, for a batch
         that is none.
         """
-        for bundle, info in self._bundles.take(until):
-            sent, samples = unpack(bundle)
+        for batch, info in self._batches.take(until):
+            sent, samples = unpack(batch)
             offset = self._offset.update(sent, info["source_timestamp"], info["received_timestamp"])
             for sample in samples:
                 yield sample.kind, sample.stamp + offset, sample.raw
@@ -138,7 +138,7 @@ class Watcher:
 
     def close(self) -> None:
         """Stop reading; the plant then keeps no samples for this one."""
-        for intake in (self._bundles, *self._singles.values()):
+        for intake in (self._batches, *self._singles.values()):
             self._node.destroy_subscription(intake.subscription)
         self._singles, self.handles = {}, []
 

@@ -1,4 +1,4 @@
-"""A second look at a process: was it suspended (SIGSTOP, a frozen machine), is its loop stuck?"""
+"""Watchdog that detects a suspended process (SIGSTOP, a frozen machine) and a stuck event loop."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import threading
 import time
 from collections.abc import Callable
 
-BEAT = 0.1
-"""Seconds between two beats."""
+PERIOD = 0.1
+"""Seconds between two ticks."""
 IDLE = 0.05
-"""Share of a gap between two beats that a suspended process can have spent working: it worked at
-most BEAT before it was stopped. One that is starved by others still gets more."""
+"""Share of a gap between two ticks that a suspended process can have spent working: it worked at
+most PERIOD before it was stopped. One that is starved by others still gets more."""
 
 
 def nap(seconds: float) -> None:
@@ -21,28 +21,28 @@ def nap(seconds: float) -> None:
     select.select((), (), (), seconds)
 
 
-class Pulse:
+class SuspendWatchdog:
     """A thread that does nothing but wake up, so that only a suspension keeps it from it.
 
     The loop itself is no measure: it may compute for seconds. A thread that sleeps is scheduled
     promptly even on a busy machine, and NumPy and Numba let it in between.
 
-    each_beat: called from that thread, about every BEAT seconds.
+    on_tick: called from that thread, about every PERIOD seconds.
     """
 
     def __init__(
         self,
-        each_beat: Callable[[], None] | None = None,
+        on_tick: Callable[[], None] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._clock, self._each_beat = clock, each_beat
+        self._clock, self._on_tick = clock, on_tick
         self._lock = threading.Lock()
         self._longest = 0.0
         self._last, self._cpu = clock(), time.process_time()
         self._stopped = False
-        self._thread = threading.Thread(target=self._run, name="pulse", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="watchdog", daemon=True)
 
-    def __enter__(self) -> Pulse:
+    def __enter__(self) -> SuspendWatchdog:
         self._last, self._cpu = self._clock(), time.process_time()
         self._thread.start()
         return self
@@ -52,17 +52,17 @@ class Pulse:
 
     def longest(self) -> float:
         """The longest suspension in s so far, one that has just ended included."""
-        self._beat()
+        self._tick()
         return self._longest
 
     def _run(self) -> None:
         while not self._stopped:
-            nap(BEAT)
-            self._beat()
-            if self._each_beat and not self._stopped:
-                self._each_beat()
+            nap(PERIOD)
+            self._tick()
+            if self._on_tick and not self._stopped:
+                self._on_tick()
 
-    def _beat(self) -> None:
+    def _tick(self) -> None:
         with self._lock:
             now, cpu = self._clock(), time.process_time()
             gap, worked = now - self._last, cpu - self._cpu
