@@ -11,7 +11,7 @@ import numpy as np
 import rclpy
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
-from loop_interfaces.fast_path.channel import CAPACITY
+from loop_interfaces.fast_path.channel import CAPACITY, LARGE
 from loop_interfaces.frames import HEADER
 from loop_interfaces.ros.endpoints import raw_subscription, samples_qos
 from loop_interfaces.ros.node_loop import NodeLoop
@@ -142,8 +142,9 @@ def plant_on_topics(*, timed: bool = False, helped: bool = False, **overrides: o
         for bad in (good[:-8], good + bytes(8), good.replace(b"env", b"enw", 1)):
             peer.say(bad)
             assert answer_for(path, 1.0) == bad
-        peer.say(bad := good + bytes(100_000))
+        peer.say(bad := good + bytes(2 * LARGE))
         assert (answer_for(path, 1.0) or b"")[: len(bad)] == bad
+        assert all(slot.capacity <= LARGE for slot in path.channel._slots)
         assert plant.lockstep.step == 7
         # The next one, an old one again, and one that comes when the old one waits.
         _, state = plant.expected(good)

@@ -89,6 +89,8 @@ CHANNEL = np.dtype(
 CAPACITY = 16
 """Messages that the mailbox holds: twice what the middleware keeps for a reader of its own."""
 SLOTS = CAPACITY + 1
+LARGE = 2**20
+"""Bytes of a message in the mailbox whose memory is given back as soon as it was read."""
 SLOT_BYTES, BUFFER, LENGTH = 64, 0, 1
 """Size of an rcl_serialized_message_t, and the two of its words that are used."""
 MUTEX_BYTES = 64
@@ -328,6 +330,8 @@ class RclChannel:
             return None
         slot = SerializedMessage.from_address(message)
         raw = ctypes.string_at(slot.buffer, slot.length)
+        if slot.capacity > LARGE:
+            self._free(ctypes.byref(slot))
         pop(self.record)
         return raw
 
