@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import fields
 from functools import partial
 
 from rclpy.node import Node
@@ -23,7 +22,7 @@ from controller_node.responder import Responder
 from loop_interfaces.diagnostics import Health
 from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.parameters import EXECUTION, PROBLEM, model_order
+from loop_interfaces.parameters import model_order, taken_by
 from loop_interfaces.protocol import ModelFailure, Send
 from loop_interfaces.ros.endpoints import writer_qos
 from loop_interfaces.ros.node_loop import NodeLoop
@@ -43,21 +42,6 @@ from loop_interfaces.topics import (
     Topic,
 )
 
-CONTROLLER_PARAMETERS = (
-    *(
-        spec
-        for spec in PROBLEM
-        if spec.name
-        in (
-            "problem",
-            *(f.name for f in fields(DesignSettings)),
-        )
-    ),
-    *EXECUTION,
-)
-"""The parameters that concern the controller."""
-
-
 Handler = Callable[[Frame], Sequence[Send | ModelFailure]]
 
 
@@ -65,7 +49,7 @@ class ControllerNode:
     """Moves messages between the topics and the responder."""
 
     def __init__(self, node: Node, loop: NodeLoop) -> None:
-        values = declare(node, CONTROLLER_PARAMETERS, given_parameters(node))
+        values = declare(node, taken_by("controller_node"), given_parameters(node))
         settings = {k: v for k, v in values.items() if k not in ("problem", "pin")}
         loop.pin(values["pin"])
         responder = Responder(DesignSettings(**settings))
@@ -75,7 +59,7 @@ class ControllerNode:
         node.get_logger().info(f"{values['problem']}: order {model_order(values)} tracking law")
 
     def join(self, node: Node, loop: NodeLoop) -> None:
-        declare(node, CONTROLLER_PARAMETERS, given_parameters(node))
+        declare(node, taken_by("controller_node"), given_parameters(node))
         self._wire(node, loop)
 
     def _wire(self, node: Node, loop: NodeLoop) -> None:

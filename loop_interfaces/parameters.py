@@ -2,12 +2,15 @@
 
 A problem is one YAML file (loop_interfaces.spec), read unchanged by the three nodes
 (`--params-file`) and by the command line. The nodes declare from this table, the command line
-validates by it and docs/interfaces.md lists it. No ROS import.
+validates by it and docs/interfaces.md lists it. A parameter says itself which nodes take it
+(`nodes`) and under which heading of `pdeloop train --help` its flag stands (`group`), so that a new
+one is an entry here and its use. No ROS import.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from loop_interfaces.spec import Spec
@@ -15,14 +18,30 @@ from loop_interfaces.spec import Spec
 MAX_SEED = 2**53 - 1
 ROLLOUTS = 80
 """The budget of a seed that is given neither rollouts nor iterations."""
+NODES = {
+    "P": "pde_sim_node",
+    "C": "controller_node",
+    "T": "tuner_node",
+    "R": "recorder_node",
+    "V": "viewer_node",
+}
+"""Letters by which a parameter says which nodes take it."""
 
-INSTRUMENTS = (
+
+def _section(nodes: str, *specs: Spec) -> tuple[Spec, ...]:
+    """Parameters that these nodes take, where one does not say otherwise."""
+    return tuple(spec if spec.nodes else replace(spec, nodes=nodes) for spec in specs)
+
+
+INSTRUMENTS = _section(
+    "PT",
     Spec(
         "measurement_noise",
         0.0,
         "standard deviation of the noise on every number of the published state; 0: none",
         0.0,
         1e6,
+        group="problem",
     ),
     Spec(
         "process_noise",
@@ -31,6 +50,7 @@ INSTRUMENTS = (
         "N(0, sigma^2 sample_time / dx) per step and grid point; 0: none",
         0.0,
         1e6,
+        group="problem",
     ),
     Spec(
         "action_limit",
@@ -38,6 +58,8 @@ INSTRUMENTS = (
         "largest magnitude of an action, which saturates there; 0: no limit",
         0.0,
         1e9,
+        nodes="PCT",
+        group="problem",
     ),
     Spec(
         "sensors",
@@ -45,6 +67,7 @@ INSTRUMENTS = (
         "point sensors n_y, equally spaced, instead of the whole state; 0: the whole state",
         0,
         65536,
+        group="problem",
     ),
     Spec(
         "sensor_delays",
@@ -52,16 +75,19 @@ INSTRUMENTS = (
         "last measurements d of each sensor that the published state holds, if there are sensors",
         1,
         1024,
+        group="problem",
     ),
 )
 """What stands between the field and its controller (docs/robustness.md)."""
 
-PROBLEM = (
+PROBLEM = _section(
+    "PT",
     Spec(
         "problem",
         "burgers",
         "name of the problem, used in messages and result folders",
         file_name=True,
+        nodes="PCTV",
     ),
     Spec(
         "equation",
@@ -69,7 +95,14 @@ PROBLEM = (
         "PDE of the plant: a shipped or installed name; or code that the user has to allow, "
         "'package.module:Class' or 'path/to/file.py:Class'",
     ),
-    Spec("length", 1.0, "length L of the periodic domain", positive=True, unit="m"),
+    Spec(
+        "length",
+        1.0,
+        "length L of the periodic domain",
+        positive=True,
+        unit="m",
+        nodes="PTV",
+    ),
     Spec(
         "n_z",
         128,
@@ -78,7 +111,14 @@ PROBLEM = (
         65536,
         multiple_of=2,
     ),
-    Spec("n_a", 6, "actuators, the size of the action", 1, 1024),
+    Spec(
+        "n_a",
+        6,
+        "actuators, the size of the action",
+        1,
+        1024,
+        nodes="PCT",
+    ),
     Spec("actuator_width", 0.15, "width of one actuator as a share of L", positive=True, maximum=1),
     Spec("sample_time", 0.05, "sampling time; the action is held over it", positive=True, unit="s"),
     Spec(
@@ -88,9 +128,28 @@ PROBLEM = (
         positive=True,
         unit="s",
     ),
-    Spec("horizon", 300, "steps T of an episode", 1, 1_000_000),
-    Spec("state_weight", 1.0, "q of Q = q I in the stage cost", positive=True),
-    Spec("action_weight", 1.0, "r of R = r I in the stage cost", positive=True),
+    Spec(
+        "horizon",
+        300,
+        "steps T of an episode",
+        1,
+        1_000_000,
+        nodes="PTV",
+    ),
+    Spec(
+        "state_weight",
+        1.0,
+        "q of Q = q I in the stage cost",
+        positive=True,
+        nodes="PCTV",
+    ),
+    Spec(
+        "action_weight",
+        1.0,
+        "r of R = r I in the stage cost",
+        positive=True,
+        nodes="PCTV",
+    ),
     Spec(
         "divergence_bound",
         1e3,
@@ -98,34 +157,59 @@ PROBLEM = (
         positive=True,
         maximum=1e6,
     ),
-    Spec("reduced_order", 4, "n_s, order of the reduced model", 1, 1024),
+    Spec("reduced_order", 4, "n_s, order of the reduced model", 1, 1024, nodes="CT"),
     Spec(
         "identification",
         "regression",
         "how the reduced model is identified: least squares in reduced coordinates with the inputs "
         "whole, or the paper's truncated DMDc, which the optimizers that learn from costs begin with",
         choices=("regression", "dmdc"),
+        nodes="CT",
     ),
-    Spec("dmdc_rank", 0, "p of the identification dmdc, rank of [Z; Y]; 0: n_s + n_a", 0, 4096),
-    Spec("dmdc_order", 0, "n_s of the identification dmdc; 0: reduced_order", 0, 1024),
+    Spec(
+        "dmdc_rank",
+        0,
+        "p of the identification dmdc, rank of [Z; Y]; 0: n_s + n_a",
+        0,
+        4096,
+        nodes="CT",
+    ),
+    Spec("dmdc_order", 0, "n_s of the identification dmdc; 0: reduced_order", 0, 1024, nodes="CT"),
     Spec(
         "exploration_variance",
         0.1,
         "variance of each exploratory action, drawn from N(0, variance)",
         positive=True,
+        nodes="T",
     ),
     Spec(
-        "learning_rate", 1e-4, "eta of the policy gradient from the LQT warm start", positive=True
+        "learning_rate",
+        1e-4,
+        "eta of the policy gradient from the LQT warm start",
+        positive=True,
+        nodes="T",
     ),
-    Spec("learning_rate_from_zero", 1e-5, "eta of the policy gradient from zero", positive=True),
     Spec(
-        "smoothing_radius", 0.1, "r, size of the two-point perturbation", positive=True, maximum=1e6
+        "learning_rate_from_zero",
+        1e-5,
+        "eta of the policy gradient from zero",
+        positive=True,
+        nodes="T",
+    ),
+    Spec(
+        "smoothing_radius",
+        0.1,
+        "r, size of the two-point perturbation",
+        positive=True,
+        maximum=1e6,
+        nodes="T",
     ),
     *INSTRUMENTS,
 )
 """What a problem's YAML file may set, besides `physical.*` (the equation's own parameters)."""
 
-PLANT = (
+PLANT = _section(
+    "P",
     Spec(
         "action_timeout",
         0.05,
@@ -160,6 +244,7 @@ PLANT = (
         0.0,
         1e6,
         live=True,
+        group="problem",
     ),
     Spec(
         "solver_cores",
@@ -174,7 +259,8 @@ PLANT = (
     ),
 )
 
-EXECUTION = (
+EXECUTION = _section(
+    "PC",
     Spec(
         "pin",
         -1,
@@ -185,10 +271,23 @@ EXECUTION = (
 )
 """How plant and controller use the machine."""
 
-TUNER = (
-    Spec("seed", 0, "seed of everything random in the training", 0, MAX_SEED),
+TUNER = _section(
+    "T",
     Spec(
-        "seeds", 1, "trainings side by side in one batch, with seeds seed, seed + 1, ...", 1, 1024
+        "seed",
+        0,
+        "seed of everything random in the training",
+        0,
+        MAX_SEED,
+        group="budget and method",
+    ),
+    Spec(
+        "seeds",
+        1,
+        "trainings side by side in one batch, with seeds seed, seed + 1, ...",
+        1,
+        1024,
+        group="budget and method",
     ),
     Spec(
         "rollouts",
@@ -197,6 +296,7 @@ TUNER = (
         f"them; 0: {ROLLOUTS}, unless 'iterations' is given",
         0,
         2_000_000,
+        group="budget and method",
     ),
     Spec(
         "iterations",
@@ -205,12 +305,14 @@ TUNER = (
         "exploration and check, as the paper counts; 0: not given",
         0,
         1_000_000,
+        group="budget and method",
     ),
     Spec(
         "start",
         "lqt",
         "where the policy starts: the LQT gains of the reduced model, or zero",
         choices=("lqt", "zero"),
+        group="budget and method",
     ),
     Spec(
         "model",
@@ -266,6 +368,7 @@ TUNER = (
         "gauss_newton",
         "method of the adapt phase",
         choices=("two_point", "directions", "gauss_newton"),
+        group="budget and method",
     ),
     Spec(
         "directions",
@@ -273,6 +376,7 @@ TUNER = (
         "directions D of a step of the optimizer 'directions', which takes 2 D rollouts side by side",
         1,
         1_000_000,
+        group="budget and method",
     ),
     Spec(
         "recorder",
@@ -285,17 +389,20 @@ TUNER = (
         "pairs",
         [""],
         "namespaces of the plant and controller pairs that serve this tuner, relative to its own",
+        nodes="TR",
     ),
 )
 
-RECORDER = (
+RECORDER = _section(
+    "R",
     Spec("bag", "", "new folder of the bag; empty: bags/ and the time"),
     Spec("bag_storage", "mcap", "format of the bag", choices=("mcap", "sqlite3")),
     Spec("bag_per_episode", False, "one bag an episode instead of one for all"),
     Spec("record_clock", True, "record /clock, too"),
 )
 
-VIEWER = (
+VIEWER = _section(
+    "V",
     Spec("view_rate", 10.0, "views a second", 0.1, 100.0, unit="1/s", live=True),
     Spec(
         "view_environment",
@@ -336,6 +443,16 @@ def model_order(values: Mapping[str, Any]) -> int:
     own = values["dmdc_order"] if values["identification"] == "dmdc" else 0
     order: int = own or values["reduced_order"]
     return order
+
+
+def taken_by(node: str) -> tuple[Spec, ...]:
+    """The parameters of a node, by the name of its package."""
+    return tuple(spec for spec in table() if node in (NODES[letter] for letter in spec.nodes))
+
+
+def flags(group: str | None = None) -> tuple[Spec, ...]:
+    """The parameters that `pdeloop train` and the launch files have a flag for, in a group or all."""
+    return tuple(spec for spec in table() if spec.group and group in (None, spec.group))
 
 
 def noisy(values: Mapping[str, Any]) -> bool:

@@ -5,6 +5,7 @@ A file is YAML in ROS parameter-file form (`/**: ros__parameters: ...`).
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import math
 import re
@@ -31,7 +32,9 @@ class Spec:
 
     minimum, maximum: inclusive, unless `positive` (then value > 0). choices: the allowed words.
     live: it may be changed while the node runs, because no result depends on it. file_name: a text that
-    names files and folders, and therefore holds no path.
+    names files and folders, and therefore holds no path. nodes: letters of the nodes that take it
+    (loop_interfaces.parameters.NODES). group: heading of `pdeloop train --help` under which its flag
+    stands; empty: it has none.
     """
 
     name: str
@@ -45,6 +48,13 @@ class Spec:
     multiple_of: int = 1
     live: bool = False
     file_name: bool = False
+    nodes: str = ""
+    group: str = ""
+
+    @property
+    def flag(self) -> str:
+        """As the command line writes it."""
+        return f"--{self.name.replace('_', '-')}"
 
     @property
     def type(self) -> type:
@@ -80,6 +90,19 @@ class Spec:
                 + (f" ({self.unit})" if self.unit else "")
             )
         return good
+
+    def parse(self, text: str) -> Value:
+        """The value that a text stands for, as in a launch argument; a ParameterError if it is bad.
+
+        >>> Spec("horizon", 300, "steps of an episode", 1).parse("20")
+        20
+        """
+        words = {"true": True, "false": False}
+        value: Any = words.get(text, text) if self.type is bool else text
+        if self.type in (int, float):
+            with contextlib.suppress(ValueError):
+                value = self.type(text)
+        return self.check(value)
 
     def _coerce(self, value: Any) -> Any:
         if self.type is float and isinstance(value, int) and not isinstance(value, bool):

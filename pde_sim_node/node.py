@@ -19,7 +19,7 @@ from rosgraph_msgs.msg import Clock
 from loop_interfaces.affinity import core_list
 from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.parameters import EXECUTION, PLANT, PROBLEM
+from loop_interfaces.parameters import PLANT, taken_by
 from loop_interfaces.protocol import Send
 from loop_interfaces.ros.introspection import offer
 from loop_interfaces.ros.node_loop import NodeLoop
@@ -43,9 +43,8 @@ def declare_parameters(node: Node, changed: Mapping[str, Any] | None = None) -> 
     changed: live ones as they were set meanwhile, when the network is joined again.
     """
     given = {**given_parameters(node), **(changed or {})}
-    names = {spec.name for spec in PLANT_PARAMETERS}
     physical = {name: value for name, value in given.items() if name.startswith("physical.")}
-    values = declare(node, [s for s in PROBLEM if s.name in names] + [*PLANT, *EXECUTION], given)
+    values = declare(node, taken_by("pde_sim_node"), given)
     specs = [
         Spec(
             f"physical.{item.name}",
@@ -59,11 +58,6 @@ def declare_parameters(node: Node, changed: Mapping[str, Any] | None = None) -> 
         if item.name != "length"
     ]
     return {**physical, **values, **declare(node, specs, given)}
-
-
-_OTHERS = ("dmdc", "reduced", "identification", "exploration", "learning", "smoothing")
-PLANT_PARAMETERS = tuple(spec for spec in PROBLEM if not spec.name.startswith(_OTHERS))
-"""The problem parameters that concern the plant."""
 
 
 class PlantNode:

@@ -103,6 +103,7 @@ def parser() -> argparse.ArgumentParser:
     commands = root.add_subparsers(required=True, metavar="COMMAND")
     for module in (train, evaluate, bag, monitor, reproduce, secure, problems, completion):
         module.add(commands)
+    root.set_defaults(root=root)  # for what is made from the parser itself
     return root
 
 

@@ -23,7 +23,7 @@ from std_msgs.msg import Float64MultiArray, String
 
 from loop_interfaces.frames import FrameError
 from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.parameters import RECORDER, TUNER
+from loop_interfaces.parameters import taken_by
 from loop_interfaces.ros.endpoints import raw_subscription, reader_qos, scoped
 from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.node_main import ConfigurationError, node_main
@@ -76,8 +76,7 @@ STATUS_QOS = QoSProfile(
 
 
 def _declare(node: Node) -> dict[str, Any]:
-    pairs = [spec for spec in TUNER if spec.name == "pairs"]
-    return declare(node, [*RECORDER, *pairs], given_parameters(node))
+    return declare(node, taken_by("recorder_node"), given_parameters(node))
 
 
 class RecorderNode:

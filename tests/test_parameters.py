@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import pytest
 
-from loop_interfaces.parameters import PROBLEM, table
+from loop_interfaces.parameters import NODES, PROBLEM, table, taken_by
 from loop_interfaces.problem import load_parameters, shipped_problems
 from loop_interfaces.spec import ParameterError as Refused
 from loop_interfaces.spec import (
@@ -108,3 +111,37 @@ def test_an_equation_file_is_found_beside_its_yaml(tmp_path):
     assert (
         load_parameters(str(tmp_path / "mine.yaml"), {})["equation"] == f"{tmp_path}/heat.py:Heat"
     )
+
+
+def test_the_documents_table_is_that_of_the_specs():
+    """docs/interfaces.md: name, default, unit, nodes and meaning of every parameter, in any order."""
+    text = (Path(__file__).parent.parent / "docs" / "interfaces.md").read_text()
+    rows = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in text.splitlines()]
+    rows = [row for row in rows if len(row) == 6 and row[0][:1] == "`" and "physical" not in row[1]]
+    documented = {row[0].strip("`"): row for row in rows}
+    for spec in table():
+        default = str(spec.default).lower() if spec.type is bool else str(spec.default)
+        _, shown, _, unit, nodes, meaning = documented.pop(spec.name, [""] * 6)
+        if spec.name != "pairs":
+            assert shown == (f"`{default}`" if default else "empty"), spec.name
+        assert (unit, nodes) == (spec.unit, " ".join(spec.nodes)), spec.name
+        assert re.sub(r"\[(.*?)\]\(.*?\)", r"\1", meaning) == spec.description, spec.name
+    assert documented == {}
+
+
+def test_a_text_is_parsed_as_its_parameter_asks():
+    assert SPECS["horizon"].parse("20") == 20
+    assert SPECS["sample_time"].parse("1e-3") == 1e-3
+    assert SPECS["publish_clock"].parse("false") is False
+    assert SPECS["problem"].parse("5") == "5"
+    for name, text in (("horizon", "2.5"), ("sample_time", "fast"), ("publish_clock", "no")):
+        with pytest.raises(Refused, match=f"'{name}' is '{text}'; expected"):
+            SPECS[name].parse(text)
+
+
+def test_every_parameter_says_which_nodes_take_it():
+    for node in ("pde_sim_node", "controller_node", "tuner_node", "recorder_node", "viewer_node"):
+        assert taken_by(node)
+    assert {spec.name for spec in table()} == {
+        spec.name for node in NODES.values() for spec in taken_by(node)
+    }

@@ -23,7 +23,7 @@ from std_msgs.msg import String
 
 from loop_interfaces.frames import MAX_ID, Frame
 from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.parameters import PROBLEM, TUNER, with_budget
+from loop_interfaces.parameters import TUNER, taken_by, with_budget
 from loop_interfaces.protocol import NO_CONTROLLER, STOPPED, ModelFailure
 from loop_interfaces.ros.endpoints import Sender, reader_qos, scoped
 from loop_interfaces.ros.introspection import offer
@@ -70,7 +70,7 @@ def declare_parameters(node: Node, changed: Mapping[str, Any] | None = None) -> 
     changed: live ones as they were set meanwhile, when the network is joined again.
     """
     given = {**given_parameters(node), **(changed or {})}
-    values = with_budget(declare(node, [*PROBLEM, *TUNER], given))
+    values = with_budget(declare(node, taken_by("tuner_node"), given))
     # The equation's own parameters are the plant's to check; here they only identify the run.
     return values | {name: value for name, value in given.items() if name.startswith("physical.")}
 

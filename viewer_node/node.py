@@ -21,7 +21,7 @@ from std_msgs.msg import ColorRGBA, Float64
 from visualization_msgs.msg import Marker
 
 from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.parameters import PROBLEM, VIEWER
+from loop_interfaces.parameters import VIEWER, taken_by
 from loop_interfaces.ros.node_main import node_main
 from loop_interfaces.ros.observer import Observer
 from loop_interfaces.ros.parameters import declare, given_parameters, on_change
@@ -38,16 +38,6 @@ FRAME_ID = "field"
 LINE_WIDTH = 0.006
 """Width of the lines, as a share of the domain's length."""
 COLOURS = {"field": (0.13, 0.40, 0.67), "target": (0.90, 0.45, 0.10)}
-
-VIEWER_PARAMETERS = (
-    *(
-        spec
-        for spec in PROBLEM
-        if spec.name in ("problem", "length", "horizon", "state_weight", "action_weight")
-    ),
-    *VIEWER,
-)
-"""The parameters that concern the viewer."""
 
 
 class ViewerNode:
@@ -70,7 +60,7 @@ class ViewerNode:
         self._wire(node, loop)
 
     def _declare(self, node: Node) -> dict[str, Any]:
-        return declare(node, VIEWER_PARAMETERS, {**given_parameters(node), **self._changed})
+        return declare(node, taken_by("viewer_node"), {**given_parameters(node), **self._changed})
 
     def _wire(self, node: Node, loop: Observer) -> None:
         self._node, self._loop = node, loop

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable
 from typing import TypeAlias
 
-from loop_interfaces.parameters import TUNER
+from loop_interfaces.parameters import TUNER, flags
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 """Where a command adds its parser."""
@@ -36,6 +36,29 @@ def command(
     if run is not None:
         parser.set_defaults(command=run)
     return parser
+
+
+def add_flags(parser: argparse._ActionsContainer, group: str) -> None:
+    """The flags of a group of parameters (loop_interfaces.parameters)."""
+    for spec in flags(group):
+        parser.add_argument(
+            spec.flag,
+            type=_word if spec.choices else spec.type,
+            choices=spec.choices or None,
+            metavar=None if spec.choices else "N" if spec.type is int else "X",
+            help=f"{spec.description} [{spec.default}]".replace("%", "%%"),
+        )
+
+
+def given_flags(options: argparse.Namespace) -> dict[str, object]:
+    """The parameters whose flags were given, by name."""
+    given = {spec.name: getattr(options, spec.name) for spec in flags()}
+    return {name: value for name, value in given.items() if value is not None}
+
+
+def _word(text: str) -> str:
+    """gauss-newton as well as gauss_newton."""
+    return text.replace("-", "_")
 
 
 def add_json(parser: argparse._ActionsContainer, what: str = "print JSON") -> None:

@@ -30,11 +30,8 @@ def add(commands: Commands) -> None:
 def _completion(options: argparse.Namespace) -> int:
     import shtab
 
-    from pdeloop.cli import parser
-
-    root = parser()
-    _say_what_follows(root, shtab)
-    print(shtab.complete(root, shell=options.shell))
+    _say_what_follows(options.root, shtab)
+    print(shtab.complete(options.root, shell=options.shell))
     return 0
 
 

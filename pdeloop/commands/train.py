@@ -5,10 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from loop_interfaces.parameters import INSTRUMENTS, ROLLOUTS
 from loop_interfaces.problem import shipped_problems
 from loop_interfaces.spec import ParameterError
-from pdeloop.commands.common import DEFAULTS, Commands, add_json, command
+from pdeloop.commands.common import Commands, add_flags, add_json, command, given_flags
 
 
 def add(commands: Commands) -> None:
@@ -23,7 +22,8 @@ def add(commands: Commands) -> None:
         "nodes in processes of their own.",
         example="pdeloop train burgers --rollouts 80 --seed 0",
     )
-    add = train.add_argument_group("problem").add_argument
+    problem = train.add_argument_group("problem")
+    add = problem.add_argument
     add(
         "problem",
         nargs="?",
@@ -36,45 +36,10 @@ def add(commands: Commands) -> None:
         help="the plant's PDE instead of that of the problem; an own one, 'file.py:Class' or "
         "'package.module:Class', has to be named here, as a problem's file alone runs no code",
     )
-    for spec in INSTRUMENTS:
-        add(
-            f"--{spec.name.replace('_', '-')}",
-            type=spec.type,
-            metavar="N" if spec.type is int else "X",
-            help=f"{spec.description} [{spec.default}]",
-        )
-    add = train.add_argument_group("budget and method").add_argument
-    add(
-        "--rollouts",
-        type=int,
-        metavar="N",
-        help="budget of a seed: all rollouts before the closing evaluation, explorations and checks "
-        f"among them [{ROLLOUTS}]",
-    )
-    add(
-        "--iterations",
-        type=int,
-        metavar="N",
-        help="instead of --rollouts, for --optimizer two-point: iterations of two rollouts each, "
-        "after exploration and check, as the paper counts",
-    )
-    for name, metavar in (("seed", "S"), ("seeds", "N")):
-        spec = DEFAULTS[name]
-        add(f"--{name}", type=int, metavar=metavar, help=f"{spec.description} [{spec.default}]")
-    for name in ("start", "optimizer"):
-        spec = DEFAULTS[name]
-        add(
-            f"--{name}",
-            type=lambda text: text.replace("-", "_"),  # gauss-newton as well as gauss_newton
-            choices=spec.choices,
-            help=f"{spec.description} [{spec.default}]",
-        )
-    add(
-        "--directions",
-        type=int,
-        metavar="D",
-        help="directions of a step, which takes 2 D rollouts side by side (--optimizer directions)",
-    )
+    add_flags(problem, "problem")
+    method = train.add_argument_group("budget and method")
+    add_flags(method, "budget and method")
+    add = method.add_argument
     add(
         "--model",
         type=Path,
@@ -149,9 +114,7 @@ def _train(options: argparse.Namespace) -> int:
         options.view,
         options.spread,
     )
-    names = ["rollouts", "iterations", "seed", "seeds", "start", "optimizer", "directions"]
-    names += [spec.name for spec in INSTRUMENTS]
-    given = {n: getattr(options, n) for n in names if getattr(options, n) is not None}
+    given = given_flags(options)
     if (
         options.directions is not None
         and given.setdefault("optimizer", "directions") != "directions"
