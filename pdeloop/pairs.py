@@ -1,6 +1,6 @@
 """The nodes of a run: which plants and controllers serve one tuner, and what each is told.
 
-`pdeloop train` starts them as processes (pdeloop.supervisor), `ros2 launch` by the launch files.
+`pdeloop train` starts them as processes (pdeloop.supervisor); `ros2 launch` by the files in launch/.
 """
 
 from __future__ import annotations
@@ -9,14 +9,17 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from loop_interfaces.affinity import core_text, least_busy_cores, usable_cores
-from loop_interfaces.spec import ParameterError
+from loop_interfaces.spec import ParameterError, Spec
 from pde_sim_node.build import fingerprint
 from tuner_node.results import RunFolder
 
 MAX_PAIRS = 64
 """On one machine; on several, start the pairs by hand (docs/scaling.md)."""
+PAIRS = Spec("pairs", 1, "plants with a controller each", 1, MAX_PAIRS)
+"""How many pairs a command or a launch file starts."""
 PLACEMENTS = ("shared", "pinned", "any")
 """Where plant and controller of a pair run, for good: on one core for both, which they take in turns,
 so that a message wakes no idle core; the same, with a core for each pair and the plant's helpers
@@ -92,6 +95,14 @@ def pair_cores(pairs: int, placement: str) -> list[int | None]:
     return list(least_busy_cores(pairs))
 
 
+def core_parameters(package: str, core: int | None, *, solver_polls: bool) -> dict[str, Any]:
+    """What keeps a node of a pair on its core, and the plant's helpers on all."""
+    if core is None:
+        return {}
+    solver = {"solver_cores": core_text(usable_cores()), "solver_polls": solver_polls}
+    return {"pin": core, **(solver if package == "pde_sim_node" else {})}
+
+
 def pair_nodes(
     cores: Sequence[int | None],
     remaps: Mapping[str, Sequence[str]] | None = None,
@@ -105,12 +116,10 @@ def pair_nodes(
     nodes = []
     for number, (namespace, core) in enumerate(zip(namespaces(len(cores)), cores, strict=True)):
         for package in PAIR:
-            parameters = [] if core is None else [f"pin:={core}"]
+            own = core_parameters(package, core, solver_polls=solver_polls)
+            parameters = [f"{name}:={argument(value)}" for name, value in own.items()]
             if number and package == "pde_sim_node":  # /clock is one topic for all
                 parameters.append("publish_clock:=false")
-            if core is not None and package == "pde_sim_node":
-                parameters.append(f"solver_cores:={quoted(core_text(usable_cores()))}")
-                parameters.append(f"solver_polls:={str(solver_polls).lower()}")
             name = f"{package}-{namespace}" if namespace else package
             more = (remaps or {}).get(package, ())
             nodes.append(LoopNode(name, package, parameters, more, namespace))
@@ -165,6 +174,13 @@ class Layout:
 def tuner_parameter(pairs: int) -> list[str]:
     """What the tuner and the recorder have to know of the pairs."""
     return [f"pairs:=[{', '.join(namespaces(pairs) if pairs > 1 else [quoted('')])}]"]
+
+
+def argument(value: object) -> str:
+    """A value as a ROS argument."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return quoted(value) if isinstance(value, str) else str(value)
 
 
 def quoted(text: object) -> str:

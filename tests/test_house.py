@@ -23,7 +23,6 @@ WITH_ROS = {
     "endpoints.py",
     "introspection.py",
     "parameters.py",
-    "launch_actions.py",
 }
 """Files that may import rclpy or messages."""
 ROS = (

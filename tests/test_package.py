@@ -5,22 +5,26 @@ from __future__ import annotations
 import argparse
 import ast
 import importlib.util
+import json
+import os
 import re
+import subprocess
+import sys
 import tomllib
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from loop_interfaces.parameters import table
-from loop_interfaces.spec import ParameterError, read_yaml
+from loop_interfaces.isolation import NETWORK
+from loop_interfaces.parameters import flags, table
+from loop_interfaces.spec import read_yaml
+from pde_sim_node.build import fingerprint
 from pde_sim_node.equations import ALLOWED
-from pdeloop import cli, launch_plan
-from pdeloop.launch_plan import LOOP_ARGUMENTS, TRAIN_ARGUMENTS, loop_plan, train_plan
-from pdeloop.pairs import LoopNode
+from pdeloop import cli
 from tests.colcon_workspace import ROOT, Workspace, build
 from tests.small import SMALL
-from tuner_node.results import RunFolderError
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 NODES = ("pde_sim_node", "controller_node", "tuner_node", "recorder_node")
@@ -40,7 +44,8 @@ def test_the_manifest_names_every_ros_package_that_is_imported() -> None:
     declared = {e.text for e in ElementTree.parse(ROOT / "package.xml").iter("exec_depend")}
     ros = re.compile(r"rclpy|launch|launch_ros|[a-z_]+_(msgs|srvs|interfaces)")
     used = set()
-    for package in {name.split(".")[0] for name in PROJECT["tool"]["setuptools"]["packages"]}:
+    packages = {name.split(".")[0] for name in PROJECT["tool"]["setuptools"]["packages"]}
+    for package in (*packages, "launch"):
         for path in (ROOT / package).rglob("*.py"):
             for node in ast.walk(ast.parse(path.read_text())):
                 names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
@@ -110,42 +115,81 @@ def test_merged_and_linked_installations_work_too(option: str, tmp_path: Path) -
     assert str(used / "config/problems/burgers.yaml") in done.stdout
 
 
-def names_of(node: LoopNode) -> list[str]:
-    return [word.partition(":=")[0] for word in node.parameters]
+def launched(file: str, **texts: object) -> list[dict[str, Any]]:
+    """The nodes that a launch file starts with these arguments, as the stand-in for launch says."""
+    program = (
+        "import sys\n"
+        "from launch import LaunchDescription, LaunchService\n"
+        "from launch.actions import IncludeLaunchDescription\n"
+        "from launch.launch_description_sources import PythonLaunchDescriptionSource\n"
+        "arguments = [tuple(word.split(':=', 1)) for word in sys.argv[2:]]\n"
+        "source = PythonLaunchDescriptionSource(sys.argv[1])\n"
+        "service = LaunchService()\n"
+        "included = IncludeLaunchDescription(source, launch_arguments=arguments)\n"
+        "service.include_launch_description(LaunchDescription([included]))\n"
+        "sys.exit(service.run())\n"
+    )
+    path = os.pathsep.join([str(ROOT / "tests" / "launch_stand_in"), str(ROOT)])
+    words = [f"{name}:={text}" for name, text in texts.items()]
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(ROOT / "launch" / file), *words],
+        env={**os.environ, "PYTHONPATH": path, "LAUNCH_DRY_RUN": "1"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert "Traceback" not in done.stderr, done.stderr
+    said = done.stdout.splitlines()
+    if done.returncode:
+        raise ValueError(said[0])
+    return [json.loads(line) for line in said if line.startswith("{")]
 
 
-def train(**texts: object) -> launch_plan.Plan:
-    return train_plan({"problem": str(SMALL), **{k: str(v) for k, v in texts.items()}})
+def train(**texts: object) -> list[dict[str, Any]]:
+    return launched("train.launch.py", problem=SMALL, **texts)
+
+
+def given_to(node: dict[str, Any]) -> dict[str, Any]:
+    """What a node is told besides the parameter file."""
+    own: dict[str, Any] = node["parameters"][1]
+    return own
 
 
 def test_a_launched_training_has_the_nodes_and_parameters_that_exist(tmp_path: Path) -> None:
-    plan = train(out=tmp_path / "run", pairs=2, record="true", iterations=3, real_time_factor=50)
-    assert [node.name for node in plan.nodes] == [
-        "recorder_node",
-        *("pde_sim_node-pair0", "controller_node-pair0"),
-        *("pde_sim_node-pair1", "controller_node-pair1"),
-        "tuner_node",
+    run = tmp_path / "run"
+    nodes = train(out=run, pairs=2, record="true", iterations=3, real_time_factor=50, view="true")
+    assert [(node["executable"], node["namespace"]) for node in nodes] == [
+        ("recorder_node", ""),
+        *(("pde_sim_node", "pair0"), ("controller_node", "pair0")),
+        *(("pde_sim_node", "pair1"), ("controller_node", "pair1")),
+        ("tuner_node", ""),
+        ("viewer_node", "pair0"),
     ]
     known = {spec.name for spec in table()}
-    for node in plan.nodes:
-        assert node.package in PROJECT["project"]["scripts"]
-        assert importlib.util.find_spec(f"{node.package}.node") is not None
-        assert set(names_of(node)) <= known
-    values = read_yaml(plan.parameter_file)
+    for node in nodes:
+        assert node["executable"] in PROJECT["project"]["scripts"]
+        assert importlib.util.find_spec(f"{node['executable']}.node") is not None
+        assert set(given_to(node)) <= known
+        assert node["parameters"][0] == str(run / "parameters.yaml")
+    values = read_yaml(run / "parameters.yaml")
     assert (values["iterations"], values["real_time_factor"], values["n_z"]) == (3, 50.0, 32)
-    assert "recorder:=start" in plan.nodes[-1].parameters
+    by_name = {node["executable"]: given_to(node) for node in nodes}
+    assert by_name["tuner_node"]["recorder"] == "start"
+    assert by_name["tuner_node"]["plant"] == fingerprint(values)
+    assert by_name["tuner_node"]["pairs"] == by_name["recorder_node"]["pairs"] == ["pair0", "pair1"]
+    assert [given_to(node)["publish_clock"] for node in nodes[1:5:2]] == [True, False]
 
 
 def test_an_interrupted_launched_training_is_continued_with_its_own_parameters(tmp_path) -> None:
-    first = train(out=tmp_path / "run", iterations=3)
-    again = train_plan({"resume": str(tmp_path / "run"), "record_or_stop": "true"})
-    assert again.parameter_file == first.parameter_file
-    assert "recorder:=required" in again.nodes[-1].parameters
-    with pytest.raises(ParameterError, match="leave out seed"):
-        train_plan({"resume": str(tmp_path / "run"), "seed": "1"})
-    with pytest.raises(RunFolderError, match="no run in"):
-        train_plan({"resume": str(tmp_path)})
-    with pytest.raises(RunFolderError, match="already holds a run"):
+    train(out=tmp_path / "run", iterations=3)
+    again = launched("train.launch.py", resume=tmp_path / "run", record_or_stop="true")
+    assert again[0]["parameters"][0] == str(tmp_path / "run" / "parameters.yaml")
+    assert given_to(again[-1])["recorder"] == "required"
+    with pytest.raises(ValueError, match="leave out seed"):
+        launched("train.launch.py", resume=tmp_path / "run", seed=1)
+    with pytest.raises(ValueError, match="no run in"):
+        launched("train.launch.py", resume=tmp_path)
+    with pytest.raises(ValueError, match="already holds a run"):
         train(out=tmp_path / "run")
 
 
@@ -155,8 +199,8 @@ def test_an_interrupted_launched_training_is_continued_with_its_own_parameters(t
         ({"problem": "stokes"}, "unknown problem 'stokes'"),
         ({"iterations": "many"}, "parameter 'iterations' is 'many'; expected a whole number"),
         ({"pairs": "0"}, "parameter 'pairs' is 0; expected"),
-        ({"record": "yes"}, "parameter 'record' is 'yes'; expected true or false"),
-        ({"optimizer": "adam"}, "parameter 'optimizer' is 'adam'"),
+        ({"record": "yes"}, "yes"),
+        ({"optimizer": "adam"}, "adam"),
         ({"real_time_factor": "-1"}, "parameter 'real_time_factor' is -1.0"),
         ({"pairs": "64", "pin": "true"}, "a core of its own"),
     ],
@@ -165,7 +209,7 @@ def test_a_bad_argument_is_refused_before_anything_is_made(
     texts: dict[str, str], said: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ValueError, match=said):
-        train(out=tmp_path / "run", **texts)
+        launched("train.launch.py", **{"problem": SMALL, "out": tmp_path / "run", **texts})
     assert list(tmp_path.iterdir()) == []
 
 
@@ -181,39 +225,38 @@ def own_equation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_code_that_only_a_problems_file_names_is_not_run(own_equation: Path) -> None:
-    out = str(own_equation.parent / "run")
+    out, own = own_equation.parent / "run", f"{own_equation.parent}/own.py:Own"
     with pytest.raises(ValueError, match="is code, which is not run because a file names it"):
-        train_plan({"problem": str(own_equation), "out": out})
-    plan = train_plan(
-        {"problem": str(own_equation), "out": out, "equation": f"{own_equation.parent}/own.py:Own"}
-    )
-    assert plan.environment == {ALLOWED: f",{own_equation.parent}/own.py:Own".lstrip(",")}
+        launched("train.launch.py", problem=own_equation, out=out)
+    nodes = launched("train.launch.py", problem=own_equation, out=out, equation=own)
+    assert all(own in node["environment"][ALLOWED].split(",") for node in nodes)
 
 
 def test_a_loop_without_a_tuner_finds_an_equation_beside_its_file(own_equation: Path) -> None:
-    plan = loop_plan({"problem": str(own_equation), "namespace": "lab", "process_noise": "0.1"})
-    assert plan.namespace == "lab"
-    assert plan.environment == {}
-    for node in plan.nodes:
-        assert f"equation:='{own_equation.parent / 'own.py'}:Own'" in node.parameters
-        assert "process_noise:=0.1" in node.parameters
+    nodes = launched("loop.launch.py", problem=own_equation, namespace="lab", process_noise=0.1)
+    assert [node["executable"] for node in nodes] == ["pde_sim_node", "controller_node"]
+    for node in nodes:
+        assert node["namespace"] == "lab"
+        assert given_to(node)["equation"] == f"{own_equation.parent / 'own.py'}:Own"
+        assert given_to(node)["process_noise"] == 0.1
+        assert NETWORK not in node["environment"]
+    nodes = launched("loop.launch.py", problem=SMALL, network="true")
+    assert all(node["environment"][NETWORK] == "1" for node in nodes)
 
 
-def test_what_train_takes_is_a_launch_argument_too() -> None:
+def test_what_train_takes_is_a_launch_argument_too(tmp_path: Path) -> None:
     subcommands = next(
         a for a in cli.parser()._actions if isinstance(a, argparse._SubParsersAction)
     )
     actions = subcommands.choices["train"]._actions
-    known = {argument.spec.name for argument in TRAIN_ARGUMENTS}
-    # `ros2 launch` does not place processes, whence no spread.
-    not_for_launch = {"help", "in_process", "faulty_line", "json", "spread"}
-    assert {action.dest for action in actions} - not_for_launch <= known
-
-
-def test_every_launch_argument_is_described() -> None:
-    for argument in (*LOOP_ARGUMENTS, *TRAIN_ARGUMENTS):
-        assert len(argument.description) > 10
-        assert argument.value(argument.default) in (None, argument.spec.default)
+    text = (ROOT / "launch/train.launch.py").read_text() + (
+        ROOT / "launch/loop.launch.py"
+    ).read_text()
+    known = {spec.name for spec in flags()} | set(re.findall(r'"([a-z_]+)"', text))
+    # About processes that `pdeloop train` starts itself, and about bags.
+    others = {"help", "in_process", "faulty_line", "json", "spread"}
+    others |= {"bag_storage", "bag_per_episode"}
+    assert {action.dest for action in actions} - others <= known
 
 
 def test_the_package_says_who_makes_it_and_where_it_lives() -> None:

@@ -1,0 +1,3 @@
+"""Events of processes."""
+
+from launch import ProcessExited as ProcessExited
