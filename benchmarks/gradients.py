@@ -12,7 +12,7 @@ law a = K_a s + b = theta [s; 1], s = U^T z.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from pde_sim_node.measurement import InstrumentedPlant
 from pde_sim_node.plant import Plant
 from pde_sim_node.solver.adjoint import Adjoint
+from pdeloop.rollout import Law, rollout
 
 __all__ = ["Gradients", "features"]
 
@@ -111,19 +112,21 @@ class Gradients:
             fields, lambda _, states: features(U, self.plant.target, states) @ theta.T
         )
 
-    def _roll(self, fields: Sequence[int], act: Callable[[int, Array], Array]) -> Path:
+    def _roll(self, fields: Sequence[int], law: Law) -> Path:
+        def finite(k: int, z: Array) -> Array:
+            a = law(k, z)
+            if not np.isfinite(a).all():
+                raise FloatingPointError
+            return a
+
         plant = self.plant
-        states = np.empty((plant.horizon, len(fields), plant.n_z))
-        actions = np.empty((plant.horizon, len(fields), plant.n_a))
-        z = plant.reset(np.array(fields, dtype=np.int64))
-        for k in range(plant.horizon):
-            states[k] = z
-            actions[k] = act(k, states[k])
-            if not np.isfinite(actions[k]).all():
-                return Path(states, actions, np.full(len(fields), np.inf), False)
-            z = plant.step(actions[k])
-        costs = plant.episode_costs()
-        return Path(states, actions, costs.mean, not (costs.diverged_step >= 0).any())
+        try:
+            episode = rollout(plant, finite, fields)
+        except FloatingPointError:  # gains so large that the actions overflow
+            nothing = np.empty((plant.horizon, len(fields), 0))
+            return Path(nothing, nothing, np.full(len(fields), np.inf), False)
+        whole = not (episode.costs.diverged_step >= 0).any()
+        return Path(episode.states[:-1], episode.actions, episode.costs.mean, whole)
 
     def _backwards(
         self, path: Path, U: Array | None = None, theta: Array | None = None

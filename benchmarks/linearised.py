@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import Plant
+from pdeloop.rollout import Law, rollout
 from tuner_node.seeds import Purpose, derive
 
 SMALL = 1e-6
@@ -34,6 +35,11 @@ def linearisation(plant: Plant) -> tuple[NDArray[np.float64], NDArray[np.float64
         minus, _ = plant.evaluate(-SMALL * states, -SMALL * actions)
         columns.append((plus - minus).T / (2 * SMALL))
     return columns[0], columns[1]
+
+
+def linear(K: NDArray[np.float64]) -> Law:
+    """a = K z."""
+    return lambda k, z: z @ K.T
 
 
 def costs(problem: str, changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -56,10 +62,8 @@ def costs(problem: str, changes: Mapping[str, Any]) -> dict[str, Any]:
     seeds = [derive(0, Purpose.EVALUATION_FIELD, i) for i in range(FIELDS)]
     found: dict[str, Any] = {"radius": float(np.abs(np.linalg.eigvals(A)).max()), "lqr": None}
     for name, gain in laws.items():
-        z = plant.reset(seeds)
-        for _ in range(plant.horizon):
-            z = plant.step(z @ gain.T)
-        found[name] = float(plant.episode_costs().mean.mean())
+        episode = rollout(plant, linear(gain), seeds, keep=False)
+        found[name] = float(episode.costs.mean.mean())
     return found
 
 

@@ -14,10 +14,9 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from multiprocessing import get_context
 from typing import Any
 
@@ -32,6 +31,7 @@ from pde_sim_node.build import build_plant
 from pde_sim_node.plant import Plant
 from pdeloop.reference import Reference, find
 from pdeloop.reproduce.experiment import PAPER
+from pdeloop.rollout import Law, rollout
 from tuner_node.optimizers import OPTIMIZERS, Context, Rollout, RolloutResult, Trajectory
 from tuner_node.seeds import Purpose, derive
 from tuner_node.training import CHECK_FIELDS
@@ -57,29 +57,22 @@ class Job:
     options: dict[str, Any]
 
 
-def run_episode(
-    plant: Plant, seeds: Sequence[int], act: Callable[[int, Array], Array]
-) -> list[RolloutResult]:
-    """One episode from the fields of `seeds`; act(k, states) gives the actions."""
-    states = np.empty((plant.horizon + 1, len(seeds), plant.n_z))
-    actions = np.empty((plant.horizon, len(seeds), plant.n_a))
-    states[0] = plant.reset(np.array(seeds, dtype=np.int64))
-    for k in range(plant.horizon):
-        actions[k] = act(k, states[k])
-        states[k + 1] = plant.step(actions[k])
-    costs = plant.episode_costs()
-    results = []
+def run_episode(plant: Plant, seeds: Sequence[int], law: Law) -> list[RolloutResult]:
+    """One episode from the fields of `seeds` under a law."""
+    episode = rollout(plant, law, seeds)
+    costs, results = episode.costs, []
     for m, diverged_step in enumerate(costs.diverged_step):
         diverged = bool(diverged_step >= 0)
         length = int(diverged_step) if diverged else plant.horizon
-        trajectory = Trajectory(states[: length + 1, m].copy(), actions[:length, m].copy())
+        states, actions = episode.states[: length + 1, m], episode.actions[:length, m]
+        trajectory = Trajectory(states.copy(), actions.copy())
         results.append(RolloutResult(float(costs.mean[m]), diverged, trajectory))
     return results
 
 
-def answer(law: ProjectedLaw, step: int, states: Array) -> Array:
-    """The actions of a law, whatever the step."""
-    return law.actions(states)
+def projected(law: ProjectedLaw) -> Law:
+    """A projected law, whose policies are set, as a law of `rollout`."""
+    return lambda k, states: law.actions(states)
 
 
 def run_rollouts(plant: Plant, U: Array, rollouts: Sequence[Rollout]) -> list[RolloutResult]:
@@ -90,7 +83,7 @@ def run_rollouts(plant: Plant, U: Array, rollouts: Sequence[Rollout]) -> list[Ro
         law = ProjectedLaw([U], plant.target)
         law.set(np.stack([rollout.policy for rollout in part]))
         seeds = [rollout.field_seed for rollout in part]
-        results += run_episode(plant, seeds, partial(answer, law))
+        results += run_episode(plant, seeds, projected(law))
     return results
 
 

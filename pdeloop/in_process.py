@@ -18,6 +18,7 @@ from loop_interfaces import model_rows
 from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn, noise_seeds
 from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.plant import Plant
+from pdeloop.rollout import Law, rollout
 from tuner_node.batch import Batch, BatchResult
 from tuner_node.training import Training
 from tuner_node.trajectory_collector import cut
@@ -71,37 +72,16 @@ class LocalPair:
 
     def _episode(self, batch: Batch) -> BatchResult:
         plant, settings = self.plant, self._settings
-        states = plant.reset(
-            batch.rows[:, StartColumn.SEED].astype(np.int64), noise_seeds(batch.rows)
-        )
-        columns = batch.rows[:, [StartColumn.EXCITATION, StartColumn.VARIANCE]]
-        excitations = [(int(seed), float(variance)) for seed, variance in columns]
-        watched = batch.exploratory or batch.trajectories
-        history, actions_taken = [states.copy()], []
-        if not batch.exploratory:
-            assert self._law is not None and batch.policies is not None
-            self._law.set(batch.policies, batch.rows[:, StartColumn.MODEL].astype(np.int64))
-        for k in range(plant.horizon):
-            if batch.exploratory:
-                actions = np.stack(
-                    [
-                        excitation(s, k, settings.n_a, v, settings.action_limit)
-                        for s, v in excitations
-                    ]
-                )
-            else:
-                assert self._law is not None
-                actions = self._law.actions(states)
-            states = plant.step(actions)
-            if watched:
-                actions_taken.append(actions.copy())
-                history.append(states.copy())
-        costs = plant.episode_costs()
+        law = self._exploration(batch) if batch.exploratory else self._policies(batch)
+        seeds = batch.rows[:, StartColumn.SEED].astype(np.int64)
+        keep = batch.exploratory or batch.trajectories
+        episode = rollout(plant, law, seeds, noise_seeds(batch.rows), keep=keep)
+        costs = episode.costs
         ended = np.where(costs.diverged_step >= 0, costs.diverged_step, COMPLETED)
         table = np.column_stack([costs.mean, costs.total, ended.astype(np.float64)])
         seen = None
         if batch.trajectories:
-            seen = cut(np.stack(history), np.stack(actions_taken), table[:, CostColumn.ENDED])
+            seen = cut(episode.states, episode.actions, table[:, CostColumn.ENDED])
         if not batch.exploratory:
             return BatchResult(table, trajectories=seen)
         if (ended != COMPLETED).any():
@@ -109,12 +89,26 @@ class LocalPair:
                 f"no reduced model: the plant diverged under exploration at step "
                 f"{int(ended.max())}; lower exploration_variance"
             )
-        trajectory, applied = np.stack(history), np.stack(actions_taken)
+        states, actions = episode.states, episode.actions
         models = [
-            model_rows.pack(design([(trajectory[:, m], applied[:, m])], plant.target, settings))
-            for m in range(len(excitations))
+            model_rows.pack(design([(states[:, m], actions[:, m])], plant.target, settings))
+            for m in range(len(seeds))
         ]
         return BatchResult(table, np.stack(models), trajectories=seen)
+
+    def _policies(self, batch: Batch) -> Law:
+        """Every environment's policy on the model that it belongs to."""
+        law, policies = self._law, batch.policies
+        assert law is not None and policies is not None
+        law.set(policies, batch.rows[:, StartColumn.MODEL].astype(np.int64))
+        return lambda k, states: law.actions(states)
+
+    def _exploration(self, batch: Batch) -> Law:
+        """Every environment's excitation, whatever the states."""
+        n_a, limit = self._settings.n_a, self._settings.action_limit
+        columns = batch.rows[:, [StartColumn.EXCITATION, StartColumn.VARIANCE]]
+        drawn = [(int(seed), float(variance)) for seed, variance in columns]
+        return lambda k, states: np.stack([excitation(s, k, n_a, v, limit) for s, v in drawn])
 
 
 def train(training: Training, pair: LocalPair, report: Report, *, max_batch: int = 1024) -> None:

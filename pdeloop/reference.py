@@ -21,6 +21,7 @@ from loop_interfaces.parameters import PROBLEM, as_recorded, model_order
 from loop_interfaces.problem import config_folder
 from pde_sim_node.build import build_equation, build_plant
 from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD
+from pdeloop.rollout import rollout
 from tuner_node.results import RunFolderError
 
 __all__ = ["FORMAT", "Reference", "bound_parameters", "find", "no_control_cost"]
@@ -93,10 +94,8 @@ def bound_parameters(values: Mapping[str, Any]) -> dict[str, Any]:
 def no_control_cost(values: Mapping[str, Any]) -> float:
     """The mean stage cost from the mean initial field without control."""
     plant = build_plant(values)
-    plant.reset([MEAN_FIELD])
-    for _ in range(plant.horizon):
-        plant.step(np.zeros((1, plant.n_a)))
-    return float(plant.episode_costs().mean[0])
+    nothing = np.zeros((1, plant.n_a))
+    return float(rollout(plant, lambda k, z: nothing, [MEAN_FIELD], keep=False).costs.mean[0])
 
 
 def find(

@@ -17,6 +17,7 @@ from pde_sim_node.build import build_plant
 from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD, Plant
 from pdeloop.reference import Reference, find
 from pdeloop.reproduce import experiment as reproduce
+from pdeloop.rollout import rollout
 from tuner_node.results import RunFolder, RunFolderError
 
 Array = NDArray[np.float64]
@@ -229,23 +230,17 @@ def _behaviours(
 ) -> list[Behaviour]:
     law = ProjectedLaw([model.U], plant.target, action_limit)
     law.set(np.stack(list(policies.values())))
-    published = plant.reset(np.full(len(policies), MEAN_FIELD))
-    states, actions = [plant.states.copy()], []  # the fields, whatever is measured of them
-    for _ in range(plant.horizon):
-        actions.append(law.actions(published).copy())
-        published = plant.step(actions[-1])
-        states.append(plant.states.copy())
-    costs = plant.episode_costs()
+    fields = np.full(len(policies), MEAN_FIELD)
+    episode = rollout(plant, lambda k, states: law.actions(states), fields)
     t = plant.sample_time * np.arange(plant.horizon + 1, dtype=np.float64)
-    field, action = np.stack(states), np.stack(actions)
     return [
         Behaviour(
             name,
             t,
-            field[:, i],
-            action[:, i],
-            float(costs.mean[i]),
-            int(costs.diverged_step[i]),
+            episode.fields[:, i],
+            episode.actions[:, i],
+            float(episode.costs.mean[i]),
+            int(episode.costs.diverged_step[i]),
         )
         for i, name in enumerate(policies)
     ]

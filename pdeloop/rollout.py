@@ -1,0 +1,105 @@
+"""An episode of a plant under a law, in this process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pde_sim_node.measurement import InstrumentedPlant
+from pde_sim_node.plant import EpisodeCosts, Plant
+
+__all__ = ["EpisodeRecord", "Law", "rollout"]
+
+Array = NDArray[np.float64]
+Law: TypeAlias = Callable[[int, Array], Array]
+"""(k, z_k of shape (M, state_size)) -> a_k of shape (M, n_a)."""
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeRecord:
+    """What happened in an episode of T steps of M environments.
+
+    Attributes
+    ----------
+    states : (T + 1, M, state_size) array
+        z_0 .. z_T as the plant publishes them: its fields, or what its sensors measure of them. An
+        environment that diverged keeps its last state. Without `keep` there are none, (0, M, ...).
+    fields : (T + 1, M, n_z) array
+        The fields themselves; the same array where they are what is published.
+    actions : (T, M, n_a) array
+        a_0 .. a_{T-1}, as the law gave them.
+    costs : EpisodeCosts
+        Mean and sum of the stage costs, and where an environment diverged.
+    """
+
+    states: Array
+    fields: Array
+    actions: Array
+    costs: EpisodeCosts
+
+
+def rollout(
+    plant: Plant,
+    law: Law,
+    seeds: ArrayLike,
+    noise: NDArray[np.int64] | None = None,
+    *,
+    keep: bool = True,
+) -> EpisodeRecord:
+    """Run one episode, z_{k+1} = f(z_k, law(k, z_k)) for k = 0 .. T - 1.
+
+    Parameters
+    ----------
+    plant
+        Whose episode it is; one that is under way there ends.
+    law
+        Is called once a step, in order, with the plant's own array, which it must not change.
+    seeds : (M,) int
+        Of the initial fields: 0 or more draws one, -1 is the mean field.
+    noise : (M,) int, optional
+        Of the noise of each environment, where the plant has noise.
+    keep
+        Whether to keep states and actions; costs are always.
+
+    Returns
+    -------
+    EpisodeRecord
+
+    Raises
+    ------
+    ValueError
+        The seeds are refused, or the law gives actions of another shape or that are not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from loop_interfaces.problem import load_parameters
+    >>> from pde_sim_node.build import build_plant
+    >>> plant = build_plant(load_parameters("burgers", {}))
+    >>> episode = rollout(plant, lambda k, z: np.zeros((2, plant.n_a)), [0, 1])
+    >>> episode.states.shape, episode.actions.shape
+    ((301, 2, 128), (300, 2, 6))
+    >>> (episode.costs.diverged_step < 0).all()
+    np.True_
+    """
+    z = plant.reset(seeds, noise)
+    batch, kept = len(z), plant.horizon if keep else -1
+    states = np.empty((kept + 1, *z.shape))
+    actions = np.empty((max(kept, 0), batch, plant.n_a))
+    own = isinstance(plant, InstrumentedPlant)
+    fields = np.empty((kept + 1, batch, plant.n_z)) if own else states
+    for k in range(plant.horizon + 1):
+        if keep:
+            states[k] = z
+            if own:
+                fields[k] = plant.states
+        if k < plant.horizon:
+            a = law(k, z)
+            z = plant.step(a)
+            if keep:
+                actions[k] = a
+    return EpisodeRecord(states, fields, actions, plant.episode_costs())
