@@ -103,7 +103,7 @@ def test_recorder_and_viewer_leave_the_core_of_the_pair_to_it(tmp_path: Path) ->
     ("words", "said"),
     [
         (["--directions", "4", "--optimizer", "two_point"], "--directions goes with"),
-        (["--directions", "99"], "'directions' is 99; expected at most 40"),
+        (["--directions", "99"], "'directions' is 99; expected at most 48"),
         (["--in-process", "--pairs", "2"], "leave out --in-process"),
         (["--in-process", "--pin"], "leave out --in-process"),
         (["--in-process", "--spread"], "leave out --in-process"),
