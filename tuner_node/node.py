@@ -340,9 +340,11 @@ class TunerNode:
     def _report(self, row: Mapping[str, Any]) -> None:
         if self._recorder:
             self._recorder.note(row)
-        told = self._log.warning if row["event"] == "repeated" else self._log.info
         for line in self._narration.lines(row):
-            told(line)
+            if row["event"] == "repeated":
+                self._log.warning(line)
+            else:  # a call of its own: rclpy refuses another severity at the same place
+                self._log.info(line)
         if row["event"] == "adapted":  # hundreds a second of a small problem
             known = self._narration
             self._log.info(
