@@ -364,6 +364,7 @@ def test_the_last_whole_episode_is_shown_until_the_next_has_run_for_a_while():
     view.cost(cost([1.0, 1.0], episode=2), 0.2)
     view.state(state(7, episode=3), 0.3)
     view.cost(cost([1.0, 1.0], episode=3), 0.4)  # the end alone does not replace a whole one
+    assert view.shown(0.4 + SLOW).key[1] == 2
     view.state(state(0, episode=4), 0.5)
     assert view.shown(0.5).key[1] == 2
     assert view.shown(0.6 + SLOW).key[1] == 4  # a plant that is held in the middle of an episode

@@ -200,9 +200,9 @@ class LoopView:
 
     def shown(self, now: float) -> EpisodeSamples | None:
         """The episode that runs, if it has for longer than SLOW, else the last that is over."""
-        if self.finished is None or now - self._current_since > SLOW:
-            return self.current
-        return self.finished
+        current = self.current
+        runs = current is not None and not current.ended and now - self._current_since > SLOW
+        return current if runs or self.finished is None else self.finished
 
     @property
     def complete(self) -> bool:

@@ -12,6 +12,12 @@ function shortly(_, value) {
   return value === null || value === undefined ? "" : text(value);
 }
 
+// Of the steps of a logarithmic axis those that have a label.
+function oneTwoFive(value) {
+  const leading = value / 10 ** Math.floor(Math.log10(value) + 1e-9);
+  return [1, 2, 5].some((n) => Math.abs(leading - n) < 1e-6) ? value : null;
+}
+
 export class Chart {
   // id: of the element that it fills; right: pixels kept free there; hooks: of uPlot.
   constructor(id, { right = 14, legend = true, grid = true, hooks = {} } = {}) {
@@ -91,6 +97,7 @@ export class Chart {
         axis(y.label, SPACE_Y, {
           size: 46,
           values: (_, at) => at.map((v) => (v === null ? "" : text(v))),
+          ...(y.log ? { filter: (_, at) => at.map(oneTwoFive) } : {}),
         }),
       ],
       series: [
