@@ -16,7 +16,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from typing import Any
 
@@ -32,7 +32,14 @@ from pde_sim_node.plant import Plant
 from pdeloop.reference import Reference, find
 from pdeloop.reproduce.experiment import PAPER
 from pdeloop.rollout import Law, rollout
-from tuner_node.optimizers import OPTIMIZERS, Context, Rollout, RolloutResult, Trajectory
+from tuner_node.optimizers import (
+    OPTIMIZERS,
+    Context,
+    Measured,
+    Rollout,
+    RolloutResult,
+    Trajectory,
+)
 from tuner_node.seeds import Purpose, derive
 from tuner_node.training import CHECK_FIELDS
 
@@ -88,22 +95,36 @@ def run_rollouts(plant: Plant, U: Array, rollouts: Sequence[Rollout]) -> list[Ro
 
 
 def warm_start(plant: Plant, parameters: dict[str, Any], seed: int) -> tuple[Array, Context]:
-    """The tracking gains of the model that one exploratory episode gives.
+    """The law that a training of this seed begins with, and what its optimiser knows.
 
-    As in a training, an episode whose gains do no better than no control is explored again.
+    As in a training, an episode whose gains do no better than no control is explored again, and in the
+    end no control is taken.
     """
     attempts = int(parameters["identification_attempts"])
+    policy, context = design(plant, parameters, seed, 0)
+    if attempts == 1:
+        return policy, context
     check = [derive(seed, Purpose.CHECK_FIELD, i) for i in range(CHECK_FIELDS)]
+    measured: list[Measured] = []
     for attempt in range(attempts):
-        policy, context = design(plant, parameters, seed, attempt)
+        if attempt:
+            policy, context = design(plant, parameters, seed, attempt)
         rollouts = [Rollout(p, f) for p in (np.zeros_like(policy), policy) for f in check]
         results = run_rollouts(plant, context.U, rollouts)
+        measured = [m for m in measured if not m.policy.any()]
+        measured += [
+            Measured(rollout.policy, result.cost, result.trajectory)
+            for rollout, result in zip(rollouts, results, strict=True)
+            if result.usable and result.trajectory is not None
+        ]
         none, lqt = results[: len(check)], results[len(check) :]
         if not any(result.diverged for result in lqt) and np.mean(
             [result.cost for result in lqt]
         ) < np.mean([result.cost for result in none]):
             break
-    return policy, context
+    else:
+        policy = np.zeros_like(policy)
+    return policy, replace(context, measured=measured)
 
 
 def design(

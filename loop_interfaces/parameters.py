@@ -178,7 +178,8 @@ PROBLEM = _section(
     Spec(
         "exploration_variance",
         0.1,
-        "variance of each exploratory action, drawn from N(0, variance)",
+        "least variance of each exploratory action, drawn from N(0, variance); with measurement_noise "
+        "as much as B needs",
         positive=True,
         nodes="T",
     ),
@@ -322,9 +323,10 @@ TUNER = _section(
     ),
     Spec(
         "identification_attempts",
-        10,
-        "exploratory episodes a seed may use until its LQT law beats no control on four "
-        "sampled fields; 1: take the first, unchecked, as the paper does",
+        3,
+        "exploratory episodes a seed may use until its LQT law beats no control on a sampled field, "
+        "which the adaptation begins with if none does; 1: take the first, unchecked, as the paper "
+        "does",
         1,
         1000,
     ),

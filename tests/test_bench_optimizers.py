@@ -28,7 +28,7 @@ def test_it_is_the_training_of_the_loop():
         options={},
     )
     measured = train(job)
-    options = {"seed": 3, "rollouts": 21, "optimizer": "gauss_newton"}
+    options = {"seed": 3, "rollouts": 15, "optimizer": "gauss_newton"}
     training = train_here(parameters(**options))
     rows = [
         {name: value for name, value in row.items() if name not in ("event", "seed")}

@@ -14,6 +14,7 @@ from loop_interfaces.model_rows import unpack
 from loop_interfaces.parameters import model_order, noisy
 from loop_interfaces.spec import ParameterError
 from tuner_node.batch import UNKNOWN_PLANT, TrainingSettings
+from tuner_node.exploration import least_variance
 from tuner_node.optimizers import NEED_TRAJECTORIES, OPTIMIZERS, Context, Optimizer, TwoPoint
 from tuner_node.optimizers.gauss_newton import FIELDS
 from tuner_node.training import CHECK, EXPLORATION, Training
@@ -110,7 +111,16 @@ def build_training(values: Mapping[str, Any]) -> Training:
         evaluation_fields=values["evaluation_fields"],
         evaluation_seed=values["evaluation_seed"],
         start=values["start"],
-        exploration_variance=values["exploration_variance"],
+        exploration_variance=max(
+            values["exploration_variance"],
+            least_variance(
+                noise=values["measurement_noise"],
+                steps=values["horizon"],
+                sample_time=values["sample_time"],
+                width=values["actuator_width"],
+                n_z=values["sensors"] or values["n_z"],
+            ),
+        ),
         identification_attempts=values["identification_attempts"],
         rollouts=values["rollouts"],
         adaptation=2 * values["iterations"],

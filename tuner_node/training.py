@@ -1,10 +1,11 @@
 """The training as a state machine: which rollouts it needs next, what it does with their costs.
 
 Phases: identify (one exploratory episode a seed, from which the controller designs the warm start),
-check (a warm start that is no better than no control on a few fields is thrown away, and another
-exploratory episode is drawn), adapt (the optimiser's rollouts), evaluate (no control, LQT and the
-adapted policy on the same sampled fields). The first three share the budget of a seed. Pure: it
-knows neither topics nor time, so over topics and in one process it is the same training, to the bit.
+check (the warm start and no control on a field; where it is no better, another exploratory episode is
+drawn, and in the end the adaptation begins with no control), adapt (the optimiser's rollouts),
+evaluate (no control, LQT and the adapted policy on the same sampled fields). The first three share the
+budget of a seed. Pure: it knows neither topics nor time, so over topics and in one process it is the
+same training, to the bit.
 
 Source: Zhang, Mowlavi, Benosman, Basar, arXiv:2403.01005, section IV; the check is ours.
 """
@@ -25,13 +26,20 @@ from tuner_node import noise
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, TrainingSettings, batch_of
 from tuner_node.budget import Budget
 from tuner_node.checkpoint import taken
-from tuner_node.optimizers import Context, Optimizer, Rollout, RolloutResult, Trajectory
+from tuner_node.optimizers import (
+    Context,
+    Measured,
+    Optimizer,
+    Rollout,
+    RolloutResult,
+    Trajectory,
+)
 from tuner_node.published_law import follows
 from tuner_node.seeds import Purpose, derive
 
 Array = NDArray[np.float64]
 PHASES = ("identify", "check", "adapt", "evaluate", "done")
-CHECK_FIELDS = 4
+CHECK_FIELDS = 1
 """Sampled fields on which a warm start must beat no control."""
 EXPLORATION = 1
 """Rollouts of an exploration."""
@@ -72,11 +80,17 @@ class Training:
     explorations: list[Trajectory | None] = field(default_factory=list)
     """The exploratory trajectory of every seed, where the optimiser wants trajectories."""
     target: Array | None = None
+    measured: list[list[Measured]] = field(default_factory=list)
+    """The rollouts of every seed's checks, where the optimiser wants trajectories."""
+    worse: list[bool] = field(default_factory=list)
+    """Whether the warm start of a seed was measured to be no better than no control."""
 
     def __post_init__(self) -> None:
         self.pending = list(range(self.settings.seeds))
         self.attempts = [0] * self.settings.seeds
         self.explorations = [None] * self.settings.seeds
+        self.measured = [[] for _ in range(self.settings.seeds)]
+        self.worse = [False] * self.settings.seeds
         settings = self.settings
         self.budget = Budget(settings.seeds, settings.rollouts, settings.adaptation)
         if self.settings.model is not None and not self.settings.trajectories:
@@ -98,7 +112,7 @@ class Training:
             ]
             batch = Batch(np.array(rows, dtype=np.float64), None, self.settings.trajectories)
         elif self.phase == "check":
-            batch = batch_of(self._check_rollouts())
+            batch = batch_of(self._check_rollouts(), self.settings.trajectories)
         elif self.phase == "adapt":
             wanted = [(m, rollout) for m, asked in enumerate(self._asked()) for rollout in asked]
             batch = batch_of(wanted, self.settings.trajectories)
@@ -145,7 +159,9 @@ class Training:
     def starts(self) -> Array:
         """The policies that the adaptation begins with, of the shape of the warm starts."""
         warm = self.warm_starts()
-        return np.zeros_like(warm) if self.settings.start == "zero" else warm
+        zero = np.array(self.worse) | (self.settings.start == "zero")
+        starts: Array = np.where(zero[:, None, None], 0.0, warm)
+        return starts
 
     @property
     def generation(self) -> int:
@@ -178,7 +194,16 @@ class Training:
             "history": np.array(json.dumps(self.history)),
             "budget": self.budget.state(),
             "law_seen": np.array(self.law_seen),
+            "worse": np.array(self.worse),
         }
+        for m, rollouts in enumerate(self.measured):
+            for i, rollout in enumerate(rollouts):
+                arrays |= {
+                    f"measured{m}.{i}.policy": rollout.policy,
+                    f"measured{m}.{i}.cost": np.array(rollout.cost),
+                    f"measured{m}.{i}.states": rollout.trajectory.states,
+                    f"measured{m}.{i}.actions": rollout.trajectory.actions,
+                }
         if self.models is not None:
             arrays["models"] = self.models
         for m, exploration in enumerate(self.explorations):
@@ -229,6 +254,21 @@ class Training:
                     taken(arrays, f"exploration{m}.states", "f", (None, None)),
                     taken(arrays, f"exploration{m}.actions", "f", (None, self.settings.n_a)),
                 )
+            i = 0
+            while f"measured{m}.{i}.policy" in arrays:
+                name, n_a = f"measured{m}.{i}.", self.settings.n_a
+                self.measured[m].append(
+                    Measured(
+                        taken(arrays, f"{name}policy", "f", (n_a, None)),
+                        float(taken(arrays, f"{name}cost", "f", ())),
+                        Trajectory(
+                            taken(arrays, f"{name}states", "f", (None, None)),
+                            taken(arrays, f"{name}actions", "f", (None, n_a)),
+                        ),
+                    )
+                )
+                i += 1
+        self.worse = taken(arrays, "worse", "b", (seeds,)).tolist()
         if "evaluation" in arrays:
             self.evaluation = taken(arrays, "evaluation", "f", shape)
             self.ended = taken(arrays, "ended", "f", shape)
@@ -336,6 +376,7 @@ class Training:
     def _checked(self, result: BatchResult) -> list[dict[str, Any]]:
         costs = result.costs.reshape(len(self.pending), 2, CHECK_FIELDS, len(CostColumn))
         self.budget.count("check", np.repeat(self.pending, CHECK))
+        self._keep(result)
         rows: list[dict[str, Any]] = []
         failed = []
         for m, (none, lqt) in zip(self.pending, costs, strict=True):
@@ -352,10 +393,13 @@ class Training:
                     "accepted": good,
                 }
             )
+            self.worse[m] = not good
             again = not good and self._can_explore_again(m)
             rows[-1]["again"] = again
             if again:
                 self.attempts[m] += 1
+                # Laws of the basis that is given up mean nothing on the next one.
+                self.measured[m] = [k for k in self.measured[m] if not k.policy.any()]
                 failed.append(m)
         self.pending = failed
         if failed:
@@ -363,6 +407,18 @@ class Training:
         else:
             self._start_adapting()
         return rows
+
+    def _keep(self, result: BatchResult) -> None:
+        """Keep the trajectories of a check, as far as its rollouts came to their end."""
+        if result.trajectories is None:
+            return
+        asked = self._check_rollouts()
+        for (m, rollout), cost, trajectory in zip(
+            asked, result.costs, result.trajectories, strict=True
+        ):
+            if cost[CostColumn.ENDED] == COMPLETED:
+                kept = Measured(rollout.policy, float(cost[CostColumn.MEAN]), trajectory)
+                self.measured[m].append(kept)
 
     def _can_explore_again(self, m: int) -> bool:
         """Whether there are attempts left, and rollouts for another one and a step afterwards."""
@@ -396,6 +452,7 @@ class Training:
             action_weight=self.settings.action_weight,
             horizon=len(exploration.actions),
             exploration=exploration,
+            measured=self.measured[m],
             action_limit=self.settings.action_limit,
         )
 

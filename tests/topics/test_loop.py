@@ -229,7 +229,7 @@ DIVERGING = {
             "reduced_order:=0",
             "'reduced_order' is 0; expected a whole number from 1",
         ),
-        ("tuner_node", "rollouts:=3", "'rollouts' is 3; expected at least 11"),
+        ("tuner_node", "rollouts:=3", "'rollouts' is 3; expected at least 5"),
         ("tuner_node", "start:=lqg", "'start' is 'lqg'; expected one of lqt, zero"),
         ("tuner_node", "smoothing_radius:=-0.1", "'smoothing_radius' is -0.1; expected"),
     ],

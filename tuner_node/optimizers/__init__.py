@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 from tuner_node.optimizers.base import (
     Context,
+    Measured,
     Optimizer,
     Rollout,
     RolloutResult,
@@ -21,6 +22,7 @@ __all__ = [
     "Context",
     "Directions",
     "GaussNewton",
+    "Measured",
     "Optimizer",
     "Rollout",
     "RolloutResult",

@@ -19,7 +19,16 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["Context", "Optimizer", "Rollout", "RolloutResult", "Row", "State", "Trajectory"]
+__all__ = [
+    "Context",
+    "Measured",
+    "Optimizer",
+    "Rollout",
+    "RolloutResult",
+    "Row",
+    "State",
+    "Trajectory",
+]
 
 Array = NDArray[np.float64]
 Row = dict[str, float | int | bool | str]
@@ -76,6 +85,15 @@ class RolloutResult:
 
 
 @dataclass(frozen=True, eq=False)
+class Measured:
+    """A rollout to its end: policy, mean stage cost and trajectory."""
+
+    policy: Array
+    cost: float
+    trajectory: Trajectory
+
+
+@dataclass(frozen=True, eq=False)
 class Context:
     """What a model-based optimiser knows about the problem.
 
@@ -91,6 +109,8 @@ class Context:
         T, the steps of an episode.
     exploration : Trajectory
         The exploratory trajectory that the reduced model was identified from.
+    measured : sequence of Measured
+        Rollouts from before the optimisation: those that checked the first law, and no control.
     action_limit : float
         Magnitude at which actions saturate; 0 for none.
     """
@@ -101,6 +121,7 @@ class Context:
     action_weight: float
     horizon: int
     exploration: Trajectory
+    measured: Sequence[Measured] = ()
     action_limit: float = 0.0
 
 

@@ -133,7 +133,13 @@ class Proposer:
         self._q, self._r = context.state_weight, context.action_weight
         self._horizon = context.horizon
         self._action_limit = context.action_limit
-        self._exploration = Record(-1, np.zeros_like(policy), np.inf, states, actions)
+        self._before = [
+            Record(-1, np.zeros_like(policy), np.inf, states, actions),
+            *(
+                Record(-1, m.policy, m.cost, m.trajectory.states, m.trajectory.actions)
+                for m in context.measured
+            ),
+        ]
         # U^T z_r, as a plain sum like the controller's.
         self._s_r: Array = np.sum(U * target[:, None], axis=0)
         self._s_r_square = float(np.sum(self._s_r * self._s_r))
@@ -177,7 +183,7 @@ class Proposer:
         accepted : bool
             Whether the last candidate was accepted.
         """
-        data = [record for record in (self._exploration, *records) if len(record.states) > 1]
+        data = [record for record in (*self._before, *records) if len(record.states) > 1]
         simulated = self._simulated(data, incumbents, damping)
         if simulated is not None:
             return simulated
