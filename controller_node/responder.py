@@ -34,6 +34,9 @@ from loop_interfaces.topics import (
 MAX_KEPT = 8
 """Runs, and plants, whose messages are kept apart. The longest unheard one is forgotten first, but
 never the one that was answered last: a flood of strangers cannot push it out."""
+KEPT_BYTES = 2**29
+"""Bytes that are kept of all runs together. Runs that were heard longer ago are forgotten for a newer
+one; a run that has no room alone is refused, and an exploratory episode without room gives no model."""
 AHEAD = 32
 """Exploratory actions that are drawn at once, of all environments: well below a millisecond."""
 
@@ -53,8 +56,28 @@ class _Run:
     """Exploratory actions of some steps of the episode, by step."""
     samples: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)
     """States of an exploratory episode, by (plant, step)."""
+    sampled: int = 0
+    """Bytes of these."""
+    unusable: ModelFailure | None = None
+    """Why no model can come out of the exploratory episode, whatever its cost is."""
+    disputed: int = -1
+    """The episode for which two different policies came."""
     identified: dict[int, Send | ModelFailure] = field(default_factory=dict)
     """What came out of an exploratory episode, by plant."""
+
+    @property
+    def kept(self) -> int:
+        """Bytes."""
+        frames = [frame.values.nbytes for frame in (self.start, self.policy) if frame is not None]
+        models = [a.nbytes for model in self.models for a in (model.U, model.A, model.B)]
+        laws = len(self.laws) * sum(model.U.nbytes for model in self.models)
+        return sum(frames) + sum(models) + laws + self.sampled
+
+    def begin(self, start: Frame) -> None:
+        """An episode begins."""
+        self.start = start
+        self.samples, self.sampled, self.unusable = {}, 0, None
+        self.identified, self.ahead = {}, {}
 
     def episode_start(self, frame: Frame) -> Frame | None:
         """The start of the frame's episode, if it is the one this run is in."""
@@ -106,7 +129,8 @@ class Responder:
         self._targets[frame.plant] = frame.values.copy()
         _forget(self._targets, frame.plant, self._served[1])
         for run in self._runs.values():
-            run.laws.pop(frame.plant, None)
+            known = set(run.laws) & set(self._targets) - {frame.plant}
+            run.laws = {plant: run.laws[plant] for plant in known}
         return self._answer_pending()
 
     def start(self, frame: Frame) -> Sequence[Send | ModelFailure]:
@@ -127,10 +151,9 @@ class Responder:
             raise FrameError("expected seeds and model indices that are whole numbers")
         if (rows[:, StartColumn.VARIANCE] < 0).any():
             raise FrameError("expected exploration variances of at least 0")
-        run = self._run(frame.run)
+        run = self._run(frame.run, rows.nbytes)
         if run.episode_start(frame) is None:
-            run.start = replace(frame, values=rows.copy())
-            run.samples, run.identified, run.ahead = {}, {}, {}
+            run.begin(replace(frame, values=rows.copy()))
             self.failure = ""
         elif run.identified:
             return list(
@@ -145,14 +168,25 @@ class Responder:
             raise FrameError(f"expected gains of {n_a} actuators, got {frame.values.shape[1]}")
         if frame.values.size and np.abs(frame.values).max() > MAX_GAIN:
             raise FrameError(f"expected gains of at most {MAX_GAIN:g} in magnitude")
-        run = self._run(frame.run)
+        run = self._run(frame.run, frame.values.nbytes)
+        known = run.policy
+        shape = frame.values.shape
+        # One of another shape could never have been used: it puts nothing in doubt.
+        if known and known.episode == frame.episode and known.values.shape == shape:
+            if np.array_equal(known.values, frame.values):
+                return self._answer_pending()
+            run.disputed, run.laws = frame.episode, {}
+            raise FrameError(
+                f"two different policies came for episode {frame.episode}, which is therefore not "
+                "answered; expected one tuner"
+            )
         run.policy = replace(frame, values=frame.values.copy())
         run.laws = {plant: (law, -1) for plant, (law, _) in run.laws.items()}
         return self._answer_pending()
 
     def model(self, frame: Frame) -> list[Send]:
         """Take a run's reduced models."""
-        run = self._run(frame.run)
+        run = self._run(frame.run, 2 * frame.values.nbytes)
         run.models = [model_rows.unpack(rows.copy(), self._settings.n_a) for rows in frame.values]
         run.generation, run.laws = frame.step, {}
         return self._answer_pending()
@@ -227,12 +261,48 @@ class Responder:
             lacking += [] if run.models and run.generation == start.step else ["model"]
             if run.policy is None or run.policy.episode != pending.episode:
                 lacking.append("policy")
+            elif run.disputed == pending.episode:
+                lacking.append("policy (two different ones came)")
         return lacking
 
-    def _run(self, number: int) -> _Run:
+    def _run(self, number: int, more: int) -> _Run:
+        """What is known of a run, of which `more` bytes come. FrameError if there is no room."""
         run = self._runs.setdefault(number, _Run())
         _forget(self._runs, number, self._served[0])
+        if not self._has_room(number, more):
+            raise FrameError(f"expected less than {KEPT_BYTES} bytes of all runs together")
         return run
+
+    def _has_room(self, number: int, more: int) -> bool:
+        """Forget runs that were heard longer ago than this one, until `more` bytes have room."""
+        others = [key for key in self._runs if key not in (number, self._served[0])]
+        while sum(run.kept for run in self._runs.values()) + more > KEPT_BYTES:
+            if not others:
+                return False
+            del self._runs[others.pop(0)]
+        return True
+
+    def _keep_sample(self, run: _Run, frame: Frame) -> None:
+        """A state of an exploratory episode, for its identification."""
+        known = run.samples.get((frame.plant, frame.step))
+        again = known is not None and np.array_equal(known, frame.values)
+        if run.unusable is not None or again:
+            return
+        size = frame.values.nbytes
+        if known is not None:
+            reason = f"two different states came for step {frame.step} of the exploratory episode"
+            run.unusable = ModelFailure(frame.run, frame.episode, True, reason)
+        elif self._has_room(frame.run, size):
+            run.samples[frame.plant, frame.step] = frame.values.copy()
+            run.sampled += size
+            return
+        else:
+            reason = (
+                f"the states of the exploratory episode take more than {KEPT_BYTES} bytes; "
+                "explore fewer seeds at once (max_batch)"
+            )
+            run.unusable = ModelFailure(frame.run, frame.episode, False, reason)
+        run.samples, run.sampled = {}, 0
 
     def _actions(self, frame: Frame) -> np.ndarray | None:
         run = self._runs.get(frame.run)
@@ -247,7 +317,7 @@ class Responder:
         if target is None:
             return None
         if start.values[0, StartColumn.EXCITATION] >= 0:
-            run.samples[frame.plant, frame.step] = frame.values.copy()
+            self._keep_sample(run, frame)
             return self._exploratory(run, start, frame.step)
         law, episode = run.laws.get(frame.plant, (None, -1))
         if law is None or episode != frame.episode:
@@ -267,7 +337,7 @@ class Responder:
     ) -> ProjectedLaw | None:
         """The law set for the run's episode; None while something has not arrived yet."""
         policy = run.policy
-        if policy is None or policy.episode != start.episode:
+        if policy is None or policy.episode != start.episode or run.disputed == start.episode:
             return None
         if not run.models or run.generation != start.step:
             return None
@@ -310,6 +380,8 @@ class Responder:
                 f"the plant diverged under exploration at step {int(ended.max())}; "
                 "lower exploration_variance",
             )
+        if run.unusable is not None:
+            return run.unusable
         held = {step: z for (plant, step), z in run.samples.items() if plant == cost.plant}
         if len(held) != cost.step + 1 or max(held) != cost.step:
             return failure(

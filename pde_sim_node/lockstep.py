@@ -8,7 +8,8 @@ is not a cost. The answer to state T moves nothing: it says that the last state 
 
 Whoever is asked twice answers the same to the bit. So another answer to a state that was answered
 already comes from somebody else, or from a controller that cannot be relied on: which of the two was
-taken is chance, and the episode is void.
+taken is chance, and the episode is void. When it comes after the end of one of the last episodes, the
+cost of that episode is taken back: it is sent again, void.
 
 A paused plant takes the answer it waits for and holds the next state back. Nothing is sent again and
 nothing is given up meanwhile; `episode/paused` tells everybody who waits for the plant.
@@ -17,6 +18,7 @@ nothing is given up meanwhile; `episode/paused` tells everybody who waits for th
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -31,6 +33,7 @@ from loop_interfaces.topics import (
     STATE,
     TARGET,
     VOID,
+    CostColumn,
     StartColumn,
     Topic,
     noise_seeds,
@@ -38,6 +41,8 @@ from loop_interfaces.topics import (
 from pde_sim_node.plant import Plant
 from pde_sim_node.real_time import RealTimePacer
 
+REMEMBERED = 16
+"""Episodes whose actions can still be contradicted."""
 PAUSED_REPORT = 1.0
 """Seconds between two messages on `episode/paused` while the plant is paused."""
 
@@ -93,8 +98,10 @@ class Lockstep:
         """What the last episode that ended came to; None once another run has the plant."""
         self._taken: list[int] = []
         """A digest of the action that was taken at each step of the episode."""
+        self._past: dict[int, tuple[list[int], Frame]] = {}
+        """The same of the last episodes that came to a cost, and that cost."""
         self.contradiction = ""
-        """Why the last episode that ended is void, if two answers to one state came in it."""
+        """Why the last cost that was sent is void, if two answers to one state came."""
         self._repeats = 0
         self._tuner_heard = -np.inf
         self._deadline: float | None = None
@@ -246,6 +253,7 @@ class Lockstep:
                     f"(until it ends, or is silent for {self._run_hold:g} s)"
                 )
             self.run, self.episode, self._cost = frame.run, -1, None
+            self._past = {}
             self._idle(now)
         self._tuner_heard = now
         if not len(rows):
@@ -282,7 +290,7 @@ class Lockstep:
         plant = self.plant
         if not self._active or frame.run != self.run or frame.episode != self.episode:
             self.tally["actions of another episode"] += 1
-            return []
+            return self._judge_late(frame)
         if frame.plant != self._fingerprint:
             self.tally["actions for another plant"] += 1
             return []
@@ -292,11 +300,7 @@ class Lockstep:
             # One of another shape could never have been taken: it puts nothing in doubt.
             past = frame.step < plant.step_index and frame.values.shape == expected
             if past and frame.digest() != self._taken[frame.step]:
-                self.contradiction = (
-                    f"two different actions came for step {frame.step} of episode {frame.episode}; "
-                    "expected one controller, which answers a repeated state with the same action"
-                )
-                return [self._finish(now, void=True)]
+                return [self._finish(now, void=True, contradiction=_contradiction(frame))]
             return []
         if frame.values.shape != expected:
             raise FrameError(
@@ -315,6 +319,33 @@ class Lockstep:
             self._deadline = self.pacer.next(now)
             return []
         return self._publish_state(now)
+
+    def awaits(self, frame: Frame) -> bool:
+        """Whether `action` will take this: it answers the state that was sent, and has its shape."""
+        ids = self.run, self.episode, self.plant.step_index, self._fingerprint
+        return (
+            self._active
+            and not self._held
+            and (frame.run, frame.episode, frame.step, frame.plant) == ids
+            and frame.values.shape == (self.plant.batch, self.plant.n_a)
+        )
+
+    def _judge_late(self, frame: Frame) -> list[Send]:
+        """Take back the cost of one of the last episodes, if this action contradicts one of its own."""
+        if frame.run != self.run or frame.plant != self._fingerprint:
+            return []
+        taken, cost = self._past.get(frame.episode, ([], frame))
+        shape = len(cost.values), self.plant.n_a
+        if frame.step >= len(taken) or frame.values.shape != shape:
+            return []
+        if frame.digest() == taken[frame.step]:
+            return []
+        del self._past[frame.episode]
+        self.contradiction = _contradiction(frame)
+        self.tally["costs taken back"] += 1
+        values = cost.values.copy()
+        values[:, CostColumn.ENDED] = VOID
+        return [Send(COST, replace(cost, values=values))]
 
     def advance_counters(self, digests: Sequence[int], now: float) -> None:
         """Account for awaited actions, the last of them at `now`, that the plant has taken.
@@ -373,7 +404,8 @@ class Lockstep:
         self._active = self._held = self._stepping = False
         self._deadline = now + PAUSED_REPORT if self.paused else None
 
-    def _finish(self, now: float, *, void: bool) -> Send:
+    def _finish(self, now: float, *, void: bool, contradiction: str = "") -> Send:
+        self.contradiction = contradiction
         costs = self.plant.episode_costs()
         ended = np.where(costs.diverged_step >= 0, costs.diverged_step, COMPLETED)
         if void:
@@ -382,6 +414,10 @@ class Lockstep:
         values = np.column_stack([costs.mean, costs.total, ended.astype(np.float64)])
         self.last_cost = values
         self._cost = self._stamped(COST, values)
+        if not void:
+            self._past[self.episode] = self._taken, self._cost.frame
+            if len(self._past) > REMEMBERED:
+                del self._past[min(self._past)]
         self._idle(now)
         self.episodes_total += not void
         return self._cost
@@ -407,3 +443,10 @@ class Lockstep:
         if noise.size and (noise.min() < 0 or (noise != np.floor(noise)).any()):
             raise FrameError("expected noise seeds that are whole numbers of at least 0")
         return rows
+
+
+def _contradiction(action: Frame) -> str:
+    return (
+        f"two different actions came for step {action.step} of episode {action.episode}; "
+        "expected one controller, which answers a repeated state with the same action"
+    )

@@ -25,7 +25,7 @@ from loop_interfaces.ros.introspection import offer
 from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.node_main import node_main
 from loop_interfaces.ros.parameters import declare, given_parameters, on_change
-from loop_interfaces.samples import clock_message
+from loop_interfaces.samples import ACTION_KIND, clock_message
 from loop_interfaces.spec import Spec
 from loop_interfaces.topics import ACTION, COST, PAUSED, START, STATE, TARGET
 from pde_sim_node.build import build_plant, fingerprint
@@ -106,7 +106,7 @@ class PlantNode:
         self._batcher.timed = publish_clock
         self._clock_wanted = False
         loop.receive(START, self._on_start)
-        actions = loop.receive(ACTION, self._on_action, sampled=True)
+        self._actions = actions = loop.receive(ACTION, self._on_action)
         self._fast_path: PlantFastPath | None = None
         if type(self._lockstep.plant) is Plant:  # what instruments do to a step is not compiled
             self._fast_path = PlantFastPath(self._lockstep, actions.codec, self._batcher)
@@ -156,7 +156,11 @@ class PlantNode:
             self._report_pace()
 
     def _on_action(self, frame: Frame) -> None:
-        self._send(self._lockstep.action(frame, self._loop.now()))
+        taken = self._lockstep.awaits(frame)
+        sends = self._lockstep.action(frame, self._loop.now())
+        if taken and self._batcher.wanted:
+            self._batcher.add(ACTION_KIND, self._actions.codec.encode(frame))
+        self._send(sends)
         if self._paced:
             self._send(self._lockstep.tick(self._loop.now()))
 

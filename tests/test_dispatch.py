@@ -131,6 +131,19 @@ def test_two_different_costs_of_one_episode_end_the_run():
         served.cost(0, replace(cost, values=np.nextafter(cost.values, 9.0)), 0.0)
 
 
+def test_a_cost_that_is_taken_back_after_it_was_used_ends_the_run():
+    served = dispatcher()
+    ((_, first),) = starts(served.assign(batch(2), 0.0))
+    served.cost(0, costs_of(first), 0.0)
+    assert served.result() is not None
+    ((_, second),) = starts(served.assign(batch(2), 1.0))
+    with pytest.raises(DispatchError, match=f"took back the cost of episode {first.episode}"):
+        served.cost(0, void_of(first), 1.0)
+    served.cost(0, costs_of(second), 1.0)
+    with pytest.raises(DispatchError, match=r"two different messages on episode/cost"):
+        served.cost(0, replace(costs_of(first), values=costs_of(first).values + 1.0), 2.0)
+
+
 def test_two_different_models_of_one_episode_end_the_run():
     served = dispatcher()
     rows = np.array([[3.0, 4.0, 0.1, 0.0]])

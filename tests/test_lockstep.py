@@ -355,3 +355,42 @@ def test_a_pause_moves_the_instants_of_a_paced_plant():
     assert np.delete(gaps, 10).max() < 0.06
     assert np.delete(gaps, 10).min() > 0.04
     assert protocol.pacer.missed == 0
+
+
+@pytest.mark.parametrize("later", [0, 3])
+def test_an_action_that_contradicts_one_of_an_episode_that_ended_takes_its_cost_back(later):
+    protocol = plant_protocol()
+    *states, cost = run_episode(protocol, 1)
+    for episode in range(2, 2 + later):
+        run_episode(protocol, episode)
+    for state in states[:-1]:
+        assert protocol.action(answer(state), 1.0) == []  # the same again contradicts nothing
+    late = answer(states[28], scale=0.2)
+    for harmless in (replace(late, run=RUN + 1), replace(late, plant=1), replace(late, step=31)):
+        assert protocol.action(harmless, 1.0) == []
+    assert protocol.action(replace(late, values=late.values[:1]), 1.0) == []
+    (send,) = protocol.action(late, 1.0)
+    assert send.topic is COST
+    assert (send.frame.run, send.frame.episode, send.frame.step) == (RUN, 1, cost.step)
+    assert (send.frame.values[:, CostColumn.ENDED] == VOID).all()
+    assert "two different actions came for step 28 of episode 1" in protocol.contradiction
+    assert protocol.action(late, 1.0) == []
+    run_episode(protocol, 9)
+    assert protocol.contradiction == ""
+
+
+def test_only_the_action_that_will_be_taken_is_awaited():
+    protocol = plant_protocol()
+    (send,) = protocol.start(start(1), 0.0)
+    good = answer(send.frame)
+    others = (
+        replace(good, run=RUN + 1),
+        replace(good, episode=2),
+        replace(good, step=1),
+        replace(good, plant=1),
+        replace(good, values=good.values[:1]),
+        replace(good, values=good.values[:, :3]),
+    )
+    assert protocol.awaits(good) and not any(map(protocol.awaits, others))
+    protocol.action(good, 0.0)
+    assert not protocol.awaits(good)

@@ -214,3 +214,58 @@ def test_a_policy_that_does_not_fit_the_episode_is_refused_and_a_good_one_serves
         responder.state(state)
     responder.policy(Frame(RUN, 1, 0, 0.0, policy[np.newaxis]))
     assert len(responder.state(state)) == 1
+
+
+def test_a_run_of_a_stranger_fills_no_memory(monkeypatch):
+    monkeypatch.setattr("controller_node.responder.KEPT_BYTES", 100_000)
+    responder = Responder(SETTINGS)
+    responder.target(TARGET)
+    states = PLANT.reset(np.array([1]))
+    for run in range(100, 120):
+        responder.start(start(1, (1, 2, 0.1, 0), run=run))
+        for k in range(2000):
+            assert len(responder.state(Frame(run, 1, k, 0.0, states + k))) == 1
+        assert sum(known.kept for known in responder._runs.values()) <= 100_000
+    costs = np.array([[1.0, 30.0, COMPLETED]])
+    (failure,) = responder.cost(Frame(119, 1, 1999, 1.0, costs))
+    assert isinstance(failure, ModelFailure) and not failure.retry
+    assert "more than 100000 bytes; explore fewer seeds at once" in failure.reason
+    with pytest.raises(FrameError, match="expected less than 100000 bytes of all runs"):
+        responder.policy(Frame(7, 1, 0, 0.0, np.ones((50, 4, 80))))
+    (model,) = explore(responder, 5)  # the run with room is served as before
+    assert model.topic is MODEL_IDENTIFIED
+
+
+def test_two_different_states_of_one_step_give_no_model_and_ask_for_the_episode_again():
+    responder = Responder(SETTINGS)
+    responder.target(TARGET)
+    responder.start(start(1, (1, 2, 0.1, 0)))
+    states = PLANT.reset(np.array([1]))
+    responder.state(Frame(RUN, 1, 0, 0.0, states))
+    responder.state(Frame(RUN, 1, 3, 0.0, states + 1.0))  # before the plant's
+    (failure,) = explore(responder, 1)
+    assert isinstance(failure, ModelFailure) and failure.retry
+    assert "two different states came for step 3" in failure.reason
+    (model,) = explore(responder, 2)
+    assert model.topic is MODEL_IDENTIFIED
+
+
+@pytest.mark.parametrize("when", ["before", "after"])
+def test_an_episode_with_two_different_policies_is_not_answered(when):
+    responder = Responder(SETTINGS)
+    responder.target(TARGET)
+    responder.model(Frame(RUN, 0, 0, 0.0, models()))
+    good, forged = (Frame(RUN, 4, 0, 0.0, np.full((1, 4, 8), gain)) for gain in (0.1, 0.2))
+    state = Frame(RUN, 4, 0, 0.0, PLANT.reset(np.array([1])))
+    first, second = (forged, good) if when == "before" else (good, forged)
+    responder.policy(first)
+    responder.start(start(4, (1, -1, 0.0, 0)))
+    assert len(responder.policy(first)) == 0
+    assert len(responder.state(state)) == 1
+    with pytest.raises(FrameError, match="two different policies came for episode 4"):
+        responder.policy(second)
+    assert responder.state(state) == [] and responder.law_for(state) is None
+    assert responder.waits_for() == ["policy (two different ones came)"]
+    responder.policy(Frame(RUN, 5, 0, 0.0, good.values))
+    responder.start(start(5, (1, -1, 0.0, 0)))
+    assert len(responder.state(Frame(RUN, 5, 0, 0.0, state.values))) == 1

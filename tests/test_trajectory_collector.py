@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
+import pytest
 
-from loop_interfaces.frames import Frame
+from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.topics import COMPLETED
 from tests.test_dispatch import RUN, batch, costs_of, dispatcher, starts
 from tuner_node.batch import Batch
@@ -20,7 +22,7 @@ def samples(start: Frame, plant: int = 0):
     count = len(start.values)
     for k in range(STEPS + 1):
         states = np.tile(np.array([k, 0.5]), (count, 1)) + np.arange(count)[:, None] * 100
-        yield Frame(RUN, start.episode, k, 0.0, states, plant), -states[:, :1]
+        yield Frame(RUN, start.episode, k, 0.0, states, plant), -states
 
 
 def feed(served, pair: int, start: Frame, lose_state: int = -1, lose_action: int = -1) -> None:
@@ -46,7 +48,7 @@ def test_trajectories_come_with_the_costs_in_the_batchs_order_over_several_episo
     assert result.trajectories is not None
     assert len(result.trajectories) == 3
     assert [t.states.shape for t in result.trajectories] == [(STEPS + 1, 2)] * 3
-    assert [t.actions.shape for t in result.trajectories] == [(STEPS, 1)] * 3
+    assert [t.actions.shape for t in result.trajectories] == [(STEPS, 2)] * 3
     assert result.trajectories[0].states[:, 0].tolist() == list(range(STEPS + 1))
     assert result.target is not None
 
@@ -89,9 +91,54 @@ def test_samples_of_other_runs_episodes_and_plants_are_not_mixed_in():
             observer.action(replace(stranger, values=actions + 9))
         observer.state(frame)
         observer.action(replace(frame, values=actions))
-    assert observer.lost(1, STEPS) == 0
+    assert observer.lost(1, STEPS, 2) == 0
     (trajectory,) = observer.trajectories(1, STEPS, np.array([COMPLETED]))
     assert trajectory.states[:, 0].tolist() == list(range(STEPS + 1))
     (short,) = observer.trajectories(1, STEPS, np.array([12.0]))
     assert short.states.shape == (13, 2)
-    assert short.actions.shape == (12, 1)
+    assert short.actions.shape == (12, 2)
+
+
+@pytest.mark.parametrize("shape", [(1, 3), (2, 2), (0, 2), (1, 0), (1, 2, 1)])
+def test_samples_of_a_wrong_shape_are_refused_and_change_nothing(shape):
+    served = dispatcher()
+    served.target(0, Frame(0, 0, 0, 0.0, np.ones(2)), 0.0)
+    ((_, start),) = starts(served.assign(observed(1), 0.0))
+    forged = Frame(RUN, start.episode, 3, 0.0, np.ones(shape))
+    for take in (served.state, served.action):
+        with pytest.raises(FrameError, match=r"expected a sample of shape \(1, 2\) for step 3"):
+            take(0, forged)
+    feed(served, 0, start)
+    served.cost(0, costs_of(start), 0.0)
+    assert served.result() is not None
+
+
+def test_a_state_of_a_wrong_size_that_came_before_the_target_is_not_taken():
+    served = dispatcher()
+    ((_, start),) = starts(served.assign(observed(1), 0.0))
+    served.state(0, Frame(RUN, start.episode, 3, 0.0, np.ones((1, 5))))
+    served.target(0, Frame(0, 0, 0, 0.0, np.ones(2)), 0.0)
+    feed(served, 0, start)
+    ((_, again),) = starts(served.cost(0, costs_of(start), 0.0))
+    assert again.episode == start.episode + 1
+    assert "two different states came for step 3" in served.notes[-1]
+
+
+@pytest.mark.parametrize("kind", ["state", "action"])
+@pytest.mark.parametrize("first", [True, False])
+def test_two_different_samples_of_one_step_repeat_the_episode(kind, first):
+    served = dispatcher()
+    served.target(0, Frame(0, 0, 0, 0.0, np.ones(2)), 0.0)
+    ((_, start),) = starts(served.assign(observed(1), 0.0))
+    forge = partial(getattr(served, kind), 0, Frame(RUN, start.episode, 3, 0.0, np.ones((1, 2))))
+    if first:
+        forge()
+    feed(served, 0, start)
+    if not first:
+        forge()
+    ((_, again),) = starts(served.cost(0, costs_of(start), 0.0))
+    assert again.episode == start.episode + 1
+    assert f"two different {kind}s came for step 3" in served.notes[-1]
+    feed(served, 0, again)
+    served.cost(0, costs_of(again), 0.0)
+    assert served.result() is not None

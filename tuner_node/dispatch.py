@@ -168,7 +168,7 @@ class Dispatcher:
                 f"the plant declared episode {known.episode} void: no action came, or different ones",
             )
         else:
-            known.answers[COST.name] = frame.episode, frame.digest()
+            known.remember(COST.name, frame)
             known.chunk.costs = frame.values.copy()
             self.last_costs = known.chunk.costs[:, CostColumn.MEAN]
             if self._batch.trajectories:
@@ -220,15 +220,18 @@ class Dispatcher:
 
     def state(self, pair: int, frame: Frame) -> bool:
         """Take a sample z_k of a pair's episode; whether it is the last one, and the cost is there:
-        then `tick`, they come in their order.
+        then `tick`, they come in their order. Raises FrameError for one of another shape.
         """
         known = self.pairs[pair]
-        known.observer.state(frame)
+        target = self._targets.get(frame.plant)
+        if self._is_sample(known, frame, frame.values.shape[1] if target is None else len(target)):
+            known.observer.state(frame)
         return known.held is not None and frame.step == known.held.step
 
     def action(self, pair: int, frame: Frame) -> None:
-        """Take a sample a_k of a pair's episode."""
-        self.pairs[pair].observer.action(frame)
+        """Take a sample a_k of a pair's episode. Raises FrameError for one of another shape."""
+        if self._is_sample(self.pairs[pair], frame, self.n_a):
+            self.pairs[pair].observer.action(frame)
 
     def model(self, pair: int, frame: Frame, now: float) -> list[Order]:
         """Take the reduced models of an exploratory episode."""
@@ -241,7 +244,7 @@ class Dispatcher:
         if self.plant not in (UNKNOWN_PLANT, frame.plant):
             raise FrameError(f"expected a model of plant {self.plant}, got one of {frame.plant}")
         known.heard = now
-        known.answers[MODEL_IDENTIFIED.name] = frame.episode, frame.digest()
+        known.remember(MODEL_IDENTIFIED.name, frame)
         known.chunk.models = frame.values.copy()
         self._release_if_done(known)
         return self._hand_out(now)
@@ -271,7 +274,8 @@ class Dispatcher:
             if pair.held is not None:
                 self._collect(pair)
                 if pair.held is not None and now - pair.held_since > LATE:
-                    lost = pair.observer.lost(pair.held.plant, pair.held.step)
+                    width = len(self._targets.get(pair.held.plant, ()))
+                    lost = pair.observer.lost(pair.held.plant, pair.held.step, width)
                     self._retry(pair, f"the tuner missed {lost} samples of episode {pair.episode}")
                 else:
                     self._release_if_done(pair)
@@ -334,29 +338,52 @@ class Dispatcher:
         if frame.run != self.run:
             self.tally["answers of another run"] += 1
             return None
-        episode, digest = known.answers.get(topic.name, (-1, 0))
+        taken = known.answers.get(topic.name, {}).get(frame.episode)
         void = topic is COST and bool((frame.values[:, -1:] == VOID).any())
         same_plant = self.plant in (UNKNOWN_PLANT, frame.plant)
-        if frame.episode == episode and same_plant and not void and frame.digest() != digest:
+        if taken is not None and same_plant and not void and frame.digest() != taken:
             raise DispatchError(
-                f"two different messages on {topic.name} answer episode {episode}; expected one "
+                f"two different messages on {topic.name} answer episode {frame.episode}; expected one "
                 "plant and one controller in this namespace: stop the other and start a new run"
+            )
+        used = known.chunk is None or frame.episode != known.episode
+        if taken is not None and same_plant and void and used and not self.held:
+            raise DispatchError(
+                f"the plant took back the cost of episode {frame.episode}, which this run has used, "
+                "because different actions came for one step: stop the second controller and start "
+                "a new run"
             )
         if known.chunk is None or frame.episode != known.episode:
             self.tally["answers of another episode"] += 1
             return None
         return known
 
+    def _is_sample(self, pair: Pair, frame: Frame, width: int) -> bool:
+        """Whether this is a sample of the pair's episode; a FrameError if it has another shape."""
+        if pair.chunk is None or (frame.run, frame.episode) != (self.run, pair.episode):
+            return False
+        expected = (pair.chunk.rows.stop - pair.chunk.rows.start, width)
+        if frame.values.shape != expected:
+            raise FrameError(
+                f"expected a sample of shape {expected} for step {frame.step}, "
+                f"got {frame.values.shape}"
+            )
+        return True
+
     def _release_if_done(self, pair: Pair) -> None:
-        assert pair.chunk is not None and self._batch is not None
-        if pair.chunk.done(self._batch):
+        assert self._batch is not None
+        if pair.chunk is not None and pair.chunk.done(self._batch):
             pair.chunk = None
 
     def _collect(self, pair: Pair) -> None:
         """Take the held episode's trajectories, if all samples and the target are there."""
         held, chunk = pair.held, pair.chunk
         assert held is not None and chunk is not None
-        if held.plant in self._targets and not pair.observer.lost(held.plant, held.step):
+        if pair.observer.contradiction:
+            self._retry(pair, pair.observer.contradiction)
+            return
+        target = self._targets.get(held.plant)
+        if target is not None and not pair.observer.lost(held.plant, held.step, len(target)):
             ended = held.values[:, CostColumn.ENDED]
             chunk.trajectories = pair.observer.trajectories(held.plant, held.step, ended)
             pair.held = None

@@ -15,6 +15,8 @@ from tuner_node.optimizers import Trajectory
 from tuner_node.trajectory_collector import Observer
 
 Array = NDArray[np.float64]
+REMEMBERED = 16
+"""Episodes of a pair whose answers can still be contradicted."""
 
 
 @dataclass
@@ -55,7 +57,14 @@ class Pair:
     """Since when only another plant's costs come."""
     paused_until: float = -math.inf
     """How long what its plant said of being paused holds."""
-    answers: dict[str, tuple[int, int]] = field(default_factory=dict)
-    """By topic: the episode that was answered last, and a digest of the answer that was taken."""
+    answers: dict[str, dict[int, int]] = field(default_factory=dict)
+    """By topic and episode, of the last REMEMBERED: a digest of the answer that was taken."""
     last: Send | None = None
     """The last start, which keeps the plant for this run while nothing new is handed out."""
+
+    def remember(self, topic: str, answer: Frame) -> None:
+        """An answer was taken: another one for its episode contradicts it."""
+        known = self.answers.setdefault(topic, {})
+        known[answer.episode] = answer.digest()
+        if len(known) > REMEMBERED:
+            del known[min(known)]

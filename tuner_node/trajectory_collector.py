@@ -1,6 +1,7 @@
 """Collects the trajectories of an episode from the ordinary `state` and `action` topics. Pure.
 
-A sample that was lost is never interpolated: the episode has no trajectories then, and is run again.
+A sample that was lost is never interpolated: the episode has no trajectories then, and is run again. So
+it is when a sample comes twice with different content: which of them was the plant's would be chance.
 """
 
 from __future__ import annotations
@@ -23,27 +24,41 @@ class Observer:
 
     run: int = -1
     episode: int = -1
+    contradiction: str = ""
+    """Why the episode cannot be used, if two different samples came for one step."""
     _states: dict[tuple[int, int], Array] = field(default_factory=dict)
     _actions: dict[tuple[int, int], Array] = field(default_factory=dict)
 
     def begin(self, run: int, episode: int) -> None:
         """Forget the last episode and listen to this one."""
-        self.run, self.episode = run, episode
+        self.run, self.episode, self.contradiction = run, episode, ""
         self._states, self._actions = {}, {}
 
     def state(self, frame: Frame) -> None:
         """Take z_k; repeated ones are equal."""
-        if (frame.run, frame.episode) == (self.run, self.episode):
-            self._states[frame.plant, frame.step] = frame.values.copy()
+        self._take(self._states, frame, "states")
 
     def action(self, frame: Frame) -> None:
         """Take a_k."""
-        if (frame.run, frame.episode) == (self.run, self.episode):
-            self._actions[frame.plant, frame.step] = frame.values.copy()
+        self._take(self._actions, frame, "actions")
 
-    def lost(self, plant: int, steps: int) -> int:
-        """How many of the samples z_0..z_T and a_0..a_{T-1} are missing."""
-        states = sum(p == plant and k <= steps for p, k in self._states)
+    def _take(self, known: dict[tuple[int, int], Array], frame: Frame, what: str) -> None:
+        if (frame.run, frame.episode) != (self.run, self.episode):
+            return
+        key = frame.plant, frame.step
+        if key not in known:
+            known[key] = frame.values.copy()
+        elif not np.array_equal(known[key], frame.values):
+            self.contradiction = (
+                f"two different {what} came for step {frame.step} of episode {frame.episode}"
+            )
+
+    def lost(self, plant: int, steps: int, n_z: int) -> int:
+        """How many of the samples z_0..z_T, of n_z numbers each, and a_0..a_{T-1} are missing."""
+        states: int = sum(
+            p == plant and k <= steps and values.shape[1] == n_z
+            for (p, k), values in self._states.items()
+        )
         actions = sum(p == plant and k < steps for p, k in self._actions)
         return 2 * steps + 1 - states - actions
 

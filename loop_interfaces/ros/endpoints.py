@@ -230,7 +230,7 @@ class Sender:
 
 
 class Receiver:
-    """Takes frames from one topic and hands them to a callback, and their bytes to the batcher.
+    """Takes frames from one topic and hands them to a callback.
 
     codec: decodes them.
     """
@@ -241,10 +241,8 @@ class Receiver:
         topic: Topic,
         callback: Callable[[Frame], None],
         namespace: str = "",
-        batcher: SampleBatcher | None = None,
     ) -> None:
         self.callback = callback
-        self.batcher = batcher
         self.codec = ArrayCodec(topic.labels)
         self.decode = self.codec.decode
         self.subscription = raw_subscription(

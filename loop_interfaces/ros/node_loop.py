@@ -106,19 +106,10 @@ class NodeLoop:
         return Sender(self.node, topic, namespace, self.batcher if sampled else None)
 
     def receive(
-        self,
-        topic: Topic,
-        callback: Callable[[Frame], None],
-        namespace: str = "",
-        *,
-        sampled: bool = False,
+        self, topic: Topic, callback: Callable[[Frame], None], namespace: str = ""
     ) -> Receiver:
-        """Call `callback` with every frame of `topic`; a ValueError it raises refuses the message.
-
-        sampled: what has come in goes out on `samples`, too.
-        """
-        batcher = self.batcher if sampled else None
-        receiver = Receiver(self.node, topic, callback, namespace, batcher)
+        """Call `callback` with every frame of `topic`; a ValueError it raises refuses the message."""
+        receiver = Receiver(self.node, topic, callback, namespace)
         self._receivers.append(receiver)
         return receiver
 
@@ -321,9 +312,6 @@ class NodeLoop:
 
     def _handle(self, receiver: Receiver, raw: bytes) -> int:
         """Handle a message of `receiver`; 1."""
-        batcher = receiver.batcher
-        if batcher is not None and batcher.wanted:
-            batcher.add(ACTION_KIND, raw)
         try:
             receiver.callback(receiver.decode(raw))
         except ValueError as error:

@@ -343,9 +343,15 @@ def test_a_second_controller_that_answers_otherwise_never_mixes_in(loop, tmp_pat
         "contradiction",
     )
     second.kill()
-    text = loop.wait(tuner, LIMIT)
-    assert "the plant declared episode" in text
-    assert_same_training(out, in_process(iterations=2000))
+    tuner.wait(LIMIT)
+    if tuner.returncode == 0:  # each contradiction came before its episode had ended
+        assert "the plant declared episode" in loop.output(tuner)
+        assert_same_training(out, in_process(iterations=2000))
+    else:
+        last = loop.wait(tuner, LIMIT, code=1).strip().splitlines()[-1]
+        assert "the plant took back the cost of episode" in last
+        assert "stop the second controller and start a new run" in last
+        assert not (out / "result.json").exists()
 
 
 SECOND_CONTROLLER = """

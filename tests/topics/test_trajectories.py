@@ -43,3 +43,48 @@ def test_gauss_newton_ends_with_the_policy_of_one_process(loop: Processes, tmp_p
         tuner = loop.node("tuner_node", *start, *arguments)
     loop.wait(tuner, LIMIT)
     assert_same_training(out, train_here(parameters(**options)))
+
+
+def test_actions_of_a_wrong_shape_with_the_right_ids_change_nothing(loop: Processes, tmp_path):
+    """Somebody who listens to the loop answers each state before, at and after its step."""
+    out = tmp_path / "run"
+    start = ("--params-file", str(SMALL))
+    plant = loop.node("pde_sim_node", *start)
+    loop.node("controller_node", *start)
+    stranger = loop.start("-c", WRONG_SHAPES, name="stranger")
+    until(lambda: "listening" in loop.output(stranger), LIMIT, "the stranger")
+    options = {"rollouts": ROLLOUTS, "optimizer": "gauss_newton", "seeds": 2}
+    tuner = loop.node("tuner_node", *start, *tuner_arguments(out, **options, max_attempts=50))
+    loop.wait(tuner, LIMIT)
+    assert_same_training(out, train_here(parameters(**options)))
+    until(lambda: "expected an action of shape" in loop.output(plant), LIMIT, "refusal")
+    assert int(loop.output(stranger).split()[-1]) > 100  # it had its say
+    stranger.kill()
+
+
+WRONG_SHAPES = """
+from dataclasses import replace
+import numpy as np, rclpy
+from std_msgs.msg import Float64MultiArray
+from loop_interfaces.frames import ArrayCodec
+from loop_interfaces.ros.endpoints import reader_qos, writer_qos
+from loop_interfaces.topics import ACTION, STATE
+rclpy.init()
+node = rclpy.create_node("stranger")
+publisher = node.create_publisher(Float64MultiArray, "action", writer_qos(ACTION))
+states, actions = ArrayCodec(STATE.labels), ArrayCodec(ACTION.labels)
+count = 0
+def answer(message):
+    global count
+    state = states.decode(message)
+    rows = len(state.values)
+    for step in (state.step - 1, state.step, state.step + 1):
+        for shape in ((rows, 3), (rows + 1, 4), (rows, 5), (0, 4)):
+            wrong = replace(state, step=max(step, 0), values=np.full(shape, 0.5))
+            publisher.publish(actions.encode(wrong))
+            count += 1
+    print(count, flush=True)
+node.create_subscription(Float64MultiArray, "state", answer, reader_qos(STATE), raw=True)
+print("listening", flush=True)
+rclpy.spin(node)
+"""
