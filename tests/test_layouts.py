@@ -9,9 +9,10 @@ from typing import Any
 
 import yaml
 
+from loop_interfaces.controllers import CONTROLLERS
 from loop_interfaces.problem import config_folder
 from pdeloop.secure import ROLES
-from viewer_node.loop_view import NUMBERS
+from viewer_node.loop_view import COSTS, NUMBERS
 
 VIEWS = config_folder() / "views"
 FLOAT, MARKER, IMAGE = (
@@ -99,6 +100,17 @@ def test_every_topic_of_the_layouts_is_published_with_that_type():
 def test_every_number_is_plotted():
     curves = {curve.attrib["name"] for curve in plotjuggler().iter("curve")}
     assert curves == {f"/view/{name}/data" for name in NUMBERS}
+
+
+def test_the_costs_have_the_names_and_colours_of_their_controllers():
+    curves = {curve.attrib["name"]: curve.attrib["color"] for curve in plotjuggler().iter("curve")}
+    configs = foxglove()["configById"]
+    paths = {p["value"]: p for c in configs.values() if "paths" in c for p in c["paths"]}
+    for key, number in COSTS.items():
+        name, colour, _ = CONTROLLERS[key]
+        assert curves[f"/view/{number}/data"] == colour
+        path = paths[f"/view/{number}.data"]
+        assert (path["label"], path["color"]) == (name, colour)
 
 
 def test_the_plotjuggler_layout_has_its_form():

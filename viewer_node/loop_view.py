@@ -47,7 +47,8 @@ NUMBERS = {
     "step": "k of the newest sample",
 }
 """Names of the numbers, published below `view/`, and what they are."""
-_COSTS = {"none": "cost_no_control", "lqt": "cost_lqt", "adapted": "cost"}
+COSTS = {"none": "cost_no_control", "lqt": "cost_lqt", "adapted": "cost"}
+"""The number with the cost of each controller (loop_interfaces.controllers)."""
 
 
 class LoopView:
@@ -175,7 +176,7 @@ class LoopView:
         rollouts = self._costs.cost(frame)
         if rollouts is None:
             return
-        for controller, name in _COSTS.items():
+        for controller, name in COSTS.items():
             if (mean := rollouts.mean_cost(controller)) is not None:
                 self._numbers[name] = mean
         if self._numbers.get("cost_lqt", 0.0) > 0.0 and "cost" in self._numbers:
