@@ -28,7 +28,7 @@ from loop_interfaces.ros.endpoints import raw_subscription, reader_qos, scoped
 from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.node_main import ConfigurationError, node_main
 from loop_interfaces.ros.parameters import declare, given_parameters
-from loop_interfaces.ros.sample_subscription import Intake, Watcher
+from loop_interfaces.ros.sample_subscription import SampleSubscription, SerializedSubscription
 from loop_interfaces.samples import ACTION_KIND, CLOCK_KIND, STATE_KIND
 from loop_interfaces.topics import ACTION, RECORDER_STATUS, START, STATE
 from recorder_node.bag import BagError
@@ -113,7 +113,7 @@ class RecorderNode:
     def _wire(self, node: Node, loop: NodeLoop) -> None:
         self._node, self._loop, self._log = node, loop, node.get_logger()
         # States, actions and /clock come from watchers, the rest from subscriptions of their own.
-        self._watchers: list[tuple[Watcher, dict[int, Source]]] = []
+        self._watchers: list[tuple[SampleSubscription, dict[int, Source]]] = []
         clocks = [source for source in self._what if source.channel.type == CLOCK_TYPE]
         times, told = {CLOCK_KIND: clocks[0]} if clocks else {}, bool(clocks)
         for absolute in self._namespaces:
@@ -121,7 +121,7 @@ class RecorderNode:
             mine = [s for s in self._what if s.namespace == namespace]
             kinds = {_KINDS[s.array]: s for s in mine if s.array in _KINDS} | times
             first = not self._watchers
-            watcher = Watcher(node, namespace, clock=told, single_clock=first and told)
+            watcher = SampleSubscription(node, namespace, clock=told, single_clock=first and told)
             self._watchers.append((watcher, kinds))
         self._intakes = [(s, self._subscribe(s)) for s in self._what if s.channel.latched]
         self._peers = Peers(
@@ -157,9 +157,11 @@ class RecorderNode:
         )
         return 0
 
-    def _subscribe(self, source: Source) -> Intake:
+    def _subscribe(self, source: Source) -> SerializedSubscription:
         kind, qos = _TYPES[source.channel.type], reader_qos(START, DEPTH)
-        return Intake(raw_subscription(self._node, kind, source.channel.topic, qos), kind, DEPTH)
+        return SerializedSubscription(
+            raw_subscription(self._node, kind, source.channel.topic, qos), kind, DEPTH
+        )
 
     def _tick(self, _: float) -> None:
         if not self._behind:

@@ -15,7 +15,7 @@ from loop_interfaces.fast_path.channel import CAPACITY, LARGE
 from loop_interfaces.frames import HEADER
 from loop_interfaces.ros.endpoints import raw_subscription, samples_qos
 from loop_interfaces.ros.node_loop import NodeLoop
-from loop_interfaces.ros.sample_subscription import Intake
+from loop_interfaces.ros.sample_subscription import SerializedSubscription
 from loop_interfaces.samples import ACTION_KIND, NO_TIME, STATE_KIND, unpack
 from loop_interfaces.topics import ACTION, COST, STATE, VOID, CostColumn
 from pde_sim_node.solver import workers
@@ -30,9 +30,9 @@ class Peer:
         self._publisher = self.node.create_publisher(Float64MultiArray, sends, 10)
         self._intake = self._reader(Float64MultiArray, reads, 10)
 
-    def _reader(self, kind: Any, name: str, depth: int) -> Intake:
+    def _reader(self, kind: Any, name: str, depth: int) -> SerializedSubscription:
         subscription = raw_subscription(self.node, kind, name, samples_qos(depth))
-        return Intake(subscription, kind, depth)
+        return SerializedSubscription(subscription, kind, depth)
 
     def watch(self) -> None:
         self._batches = self._reader(UInt8MultiArray, "samples", 50)
@@ -52,7 +52,7 @@ class Peer:
             self._publisher.publish(raw)
         time.sleep(0.05)  # until they are there
 
-    def heard(self, count: int, intake: Intake | None = None) -> list[bytes]:
+    def heard(self, count: int, intake: SerializedSubscription | None = None) -> list[bytes]:
         deadline, got = time.monotonic() + 5.0, []
         while len(got) < count and time.monotonic() < deadline:
             got += [bytes(raw) for raw, _ in (intake or self._intake).take()]

@@ -17,7 +17,7 @@ from std_msgs.msg import Float64MultiArray
 
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.ros.endpoints import raw_subscription, reader_qos, scoped
-from loop_interfaces.ros.sample_subscription import Watcher
+from loop_interfaces.ros.sample_subscription import SampleSubscription
 from loop_interfaces.samples import ACTION_KIND, STATE_KIND
 from loop_interfaces.topics import ACTION, COST, MODEL, PAUSED, POLICY, START, STATE, TARGET, Topic
 from viewer_node.loop_view import LoopView
@@ -45,7 +45,7 @@ class LoopReader:
         }
         self._latched = [self._subscribe(topic, handle) for topic, handle in handlers.items()]
         self._costs = self._subscribe(COST, view.cost)
-        self._samples: Watcher | None = None
+        self._samples: SampleSubscription | None = None
         self._handlers: dict[int, tuple[Callable[[bytes], Frame], Handler]] = {
             STATE_KIND: (ArrayCodec(STATE.labels).decode, view.state),
             ACTION_KIND: (ArrayCodec(ACTION.labels).decode, view.action),
@@ -54,7 +54,7 @@ class LoopReader:
     def listen(self, yes: bool) -> None:
         """Whether states and actions are read, too: each costs their sender something."""
         if yes and self._samples is None:
-            self._samples = Watcher(self._node, self._namespace, throttled=True)
+            self._samples = SampleSubscription(self._node, self._namespace, throttled=True)
             self._samples.look()
         elif not yes and self._samples is not None:
             self._samples.close()

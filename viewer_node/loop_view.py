@@ -238,17 +238,19 @@ class LoopView:
 
     def state_of_loop(self, now: float) -> str:
         """What goes on, in one word."""
-        # The last word of a tuner that was interrupted may be lost: then everybody is gone.
         nobody = not any(node.present for node in self.nodes.by_role.values())
-        if self._ended or (nobody and self._heard is not None):
+        quiet = self.quiet(now)
+        # The last message of a tuner that was interrupted may be lost: then everybody is gone. Who
+        # was starved for seconds sees nobody for a moment, too, but hears them again.
+        if self._ended or (nobody and quiet is not None and quiet >= SILENT):
             return "ended"
-        if nobody:
+        if nobody and quiet is None:
             return "empty"
         if self.operation.paused():
             return "paused"
-        if self._heard is None:
+        if quiet is None:
             return "waiting"
-        return "running" if now - self._heard < SILENT else "silent"
+        return "running" if quiet < SILENT else "silent"
 
     def controller(self, shown: EpisodeSamples) -> str:
         """Who acts in the chosen environment: see RolloutCosts.controller."""

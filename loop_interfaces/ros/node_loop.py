@@ -28,7 +28,7 @@ from loop_interfaces.diagnostics import Health
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.ros.endpoints import Receiver, SampleBatcher, Sender, reader_qos, scoped
 from loop_interfaces.ros.introspection import Introspection
-from loop_interfaces.ros.sample_subscription import Watcher
+from loop_interfaces.ros.sample_subscription import SampleSubscription
 from loop_interfaces.ros.suspend_watchdog import SuspendWatchdog
 from loop_interfaces.samples import ACTION_KIND, STATE_KIND
 from loop_interfaces.topics import ACTION, SAMPLES, STATE, Topic
@@ -55,7 +55,7 @@ does not introduce itself again. Joining as a new participant is the way back.""
 class _Watched:
     """A pair that is watched: how its messages are decoded, and who is called with them."""
 
-    watcher: Watcher
+    samples: SampleSubscription
     callbacks: dict[int, tuple[Callable[[bytes], Frame], Callable[[Frame], None]]] = field(
         default_factory=dict
     )
@@ -129,7 +129,7 @@ class NodeLoop:
         """
         watched = self._watched.get(namespace)
         if watched is None:
-            watched = self._watched[namespace] = _Watched(Watcher(self.node, namespace))
+            watched = self._watched[namespace] = _Watched(SampleSubscription(self.node, namespace))
         kind = {STATE: STATE_KIND, ACTION: ACTION_KIND}[topic]
         watched.callbacks[kind] = (ArrayCodec(topic.labels).decode, callback)
 
@@ -249,7 +249,7 @@ class NodeLoop:
                 self._executor.spin_once(timeout_sec=0)
                 if self._batcher is not None:
                     self._batcher.look(now)
-                changed = [watched.watcher.look() for watched in self._watched.values()]
+                changed = [watched.samples.look() for watched in self._watched.values()]
                 if any(changed):
                     handles, take_from = self._sources(fast)
                 housekeeping(now)
@@ -296,7 +296,7 @@ class NodeLoop:
         """
         found: dict[int, tuple[Any, Callable[[], int]]] = {}
         for watched in self._watched.values():
-            for handle in watched.watcher.handles:
+            for handle in watched.samples.handles:
                 found[handle.pointer] = (handle, partial(self._drain, watched))
         for receiver in self._receivers:
             if fast is not None and receiver is fast.receiver:
@@ -331,7 +331,7 @@ class NodeLoop:
         """Handle all samples that have come in; how many."""
         count = 0
         try:
-            for kind, _, raw in watched.watcher.drain():
+            for kind, _, raw in watched.samples.drain():
                 count += 1
                 if kind in watched.callbacks:
                     decode, callback = watched.callbacks[kind]

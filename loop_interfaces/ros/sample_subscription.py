@@ -36,7 +36,7 @@ _SINGLES: dict[int, tuple[Any, str]] = {
 }
 
 
-class Intake:
+class SerializedSubscription:
     """Takes serialised messages of one raw subscription, with what the middleware says of each.
 
     depth: the most that one `take` gives.
@@ -72,7 +72,7 @@ class Intake:
             yield taken
 
 
-class Watcher:
+class SampleSubscription:
     """The states and actions of one pair, as serialised messages with the time of their arrival.
 
     clock: also the times that go with the states of a batch; single_clock: also those on /clock
@@ -96,7 +96,7 @@ class Watcher:
         name = SAMPLES_THROTTLED if throttled else SAMPLES
         depth = BUNDLE_DEPTH
         self._batches = self._subscribe(UInt8MultiArray, name, samples_qos(depth), depth)
-        self._singles: dict[int, Intake] = {}
+        self._singles: dict[int, SerializedSubscription] = {}
         self._state_topic = node.resolve_topic_name(scoped(namespace, STATE.name))
         self.handles: list[Any] = [self._batches.subscription.handle]
 
@@ -122,8 +122,8 @@ class Watcher:
     def drain(self, until: int | None = None) -> Iterator[tuple[int, int, bytes]]:
         """Kind, time of arrival (ns since the epoch) and CDR bytes of everything that has come in.
 
-        until: as of Intake.take. Raises FrameError, after which it can be called again, for a batch
-        that is none.
+        until: as of SerializedSubscription.take. Raises FrameError, after which it can be called
+        again, for a batch that is none.
         """
         for batch, info in self._batches.take(until):
             sent, samples = unpack(batch)
@@ -142,6 +142,10 @@ class Watcher:
             self._node.destroy_subscription(intake.subscription)
         self._singles, self.handles = {}, []
 
-    def _subscribe(self, message_type: Any, name: str, qos: Any, depth: int) -> Intake:
+    def _subscribe(
+        self, message_type: Any, name: str, qos: Any, depth: int
+    ) -> SerializedSubscription:
         name = scoped(self._namespace, name)
-        return Intake(raw_subscription(self._node, message_type, name, qos), message_type, depth)
+        return SerializedSubscription(
+            raw_subscription(self._node, message_type, name, qos), message_type, depth
+        )

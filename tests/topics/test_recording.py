@@ -255,10 +255,10 @@ INTAKE = """
 import rclpy, time
 from std_msgs.msg import String
 from loop_interfaces.ros.endpoints import raw_subscription
-from loop_interfaces.ros.sample_subscription import Intake
+from loop_interfaces.ros.sample_subscription import SerializedSubscription
 rclpy.init()
 node = rclpy.create_node("intake")
-intake = Intake(raw_subscription(node, String, "words", 50), String, 50)
+intake = SerializedSubscription(raw_subscription(node, String, "words", 50), String, 50)
 publisher = node.create_publisher(String, "words", 50)
 while not publisher.get_subscription_count():
     time.sleep(0.01)
