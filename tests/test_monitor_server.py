@@ -163,3 +163,36 @@ def test_the_colour_map_is_that_of_the_report():
     ours = np.frombuffer(bytes.fromhex(text), np.uint8).reshape(-1, 3)
     theirs = (colormaps[FIELD_MAP](np.arange(256))[:, :3] * 255).round()
     np.testing.assert_array_equal(ours, theirs)
+
+
+async def closed(connections: list[tuple[asyncio.StreamReader, asyncio.StreamWriter]]) -> None:
+    """Wait until the server has closed all of these."""
+    for reader, writer in connections:
+        with contextlib.suppress(ConnectionError):
+            assert await asyncio.wait_for(reader.read(), 10.0) in (b"",)
+        writer.close()
+
+
+def test_connections_that_ask_nothing_are_closed_and_a_page_stays(monkeypatch):
+    monkeypatch.setattr("viewer_node.web.server.LINGER", 1.0)
+    monkeypatch.setattr("viewer_node.web.server.MOST_CONNECTIONS", 50)
+
+    async def scenario(server: Server) -> None:
+        url = f"http://127.0.0.1:{server.port}/ws"
+        own = f"http://127.0.0.1:{server.port}"
+        async with (
+            aiohttp.ClientSession() as session,
+            session.ws_connect(url, headers={"Origin": own}) as page,
+        ):
+            await page.receive_json(timeout=10)
+            half = [await asyncio.open_connection("127.0.0.1", server.port) for _ in range(49 + 20)]
+            for _, writer in half[:10]:
+                writer.write(b"GET / HTTP/1.1\r\nHost: ")  # and never the rest
+            await closed(half[49:])  # beyond the limit: at once
+            await closed(half[:49])
+            assert (await ask(server, "GET", "/"))[0] == 200
+            assert not page.closed and server.watched()
+            await page.ping()
+
+    with served() as (server, _, _):
+        asyncio.run(scenario(server))

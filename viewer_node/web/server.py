@@ -21,6 +21,7 @@ import socket
 import threading
 import time
 from collections.abc import Awaitable, Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,11 @@ FRAMES = 20.0
 """Pictures a second at the most."""
 MOST_PAGES = 16
 """Pages that may look at the same time."""
+MOST_CONNECTIONS = 128
+"""Connections at the same time; further ones are closed as they come."""
+LINGER = 10.0
+"""Seconds after which a connection ends that is no page's WebSocket: one after its present request, one
+that is still not over after as long again at once."""
 MAX_BODY = 10_000
 HOST = "127.0.0.1"
 TOKEN = "X-Pdeloop-Token"
@@ -66,6 +72,14 @@ _HEADERS = {
 _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
+class _Refusal(asyncio.Protocol):
+    """Closes a connection as soon as it is made."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        transport.abort()
+
+
 class Server:
     """Serves the page from a thread of its own, between `start` and `stop`.
 
@@ -78,6 +92,8 @@ class Server:
         self._socket = socket.create_server((HOST, port))
         self.port: int = self._socket.getsockname()[1]
         self._open: set[web.WebSocketResponse] = set()
+        self._pages: set[object] = set()
+        """Connections that are WebSockets of pages."""
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._serve, name="page", daemon=True)
         self._ended = asyncio.Event()
@@ -111,13 +127,29 @@ class Server:
         runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
         await runner.setup()
         try:
-            await web.SockSite(runner, self._socket).start()
+            assert runner.server is not None
+            connect = partial(self._connect, runner.server)
+            listening = await self._loop.create_server(connect, sock=self._socket)
             await self._ended.wait()
+            listening.close()
             for page in list(self._open):
                 with contextlib.suppress(Exception):
                     await asyncio.wait_for(page.close(code=1001), 1.0)
         finally:
             await runner.cleanup()
+
+    def _connect(self, server: web.Server) -> asyncio.Protocol:
+        """The protocol of a connection that comes in."""
+        if len(server.connections) >= MOST_CONNECTIONS:
+            return _Refusal()
+        connection = server()
+        self._loop.call_later(LINGER, self._end, connection, connection.close)
+        self._loop.call_later(2 * LINGER, self._end, connection, connection.force_close)
+        return connection
+
+    def _end(self, connection: web.RequestHandler, end: Callable[[], None]) -> None:
+        if connection not in self._pages:
+            end()
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: _Handler) -> web.StreamResponse:
@@ -144,6 +176,7 @@ class Server:
         page = web.WebSocketResponse(heartbeat=10.0, max_msg_size=MAX_BODY, compress=False)
         await page.prepare(request)
         self._open.add(page)
+        self._pages.add(request.protocol)
         telling = asyncio.create_task(self._tell(page))
         try:
             async for message in page:  # a page says nothing; this notices that it has gone
@@ -151,6 +184,7 @@ class Server:
                     break
         finally:
             self._open.discard(page)
+            self._pages.discard(request.protocol)
             telling.cancel()
             with contextlib.suppress(asyncio.CancelledError, ConnectionError):
                 await telling
