@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import signal
 import struct
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -11,7 +13,12 @@ import pytest
 
 from loop_interfaces.frames import Frame
 from loop_interfaces.topics import COMPLETED, VOID
+from pdeloop.live import Live
+from pdeloop.monitor.finder import Finder
 from pdeloop.monitor.read_budget import ReadBudget
+from pdeloop.monitor.replay import replay
+from tests.small import parameters
+from tuner_node.results import RunFolder
 from viewer_node.episode_samples import COLUMNS, MAX_COMPONENTS, ROWS, EpisodeSamples, rows_of
 from viewer_node.learning_curve import MAX_POINTS, SENT, LearningCurve
 from viewer_node.loop_nodes import Endpoint, LoopNodes
@@ -21,6 +28,7 @@ from viewer_node.rollout_costs import RolloutCosts
 from viewer_node.sliding_rate import SlidingRate
 from viewer_node.web.messages import Cursor
 from viewer_node.web.page import Page
+from viewer_node.web.requests import Requests
 
 PLANT = 7
 
@@ -546,3 +554,51 @@ def test_the_colours_span_the_field_and_the_target_and_do_not_flicker():
     assert first == [-10.0, pytest.approx(0.3, abs=0.01)]
     assert colours(1) == first
     assert colours(90)[1] > 80
+
+
+# A run on which nothing works.
+
+
+@pytest.fixture
+def own_signals() -> Iterator[None]:
+    """The test's own handlers of SIGINT and SIGTERM; pytest has its back afterwards."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def test_a_run_that_was_interrupted_is_shown_until_it_goes_on(tmp_path, own_signals):
+    folder = RunFolder(tmp_path / "run")
+    folder.create(parameters(seeds=2))
+    folder.note({"event": "designed", "seed": 0})
+    folder.note({"event": "designed", "seed": 1})
+    folder.note({"event": "phase", "phase": "adapt", "rollouts": [9, 9], "budget": [80, 80]})
+    folder.note(adapted(0, 11, 2.0))
+    folder.note(adapted(1, 11, 4.0))
+    page, found = Page(), []
+    looks = iter(range(100))
+
+    def look() -> list[Live]:
+        if next(looks) == 2:
+            status = json.loads(page.updates(Cursor(), 0.0)[0])
+            assert status["state"] == "recorded" and not status["recorded"]["finished"]
+            assert "not recorded" in status["recorded"]["note"]
+            assert status["parameters"]["problem"] == "small"
+            assert points(page.view.curve) == [(11, 3.0, 2.0, 4.0)]
+            found.append(Live(17, folder.path, 1.0))
+        return list(found)
+
+    assert replay(folder.path, Finder(folder.path, None, look), page, Requests())
+    assert found
+
+
+def test_a_stop_signal_ends_the_replay(tmp_path, own_signals):
+    folder = RunFolder(tmp_path / "run")
+    folder.create(parameters())
+
+    def look() -> list[Live]:
+        signal.raise_signal(signal.SIGTERM)
+        return []
+
+    assert not replay(folder.path, Finder(folder.path, None, look), Page(), Requests())
