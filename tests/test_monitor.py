@@ -333,7 +333,7 @@ def test_a_node_that_comes_again_is_counted_and_one_that_is_only_seen_late_is_no
     nodes = LoopNodes()
     first, second = Endpoint("/pde_sim_node", b"a"), Endpoint("/pde_sim_node", b"b")
     for found in ([first], [], [first], [first, second], [second]):
-        nodes.look({"plant": found})
+        nodes.update({"plant": found})
     (plant, controller, _) = nodes.message(0.0)
     assert plant["restarts"] == 1 and plant["present"] and plant["rivals"] == 0
     assert not controller["present"] and controller["name"] == ""
@@ -341,7 +341,7 @@ def test_a_node_that_comes_again_is_counted_and_one_that_is_only_seen_late_is_no
 
 def test_diagnostics_belong_to_the_node_they_name_and_are_forgotten_when_they_stop():
     nodes = LoopNodes()
-    nodes.look({"plant": [Endpoint("/lab/pde_sim_node", b"a")]})
+    nodes.update({"plant": [Endpoint("/lab/pde_sim_node", b"a")]})
     values = [("paused", "yes"), ("step", "4")]
     nodes.diagnosis("lab/pde_sim_node: lock-step", 1, "paused", values, 10.0)
     nodes.diagnosis("lab/other: lock-step", 2, "no", [], 10.0)
@@ -409,7 +409,7 @@ def test_only_the_asked_run_is_shown():
 def test_who_holds_the_loop_is_told_by_the_plant_by_diagnostics_or_by_the_answer():
     view = LoopView()
     roles = {"plant": [Endpoint("/p", b"p")], "tuner": [Endpoint("/t", b"t")]}
-    view.nodes.look(roles)
+    view.nodes.update(roles)
     view.state(state(0), 0.0)
     assert view.state_of_loop(0.1) == "running" and view.state_of_loop(9.0) == "silent"
     view.paused(frame([1.0]), 1.0)
@@ -431,7 +431,7 @@ def test_who_holds_the_loop_is_told_by_the_plant_by_diagnostics_or_by_the_answer
 
 def test_what_was_asked_for_is_told_until_it_is_answered_and_a_failure_for_a_while():
     view = LoopView()
-    view.nodes.look({"tuner": [Endpoint("/t", b"t")]})
+    view.nodes.update({"tuner": [Endpoint("/t", b"t")]})
     pause, stop = Call("/t", "pause"), Call("/t", "stop")
     view.operation.asked(pause, 1.0)
     asked = {"role": "tuner", "verb": "pause", "seconds": 7, "failure": ""}
@@ -446,15 +446,15 @@ def test_what_was_asked_for_is_told_until_it_is_answered_and_a_failure_for_a_whi
     view.operation.answered(stop, 31.0, None)
     assert view.operation.stopping and view.operation.paused() == []
     view.operation.asked(pause, 32.0)
-    view.nodes.look({"tuner": [Endpoint("/t", b"u")]})  # another one, that continues the run
+    view.nodes.update({"tuner": [Endpoint("/t", b"u")]})  # another one, that continues the run
     assert not view.operation.stopping
-    view.nodes.look({})
+    view.nodes.update({})
     assert view.operation.requests(33.0) == []  # nobody is there who could answer
 
 
 def test_an_activity_is_told_with_its_seconds_while_its_node_reports_it():
     nodes = LoopNodes()
-    nodes.look({"tuner": [Endpoint("/t", b"t")]})
+    nodes.update({"tuner": [Endpoint("/t", b"t")]})
     assert nodes.activity(0.0) is None
     values = [("activity", "fitting models"), ("activity for", "5.0")]
     nodes.diagnosis("t: training", 0, "fitting models for 5 s", values, 10.0)
@@ -468,13 +468,13 @@ def test_an_activity_is_told_with_its_seconds_while_its_node_reports_it():
 def test_a_loop_that_is_gone_without_a_word_has_ended_too():
     view = LoopView()
     assert view.state_of_loop(0.0) == "empty"
-    view.nodes.look({"plant": [Endpoint("/p", b"p")]})
+    view.nodes.update({"plant": [Endpoint("/p", b"p")]})
     view.state(state(0), 0.0)
     assert view.state_of_loop(0.1) == "running"
-    view.nodes.look({})
+    view.nodes.update({})
     assert view.state_of_loop(0.2) == "running"  # it was we who were held up
     assert view.state_of_loop(SILENT) == "ended"
-    view.nodes.look({"plant": [Endpoint("/p", b"q")]})
+    view.nodes.update({"plant": [Endpoint("/p", b"q")]})
     view.state(state(1), 9.0)
     assert view.state_of_loop(9.0) == "running"
 

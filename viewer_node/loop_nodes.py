@@ -55,7 +55,7 @@ class LoopNodes:
         self.by_role = {role: LoopNode(role) for role in ROLES}
         self._reports: dict[str, Report] = {}
 
-    def look(self, found: Mapping[str, Iterable[Endpoint]]) -> None:
+    def update(self, found: Mapping[str, Iterable[Endpoint]]) -> None:
         """Take who publishes what, by role."""
         for role, node in self.by_role.items():
             endpoints = list(found.get(role, ()))

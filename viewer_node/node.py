@@ -29,7 +29,7 @@ from viewer_node.diagnostics import ViewerHealth
 from viewer_node.loop_reader import PERIOD, LoopReader
 from viewer_node.loop_view import NUMBERS, LoopView
 from viewer_node.picture import diverging
-from viewer_node.priority import stand_back
+from viewer_node.priority import lower_priority
 
 LOOK = 0.5
 """Seconds between two looks at the graph."""
@@ -139,7 +139,7 @@ def _wanted(publisher: Publisher) -> bool:
 
 def main(args: list[str] | None = None) -> int:
     """Console script."""
-    stand_back()
+    lower_priority()
     keep_on_this_machine()
     return node_main("viewer_node", args, ViewerNode, Observer)
 

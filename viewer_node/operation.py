@@ -13,7 +13,7 @@ from viewer_node.loop_nodes import LoopNodes
 VERBS = ("pause", "resume", "step", "stop")
 """std_srvs/Trigger services that nodes of a loop may offer under their private names."""
 FAILURE = 15.0
-"""Seconds for which it is told that a request failed."""
+"""Seconds for which the failure of a request is reported."""
 OVERRULED = 5.0
 """Seconds after which a paused plant that goes on was resumed by somebody else."""
 
@@ -100,7 +100,7 @@ class Operation:
         for role in ("plant", "tuner"):
             node = self._nodes.by_role[role]
             reported = self._nodes.value(role, "paused", since=self._answered.get(node.name, 0.0))
-            told = self.plant_paused and role == "plant"
-            if node.present and (told or node.name in self._paused or reported == "yes"):
+            published = self.plant_paused and role == "plant"
+            if node.present and (published or node.name in self._paused or reported == "yes"):
                 found.append(role)
         return found

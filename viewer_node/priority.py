@@ -1,4 +1,4 @@
-"""The priority of a process that only looks. Pure."""
+"""The scheduling priority of a process that only observes. Pure."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ import contextlib
 import os
 
 
-def stand_back() -> None:
-    """Let the loop's processes go first: what arrives here must not preempt its sender."""
+def lower_priority() -> None:
+    """Schedule this process as batch work at nice 19: a message that arrives here must not preempt its
+    sender.
+    """
     with contextlib.suppress(OSError, AttributeError):
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
         os.nice(19)

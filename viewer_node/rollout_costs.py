@@ -1,4 +1,4 @@
-"""Which controller caused which cost, told by the gains that were published. Pure."""
+"""Which controller caused which cost, by the gains that were published. Pure."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ def _monitor(options: argparse.Namespace) -> int:
     from pdeloop.domain import given_domain
     from pdeloop.monitor.finder import Finder, run_id
     from pdeloop.monitor.replay import replay
-    from viewer_node.priority import stand_back
+    from viewer_node.priority import lower_priority
     from viewer_node.web.page import Page
     from viewer_node.web.requests import Requests
     from viewer_node.web.server import Server
@@ -71,7 +71,7 @@ def _monitor(options: argparse.Namespace) -> int:
         raise ParameterError(f"no run in {folder}; give the folder of one, or none")
     page, requests = Page(options.environment), Requests()
     finder = Finder(folder, given_domain())
-    stand_back()
+    lower_priority()
     try:
         server = Server(page, requests, options.port)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Which loop the monitor watches: the one it was told, or the training that runs."""
+"""Which loop the monitor watches: the given one, or the training that runs."""
 
 from __future__ import annotations
 

@@ -169,7 +169,7 @@ class MonitorNode:
             self._asked.pop(process).close()
         with self._page.lock:
             self._page.place["namespaces"] = found
-            self._view.nodes.look(by_role)
+            self._view.nodes.update(by_role)
             self._page.controls = self._controls(by_role)
 
     def _refresh(self) -> None:
@@ -208,7 +208,7 @@ class MonitorNode:
         ]
 
     def _take_parameters(self, values: dict[str, Any]) -> None:
-        """Take a node's parameters; the tuner's may say where its run's folder is."""
+        """Take a node's parameters; the tuner's may name its run's folder."""
         self._page.take_parameters(values)
         if "equation" in values:
             self._view.components = component_names(values)
@@ -216,7 +216,7 @@ class MonitorNode:
         self._out = Path(out) if isinstance(out, str) and out else self._out
 
     def _follow(self) -> None:
-        """Take the curve from the folder that the tuner told, if its run is the one on the topics."""
+        """Take the curve from the tuner's folder (`out`), if its run is the one on the topics."""
         if self._progress is None and self._out is not None:
             run = self._view.run
             if run and run_id(self._out) == run:

@@ -44,7 +44,7 @@ class Page:
     """What all pages of a monitor are sent.
 
     view: of the loop that is shown; place: its domain, folder, namespace and namespaces, for people;
-    parameters, controls: what its nodes have told and what they offer; recorded: if it is a run that
+    parameters, controls: of its nodes, and the services that they offer; recorded: if it is a run that
     does not run.
     """
 
@@ -75,7 +75,7 @@ class Page:
             self.parameters, self.controls = {}, []
 
     def take_parameters(self, values: Mapping[str, Any]) -> None:
-        """Take parameters that a node told."""
+        """Take parameters of a node."""
         self.parameters |= {name: values[name] for name in PARAMETERS if name in values}
         self.view.horizon = int(self.parameters.get("horizon", 0))
 
