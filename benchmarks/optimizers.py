@@ -30,7 +30,7 @@ from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import Plant
 from pdeloop.reference import Reference, find
-from pdeloop.reproduce.experiment import PAPER
+from pdeloop.reproduce.table import PAPER
 from pdeloop.rollout import Law, rollout
 from tuner_node.optimizers import (
     OPTIMIZERS,

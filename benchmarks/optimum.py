@@ -35,7 +35,7 @@ from benchmarks.optimizers import warm_start
 from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from pdeloop.reference import FORMAT, bound_parameters, no_control_cost
-from pdeloop.reproduce.experiment import PAPER
+from pdeloop.reproduce.table import PAPER
 from tuner_node.results import RunFolderError, versions
 from tuner_node.seeds import Purpose, derive
 

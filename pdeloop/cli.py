@@ -18,6 +18,7 @@ _EXTRAS = {
     "rosbags": "record",
     "mcap": "record",
     "matplotlib": "report",
+    "jinja2": "report",
     "aiohttp": "monitor",
     "shtab": "completion",
 }

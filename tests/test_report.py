@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import subprocess
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -13,24 +12,21 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from loop_interfaces.controllers import CONTROLLERS
+from pdeloop.report.data import gather
+from tests.browser import browser
 from tests.loop_harness import processes
 from tests.small import SMALL
 
 LIMIT = 300.0
-COMMON = ("training-curves", "costs", "small-behaviour", "small-gains", "small-spectrum")
-BROWSER = [
-    "chromium",
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--enable-logging=stderr",
-    "--log-level=0",
-]
+FIGURES = (
+    "training-curves",
+    "costs",
+    "small-behaviour",
+    "small-gains",
+    "small-spectrum",
+    "small-steps",
+)
 
 
 @pytest.fixture(scope="module", params=["run", "reproduction"])
@@ -38,7 +34,7 @@ def folder(request, tmp_path_factory) -> Path:
     """A small finished run with its limits, or a small reproduction without them."""
     base = tmp_path_factory.mktemp(request.param)
     options = ("--seeds", "2", "--out", str(base / "out"))
-    command, report = ("reproduce", str(SMALL), "--iterations", "4"), ()
+    command, report = ("reproduce", str(SMALL), "--iterations", "12"), ()
     if request.param == "run":
         command = ("train", str(SMALL), "--in-process", "--rollouts", "33")
         command += ("--optimizer", "gauss_newton")
@@ -55,130 +51,237 @@ def folder(request, tmp_path_factory) -> Path:
     return base / "out"
 
 
-def figures_of(folder: Path) -> tuple[str, ...]:
-    """Only an optimiser that judges its steps has a figure of them."""
-    return COMMON if (folder / "reproduction.json").exists() else (*COMMON, "small-steps")
+def is_run(folder: Path) -> bool:
+    return (folder / "result.json").exists()
 
 
-def console(page: Path, profile: Path) -> tuple[list[str], str]:
-    """The browser's console messages while it shows `page`, and the page's final DOM."""
-    assert shutil.which("chromium"), (
-        "this test shows the report in a real browser and needs the command `chromium`; "
-        "install Debian's package chromium (make chromium, as root)"
-    )
-    done = subprocess.run(
-        [*BROWSER, f"--user-data-dir={profile}", "--dump-dom", page.as_uri()],
-        capture_output=True,
-        text=True,
-        timeout=LIMIT,
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    return [line for line in done.stderr.splitlines() if "CONSOLE" in line], done.stdout
+def controllers_of(folder: Path) -> tuple[str, ...]:
+    return ("adapted",) if is_run(folder) else ("lqt_po", "pure_po", "gauss_newton")
+
+
+@pytest.fixture(scope="module")
+def tab(tmp_path_factory):
+    with browser(tmp_path_factory.mktemp("browser")) as opened:
+        yield opened
 
 
 def test_every_figure_is_there_as_png_and_svg(folder):
-    for name in figures_of(folder):
+    for name in FIGURES:
         picture = imread(folder / "report" / f"{name}.png")
         assert picture.shape[1] > 600
         assert np.unique(picture[..., :3].reshape(-1, 3), axis=0).shape[0] > 20
         root = ElementTree.parse(folder / "report" / f"{name}.svg").getroot()
         assert root.tag.endswith("svg") and len(list(root.iter())) > 50
-    assert len(list((folder / "report").glob("*.png"))) == len(figures_of(folder))
+    assert len(list((folder / "report").glob("*.png"))) == len(FIGURES)
 
 
 def test_axes_are_labelled_with_units_and_controllers_named(folder):
-    names = ["no control", "LQT", "LQT-PO"]
-    names += ["pure PO"] if (folder / "reproduction.json").exists() else []
+    names = [CONTROLLERS[name].name for name in ("none", "lqt", *controllers_of(folder))]
     svg = (folder / "report" / "small-behaviour.svg").read_text()
-    for words in ("x (m)", "t (s)", "u(x, t)", "actions", "target", *names):
-        assert words in svg, words
+    words = ("x (m)", "t (s)", "u(x, t)", "actions", "initial field", "final field", "target")
+    for word in (*words, *names):
+        assert word in svg, word
     assert "rollouts" in (folder / "report" / "training-curves.svg").read_text()
     assert "mean stage cost" in (folder / "report" / "costs.svg").read_text()
 
 
 def test_a_controller_has_the_same_colour_in_every_figure(folder):
-    from pdeloop.report.style import COLOURS
-
     for name in ("costs", "small-behaviour", "small-spectrum"):
         svg = (folder / "report" / f"{name}.svg").read_text().lower()
-        for controller in ("none", "lqt", "lqt_po"):
-            assert COLOURS[controller].lower() in svg, (name, controller)
-    with_limits = "small-steps" in figures_of(folder)
+        for controller in ("none", "lqt", *controllers_of(folder)):
+            assert CONTROLLERS[controller].colour in svg, (name, controller)
     for name in ("training-curves", "costs"):
         svg = (folder / "report" / f"{name}.svg").read_text().lower()
-        assert (COLOURS["optimum"].lower() in svg) == with_limits, name
+        assert (CONTROLLERS["optimum"].colour in svg) == is_run(folder), name
 
 
 def test_steps_damping_and_model_error_are_those_of_the_history(folder):
     """The figure's data against result.json; the paper's optimiser has none."""
-    from pdeloop.report.data import gather
-
-    base = folder if (folder / "result.json").exists() else folder / "small" / "lqt"
-    history = json.loads((base / "result.json").read_text())["history"]
     problem = gather(folder).problems[0]
-    if base != folder:
-        assert problem.steps is None and problem.share("lqt_po") is None
-        assert problem.curves[0].rollouts.tolist() == [0, 2, 4, 6, 8]
-        return
-    own = [row for row in history if row["seed"] == 0]
+    name = controllers_of(folder)[-1]
+    base = folder if is_run(folder) else folder / "small" / name
+    history = json.loads((base / "result.json").read_text())["history"]
+    assert list(problem.steps) == [name]
+    steps = problem.steps[name]
+    before = problem.runs[name].before[problem.shown]
+    own = [row for row in history if row["seed"] == problem.shown]
     decided = [row for row in own if "accepted" in row]
-    steps = problem.steps
-    assert steps.decided.tolist() == [row["rollouts"] for row in decided]
+    assert steps.decided.tolist() == [row["rollouts"] - before for row in decided]
     assert steps.accepted.tolist() == [row["accepted"] for row in decided]
     assert steps.accepted.any() and (steps.relative[steps.accepted] < 1).all()
     assert (steps.damping > 0).all() and (steps.predicted < 1).all()
     assert steps.mismatch.tolist() == [row["mismatch"] for row in own if "mismatch" in row]
-    curve = problem.curves[0]
-    assert curve.held and curve.rollouts[-1] == max(row["rollouts"] for row in history) <= 24
+
+
+def test_a_curve_is_the_cost_of_the_policy_at_so_many_rollouts(folder):
+    problem = gather(folder).problems[0]
     lqt = problem.costs["lqt"].mean(axis=1)
-    last = [[row for row in history if row["seed"] == s][-1]["cost"] for s in (0, 1)]
-    np.testing.assert_allclose(curve.relative[-1], last / lqt, rtol=1e-12)
+    for curve, name in zip(problem.curves, controllers_of(folder), strict=True):
+        assert curve.controller == name
+        assert (np.diff(curve.rollouts) > 0).all()
+        if is_run(folder):
+            history = json.loads((folder / "result.json").read_text())["history"]
+            last = [[row for row in history if row["seed"] == s][-1] for s in (0, 1)]
+            ends = np.array([row["cost"] for row in last])
+            before = problem.runs[name].before
+            used = [row["rollouts"] - b for row, b in zip(last, before, strict=True)]
+            assert curve.rollouts[-1] == max(used)
+        else:
+            ends = problem.costs[name].mean(axis=1)
+            start = "none" if name == "pure_po" else "lqt"
+            beginning = problem.costs[start].mean(axis=1)
+            np.testing.assert_allclose(curve.relative[0], beginning / lqt, rtol=1e-12)
+        np.testing.assert_allclose(curve.relative[-1], ends / lqt, rtol=1e-12)
 
 
 def test_the_page_says_which_share_of_the_possible_gain_was_reached(folder):
     page = (folder / "report" / "index.html").read_text()
-    if (folder / "reproduction.json").exists():
+    if not is_run(folder):
         assert "possible gain" not in page and "open-loop limit" not in page
         return
-    from pdeloop.report.data import gather
-
     limits = folder.parent / "limits"
-    share = gather(folder, limits).problems[0].share("lqt_po")
+    share = gather(folder, limits).problems[0].share("adapted")
     known = json.loads((limits / "small.json").read_text())["evaluations"][0]
     costs = json.loads((folder / "result.json").read_text())["mean_cost"]
     best = np.mean(list(known["optimum"].values()))
     assert share == pytest.approx((costs["lqt"] - costs["adapted"]) / (costs["lqt"] - best))
     assert 0.2 < share < 1.05
     assert f"{100 * share:.1f} %" in page and f"{best:.4g}" in page
+    assert "A negative share means that the controller costs more than LQT" in page
 
 
-def test_the_page_needs_no_network_and_holds_everything(folder):
-    page = (folder / "report" / "index.html").read_text()
-    assert not re.search(r'(src|href)="(?!data:|#)', page)
-    assert "http" not in page
-    for name in figures_of(folder):
-        assert f'id="{name}"' in page
-    for words in ("reduced_order", "learning_rate", "numpy", "no control", "LQT-PO"):
-        assert words in page
-
-
-def test_a_real_browser_shows_the_page_without_a_console_message(folder, tmp_path):
-    page = folder / "report" / "index.html"
-    messages, dom = console(page, tmp_path / "profile")
-    assert messages == []
-    assert dom.count("<img") == len(figures_of(folder))
-    # The same page with a script that says what the browser made of it: the console is heard, and
-    # every picture was decoded.
-    script = (
-        "<script>addEventListener('load', () => { for (const i of document.images)"
-        " console.log('picture ' + i.naturalWidth); console.error('heard'); });</script></body>"
+def test_the_page_says_what_it_reports(folder, tab):
+    tab.go((folder / "report" / "index.html").as_uri())
+    facts = tab.ask(
+        "Object.fromEntries([...document.querySelectorAll('dl dt')].map("
+        "(name) => [name.textContent, name.nextElementSibling.textContent]))"
     )
-    probe = tmp_path / "probe.html"
-    probe.write_text(page.read_text().replace("</body>", script))
-    messages, _ = console(probe, tmp_path / "profile2")
-    widths = [int(m) for line in messages for m in re.findall(r"picture (\d+)", line)]
-    assert len(widths) == len(figures_of(folder)) and min(widths) > 600
-    assert any("heard" in line for line in messages)
+    assert facts["Folder"] == str(folder)
+    assert facts["Seeds"] == "0 to 1"
+    assert "32 numbers" in facts["Problem small"] and "numpy" in facts["Versions"]
+    if is_run(folder):
+        assert facts["Command"] == f"pdeloop train {folder}/parameters.yaml"
+        assert facts["Controller adapted"] == "gauss_newton, started from the LQT gains"
+    else:
+        assert facts["Command"].startswith(f"pdeloop reproduce {SMALL} --seeds 2")
+        assert facts["Controller pure PO"] == "two_point, started from zero gains"
+    words = tab.ask("document.body.innerText")
+    for controller in ("none", "lqt", *controllers_of(folder)):
+        assert CONTROLLERS[controller].name in words
+
+
+def test_contents_lead_to_every_problem_and_figure(folder, tab):
+    tab.go((folder / "report" / "index.html").as_uri())
+    links = tab.ask(
+        "[...document.querySelectorAll('nav a')].map((a) => [a.getAttribute('href').slice(1),"
+        " a.textContent, document.querySelector(a.getAttribute('href'))?.innerText ?? ''])"
+    )
+    assert {"results", "small", "budget", "parameters", *FIGURES} == {
+        target for target, *_ in links
+    }
+    for target, text, found in links:
+        assert found.startswith(text), target
+
+
+def test_on_a_phone_tables_scroll_inside_their_box(folder, tab):
+    tab.size(390, 800)
+    tab.go((folder / "report" / "index.html").as_uri())
+    tab.ask("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
+    assert tab.ask("document.documentElement.scrollWidth") == 390
+    boxes = tab.ask(
+        "[...document.querySelectorAll('table')].map((table) => { const box = table.parentElement;"
+        " return [getComputedStyle(box).overflowX, box.scrollWidth, box.clientWidth]; })"
+    )
+    assert all(overflow == "auto" and width <= 390 for overflow, _, width in boxes)
+    # Wider than the box: its cells stay on one line.
+    assert max(inside for _, inside, _ in boxes) > 390
+
+
+def test_a_figure_opens_large(folder, tab):
+    tab.size(390, 800)
+    tab.go((folder / "report" / "index.html").as_uri())
+    shown = "document.querySelector('#small-behaviour img').getBoundingClientRect().width"
+    assert tab.ask(shown) <= 390
+    # By keyboard, as by a click.
+    tab.ask("document.querySelector('#small-behaviour button').focus()")
+    for kind in ("keyDown", "keyUp"):
+        tab.send("Input.dispatchKeyEvent", type=kind, key="Enter", code="Enter", text="\r",
+                 windowsVirtualKeyCode=13)  # fmt: skip
+    large = "document.querySelector('dialog[open] img')"
+    tab.until(f"{large} !== null", 10.0)
+    width, natural = tab.ask(f"[{large}.getBoundingClientRect().width, {large}.naturalWidth]")
+    assert width == natural > 1000
+    tab.click("dialog button")
+    tab.until(f"{large} === null", 10.0)
+
+
+def test_the_page_needs_no_network_and_a_browser_shows_it_without_complaint(folder, tab):
+    page = folder / "report" / "index.html"
+    text = page.read_text()
+    assert not re.search(r'(src|href)="(?!data:|#)', text) and "http" not in text
+    for words in ("reduced_order", "learning_rate"):
+        assert words in text
+    tab.console.clear()
+    tab.requested.clear()
+    tab.go(page.as_uri())
+    widths = tab.ask("[...document.images].map((image) => image.naturalWidth)")
+    assert len(widths) == len(FIGURES) and min(widths) > 600
+    assert tab.console == []
+    assert all(address.startswith(("file:", "data:")) for address in tab.requested)
+
+
+def test_what_a_folder_is_called_is_text_on_the_page(folder, tmp_path):
+    """Whatever stands in a run's folder, the page shows it and does not run it."""
+    from pdeloop.cli import main
+
+    odd = tmp_path / "<img src=x onerror=alert(1)>"
+    shutil.copytree(folder, odd, ignore=shutil.ignore_patterns("report"))
+    assert main(["report", str(odd)]) == 0
+    page = (odd / "report" / "index.html").read_text()
+    assert "<img src=x" not in page and "&lt;img src=x" in page
+
+
+def test_a_run_with_another_law_shows_what_it_measured_and_says_what_is_missing(
+    folder, tmp_path, capsys
+):
+    """The costs of a law that is not the projected one cannot be computed again."""
+    from pdeloop.cli import main
+
+    if not is_run(folder):
+        return
+    own = tmp_path / "own"
+    shutil.copytree(folder, own, ignore=shutil.ignore_patterns("report"))
+    with np.load(own / "policy.npz") as saved:
+        arrays = dict(saved)
+    U, n_a = np.full((32, 1), 32**-0.5), arrays["policy"].shape[1]
+    rows = [U, np.zeros((1 + n_a, 1)), np.ones((n_a, 1)), np.zeros((n_a, 1)), np.ones((1, 1))]
+    arrays["model"] = np.repeat(np.concatenate(rows)[None], 2, axis=0)
+    arrays["lqt"], arrays["policy"] = np.full((2, n_a, 2), 0.5), np.full((2, n_a, 2), 0.7)
+    np.savez(own / "policy.npz", **arrays)
+    assert main(["report", str(own)]) == 0
+    assert "not shown: Behaviour, gains, spectrum" in capsys.readouterr().out
+    page = (own / "report" / "index.html").read_text()
+    assert "Not shown." in page and "had another plant or another law" in page
+    drawn = {path.stem for path in (own / "report").glob("*.png")}
+    assert drawn == {"training-curves", "costs", "small-steps"}
+
+
+def test_a_run_whose_policies_diverged_is_reported(folder, tmp_path):
+    from pdeloop.cli import main
+
+    if not is_run(folder):
+        return
+    lost = tmp_path / "lost"
+    values = {"learning_rate": 1e4, "iterations": 1, "seeds": 2}
+    own = tmp_path / "lost.yaml"
+    text = SMALL.read_text().replace("    learning_rate: 1.0e-4\n", "")
+    own.write_text(text + "".join(f"    {k}: {v}\n" for k, v in values.items()))
+    assert main(["train", str(own), "--in-process", "--out", str(lost)]) == 0
+    assert json.loads((lost / "result.json").read_text())["diverged"]["adapted"] > 0
+    assert main(["report", str(lost)]) == 0
+    page = (lost / "report" / "index.html").read_text()
+    assert "<td>diverged</td>" in page
+    assert "diverged at step" in (lost / "report" / "small-behaviour.svg").read_text()
 
 
 def test_a_plant_of_two_fields_shows_both(tmp_path):

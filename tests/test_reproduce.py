@@ -10,61 +10,109 @@ import numpy as np
 import pytest
 
 from loop_interfaces.topics import CostColumn
+from pdeloop.finished_run import reduction
 from pdeloop.in_process import LocalPair
-from pdeloop.reproduce import experiment as reproduce
+from pdeloop.reproduce.job import LEARNED
+from pdeloop.reproduce.table import beside_the_paper, rows_of, runs_of
 from tests.loop_harness import Processes, until
 from tests.small import SMALL, parameters, same_bits, train_here
 from tuner_node.batch import Batch
 from tuner_node.seeds import Purpose, derive
 
-LIMIT = 120.0
+LIMIT = 300.0
 
 
 def reproduced(loop: Processes, out, *more: str) -> str:
-    options = ("--seeds", "2", "--iterations", "4", "--out", str(out))
+    options = ("--seeds", "2", "--iterations", "12", "--out", str(out))
     return loop.wait(loop.pdeloop("reproduce", str(SMALL), *options, *more), LIMIT)
 
 
 def test_every_number_is_that_of_the_trainings(loop, tmp_path):
     text = reproduced(loop, tmp_path / "out")
-    assert "reproduce: 90 %" in text and "LQT-PO below LQT" in text
-    (results,) = reproduce.load(tmp_path / "out")
-    for start, name in (("lqt", "lqt_po"), ("zero", "pure_po")):
-        training = train_here(parameters(seeds=2, iterations=4, start=start))
-        with np.load(tmp_path / "out" / "small" / start / "curve.npz") as curve:
+    for words in ("below LQT", "LQT-PO", "pure PO", "Gauss-Newton", "bootstrap"):
+        assert words in text, words
+    runs = runs_of(tmp_path / "out", "small")
+    for name, how in LEARNED.items():
+        budget = {"rollouts": 24} if how["optimizer"] == "gauss_newton" else {"iterations": 12}
+        training = train_here(parameters(seeds=2, **how, **budget))
+        with np.load(tmp_path / "out" / "small" / name / "curve.npz") as curve:
             assert same_bits(curve["policies"][-1], training.policies())
-            assert curve["costs"].shape == (5, 2, 10)
             assert same_bits(curve["costs"][-1], training.evaluation[:, 2].copy())
-        assert same_bits(results.costs[name], training.evaluation[:, 2].copy())
-        assert same_bits(results.costs["none"], training.evaluation[:, 0].copy())
-        assert same_bits(results.costs["lqt"], training.evaluation[:, 1].copy())
-    assert np.array_equal(results.curves["lqt_po"][0], np.ones(2))
-    row = results.row()
-    ratio = 1 - results.costs["lqt_po"].mean(axis=1) / results.costs["lqt"].mean(axis=1)
-    assert row["lqt_po"]["mean_of_ratios_percent"] == pytest.approx(100 * ratio.mean())
+            start = training.evaluation[:, 0 if how["start"] == "zero" else 1]
+            assert same_bits(curve["costs"][0], start.copy())
+            assert curve["rollouts"][-1].tolist() == training.budget.paid.tolist()
+        assert same_bits(runs[name].costs["adapted"], training.evaluation[:, 2].copy())
+    (row,) = rows_of(tmp_path / "out", ["small"])
+    lqt, adapted = (runs["lqt_po"].costs[name].mean(axis=1) for name in ("lqt", "adapted"))
+    below = row["lqt_po"]["below_lqt_percent"]
+    assert below["mean_of_ratios"] == pytest.approx(100 * (1 - adapted / lqt).mean(), abs=1e-9)
+    assert below["ratio_of_means"] == pytest.approx(
+        100 * (1 - adapted.mean() / lqt.mean()), abs=1e-9
+    )
+    low, high = below["ratio_interval"]
+    assert low <= below["ratio_of_means"] <= high
     saved = json.loads((tmp_path / "out" / "table.json").read_text())
-    assert saved["rows"][0]["lqt"]["mean"] == row["lqt"]["mean"]
+    assert saved["rows"][0]["lqt"]["mean"] == row["lqt"]["mean"] == pytest.approx(lqt.mean())
 
 
-def test_the_curve_is_the_cost_of_each_iterations_policy(loop, tmp_path):
+def test_the_curve_is_the_cost_of_each_policy(loop, tmp_path):
     reproduced(loop, tmp_path / "out")
     values = parameters()
-    with (
-        np.load(tmp_path / "out" / "small" / "lqt" / "curve.npz") as curve,
-        np.load(tmp_path / "out" / "small" / "lqt" / "policy.npz") as final,
-    ):
-        pair = LocalPair(values)
-        pair.use_models(final["model"])
-        seeds = [derive(0, Purpose.EVALUATION_FIELD, i) for i in range(10)]
-        for iteration in (0, 3):
-            policy = curve["policies"][iteration][1]
-            rows = np.array([(seed, -1, 0, 1) for seed in seeds], dtype=float)
-            again = pair.run(Batch(rows, np.stack([policy] * 10))).costs[:, CostColumn.MEAN]
-            assert same_bits(curve["costs"][iteration][1].copy(), again.copy())
+    for name in ("lqt_po", "gauss_newton"):
+        folder = tmp_path / "out" / "small" / name
+        with np.load(folder / "curve.npz") as curve, np.load(folder / "policy.npz") as final:
+            pair = LocalPair(values)
+            pair.use_models(final["model"])
+            seeds = [derive(0, Purpose.EVALUATION_FIELD, i) for i in range(10)]
+            for at in (0, 3, len(curve["costs"]) - 1):
+                policy = curve["policies"][at][1]
+                rows = np.array([(seed, -1, 0, 1) for seed in seeds], dtype=float)
+                again = pair.run(Batch(rows, np.stack([policy] * 10))).costs[:, CostColumn.MEAN]
+                assert same_bits(curve["costs"][at][1].copy(), again.copy())
+            assert (np.diff(curve["rollouts"], axis=0) >= 0).all()
+
+
+def test_the_interval_covers_the_truth_as_often_as_it_says():
+    """Twenty seeds, drawn 200 times from a known distribution of costs."""
+    rng = np.random.default_rng(3)
+    hits = 0
+    for _ in range(200):
+        lqt = rng.lognormal(0.0, 0.3, (20, 1))
+        found = reduction(0.7 * lqt * rng.lognormal(-0.005, 0.1, (20, 1)), lqt)
+        low, high = found.mean_interval
+        hits += low <= 30.0 <= high
+    assert 0.85 <= hits / 200 <= 0.99
+
+
+def test_a_reduction_leaves_out_seeds_that_diverged_and_knows_no_interval_of_one():
+    lqt, own = np.array([[2.0, 2.0], [4.0, 4.0]]), np.array([[1.0, 1.0], [1e9, 1.0]])
+    found = reduction(own, lqt)
+    assert (found.seeds, found.ratio_of_means, found.ratio_interval) == (1, 50.0, None)
+    assert reduction(own[1:], lqt[1:]) is None
+    better = reduction(np.array([[1.0], [6.0]]), np.array([[2.0], [8.0]]))
+    assert (better.ratio_of_means, better.mean_of_ratios) == (
+        pytest.approx(30),
+        pytest.approx(37.5),
+    )
+
+
+@pytest.mark.parametrize(
+    ("ratio", "mean", "words"),
+    [
+        ((20.0, 30.0), (20.0, 30.0), "within the interval of the ratio of the means and that of"),
+        ((20.0, 27.0), (20.0, 30.0), "within the interval of the mean of the ratios here"),
+        ((-5.0, 20.0), (0.0, 21.0), "outside both intervals here"),
+        (None, None, "one seed cannot be compared with that"),
+    ],
+)
+def test_the_table_says_where_the_papers_figure_lies(ratio, mean, words):
+    found = {"ratio_interval": ratio, "mean_interval": mean}
+    row = {"problem": "burgers", "paper_percent": 28.0, "lqt_po": {"below_lqt_percent": found}}
+    assert words in beside_the_paper(row)
 
 
 def test_an_interrupted_reproduction_continues_to_the_same_bits(loop, tmp_path):
-    options = ("--seeds", "3", "--iterations", "400", "--processes", "1")
+    options = ("--seeds", "3", "--iterations", "80", "--processes", "1")
     run = loop.pdeloop("reproduce", str(SMALL), *options, "--out", str(tmp_path / "a"))
     until(lambda: list((tmp_path / "a").glob("small/*/progress")), LIMIT, "saved progress")
     time.sleep(0.5)
@@ -76,13 +124,13 @@ def test_an_interrupted_reproduction_continues_to_the_same_bits(loop, tmp_path):
     loop.wait(loop.pdeloop("reproduce", "--out", str(tmp_path / "a")), LIMIT)
     whole = loop.pdeloop("reproduce", str(SMALL), *options[:4], "--out", str(tmp_path / "b"))
     loop.wait(whole, LIMIT)
-    for start in ("lqt", "zero"):
+    for name in LEARNED:
         with (
-            np.load(tmp_path / "a" / "small" / start / "curve.npz") as a,
-            np.load(tmp_path / "b" / "small" / start / "curve.npz") as b,
+            np.load(tmp_path / "a" / "small" / name / "curve.npz") as a,
+            np.load(tmp_path / "b" / "small" / name / "curve.npz") as b,
         ):
-            for name in ("costs", "policies", "mean_field"):
-                assert same_bits(a[name], b[name])
+            for array in ("costs", "policies", "rollouts"):
+                assert same_bits(a[array], b[array])
 
 
 def test_what_cannot_be_done_is_one_line(loop, tmp_path):

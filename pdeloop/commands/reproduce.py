@@ -20,10 +20,10 @@ def _add_reproduce(commands: Commands) -> None:
         commands,
         "reproduce",
         _reproduce,
-        help="the paper's experiment: four controllers, several seeds, a table",
-        description="For each problem and seed: no control, LQT, LQT-PO and pure PO, with the cost "
-        "of every iteration's policy on the evaluation fields. Ctrl-C interrupts; --out DIR of an "
-        "interrupted reproduction continues it.",
+        help="the paper's experiment: its four controllers and Gauss-Newton, several seeds, a table",
+        description="For each problem and seed: no control, LQT, LQT-PO and pure PO of the paper, and "
+        "Gauss-Newton, with the cost of every policy on the evaluation fields. Ctrl-C interrupts; "
+        "--out DIR of an interrupted reproduction continues it.",
         example="pdeloop reproduce burgers kdv --seeds 6 --out runs/paper",
     )
     add = reproduce.add_argument
@@ -79,6 +79,8 @@ def _reproduce(options: argparse.Namespace) -> int:
 def _report(options: argparse.Namespace) -> int:
     from pdeloop.report.page import report
 
-    page = report(options.folder, options.out, options.limits)
+    page, missing = report(options.folder, options.out, options.limits)
+    for sentence in missing:
+        print(f"not shown: {sentence}")
     print(f"report in {page}")
     return 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,28 +11,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller_node.policy import ProjectedLaw
-from loop_interfaces import model_rows
+from loop_interfaces.array_files import read_arrays
 from loop_interfaces.model_rows import ModelRows
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD, Plant
+from pdeloop.finished_run import FinishedRun, field_means, load
 from pdeloop.reference import Reference, find
-from pdeloop.reproduce import experiment as reproduce
+from pdeloop.reproduce.experiment import ASKED, asked
+from pdeloop.reproduce.table import runs_of
 from pdeloop.rollout import rollout
-from tuner_node.results import RunFolder, RunFolderError
+from tuner_node.checkpoint import taken
+from tuner_node.noise import evaluation_noise
+from tuner_node.results import RunFolderError
+from tuner_node.seeds import Purpose, derive
 
 Array = NDArray[np.float64]
+SAME_LAW = 0.05
+"""Relative, of a cost that is computed again: rounding on another machine moves a chaotic field."""
 
 
 @dataclass(frozen=True)
 class Behaviour:
     """One controller from the mean initial field.
 
-    t (T + 1,), states (T + 1, n_z), actions (T, n_a), cost: mean stage cost; diverged at this step,
-    -1 if it did not.
+    states (T + 1, n_z), actions (T, n_a), cost: mean stage cost; diverged at this step, -1 if it did
+    not. What follows a divergence is NaN.
     """
 
     controller: str
-    t: Array
     states: Array
     actions: Array
     cost: float
@@ -41,25 +47,26 @@ class Behaviour:
 
 @dataclass(frozen=True)
 class Curve:
-    """A controller's cost while it learns, relative to the seed's LQT cost.
+    """A controller's cost while it learns: it holds from so many rollouts on.
 
-    rollouts (N,): how many a seed has used; relative (N, S); held: the cost stays until the next.
+    rollouts (N,): how many a seed's adaptation has used; relative (N, S): cost over the seed's LQT
+    cost, NaN where a rollout diverged.
     """
 
     controller: str
     rollouts: Array
     relative: Array
-    held: bool = False
 
 
 @dataclass(frozen=True)
 class Steps:
     """What became of the steps that one seed's optimiser tried, and of the models behind them.
 
-    decided (N,): rollouts used when each was decided; accepted (N,) bool; relative (N,): cost of the
-    candidate over the incumbent's, on the fields it ran on, NaN where one diverged; predicted (N,):
-    the same as the quadratic model predicts it; damping (N,): lambda afterwards; proposed (P,),
-    mismatch (P,): rollouts used when a step was proposed, and the error E of the best model then.
+    decided (N,): rollouts of the adaptation when each was decided; accepted (N,) bool; relative (N,):
+    cost of the candidate over the incumbent's, on the fields it ran on, NaN where one diverged;
+    predicted (N,): the same as the quadratic model predicts it; damping (N,): lambda afterwards;
+    proposed (P,), mismatch (P,): rollouts when a step was proposed, and the error E of the best model
+    then.
     """
 
     decided: Array
@@ -75,50 +82,67 @@ class Steps:
 class ProblemData:
     """A problem's part of a report.
 
-    costs: (S, fields) by controller; curves; policies: by controller, of the shown seed; models: of
-    all seeds, with the adapted policies; shown: the seed whose behaviour is shown; components: the
-    names of the fields that a state consists of; steps: of the shown seed, where the optimiser
-    judges its steps; reference: the limits, where they are known.
+    runs: by adapted controller; costs: by controller, (S, fields); curves: while they learn;
+    shown: index of the seed whose behaviour, gains and steps are shown; x (n_x,), target (n_x times
+    components,), components: names of the fields that a state consists of; behaviours: empty where
+    they cannot be computed; steps: by controller, where the optimiser judges its steps; reference:
+    the limits, where they are known; missing: a sentence for each thing that cannot be shown.
     """
 
-    name: str
-    values: Mapping[str, Any]
+    runs: Mapping[str, FinishedRun]
     costs: Mapping[str, Array]
-    curves: list[Curve]
-    curve_label: str
-    policies: Mapping[str, Array]
-    models: list[ModelRows]
-    adapted: Mapping[str, Array]
+    curves: Sequence[Curve]
     shown: int
-    behaviours: list[Behaviour]
     x: Array
     target: Array
     components: tuple[str, ...]
-    steps: Steps | None
+    behaviours: Sequence[Behaviour]
+    steps: Mapping[str, Steps]
     reference: Reference | None
+    missing: Sequence[str]
 
     @property
-    def seeds(self) -> int:
-        return len(self.models)
+    def first(self) -> FinishedRun:
+        """The run whose identification, LQT law and parameters of the problem are shown."""
+        return next(iter(self.runs.values()))
+
+    @property
+    def name(self) -> str:
+        return str(self.first.values["problem"])
+
+    @property
+    def policies(self) -> dict[str, Array]:
+        """The gains of the shown seed, by controller."""
+        warm = self.first.warm[self.shown]
+        own = {name: run.policies[self.shown] for name, run in self.runs.items()}
+        return {"none": np.zeros_like(warm), "lqt": warm, **own}
+
+    @property
+    def models(self) -> list[ModelRows]:
+        return self.first.models
 
     def share(self, controller: str) -> float | None:
         """(J_LQT - J)/(J_LQT - J_opt) of the means over the seeds, None where it is not known."""
         if self.reference is None:
             return None
-        first = int(self.values["seed"])
-        return self.reference.share(
-            range(first, first + self.seeds), self.costs["lqt"], self.costs[controller]
-        )
+        return self.reference.share(self.first.seeds, self.costs["lqt"], self.costs[controller])
+
+    def limits(self) -> dict[str, Array]:
+        """Costs of the best of the class, (seeds, fields), and of the open loop; empty if unknown."""
+        if self.reference is None or self.share("lqt") is None:
+            return {}
+        known = self.reference.optimum
+        rows = [known[seed] for seed in self.first.seeds if seed in known]
+        return {"optimum": np.stack(rows), "open_loop": self.reference.open_loop}
 
 
 @dataclass(frozen=True)
 class ReportData:
-    """Everything a report shows."""
+    """Everything a report shows; asked: what a reproduction was asked for."""
 
-    title: str
+    folder: Path
     problems: list[ProblemData]
-    versions: Mapping[str, str]
-    rows: list[dict[str, Any]]
+    asked: Mapping[str, Any] = field(default_factory=dict)
 
 
 def gather(folder: Path, limits: Path | None = None) -> ReportData:
@@ -126,148 +150,135 @@ def gather(folder: Path, limits: Path | None = None) -> ReportData:
 
     limits: folder of what `python -m benchmarks optimum` saved; the shipped one if not given.
     """
-    if (folder / reproduce.ASKED).exists():
-        return _reproduction(folder, limits)
+    if (folder / ASKED).exists():
+        content = asked(folder)
+        problems = [_reproduced(folder, name, limits) for name in content["problems"]]
+        return ReportData(folder, problems, content)
     if (folder / "parameters.yaml").exists():
-        return _run(folder, limits)
+        run = load(folder)
+        return ReportData(folder, [_problem({"adapted": run}, _history(run), 0, limits)])
     raise RunFolderError(f"{folder} holds neither a run nor a reproduction")
 
 
-def _reproduction(folder: Path, limits: Path | None) -> ReportData:
-    problems, rows = [], []
-    for results in reproduce.load(folder):
-        place = folder / results.problem
-        lqt, zero = (_Trained(place / start) for start in ("lqt", "zero"))
-        curves = [
-            # Two rollouts an iteration: it is the paper's optimiser that is reproduced.
-            Curve(name, 2 * np.arange(len(relative), dtype=np.float64), relative)
-            for name, relative in results.curves.items()
-        ]
-        final = {"lqt_po": lqt.policies, "pure_po": zero.policies}
-        ratio = results.curves["lqt_po"][-1]
-        known = max(1, int(np.isfinite(ratio).sum()))
-        shown = int(np.argsort(ratio, kind="stable")[(known - 1) // 2])  # the median seed
-        label = "cost relative to LQT"
-        problems.append(_problem(lqt, results.costs, curves, label, final, shown, limits))
-        rows.append(results.row())
-    return ReportData(
-        title="Policy optimisation for PDE control with a warm start",
-        problems=problems,
-        versions=reproduce.asked(folder).get("versions", {}),
-        rows=rows,
-    )
+def _reproduced(folder: Path, name: str, limits: Path | None) -> ProblemData:
+    runs = runs_of(folder, name)
+    lqt = field_means(runs["lqt_po"].costs["lqt"])
+    curves = []
+    for controller in runs:
+        path, seeds = folder / name / controller / "curve.npz", len(lqt)
+        try:
+            arrays = read_arrays(path)
+            used = taken(arrays, "rollouts", "f", (None, seeds)) - runs[controller].before
+            costs = field_means(taken(arrays, "costs", "f", (len(used), seeds, None)))
+        except ValueError as error:
+            raise RunFolderError(f"{path} cannot be read: {error}") from error
+        curves += _curve(controller, [(used[:, s], costs[:, s] / lqt[s]) for s in range(seeds)])
+    ratio = field_means(runs["lqt_po"].costs["adapted"]) / lqt
+    known = max(1, int(np.isfinite(ratio).sum()))
+    median = int(np.argsort(ratio, kind="stable")[(known - 1) // 2])
+    return _problem(runs, curves, median, limits)
 
 
-def _run(folder: Path, limits: Path | None) -> ReportData:
-    trained = _Trained(folder)
-    result = trained.result
-    name = "pure_po" if trained.values["start"] == "zero" else "lqt_po"
-    costs = {
-        own: np.array(result["costs_by_field"][theirs])
-        for own, theirs in (("none", "none"), ("lqt", "lqt"), (name, "adapted"))
-    }
-    curve = _history(result, name, costs["lqt"].mean(axis=1))
-    final = {name: trained.policies}
-    label = "cost of the rollouts\nrelative to LQT"
-    problem = _problem(
-        trained, costs, [curve] if len(curve.rollouts) else [], label, final, 0, limits
-    )
-    return ReportData(
-        title=f"Training of {problem.name}",
-        problems=[problem],
-        versions=result.get("versions", {}),
-        rows=[],
-    )
+def _history(run: FinishedRun) -> list[Curve]:
+    """The costs in the optimiser's rows."""
+    lqt = field_means(run.costs["lqt"])
+    seeds = []
+    for seed, base, before in zip(run.seeds, lqt, run.before, strict=True):
+        rows = [row for row in run.result["history"] if row["seed"] == seed]
+        costs = np.array([row.get("cost", np.nan) for row in rows], dtype=np.float64)
+        costs[~(costs < DIVERGED_COST)] = np.nan
+        used = np.array([row["rollouts"] - before for row in rows], dtype=np.float64)
+        seeds.append((used, costs / base))
+    return _curve("adapted", seeds)
 
 
-class _Trained:
-    """A finished run folder."""
+def _curve(controller: str, seeds: Sequence[tuple[Array, Array]]) -> list[Curve]:
+    """One curve from each seed's rollouts and relative costs; none where nothing was learned.
 
-    def __init__(self, folder: Path) -> None:
-        run = RunFolder(folder)
-        self.values = run.values()
-        arrays = run.policies()
-        self.policies, self.warm = arrays["policy"], arrays["lqt"]
-        self.models = [model_rows.unpack(rows, self.values["n_a"]) for rows in arrays["model"]]
-        self.result = run.result()
+    Seeds may use their rollouts in unequal portions: a cost holds until the next one.
+    """
+    used = np.unique(np.concatenate([rollouts for rollouts, _ in seeds]))
+    relative = np.full((len(used), len(seeds)), np.nan)
+    for s, (rollouts, costs) in enumerate(seeds):
+        last = np.searchsorted(rollouts, used, side="right") - 1
+        relative[last >= 0, s] = costs[last[last >= 0]]
+    return [Curve(controller, used, relative)] if np.isfinite(relative).any() else []
 
 
 def _problem(
-    trained: _Trained,
-    costs: Mapping[str, Array],
-    curves: list[Curve],
-    label: str,
-    final: Mapping[str, Array],
-    shown: int,
-    limits: Path | None,
+    runs: Mapping[str, FinishedRun], curves: Sequence[Curve], shown: int, limits: Path | None
 ) -> ProblemData:
-    plant = build_plant(trained.values)
-    warm = trained.warm[shown]
-    policies = {"none": np.zeros_like(warm), "lqt": warm}
-    policies |= {name: own[shown] for name, own in final.items()}
-    behaviours = _behaviours(plant, trained.models[shown], policies, trained.values["action_limit"])
-    return ProblemData(
-        name=str(trained.values["problem"]),
-        values=trained.values,
+    first = next(iter(runs.values()))
+    costs = {"none": first.costs["none"], "lqt": first.costs["lqt"]}
+    costs |= {name: run.costs["adapted"] for name, run in runs.items()}
+    steps = {name: _steps(run, shown) for name, run in runs.items()}
+    plant, missing = build_plant(first.values), []
+    if not curves:
+        missing.append(
+            "Training curves: LQT diverged, or every rollout of the adaptation did, or there was none."
+        )
+    data = ProblemData(
+        runs=runs,
         costs=costs,
         curves=curves,
-        curve_label=label,
-        policies=policies,
-        models=trained.models,
-        adapted=final,
         shown=shown,
-        behaviours=behaviours,
         x=plant.x,
         target=plant.field_target,
         components=plant.equation.components,
-        steps=_steps(trained.result["history"], int(trained.values["seed"]) + shown),
-        reference=find(trained.values, behaviours[0].cost, limits),
+        behaviours=[],
+        steps={name: found for name, found in steps.items() if found is not None},
+        reference=None,
+        missing=missing,
     )
-
-
-def _behaviours(
-    plant: Plant, model: ModelRows, policies: Mapping[str, Array], action_limit: float
-) -> list[Behaviour]:
-    law = ProjectedLaw([model.U], plant.target, action_limit)
-    law.set(np.stack(list(policies.values())))
-    fields = np.full(len(policies), MEAN_FIELD)
-    episode = rollout(plant, lambda k, states: law.actions(states), fields)
-    t = plant.sample_time * np.arange(plant.horizon + 1, dtype=np.float64)
-    return [
-        Behaviour(
-            name,
-            t,
-            episode.fields[:, i],
-            episode.actions[:, i],
-            float(episode.costs.mean[i]),
-            int(episode.costs.diverged_step[i]),
+    behaviours = _behaviours(data, plant)
+    if behaviours is None:
+        nodes = ", ".join(first.result.get("controller", {}).get("nodes", ()))
+        missing.append(
+            "Behaviour, gains, spectrum and share of the possible gain: the costs of this run are not "
+            "those of the built-in plant and law, so that it had another plant or another law"
+            + (f" (its controller: {nodes})" if nodes else "")
+            + ", which cannot be computed here. All costs are those that the run measured."
         )
-        for i, name in enumerate(policies)
-    ]
+        return data
+    reference = find(first.values, behaviours[0].cost, limits)
+    return replace(data, behaviours=behaviours, reference=reference)
 
 
-def _history(result: Mapping[str, Any], controller: str, lqt: Array) -> Curve:
-    """Costs of the optimiser's rows against the rollouts used; NaN where a rollout diverged."""
-    first, seeds = int(result["seed"]), int(result["seeds"])
-    rows = result["history"]
-    used = np.array(sorted({int(row["rollouts"]) for row in rows}), dtype=np.float64)
-    relative = np.full((len(used), seeds), np.nan)
-    for s in range(seeds):
-        own = [row for row in rows if int(row["seed"]) - first == s]
-        if not own:
-            continue
-        costs = np.array([row.get("cost", np.nan) for row in own], dtype=np.float64)
-        costs[~(costs < DIVERGED_COST)] = np.nan
-        # Seeds may use their rollouts in unequal portions: a cost holds until the next row.
-        last = np.searchsorted([row["rollouts"] for row in own], used, side="right") - 1
-        relative[:, s] = np.where(last >= 0, costs[last], np.nan) / lqt[s]
-    held = any("role" in row for row in rows)
-    return Curve(controller, used, relative, held)
+def _behaviours(data: ProblemData, plant: Plant) -> list[Behaviour] | None:
+    """The shown seed's controllers from the mean field; None if they are not those of the run.
+
+    Beside it each starts from the first field of the closing evaluation, whose cost is known.
+    """
+    policies, values = data.policies, data.first.values
+    models = {name: run.models[data.shown] for name, run in data.runs.items()}
+    bases = [models.get(name, data.models[data.shown]).U for name in policies]
+    if any(len(basis) != plant.n_z for basis in bases):
+        return None
+    law = ProjectedLaw(bases, plant.target, values["action_limit"])
+    count, seed = len(policies), values["evaluation_seed"]
+    law.set(np.stack([*policies.values()] * 2), np.tile(np.arange(count), 2))
+    starts = [MEAN_FIELD, derive(seed, Purpose.EVALUATION_FIELD, 0)]
+    noise = np.repeat([0, *evaluation_noise(seed, 1)], count)
+    episode = rollout(
+        plant, lambda k, states: law.actions(states), np.repeat(starts, count), noise
+    )
+    costs = episode.costs
+    known = [data.costs[name][data.shown, 0] for name in policies]
+    if not np.allclose(costs.mean[count:], known, rtol=SAME_LAW):
+        return None
+    found = []
+    for i, name in enumerate(policies):
+        diverged = int(costs.diverged_step[i])
+        field, action = episode.fields[:, i], episode.actions[:, i]
+        if diverged >= 0:
+            field[diverged + 1 :], action[diverged:] = np.nan, np.nan
+        found.append(Behaviour(name, field, action, float(costs.mean[i]), diverged))
+    return found
 
 
-def _steps(history: Sequence[Mapping[str, Any]], seed: int) -> Steps | None:
+def _steps(run: FinishedRun, shown: int) -> Steps | None:
     """The judged steps of one seed; None for an optimiser that does not judge them."""
-    own = [row for row in history if int(row["seed"]) == seed]
+    own = [row for row in run.result["history"] if row["seed"] == run.seeds[shown]]
     decided = [row for row in own if "accepted" in row and "damping" in row]
     proposed = [row for row in own if "mismatch" in row]
     if not decided or not proposed:
@@ -276,7 +287,7 @@ def _steps(history: Sequence[Mapping[str, Any]], seed: int) -> Steps | None:
     def numbers(rows: Sequence[Mapping[str, Any]], name: str) -> Array:
         return np.array([row.get(name, np.nan) for row in rows], dtype=np.float64)
 
-    used, made = numbers(decided, "rollouts"), numbers(proposed, "rollouts")
+    used, made = (numbers(rows, "rollouts") - run.before[shown] for rows in (decided, proposed))
     # The step that was decided is the last one proposed before.
     last = np.searchsorted(made, used, side="left") - 1
     predicted = 1 - numbers(proposed, "predicted_fall") / numbers(proposed, "cost")

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from loop_interfaces.model_rows import ModelRows
 from pdeloop.report.data import Behaviour, ProblemData
-from pdeloop.report.style import COLOURS, FIELD_MAP, GAIN_MAP, TITLES
+from pdeloop.report.style import COLOURS, FIELD_MAP, GAIN_MAP, NAMES, boxed
 
 Array = NDArray[np.float64]
 Eigenvalues = NDArray[Any]
@@ -23,7 +23,7 @@ def behaviour(problem: ProblemData) -> Figure:
     """From the mean initial field: the fields in space and time, the actions, the final profiles."""
     shown, components = problem.behaviours, problem.components
     count, fields = len(shown), len(components)
-    figure = Figure(figsize=(2.05 * count + 0.9, 1.3 + 2.0 * fields + 1.3 * (1 + fields)))
+    figure = Figure(figsize=(2.05 * count + 0.9, 1.5 + 2.0 * fields + 1.3 * (1 + fields)))
     grid = figure.subplots(
         2 * fields + 1,
         count,
@@ -32,67 +32,84 @@ def behaviour(problem: ProblemData) -> Figure:
         squeeze=False,
         height_ratios=(1.25,) * fields + (1,) * (1 + fields),
     )
-    largest = max(float(np.abs(b.actions).max()) for b in shown) or 1.0
+    largest = max(float(np.nanmax(np.abs(b.actions), initial=0.0)) for b in shown) or 1.0
+    times = problem.first.values["sample_time"] * np.arange(len(shown[0].states))
     for column, b in enumerate(shown):
-        top = grid[0, column]
-        top.set_title(f"{TITLES[b.controller]}\nmean stage cost {b.cost:.3g}")
-        if b.diverged >= 0:
-            top.set_title(f"{TITLES[b.controller]}\ndiverged at step {b.diverged}")
-        _actions(grid[fields, column], b, largest)
-        grid[fields, column].set_xlabel("t (s)")
+        outcome = f"mean stage cost {b.cost:.3g}"
+        outcome = f"diverged at step {b.diverged}" if b.diverged >= 0 else outcome
+        grid[0, column].set_title(f"{NAMES[b.controller]}\n{outcome}", color=COLOURS[b.controller])
+        _actions(grid[fields, column], b, times, largest)
         for ax in grid[:, column]:
             ax.xaxis.set_major_locator(MaxNLocator(3))
     grid[fields, 0].set_ylabel("actions $a_j$")
     for i, name in enumerate(components):
-        _component(figure, problem, i, grid[i], grid[fields + 1 + i], name)
+        own = slice(i * len(problem.x), (i + 1) * len(problem.x))
+        _maps(figure, problem, own, grid[i], name, float(times[-1]))
+        _profiles(problem, own, grid[fields + 1 + i], name)
+    figure.legend(
+        *grid[fields + 1, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3
+    )
     return figure
 
 
-def _component(
-    figure: Figure,
-    problem: ProblemData,
-    index: int,
-    maps: Sequence[Axes],
-    profiles: Sequence[Axes],
-    name: str,
+def _maps(
+    figure: Figure, problem: ProblemData, own: slice, axes: Sequence[Axes], name: str, end: float
 ) -> None:
-    """A component of the state: its maps in space and time, and its final profiles."""
-    n_x = len(problem.x)
-    own = slice(index * n_x, (index + 1) * n_x)
+    """A component of the state in space and time."""
     fields = [b.states[:, own] for b in problem.behaviours]
-    target = problem.target[own]
-    # A few extreme points, a shock's tip, would leave no contrast to the rest.
-    low, high = (float(v) for v in np.percentile(np.stack(fields), (0.3, 99.7)))
-    length = float(problem.values["length"])
-    for b, field, top, bottom in zip(problem.behaviours, fields, maps, profiles, strict=True):
-        image = _field(top, length, float(b.t[-1]), field, low, high)
-        top.set_xlabel("t (s)")
-        bottom.plot(problem.x, target, color="black", linewidth=0.9, label="target")
-        bottom.plot(problem.x, field[-1], color=COLOURS[b.controller], label="final field")
-        bottom.set_xlim(0, length)
-        bottom.set_xlabel("x (m)")
-    maps[0].set_ylabel("x (m)")
-    profiles[0].set_ylabel(f"{name}(x, T)")
-    if index == 0:
-        _room_for_legend(profiles[0], [field[-1] for field in fields], target)
-        profiles[0].legend(loc="upper left", ncols=1, handlelength=1.4)
-    figure.colorbar(image, ax=list(maps), label=f"{name}(x, t)", aspect=14, pad=0.01, extend="both")
+    # A few extreme points, a shock's tip or a divergence, would leave no contrast to the rest.
+    low, high = np.nanpercentile(np.stack(fields), (0.3, 99.7))
+    length = float(problem.first.values["length"])
+    for ax, values in zip(axes, fields, strict=True):
+        boxed(ax)
+        ax.set_facecolor("0.9")
+        image = ax.imshow(
+            values.T,
+            origin="lower",
+            aspect="auto",
+            cmap=FIELD_MAP,
+            vmin=low,
+            vmax=high,
+            interpolation="nearest",
+            extent=(0.0, end, 0.0, length),
+        )
+        ax.set_xlabel("t (s)")
+    axes[0].set_ylabel("x (m)")
+    figure.colorbar(image, ax=list(axes), label=f"{name}(x, t)", aspect=14, pad=0.01, extend="both")
+
+
+def _profiles(problem: ProblemData, own: slice, axes: Sequence[Axes], name: str) -> None:
+    """Its initial and final profiles, and the target."""
+    for ax, b in zip(axes, problem.behaviours, strict=True):
+        colour = COLOURS[b.controller]
+        ax.plot(problem.x, b.states[0, own], ":", color="0.45", linewidth=1, label="initial field")
+        ax.plot(problem.x, problem.target[own], color="black", linewidth=0.9, label="target")
+        ax.plot(problem.x, b.states[-1, own], color=colour, label="final field")
+        ax.set_xlim(0, float(problem.first.values["length"]))
+        ax.set_xlabel("x (m)")
+    axes[0].set_ylabel(f"{name}(x, T)")
+
+
+def _actions(ax: Axes, b: Behaviour, times: Array, largest: float) -> None:
+    held = np.vstack([b.actions, b.actions[-1:]])
+    ax.step(times, held, where="post", color=COLOURS[b.controller], linewidth=0.7, alpha=0.75)
+    ax.set_xlim(0, float(times[-1]))
+    ax.set_ylim(-1.08 * largest, 1.08 * largest)
+    ax.set_xlabel("t (s)")
 
 
 def gains(problem: ProblemData) -> Figure:
     """The gains K_a and K_b of each controller: LQT's before, the adapted ones after learning."""
-    names = [name for name in problem.policies if name != "none"]
+    policies = {name: own for name, own in problem.policies.items() if name != "none"}
     n_a, n_s = problem.models[0].B.T.shape
-    figure = Figure(figsize=(6.4, 0.5 + len(names) * max(1.1, 0.11 * n_a + 0.5)))
-    grid = figure.subplots(len(names), 2, sharex=True, sharey=True, squeeze=False)
-    for part, (symbol, columns) in enumerate(
-        (("$K_a$", slice(0, n_s)), ("$K_b$", slice(n_s, 2 * n_s)))
-    ):
-        largest = max(float(np.abs(problem.policies[n][:, columns]).max()) for n in names) or 1.0
-        for row, name in enumerate(names):
-            ax = grid[row, part]
+    figure = Figure(figsize=(6.4, 0.5 + len(policies) * max(1.1, 0.11 * n_a + 0.5)))
+    grid = figure.subplots(len(policies), 2, sharex=True, sharey=True, squeeze=False)
+    for part, symbol in enumerate(("$K_a$", "$K_b$")):
+        blocks = {name: own[:, part * n_s : (part + 1) * n_s] for name, own in policies.items()}
+        largest = max(float(np.abs(block).max()) for block in blocks.values()) or 1.0
+        for ax, (name, block) in zip(grid[:, part], blocks.items(), strict=True):
             image = ax.imshow(
-                problem.policies[name][:, columns],
+                block,
                 cmap=GAIN_MAP,
                 vmin=-largest,
                 vmax=largest,
@@ -100,46 +117,43 @@ def gains(problem: ProblemData) -> Figure:
                 interpolation="nearest",
                 extent=(0.5, n_s + 0.5, n_a + 0.5, 0.5),
             )
-            for side in ("top", "right"):
-                ax.spines[side].set_visible(True)
+            boxed(ax)
             when = "before" if name == "lqt" else "after"
-            ax.set_title(f"{symbol}, {TITLES[name]} ({when})", color=COLOURS[name])
+            ax.set_title(f"{symbol}, {NAMES[name]} ({when})", color=COLOURS[name])
+            ax.xaxis.set_major_locator(MaxNLocator(6, integer=True, min_n_ticks=1))
+            ax.yaxis.set_major_locator(MaxNLocator(6, integer=True, min_n_ticks=1))
             if part == 0:
                 ax.set_ylabel("actuator j")
         grid[-1, part].set_xlabel("mode of the reduced state")
         label = f"entry of {symbol}"
         figure.colorbar(image, ax=grid[:, part].tolist(), label=label, aspect=40, pad=0.03)
-    grid[0, 0].set_xticks(_whole(n_s))
-    grid[0, 0].set_yticks(_whole(n_a))
     return figure
 
 
 def spectrum(problem: ProblemData) -> Figure:
-    """Eigenvalues of the reduced model, without control and with the gains before and after."""
-    groups: dict[str, list[Eigenvalues]] = {"none": [], "lqt": []}
-    for s, model in enumerate(problem.models):
-        A, B = model.A, model.B
-        groups["none"].append(np.linalg.eigvals(A))
-        groups["lqt"].append(np.linalg.eigvals(A + B @ model.K_a))
-        for name, policies in problem.adapted.items():
-            closed = A + B @ policies[s][:, : len(A)]
-            groups.setdefault(name, []).append(np.linalg.eigvals(closed))
+    """Eigenvalues of the reduced model, without control and with the gains of each controller."""
+    groups: dict[str, list[Eigenvalues]] = {
+        "none": [np.linalg.eigvals(model.A) for model in problem.models],
+        "lqt": [_closed_loop(model, model.K_a) for model in problem.models],
+    }
+    for name, run in problem.runs.items():
+        groups[name] = [_closed_loop(m, p) for m, p in zip(run.models, run.policies, strict=True)]
     everything = np.concatenate([values for found in groups.values() for values in found])
     near = everything[(np.abs(everything) > 0.8) & (everything.real > 0.5)]
     reach = 1.08 * max(1.0, float(np.abs(everything).max()))
     width = float(np.maximum(1 - near.real, np.abs(near.imag) / 0.6).max(initial=0.01)) * 1.12
     figure = Figure(figsize=(1.9 * len(groups) + 0.5, 4.5))
     grid = figure.subplots(2, len(groups), sharex="row", sharey="row", squeeze=False)
-    symbols = {"none": "A", "lqt": "A + B $K_a$"}
     for (whole, detail), (name, found) in zip(grid.T, groups.items(), strict=True):
         for ax in (whole, detail):
-            _eigenvalues(ax, found, name, problem.shown)
+            _eigenvalues(ax, found, COLOURS[name], problem.shown)
         whole.set_xlim(-reach, reach)
         whole.set_ylim(-reach, reach)
         detail.set_xlim(1 - width, 1 + 0.3 * width)
         detail.set_ylim(-0.65 * width, 0.65 * width)
         radius = float(np.abs(found[problem.shown]).max())
-        whole.set_title(f"{TITLES[name]}: {symbols.get(name, symbols['lqt'])}\nradius {radius:.4f}")
+        matrix = "A" if name == "none" else "A + B $K_a$"
+        whole.set_title(f"{NAMES[name]}: {matrix}\nradius {radius:.4f}", color=COLOURS[name])
         detail.set_title("around 1")
         detail.set_xlabel("real part")
         detail.xaxis.set_major_locator(MaxNLocator(4))
@@ -148,7 +162,13 @@ def spectrum(problem: ProblemData) -> Figure:
     return figure
 
 
-def _eigenvalues(ax: Axes, found: Sequence[Eigenvalues], name: str, shown: int) -> None:
+def _closed_loop(model: ModelRows, policy: Array) -> Eigenvalues:
+    """Of A + B K_a with the gains of a policy [K_a K_b]."""
+    values: Eigenvalues = np.linalg.eigvals(model.A + model.B @ policy[:, : len(model.A)])
+    return values
+
+
+def _eigenvalues(ax: Axes, found: Sequence[Eigenvalues], colour: str, shown: int) -> None:
     """The unit circle and the eigenvalues of every seed, those of the shown one filled, on top."""
     circle = np.exp(1j * np.linspace(0, 2 * np.pi, 3601))
     ax.plot(circle.real, circle.imag, color="black", linewidth=0.7)
@@ -160,47 +180,10 @@ def _eigenvalues(ax: Axes, found: Sequence[Eigenvalues], name: str, shown: int) 
             marker="o",
             linestyle="none",
             markersize=4.5 if s == shown else 3.5,
-            markerfacecolor=COLOURS[name] if s == shown else "none",
-            markeredgecolor=COLOURS[name],
+            markerfacecolor=colour if s == shown else "none",
+            markeredgecolor=colour,
             markeredgewidth=0.8,
             alpha=1.0 if s == shown else 0.6,
             zorder=3 if s == shown else 2,
         )
     ax.set_aspect("equal")
-
-
-def _field(
-    ax: Axes, length: float, duration: float, field: Array, low: float, high: float
-) -> AxesImage:
-    for side in ("top", "right"):
-        ax.spines[side].set_visible(True)
-    return ax.imshow(
-        field.T,
-        origin="lower",
-        aspect="auto",
-        cmap=FIELD_MAP,
-        vmin=low,
-        vmax=high,
-        interpolation="nearest",
-        extent=(0.0, duration, 0.0, length),
-    )
-
-
-def _actions(ax: Axes, b: Behaviour, largest: float) -> None:
-    held = np.vstack([b.actions, b.actions[-1:]])
-    for own in held.T:
-        ax.step(b.t, own, where="post", color=COLOURS[b.controller], linewidth=0.7, alpha=0.75)
-    ax.set_xlim(0, float(b.t[-1]))
-    ax.set_ylim(-1.08 * largest, 1.08 * largest)
-
-
-def _room_for_legend(ax: Axes, finals: Sequence[Array], target: Array) -> None:
-    low = min(float(target.min()), *(float(final.min()) for final in finals))
-    high = max(float(target.max()), *(float(final.max()) for final in finals))
-    span = (high - low) or 1.0
-    ax.set_ylim(low - 0.06 * span, high + 0.7 * span)
-
-
-def _whole(count: int) -> list[int]:
-    step = max(1, -(-count // 6))
-    return list(range(1, count + 1, step))

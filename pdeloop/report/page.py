@@ -1,253 +1,307 @@
 """`pdeloop report`: figures for a paper, and one page that shows them and needs no network.
 
 DIR/report/NAME.png, NAME.svg    the figures
-DIR/report/index.html            the page, with the figures inside
+DIR/report/index.html            the page (page.html.j2), with the figures inside
 """
 
 from __future__ import annotations
 
 import base64
-import html
-import io
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import jinja2
+import matplotlib
+from matplotlib.figure import Figure
+
+from loop_interfaces.problem import load_parameters, shipped_problems
+from pdeloop.report import figures, learning
 from pdeloop.report.data import ProblemData, ReportData, gather
-from tuner_node.results import RunFolderError
+from pdeloop.report.style import NAMES, STYLE
+from pdeloop.reproduce.table import CAVEAT, beside_the_paper, cost_text, reduction_texts, row_of
+from tuner_node.budget import PURPOSES
+from tuner_node.results import TRANSIENT, RunFolderError
 
 PAGE = "index.html"
+PIXELS_PER_INCH = 115
+"""On the page; the file has more, which an enlarged figure shows."""
+FLAGS = ("seed", "seeds", "rollouts", "iterations", "start", "optimizer", "directions")
+"""Parameters that `pdeloop train` has a flag for."""
+LIMITS = (
+    " Best of class: the law with these reduced states that exact gradients find; open-loop limit: the "
+    "optimal inputs of each field."
+)
 
 
-def report(folder: Path, out: Path | None, limits: Path | None = None) -> Path:
-    """Write the report of the run or reproduction in `folder`; returns the page's path.
+@dataclass(frozen=True)
+class Picture:
+    """A figure on the page: file name, heading, caption, width there in pixels, PNG in base64."""
 
-    limits: see `gather`.
+    name: str
+    heading: str
+    caption: str
+    width: int
+    png: str
+
+
+def report(folder: Path, out: Path | None, limits: Path | None = None) -> tuple[Path, list[str]]:
+    """Write the report of the run or reproduction in `folder`.
+
+    Parameters
+    ----------
+    folder, out
+        The run or reproduction; where the report goes, DIR/report if not given.
+    limits
+        See `gather`.
+
+    Returns
+    -------
+    page
+        Path of the page.
+    missing
+        A sentence for each thing that cannot be shown.
+
+    Raises
+    ------
+    RunFolderError
+        There is nothing to report, or the report cannot be written.
     """
-    import matplotlib
-
-    from pdeloop.report.style import STYLE
-
     data = gather(folder, limits)
     target = out or folder / "report"
-    inlined: list[tuple[str, str, bytes]] = []
     try:
         target.mkdir(parents=True, exist_ok=True)
         with matplotlib.rc_context(STYLE):
-            for name, caption, figure in _figures(data):
-                figure.savefig(target / f"{name}.svg", metadata={"Date": None})
-                picture = io.BytesIO()
-                figure.savefig(picture, format="png")
-                (target / f"{name}.png").write_bytes(picture.getvalue())
-                inlined.append((name, caption, picture.getvalue()))
+            shared = [_save(target, *given) for given in _shared(data.problems)]
+            own = {
+                problem.name: [_save(target, *given) for given in _of_problem(problem)]
+                for problem in data.problems
+            }
         page = target / PAGE
-        page.write_text(_page(data, inlined), encoding="utf-8")
+        page.write_text(_page(data, shared, own), encoding="utf-8")
     except OSError as error:
         raise RunFolderError(f"cannot write the report to {target}: {error.strerror}") from error
-    return page
+    return page, _missing(data)
 
 
-def _figures(data: ReportData) -> Iterator[tuple[str, str, Any]]:
-    """Name, caption and figure, one after the other."""
-    from pdeloop.report import figures, learning
-    from pdeloop.report.style import title_of
+def _save(target: Path, name: str, heading: str, caption: str, figure: Figure) -> Picture:
+    figure.savefig(target / f"{name}.svg", metadata={"Date": None})
+    picture = BytesIO()
+    figure.savefig(picture, format="png")
+    (target / f"{name}.png").write_bytes(picture.getvalue())
+    width = round(PIXELS_PER_INCH * figure.get_figwidth())
+    return Picture(name, heading, caption, width, base64.b64encode(picture.getvalue()).decode())
 
-    learned = [problem for problem in data.problems if problem.curves]
-    known = any(problem.share("lqt") is not None for problem in data.problems)
-    limits = (
-        " Best of class: the law with these reduced states that exact gradients find; open-loop "
-        "limit: the optimal inputs of each field."
-    ) * known
+
+Drawn = Iterator[tuple[str, str, str, Figure]]
+"""Name, heading, caption and figure, one after the other."""
+
+
+def _shared(problems: Sequence[ProblemData]) -> Drawn:
+    """The figures over all problems."""
+    learned = [problem for problem in problems if problem.curves]
+    limits = LIMITS * any(problem.limits() for problem in problems)
     if learned:
-        seeds = max(problem.seeds for problem in learned)
-        over = f"Line and band: mean and standard deviation over {seeds} seeds. " * (seeds > 1)
+        seeds = max(len(problem.first.seeds) for problem in learned)
+        over = f" Line and band: mean and standard deviation over {seeds} seeds." * (seeds > 1)
         yield (
             "training-curves",
-            "Cost against the rollouts used to learn, divided by the cost of LQT. "
-            f"{over}Lower is better.",
+            "Cost while learning",
+            "Cost against the rollouts of the adaptation, which exploration and check precede, divided "
+            f"by the cost of LQT.{over} Lower is better.",
             learning.training_curves(learned),
         )
     yield (
         "costs",
-        "Mean stage cost of each controller after the adaptation, over the sampled initial "
-        f"fields and the seeds, with the standard deviation.{limits}",
-        learning.bars(data.problems),
+        "Cost of each controller",
+        "Mean stage cost after the adaptation, over the sampled initial fields and the seeds, with "
+        f"the standard deviation.{limits}",
+        learning.bars(problems),
     )
-    for problem in data.problems:
-        name, prefix = title_of(problem), problem.name
-        seed = int(problem.values["seed"]) + problem.shown
-        if problem.steps is not None:
-            accepted = int(problem.steps.accepted.sum())
-            yield (
-                f"{prefix}-steps",
-                f"{name} (seed {seed}): {len(problem.steps.accepted)} steps were tried and "
-                f"{accepted} accepted; the damping, which a rejection raises; and the relative "
-                "error of the best fitted model in predicting how measured trajectories differ.",
-                learning.steps(problem, problem.steps),
-            )
+
+
+def _of_problem(problem: ProblemData) -> Drawn:
+    """The figures of one problem."""
+    name, seed = problem.name, problem.first.seeds[problem.shown]
+    for controller, steps in problem.steps.items():
         yield (
-            f"{prefix}-behaviour",
-            f"{name}, from the mean initial field (seed {seed}): the field in space and time, the "
-            "actions, and the final field against the target.",
-            figures.behaviour(problem),
+            f"{name}-steps",
+            f"Steps of {NAMES[controller]}",
+            f"Seed {seed}: {len(steps.accepted)} steps were tried and {steps.accepted.sum()} "
+            "accepted; the damping, which a rejection raises; and the relative error of the best "
+            "fitted model in predicting how measured trajectories differ.",
+            learning.steps(steps, controller),
         )
-        yield (
-            f"{prefix}-gains",
-            f"{name}: the gains before (LQT) and after learning (seed {seed}).",
-            figures.gains(problem),
-        )
-        yield (
-            f"{prefix}-spectrum",
-            f"{name}: eigenvalues of the reduced model, open loop and closed with each "
-            f"controller's gains, and the unit circle (filled: seed {seed}, open: other seeds).",
-            figures.spectrum(problem),
-        )
+    if not problem.behaviours:
+        return
+    yield (
+        f"{name}-behaviour",
+        "Behaviour",
+        f"From the mean initial field (seed {seed}): the field in space and time, the actions, and "
+        "the initial and the final field beside the target.",
+        figures.behaviour(problem),
+    )
+    yield (
+        f"{name}-gains",
+        "Gains",
+        f"Before (LQT) and after learning (seed {seed}).",
+        figures.gains(problem),
+    )
+    yield (
+        f"{name}-spectrum",
+        "Eigenvalues",
+        "Of the reduced model, open loop and closed with each controller's gains, and the unit "
+        f"circle (filled: seed {seed}, open: other seeds).",
+        figures.spectrum(problem),
+    )
 
 
-def _page(data: ReportData, pictures: list[tuple[str, str, bytes]]) -> str:
-    shown = "\n".join(_picture(*picture) for picture in pictures)
-    parameters = "\n".join(_parameters(problem) for problem in data.problems)
-    versions = _table(("", "version"), sorted(data.versions.items()))
-    title = html.escape(data.title)
-    return f"""<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<link rel="icon" href="data:,">
-<title>{title}</title>
-<style>{_CSS}</style>
-</head>
-<body>
-<main>
-<h1>{title}</h1>
-<p>Made by pdeloop on {time.strftime("%Y-%m-%d %H:%M")}.</p>
-{_results(data)}
-{shown}
-<h2>Parameters</h2>
-{parameters}
-<h2>Versions</h2>
-{versions}
-</main>
-</body>
-</html>
-"""
+def _page(data: ReportData, shared: list[Picture], own: Mapping[str, list[Picture]]) -> str:
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+    )
+    problems = data.problems
+    rows = [row_of(problem.name, problem.runs) for problem in problems]
+    several = len(problems[0].first.seeds) > 1
+    names = ", ".join(problem.name for problem in problems)
+    return environment.get_template("page.html.j2").render(
+        title="Reproduction of the paper's experiment" if data.asked else f"Training of {names}",
+        facts=_facts(data),
+        missing=_missing(data),
+        shared=shared,
+        problems=[
+            {
+                "name": problem.name,
+                "figures": own[problem.name],
+                "parameters": list(problem.first.values.items()),
+            }
+            for problem in problems
+        ],
+        costs=_costs(problems, rows),
+        reductions=_reductions(problems, rows),
+        caveat=CAVEAT if several else "",
+        paper=[sentence for row in rows if (sentence := beside_the_paper(row))],
+        first_model=problems[0].first.values["identification_attempts"] == 1,
+        shares=_shares(problems),
+        budget=_budget(problems),
+    )
 
 
-def _results(data: ReportData) -> str:
-    from pdeloop.report.style import PROBLEMS, TITLES
+def _missing(data: ReportData) -> list[str]:
+    """What cannot be shown, with the problem where there are several."""
+    several = len(data.problems) > 1
+    return [
+        f"{problem.name}: {sentence}" if several else sentence
+        for problem in data.problems
+        for sentence in problem.missing
+    ]
 
-    if data.rows:
-        names: tuple[str, ...] = ("none", "lqt", "lqt_po", "pure_po")
-        head: tuple[str, ...] = (
-            "problem",
-            *(TITLES[n] for n in names),
-            "LQT-PO below LQT",
-            "paper",
-        )
-        rows: list[tuple[str, ...]] = []
-        for row in data.rows:
-            gain = row["lqt_po"]["mean_of_ratios_percent"]
-            spread = row["lqt_po"]["std_of_ratios_percent"]
-            paper = row["paper_percent"]
-            rows.append(
-                (
-                    PROBLEMS.get(row["problem"], row["problem"]),
-                    *(_cost(row[name]) for name in names),
-                    f"{gain:.1f} % ± {spread:.1f}",
-                    "-" if paper is None else f"{paper:.1f} %",
-                )
-            )
-    else:
-        problem = data.problems[0]
-        names = tuple(problem.costs)
-        head = ("problem", *(TITLES[name] for name in names))
-        means = (f"{problem.costs[n].mean():.4g} ± {problem.costs[n].std():.2g}" for n in names)
-        rows = [(PROBLEMS.get(problem.name, problem.name), *means)]
+
+Facts = list[tuple[str, str]]
+Table = tuple[Sequence[str], list[tuple[str, ...]]]
+"""Head and rows."""
+
+
+def _facts(data: ReportData) -> Facts:
+    """What the report is about."""
+    first = data.problems[0].first
+    values = first.values
+    seeds, versions = first.seeds, first.result.get("versions", {})
+    return [
+        ("Command", _command(data)),
+        *((f"Problem {problem.name}", _problem(problem.first.values)) for problem in data.problems),
+        *(
+            (f"Controller {NAMES[name]}", f"{run.values['optimizer']}, started from {start}")
+            for name, run in data.problems[0].runs.items()
+            for start in ["zero gains" if run.values["start"] == "zero" else "the LQT gains"]
+        ),
+        ("Seeds", f"{seeds[0]} to {seeds[-1]}" if len(seeds) > 1 else str(seeds[0])),
+        (
+            "Evaluation",
+            f"{values['evaluation_fields']} initial fields drawn from seed "
+            f"{values['evaluation_seed']}",
+        ),
+        ("Folder", str(data.folder.resolve())),
+        ("Versions", ", ".join(f"{name} {number}" for name, number in versions.items())),
+        ("Report made", time.strftime("%Y-%m-%d %H:%M")),
+    ]
+
+
+def _problem(values: Mapping[str, Any]) -> str:
     return (
-        "<h2>Mean stage cost</h2>"
-        + _table(head, rows)
-        + "<p>Mean and standard deviation over seeds and sampled initial fields.</p>"
-        + _gain(data)
+        f"a state of {values['n_z']} numbers, {values['n_a']} actuators, {values['horizon']} steps of "
+        f"{values['sample_time']:g} s"
     )
 
 
-def _gain(data: ReportData) -> str:
+def _command(data: ReportData) -> str:
+    """A command that gives the same results again."""
+    if data.asked:
+        options = [f"--{k.replace('_', '-')} {v}" for k, v in data.asked["options"].items()]
+        return " ".join(["pdeloop reproduce", *data.asked["files"], *options])
+    values = data.problems[0].first.values
+    name = values["problem"]
+    if name in shipped_problems():
+        usual = load_parameters(name, {})
+        changed = [k for k in usual if k not in TRANSIENT and values.get(k, usual[k]) != usual[k]]
+        if set(changed) <= set(FLAGS):
+            flags = [f"--{k.replace('_', '-')} {values[k]}" for k in changed]
+            return " ".join(["pdeloop train", name, *flags])
+    return f"pdeloop train {data.folder}/parameters.yaml"
+
+
+def _costs(problems: Sequence[ProblemData], rows: Sequence[Mapping[str, Any]]) -> Table:
+    shown = list(problems[0].costs)
+    head = ("problem", *(NAMES[name] for name in shown))
+    return head, [(row["problem"], *(cost_text(row[name]) for name in shown)) for row in rows]
+
+
+def _reductions(problems: Sequence[ProblemData], rows: Sequence[Mapping[str, Any]]) -> Table:
+    paper = any(row["paper_percent"] for row in rows) and "lqt_po" in problems[0].runs
+    head = ("problem", "controller", "ratio of the means", "mean of the ratios")
+    found = []
+    for row in rows:
+        for name in problems[0].runs:
+            texts = reduction_texts(row[name]["below_lqt_percent"])
+            figure = row["paper_percent"] if name == "lqt_po" else None
+            cells = ("-" if figure is None else f"{figure:.1f}",) * paper
+            found.append((row["problem"], NAMES[name], *texts, *cells))
+    return (*head, *("paper",) * paper), found
+
+
+def _shares(problems: Sequence[ProblemData]) -> Table | None:
     """The share of the possible gain, of the problems whose limits are known."""
-    from pdeloop.report.style import TITLES, title_of
-
     rows = []
-    for problem in data.problems:
-        if problem.reference is None or problem.share("lqt") is None:
+    for problem in problems:
+        if not (limits := problem.limits()):
             continue
-        first = int(problem.values["seed"])
-        known = problem.reference.optimum
-        best = [known[s].mean() for s in range(first, first + problem.seeds) if s in known]
-        for name in problem.adapted:
+        best = [f"{limits[name].mean():.4g}" for name in ("optimum", "open_loop")]
+        for name in problem.runs:
             share = problem.share(name)
-            rows.append(
-                (
-                    title_of(problem),
-                    TITLES[name],
-                    "diverged" if share is None else f"{100 * share:.1f} %",
-                    f"{sum(best) / len(best):.4g}",
-                    f"{problem.reference.open_loop.mean():.4g}",
-                )
-            )
-    if not rows:
-        return ""
-    return (
-        "<h2>Share of the possible gain</h2>"
-        + _table(("problem", "", "share", TITLES["optimum"], TITLES["open_loop"]), rows)
-        + "<p>(J<sub>LQT</sub> - J)/(J<sub>LQT</sub> - J<sub>opt</sub>) with J<sub>opt</sub> the "
-        "least cost of the policy class a = K<sub>a</sub> Uᵀz + b, found with exact gradients of "
-        "the plant (python -m benchmarks optimum). The open-loop limit, the optimal inputs of each "
-        "field when it is known beforehand, is for any controller.</p>"
-    )
+            text = "diverged" if share is None else f"{100 * share:.1f} %"
+            rows.append((problem.name, NAMES[name], text, *best))
+    head = ("problem", "controller", "share", NAMES["optimum"], NAMES["open_loop"])
+    return (head, rows) if rows else None
 
 
-def _cost(entry: Mapping[str, Any]) -> str:
-    if entry["mean"] is None:
-        return "diverged"
-    note = f" ({entry['diverged']} diverged)" if entry["diverged"] else ""
-    return f"{entry['mean']:.4g} ± {entry['std']:.2g}{note}"
+def _budget(problems: Sequence[ProblemData]) -> Table:
+    """What the rollouts of a seed were for."""
+    rows = []
+    for problem in problems:
+        for name, run in problem.runs.items():
+            texts = [
+                _range([seed[purpose] for seed in run.rollouts]) for purpose in PURPOSES.values()
+            ]
+            rows.append((problem.name, NAMES[name], *texts))
+    return ("problem", "controller", *PURPOSES.values()), rows
 
 
-def _picture(name: str, caption: str, png: bytes) -> str:
-    data = base64.b64encode(png).decode()
-    text = html.escape(caption)
-    return (
-        f'<figure id="{html.escape(name)}"><img alt="{text}" src="data:image/png;base64,{data}">'
-        f"<figcaption>{text}</figcaption></figure>"
-    )
-
-
-def _parameters(problem: ProblemData) -> str:
-    rows = [(name, value) for name, value in problem.values.items() if name not in ("out", "bag")]
-    return (
-        f"<details><summary>{html.escape(problem.name)}</summary>"
-        f"{_table(('parameter', 'value'), rows)}</details>"
-    )
-
-
-def _table(head: tuple[str, ...], rows: Any) -> str:
-    cells = "".join(f"<th>{html.escape(str(cell))}</th>" for cell in head)
-    body = "".join(
-        "<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in row) + "</tr>"
-        for row in rows
-    )
-    table = f"<table><thead><tr>{cells}</tr></thead><tbody>{body}</tbody></table>"
-    return f"<div class=scroll>{table}</div>"
-
-
-_CSS = """
-body { margin: 0; font: 16px/1.5 system-ui, sans-serif; color: #1a1a1a; background: #fff; }
-main { max-width: 60rem; margin: 0 auto; padding: 1.5rem; }
-h1 { font-size: 1.6rem; line-height: 1.2; } h2 { font-size: 1.2rem; margin-top: 2rem; }
-figure { margin: 2rem 0; } img { max-width: 100%; height: auto; }
-figcaption { color: #444; font-size: .9rem; max-width: 46rem; }
-.scroll { overflow-x: auto; } table { border-collapse: collapse; font-size: .9rem; }
-th, td { text-align: left; padding: .3rem .8rem .3rem 0; border-bottom: 1px solid #ddd; }
-summary { cursor: pointer; padding: .3rem 0; }
-"""
+def _range(counts: Sequence[int]) -> str:
+    low, high = min(counts), max(counts)
+    return str(low) if low == high else f"{low} to {high}"

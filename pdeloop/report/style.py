@@ -1,8 +1,6 @@
-"""What all figures of a report share: colours, names, and where things go.
+"""What all figures of a report share. A controller's colour: loop_interfaces.controllers.
 
-The same colour (and line style) is the same controller everywhere. Colours are Okabe and Ito's,
-fields are drawn with cividis, gains with straight lines in CIELAB from white to blue and to brown:
-perceptually uniform, and readable with any colour vision.
+Fields are drawn with cividis and gains with PuOr, which any colour vision can read.
 """
 
 from __future__ import annotations
@@ -10,51 +8,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-from pdeloop.report.data import ProblemData
+from loop_interfaces.controllers import CONTROLLERS
 
-Array = NDArray[np.float64]
-COLOURS = {
-    "none": "#8C8C8C",
-    "lqt": "#0072B2",
-    "lqt_po": "#D55E00",
-    "pure_po": "#009E73",
-    "optimum": "#CC79A7",
-    "open_loop": "#404040",
-}
-STYLES: dict[str, Any] = {
-    "none": ":",
-    "lqt": "--",
-    "lqt_po": "-",
-    "pure_po": "-.",
-    "optimum": (0, (1, 1)),
-}
-TITLES = {
-    "none": "no control",
-    "lqt": "LQT",
-    "lqt_po": "LQT-PO",
-    "pure_po": "pure PO",
-    "optimum": "best of class",
-    "open_loop": "open-loop limit",
-}
-PROBLEMS = {
-    "burgers": "Burgers",
-    "allen-cahn": "Allen-Cahn",
-    "kdv": "Korteweg-de Vries",
-    "kuramoto-sivashinsky": "Kuramoto-Sivashinsky",
-    "fisher": "Fisher-KPP",
-    "cahn-hilliard": "Cahn-Hilliard",
-    "ginzburg-landau": "Ginzburg-Landau",
-    "convection-diffusion-reaction": "convection-diffusion-reaction",
-    "wave": "wave equation",
-    "schrodinger": "Schrödinger",
-}
-FIELD_MAP = "cividis"
+COLOURS = {key: controller.colour for key, controller in CONTROLLERS.items()}
+NAMES = {key: controller.name for key, controller in CONTROLLERS.items()}
+LINES: dict[str, Any] = {"lqt": "--", "pure_po": "-.", "optimum": ":", "gauss_newton": (0, (5, 1))}
+"""Line styles; the others are solid."""
+FIELD_MAP, GAIN_MAP = "cividis", "PuOr"
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9,
@@ -75,53 +39,24 @@ STYLE: dict[Any, Any] = {
 }
 
 
-def _srgb(lab: Array) -> Array:
-    """CIELAB (D65) to sRGB, shape (..., 3)."""
-    f = (lab[..., 0] + 16) / 116
-    xyz = np.stack([f + lab[..., 1] / 500, f, f - lab[..., 2] / 200], axis=-1)
-    xyz = np.where(xyz > 6 / 29, xyz**3, 3 * (6 / 29) ** 2 * (xyz - 4 / 29))
-    xyz = xyz * np.array([0.95047, 1.0, 1.08883])
-    matrix = np.array(
-        [[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]]
-    )
-    linear = np.clip(xyz @ matrix.T, 0.0, 1.0)
-    gamma = 1.055 * linear ** (1 / 2.4) - 0.055
-    srgb: Array = np.where(linear <= 0.0031308, 12.92 * linear, gamma)
-    return srgb
-
-
-def _diverging() -> ListedColormap:
-    """Blue, white, brown, with equal steps in CIELAB."""
-    blue, white, brown = (np.array(lab) for lab in ((32, 8, -44), (97, 0, 0), (32, 28, 42)))
-    share = np.linspace(0.0, 1.0, 128)[:, None]
-    return ListedColormap(
-        np.vstack([_srgb(blue + share * (white - blue)), _srgb(white + share * (brown - white))])
-    )
-
-
-GAIN_MAP = _diverging()
-
-
-def title_of(problem: ProblemData) -> str:
-    """The problem's name as a reader writes it."""
-    return PROBLEMS.get(problem.name, problem.name)
-
-
-def panels(
-    count: int, height: float, width: float = 2.35, least: float = 3.6
-) -> tuple[Figure, list[Axes]]:
+def panels(count: int, height: float, width: float, least: float) -> tuple[Figure, list[Axes]]:
     """A row of so many axes of this width, in a figure that is not narrower than `least` (inches)."""
     figure = Figure(figsize=(max(width * count + 0.5, least), height))
     return figure, list(figure.subplots(1, count, squeeze=False)[0])
 
 
-def log_ticks(ratio: float) -> tuple[float, ...]:
-    """Where a logarithmic axis over this ratio has its ticks, within a decade."""
-    if ratio > 30:
-        return (1.0, 3.0)
-    if ratio > 6:
-        return (1.0, 2.0, 5.0)
-    return (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
+def boxed(ax: Axes) -> None:
+    """All four sides of the frame, as a picture has them."""
+    ax.spines[["top", "right"]].set_visible(True)
+
+
+def plain_log(ax: Axes, ratio: float) -> None:
+    """A logarithmic axis over this ratio, its ticks written as plain numbers."""
+    ax.set_yscale("log")
+    subs = (1.0, 3.0) if ratio > 30 else (1.0, 2.0, 5.0) if ratio > 6 else (1.0, 1.5, 2, 3, 4, 6, 8)
+    ax.yaxis.set_major_locator(LogLocator(10, subs=subs))
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    ax.yaxis.set_minor_locator(NullLocator())
 
 
 def legend_above(figure: Figure, axes: Sequence[Axes]) -> None:

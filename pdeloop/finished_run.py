@@ -1,0 +1,144 @@
+"""A finished run as its folder holds it, and how far its costs lie below those of LQT."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import bootstrap
+
+from loop_interfaces import model_rows
+from loop_interfaces.model_rows import ModelRows
+from pde_sim_node.plant import DIVERGED_COST
+from tuner_node.results import RunFolder, RunFolderError
+from tuner_node.training import CONTROLLERS
+
+Array = NDArray[np.float64]
+RESAMPLES = 9999
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """What a report or a table needs of a run.
+
+    values: resolved parameters, with the present defaults; result: result.json; policies, warm: the
+    adapted gains and LQT's, (S, n_a, 2 n_s); models: of each seed; costs: by controller, (S, fields);
+    rollouts: what those of each seed were for (tuner_node.budget).
+    """
+
+    values: dict[str, Any]
+    result: dict[str, Any]
+    policies: Array
+    warm: Array
+    models: list[ModelRows]
+    costs: dict[str, Array]
+    rollouts: list[dict[str, int]]
+
+    @property
+    def seeds(self) -> range:
+        """The training seeds."""
+        first = int(self.values["seed"])
+        return range(first, first + len(self.policies))
+
+    @property
+    def before(self) -> list[int]:
+        """Rollouts of each seed before the adaptation, for exploration and check."""
+        return [seed["exploration"] + seed["check"] for seed in self.rollouts]
+
+
+def load(folder: Path) -> FinishedRun:
+    """The run in `folder`. RunFolderError if there is none, or it is not finished."""
+    run = RunFolder(folder)
+    values, arrays, result = run.values(), run.policies(), run.result()
+    counts = result.get("rollouts")
+    if not isinstance(counts, list) or len(counts) != values["seeds"]:
+        raise RunFolderError(
+            f"{folder}/result.json does not say what the rollouts were for: it is of an older version; "
+            "train again"
+        )
+    return FinishedRun(
+        values,
+        result,
+        policies=arrays["policy"],
+        warm=arrays["lqt"],
+        models=[model_rows.unpack(rows, values["n_a"]) for rows in arrays["model"]],
+        costs={name: np.array(result["costs_by_field"][name]) for name in CONTROLLERS},
+        rollouts=counts,
+    )
+
+
+def field_means(costs: Array) -> Array:
+    """Means over the last axis, the fields; NaN where a rollout diverged."""
+    means: Array = np.where((costs < DIVERGED_COST).all(axis=-1), costs.mean(axis=-1), np.nan)
+    return means
+
+
+@dataclass(frozen=True)
+class Reduction:
+    """How far a controller's mean stage cost lies below LQT's, in percent; negative: above.
+
+    ratio_of_means: of the means over the seeds, 1 - mean J / mean J_LQT; mean_of_ratios: the mean of
+    the seeds' own 1 - J / J_LQT; both from `seeds` seeds, those in which no rollout diverged.
+    The intervals are percentile bootstraps over the seeds, None of a single seed.
+    """
+
+    ratio_of_means: float
+    mean_of_ratios: float
+    ratio_interval: tuple[float, float] | None
+    mean_interval: tuple[float, float] | None
+    seeds: int
+
+
+def reduction(costs: Array, lqt: Array) -> Reduction | None:
+    """The reduction of costs (S, fields) on LQT's; None if every seed has a rollout that diverged.
+
+    The interval is that of the percentile bootstrap: the seeds are drawn again with replacement, each
+    with both its costs. Efron, Tibshirani, *An Introduction to the Bootstrap*, 1993, chapter 13.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> found = reduction(np.array([[1.0], [6.0]]), np.array([[2.0], [8.0]]))
+    >>> round(found.ratio_of_means, 2), round(found.mean_of_ratios, 2)
+    (30.0, 37.5)
+    """
+    own, base = field_means(costs), field_means(lqt)
+    whole = np.isfinite(own) & np.isfinite(base)
+    if not whole.any():
+        return None
+    pair = own[whole], base[whole]
+    return Reduction(
+        ratio_of_means=float(_ratio_of_means(*pair)),
+        mean_of_ratios=float(_mean_of_ratios(*pair)),
+        ratio_interval=_interval(pair, _ratio_of_means),
+        mean_interval=_interval(pair, _mean_of_ratios),
+        seeds=int(whole.sum()),
+    )
+
+
+def _ratio_of_means(own: Array, base: Array, axis: int = -1) -> Any:
+    return 100 * (1 - own.mean(axis=axis) / base.mean(axis=axis))
+
+
+def _mean_of_ratios(own: Array, base: Array, axis: int = -1) -> Any:
+    return 100 * (1 - own / base).mean(axis=axis)
+
+
+def _interval(pair: tuple[Array, Array], statistic: Any) -> tuple[float, float] | None:
+    if len(pair[0]) < 2:
+        return None
+    found = bootstrap(
+        pair,
+        statistic,
+        paired=True,
+        vectorized=True,
+        n_resamples=RESAMPLES,
+        confidence_level=CONFIDENCE,
+        method="percentile",
+        random_state=np.random.default_rng(0),
+    ).confidence_interval
+    return float(found.low), float(found.high)
