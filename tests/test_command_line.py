@@ -128,7 +128,7 @@ def test_a_trainings_result_is_all_of_its_output(tmp_path: Path) -> None:
 
 def test_a_reproductions_table_is_all_of_its_output(tmp_path: Path) -> None:
     out = tmp_path / "paper"
-    words = ("reproduce", str(SMALL), "--seeds", "1", "--iterations", "2", "--out", str(out))
+    words = ("reproduce", str(SMALL), "--seeds", "1", "--iterations", "12", "--out", str(out))
     done = run(*words, "--json")
     assert done.returncode == 0, done.stderr
     table = json.loads(done.stdout)

@@ -259,9 +259,7 @@ def _behaviours(data: ProblemData, plant: Plant) -> list[Behaviour] | None:
     law.set(np.stack([*policies.values()] * 2), np.tile(np.arange(count), 2))
     starts = [MEAN_FIELD, derive(seed, Purpose.EVALUATION_FIELD, 0)]
     noise = np.repeat([0, *evaluation_noise(seed, 1)], count)
-    episode = rollout(
-        plant, lambda k, states: law.actions(states), np.repeat(starts, count), noise
-    )
+    episode = rollout(plant, lambda k, states: law.actions(states), np.repeat(starts, count), noise)
     costs = episode.costs
     known = [data.costs[name][data.shown, 0] for name in policies]
     if not np.allclose(costs.mean[count:], known, rtol=SAME_LAW):

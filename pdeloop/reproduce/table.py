@@ -68,12 +68,12 @@ def text(rows: Sequence[Mapping[str, Any]]) -> str:
         lines.append(f"{row['problem']:<16}{cells}")
     if any(row[name]["diverged"] for row in rows for name in shown):
         lines.append("* without rollouts that diverged")
-    lines += ["", f"{'below LQT, %':<32}{'ratio of the means':>24}{'mean of the ratios':>24}"]
+    lines += ["", f"{'below LQT, %':<32}{'ratio of the means':>26}{'mean of the ratios':>26}"]
     for row in rows:
         for name in LEARNED:
             ratio, mean = reduction_texts(row[name]["below_lqt_percent"])
             label = f"{row['problem']:<16}{CONTROLLERS[name].name:<16}"
-            lines.append(f"{label}{ratio:>24}{mean:>24}")
+            lines.append(f"{label}{ratio:>26}{mean:>26}")
     lines += [CAVEAT, *(sentence for row in rows if (sentence := beside_the_paper(row)))]
     return "\n".join(lines)
 
