@@ -37,7 +37,7 @@ def behaviour(problem: ProblemData) -> Figure:
     for column, b in enumerate(shown):
         outcome = f"mean stage cost {b.cost:.3g}"
         outcome = f"diverged at step {b.diverged}" if b.diverged >= 0 else outcome
-        grid[0, column].set_title(f"{NAMES[b.controller]}\n{outcome}", color=COLOURS[b.controller])
+        grid[0, column].set_title(f"{NAMES[b.controller]}\n{outcome}")
         _actions(grid[fields, column], b, times, largest)
         for ax in grid[:, column]:
             ax.xaxis.set_major_locator(MaxNLocator(3))
@@ -119,7 +119,7 @@ def gains(problem: ProblemData) -> Figure:
             )
             boxed(ax)
             when = "before" if name == "lqt" else "after"
-            ax.set_title(f"{symbol}, {NAMES[name]} ({when})", color=COLOURS[name])
+            ax.set_title(f"{symbol}, {NAMES[name]} ({when})")
             ax.xaxis.set_major_locator(MaxNLocator(6, integer=True, min_n_ticks=1))
             ax.yaxis.set_major_locator(MaxNLocator(6, integer=True, min_n_ticks=1))
             if part == 0:
@@ -153,7 +153,7 @@ def spectrum(problem: ProblemData) -> Figure:
         detail.set_ylim(-0.65 * width, 0.65 * width)
         radius = float(np.abs(found[problem.shown]).max())
         matrix = "A" if name == "none" else "A + B $K_a$"
-        whole.set_title(f"{NAMES[name]}: {matrix}\nradius {radius:.4f}", color=COLOURS[name])
+        whole.set_title(f"{NAMES[name]}: {matrix}\nradius {radius:.4f}")
         detail.set_title("around 1")
         detail.set_xlabel("real part")
         detail.xaxis.set_major_locator(MaxNLocator(4))
