@@ -13,7 +13,7 @@ from scipy.stats import bootstrap
 from loop_interfaces import model_rows
 from loop_interfaces.model_rows import ModelRows
 from pde_sim_node.plant import DIVERGED_COST
-from tuner_node.results import RunFolder, RunFolderError
+from tuner_node.results import RunFolder
 from tuner_node.training import CONTROLLERS
 
 Array = NDArray[np.float64]
@@ -27,7 +27,8 @@ class FinishedRun:
 
     values: resolved parameters, with the present defaults; result: result.json; policies, warm: the
     adapted gains and LQT's, (S, n_a, 2 n_s); models: of each seed; costs: by controller, (S, fields);
-    rollouts: what those of each seed were for (tuner_node.budget).
+    rollouts: what those of each seed were for (tuner_node.budget), empty where an older version did
+    not count them.
     """
 
     values: dict[str, Any]
@@ -47,19 +48,14 @@ class FinishedRun:
     @property
     def before(self) -> list[int]:
         """Rollouts of each seed before the adaptation, for exploration and check."""
-        return [seed["exploration"] + seed["check"] for seed in self.rollouts]
+        counted = [seed["exploration"] + seed["check"] for seed in self.rollouts]
+        return counted or [0] * len(self.policies)
 
 
 def load(folder: Path) -> FinishedRun:
     """The run in `folder`. RunFolderError if there is none, or it is not finished."""
     run = RunFolder(folder)
     values, arrays, result = run.values(), run.policies(), run.result()
-    counts = result.get("rollouts")
-    if not isinstance(counts, list) or len(counts) != values["seeds"]:
-        raise RunFolderError(
-            f"{folder}/result.json does not say what the rollouts were for: it is of an older version; "
-            "train again"
-        )
     return FinishedRun(
         values,
         result,
@@ -67,7 +63,7 @@ def load(folder: Path) -> FinishedRun:
         warm=arrays["lqt"],
         models=[model_rows.unpack(rows, values["n_a"]) for rows in arrays["model"]],
         costs={name: np.array(result["costs_by_field"][name]) for name in CONTROLLERS},
-        rollouts=counts,
+        rollouts=result.get("rollouts", []),
     )
 
 

@@ -276,7 +276,7 @@ def test_a_run_whose_policies_diverged_is_reported(folder, tmp_path):
     own = tmp_path / "lost.yaml"
     text = SMALL.read_text().replace("    learning_rate: 1.0e-4\n", "")
     own.write_text(text + "".join(f"    {k}: {v}\n" for k, v in values.items()))
-    assert main(["train", str(own), "--in-process", "--out", str(lost)]) == 0
+    assert main(["train", str(own), "--in-process", "--out", str(lost)]) == 1
     assert json.loads((lost / "result.json").read_text())["diverged"]["adapted"] > 0
     assert main(["report", str(lost)]) == 0
     page = (lost / "report" / "index.html").read_text()

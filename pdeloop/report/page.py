@@ -295,10 +295,9 @@ def _budget(problems: Sequence[ProblemData]) -> Table:
     rows = []
     for problem in problems:
         for name, run in problem.runs.items():
-            texts = [
-                _range([seed[purpose] for seed in run.rollouts]) for purpose in PURPOSES.values()
-            ]
-            rows.append((problem.name, NAMES[name], *texts))
+            if run.rollouts:
+                spent = [[seed[purpose] for seed in run.rollouts] for purpose in PURPOSES.values()]
+                rows.append((problem.name, NAMES[name], *map(_range, spent)))
     return ("problem", "controller", *PURPOSES.values()), rows
 
 
