@@ -252,7 +252,7 @@ def _behaviours(data: ProblemData, plant: Plant) -> list[Behaviour] | None:
     policies, values = data.policies, data.first.values
     models = {name: run.models[data.shown] for name, run in data.runs.items()}
     bases = [models.get(name, data.models[data.shown]).U for name in policies]
-    if any(len(basis) != plant.n_z for basis in bases):
+    if any(len(basis) != plant.target.size for basis in bases):
         return None
     law = ProjectedLaw(bases, plant.target, values["action_limit"])
     count, seed = len(policies), values["evaluation_seed"]
