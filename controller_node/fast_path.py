@@ -1,7 +1,6 @@
-"""The controller's fast path: from a serialised state to its serialised action, compiled.
+"""The controller's fast path: maps a serialised state to its serialised action within an episode.
 
-It is `responder`, to the bit, as long as nothing but states of the episode come, and the law answers
-them.
+It answers the states of an episode that a law answers as `responder` does, to the bit.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""The plant's fast path: from a serialised action to the next serialised state, compiled.
+"""The plant's fast path: maps a serialised action to the next serialised state within an episode.
 
-It is `lockstep`, to the bit, as long as nothing but the awaited action comes and a step is compiled
-code alone.
+It answers the awaited action as `lockstep` does, to the bit, where a step is compiled code alone.
 """
 
 from __future__ import annotations
@@ -55,8 +54,8 @@ LOG = 50_000
 
 
 @jit
-def keep(plan: Any, kind: int, time: float, raw: int, length: int) -> None:
-    """For those who record or look."""
+def add_sample(plan: Any, kind: int, time: float, raw: int, length: int) -> None:
+    """Add a message to the batches that take samples."""
     if plan.batches[0].open or plan.batches[1].open:
         stamp = monotonic_ns(plan.clock)
         for batch in plan.batches:
@@ -71,7 +70,7 @@ def advance(plan: Any, head: int, message: int, length: int) -> bool:
         return False
     if full(plan.batches[0]) or full(plan.batches[1]):
         return False
-    keep(plan, ACTION_KIND, NO_TIME, message, length)
+    add_sample(plan, ACTION_KIND, NO_TIME, message, length)
     numbers = plan.expected.values
     for i in range(numbers):
         number = load_unaligned(head, FIRST + i)
@@ -81,7 +80,7 @@ def advance(plan: Any, head: int, message: int, length: int) -> bool:
     plan.steps += 1
     plan.time += plan.sample_time
     write_answer(plan.answer, context.step, plan.time, context.states, plan.values)
-    keep(plan, STATE_KIND, plan.time if plan.timed else NO_TIME, plan.begin, plan.length)
+    add_sample(plan, STATE_KIND, plan.time if plan.timed else NO_TIME, plan.begin, plan.length)
     return True
 
 
@@ -95,7 +94,7 @@ def load_compiled() -> None:
 
 
 class PlantFastPath(FastPath):
-    """Advances a lock-step within an episode.
+    """Advances the plant of a lock-step within an episode.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
-"""What plant and controller share of the fast path, and where they differ: one compiled function each.
+"""The fast path of plant and controller, which differ in one compiled function each.
 
-A handler takes a serialised message. Within an episode only its step, its time and its values differ
-from the one before, so it compares everything else, lets the compiled function of the node compute
-the answer, and leaves every message that is not the expected one to the node's own thread. The result
-is that of the node's protocol, to the bit.
+Within an episode only the step, the time and the values of a message differ from the one before. A
+handler compares everything else with what is expected and lets the node's compiled function compute
+the answer. Every message that is not the expected one is left to the node's own thread. The answer is
+that of the node's protocol, to the bit.
 """
 
 from __future__ import annotations
@@ -35,7 +35,11 @@ __all__ = ["FastPath", "fast_handler", "plan_type"]
 
 
 def plan_type(*fields: Any) -> np.dtype[np.void]:
-    """The record that a handler works on: what it compares, the answer's header, and own fields."""
+    """The type of the record that a handler works on.
+
+    Its first fields are `expected`, what a message is compared with, and `answer`, the address of the
+    answer's header; `fields` follow, for the node's own function.
+    """
     return np.dtype([("expected", EXPECTED), ("answer", np.int64), *fields])
 
 
@@ -44,8 +48,16 @@ def fast_handler(
 ) -> MachineCode:
     """Machine code that handles the messages of a channel, see `RclChannel`.
 
-    plan: made by `plan_type`. answer(plan, head, message, length): compiled; fills in the answer to
-    the message whose header is at an address, or returns False. sources: all it is made of.
+    Parameters
+    ----------
+    plan
+        Type of the record that it is called with, see `plan_type`.
+    answer
+        A function answer(plan, head, message, length) that can be compiled: it fills in the answer to
+        the message with its header at the address `head`, and returns True, or leaves the message
+        alone and returns False.
+    sources
+        The modules that `answer` calls: when one of them changes, it is compiled anew.
     """
     shared = atomics, cache, native, simd, messages
     return MachineCode(
@@ -109,9 +121,19 @@ class FastPath(ABC):
         """Bring the protocol up to date: so many messages were answered, the last one at a time (s)."""
 
     def expect(self, like: Frame, shape: tuple[int, ...], answer: tuple[int, ...]) -> bool:
-        """Expect messages with the ids of `like` and values of a shape, and answer with another.
+        """Expect messages with the run, episode and plant of `like`.
 
-        False if the peer that was decoded last sends others.
+        Parameters
+        ----------
+        like
+            A message of the episode.
+        shape, answer
+            Shapes of the values that are expected, and of those of the answer.
+
+        Returns
+        -------
+        bool
+            False if nothing is expected, as the peer that was decoded last sends other messages.
         """
         prefix = self._incoming.prefix_of(shape)
         if prefix is None or not self._expected.set(prefix, like, shape):

@@ -106,7 +106,7 @@ SAMPLE_BATCH = np.dtype(
 
 @jit
 def append(batch: Any, kind: int, stamp: int, time: float, raw: int, length: int) -> None:
-    """Keep the serialised message at an address, if the batch is open; there must be room."""
+    """Add the serialised message at an address, if the batch is open; there must be room."""
     if not batch.open:
         return
     at = batch.end

@@ -1,4 +1,4 @@
-"""What is had from rcl, ROS 2's C library, directly: rclpy has no such thing, or copies more."""
+"""ctypes access to rcl, for what rclpy lacks or performs with extra copies."""
 
 from __future__ import annotations
 

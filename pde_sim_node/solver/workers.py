@@ -1,4 +1,4 @@
-"""Environments side by side in threads: a compiled step shared out to the cores."""
+"""The compiled step of a batch of environments, shared out to the threads of a pool."""
 
 import os
 import time
