@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pde_sim_node.equations import EQUATIONS, Equation, Field
-from pde_sim_node.solver.etdrk4 import etdrk4_coefficients
+from pde_sim_node.equations import EQUATIONS, Equation
+from pde_sim_node.solver.reference import ReferenceStep
 from pde_sim_node.supports import indicator_supports
 
-__all__ = ["BATCHES", "GRIDS", "Grid", "NumpyPlant", "Row", "run"]
+__all__ = ["BATCHES", "GRIDS", "Grid", "Row", "run"]
 
 BATCHES = (1, 2, 12, 64)
 SECONDS = 0.25
@@ -66,51 +66,12 @@ class Row:
     microseconds: float
 
 
-class NumpyPlant:
-    """ETDRK4 over all environments at once, in plain NumPy with SciPy's real FFT.
-
-    Parameters
-    ----------
-    equation, grid
-        The problem.
-    fine
-        Points of the dealiased grid; 3/2 n_z if not given.
-    """
-
-    def __init__(self, equation: Equation, grid: Grid, fine: int | None = None) -> None:
-        self.n_z, self.steps = grid.n_z, grid.steps
-        self.fine = fine or 3 * grid.n_z // 2
-        modes = np.arange(grid.n_z // 2 + 1, dtype=np.float64)
-        k: Field = 2 * np.pi / equation.length * modes
-        self.c = etdrk4_coefficients(equation.linear_operator(k), grid.integration_time)
-        self.multiplier = equation.multiplier(k) * grid.n_z / self.fine
-        self.nonlinearity: Any = equation.nonlinearity
-        supports = indicator_supports(grid.n_z, grid.n_a, grid.width)
-        self.forcing = np.fft.rfft(supports, axis=0).T
-
-    def step(
-        self, states: NDArray[np.float64], actions: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """The states (M, n_z) one sampling time later, under the actions (M, n_a)."""
-        from scipy.fft import irfft, rfft
-
-        c, forcing = self.c, actions @ self.forcing
-        scale, modes = self.fine / self.n_z, self.n_z // 2 + 1
-
-        def nonlinear(v: Any) -> Any:
-            u = scale * irfft(v, self.fine)
-            return self.multiplier * rfft(self.nonlinearity(u))[:, :modes] + forcing
-
-        v = rfft(states)
-        for _ in range(self.steps):
-            n_v, half = nonlinear(v), c.e2 * v
-            a = half + c.q * n_v
-            n_a = nonlinear(a)
-            n_b = nonlinear(half + c.q * n_a)
-            n_c = nonlinear(c.e2 * a + c.q * (2 * n_b - n_v))
-            v = c.e * v + c.f1 * n_v + 2 * c.f2 * (n_a + n_b) + c.f3 * n_c
-        new: NDArray[np.float64] = irfft(v, self.n_z)
-        return new
+def reference(equation: Equation, grid: Grid) -> ReferenceStep:
+    """The step in plain NumPy."""
+    supports = indicator_supports(grid.n_z, grid.n_a, grid.width)
+    return ReferenceStep(
+        equation, supports, integration_time=grid.integration_time, steps=grid.steps
+    )
 
 
 def least_microseconds(step: Callable[[], object], batch: int) -> float:
@@ -162,8 +123,8 @@ def time_pdeloop(problem: str, batch: int) -> float:
 
 def time_numpy(problem: str, batch: int) -> float:
     equation, states, actions = start(problem, batch)
-    plant = NumpyPlant(equation, GRIDS[problem])
-    return least_microseconds(lambda: plant.step(states, actions), batch)
+    step = reference(equation, GRIDS[problem])
+    return least_microseconds(lambda: step(states, actions), batch)
 
 
 def time_jax(problem: str, batch: int) -> float:
@@ -173,12 +134,12 @@ def time_jax(problem: str, batch: int) -> float:
     from jax import numpy as jnp
 
     equation, states, actions = start(problem, batch)
-    plant = NumpyPlant(equation, GRIDS[problem])
-    c, modes = plant.c, plant.n_z // 2 + 1
+    plant = reference(equation, GRIDS[problem])
+    c, modes = plant.coefficients, plant.n_z // 2 + 1
 
     @jax.jit  # type: ignore[untyped-decorator, unused-ignore]
     def step(states: Any, actions: Any) -> Any:
-        forcing = actions @ plant.forcing
+        forcing = actions @ plant.supports
 
         def nonlinear(v: Any) -> Any:
             u = plant.fine / plant.n_z * jnp.fft.irfft(v, plant.fine)

@@ -54,6 +54,15 @@ def test_the_transposed_step_agrees_with_finite_differences_of_the_plant(problem
         assert (np.abs(got - expected) <= 1e-9 * scale).all()
 
 
+@pytest.mark.parametrize("problem", PROBLEMS)
+@pytest.mark.parametrize("n_z", [None, 100])
+def test_its_way_forward_is_the_step_of_the_plant_to_the_bit(problem, n_z):
+    plant = plant_of(problem, **({} if n_z is None else {"n_z": n_z}))
+    states, actions, _ = somewhere(plant)
+    expected = plant.evaluate(states, actions)[0]
+    assert Adjoint(plant).step(states, actions).tobytes() == expected.tobytes()
+
+
 def test_of_a_linear_plant_it_is_the_transposed_matrix():
     """With g = 0, f is affine: its matrix, column by column, transposed to rounding."""
 

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.kernel import Grid, NumpyPlant
 from pde_sim_node.equations import (
     AllenCahn,
     Burgers,
@@ -23,6 +22,7 @@ from pde_sim_node.equations import (
 from pde_sim_node.plant import DIVERGED_COST, Plant
 from pde_sim_node.solver import workers
 from pde_sim_node.solver.integrator import fine_length
+from pde_sim_node.solver.reference import ReferenceStep
 
 DATA = Path(__file__).parent / "data"
 
@@ -87,14 +87,13 @@ def test_trajectory_costs_and_supports_are_controlgyms(
     "equation", [Burgers(viscosity=1e-2), AllenCahn(), KortewegDeVries()], ids=lambda e: e.name
 )
 def test_every_even_grid_agrees_with_plain_numpy(equation: Equation, n_z: int) -> None:
-    grid = Grid(n_z, 2, 0.3, 0.004, 0.001)
     fine = 2 * fine_length(n_z)
     assert fine >= 1.5 * n_z
-    reference = NumpyPlant(equation, grid, fine)
     plant = make(equation, n_z=n_z, n_a=2, width=0.3, sample_time=0.004, integration_time=0.001)
+    reference = ReferenceStep(equation, plant.supports, integration_time=0.001, steps=4, fine=fine)
     z, actions = plant.reset([0, 1, -1]).copy(), np.array([[1.0, -2.0], [0.5, 0.0], [-1.0, 3.0]])
     for _ in range(3):
-        z = reference.step(z, actions)
+        z = reference(z, actions)
         np.testing.assert_allclose(plant.step(actions), z, atol=1e-12)
 
 

@@ -43,7 +43,7 @@ from pde_sim_node.equations import Equation
 from pde_sim_node.plant import Plant
 from pde_sim_node.solver import fft, kernel, spectra
 from pde_sim_node.solver.integrator import Integrator
-from pde_sim_node.solver.kernel import PLAN, force
+from pde_sim_node.solver.kernel import PLAN, force, internal_step
 from pde_sim_node.solver.kernel_memory import aligned
 from pde_sim_node.solver.spectra import (
     analyse,
@@ -52,7 +52,6 @@ from pde_sim_node.solver.spectra import (
     inverse,
     minus,
     plus,
-    product,
     put,
     rfft_pack,
     rfft_unpack,
@@ -95,36 +94,16 @@ def taped(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> int:
     return forward(w, z, plan.z1 + plan.z2 - z, d, t, c, e)
 
 
+integrate_taped = internal_step(taped)
+
+
 @jit
-def integrate_taped(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> None:
-    """As `kernel.integrate`, the same numbers to the bit, with the tape."""
-    m, factors, modes = plan.fine.m, plan.fine.split, plan.modes
-    x, next_x, to_b, to_c = plan.x, plan.next, plan.b, plan.c
-    z = taped(w, d, plan, c, e, tape)
-    for k in range(0, modes, 8):
-        g, v, qf = rfft_pack(w, z, d, m, factors, k, c, e), get(w, x + k, d), get(w, plan.qf + k, d)
-        half, qg = plus(product(c, plan.e2 + k, e, v), qf), product(c, plan.qm + k, e, g)
-        a = plus(half, qg)
-        put(w, x + k, d, a)
-        put(w, to_b + k, d, half)
-        put(w, to_c + k, d, minus(plus(product(c, plan.e2 + k, e, a), qf), qg))
-        whole = plus(product(c, plan.e + k, e, v), get(w, plan.ff + k, d))
-        put(w, next_x + k, d, plus(whole, product(c, plan.f1m + k, e, g)))
-    z = taped(w, d, plan, c, e, tape + m)
-    for k in range(0, modes, 8):
-        g = rfft_pack(w, z, d, m, factors, k, c, e)
-        put(w, x + k, d, plus(get(w, to_b + k, d), product(c, plan.qm + k, e, g)))
-        put(w, next_x + k, d, plus(get(w, next_x + k, d), product(c, plan.f2m + k, e, g)))
-    z = taped(w, d, plan, c, e, tape + 2 * m)
-    for k in range(0, modes, 8):
-        g = rfft_pack(w, z, d, m, factors, k, c, e)
-        qg = product(c, plan.qm + k, e, g)
-        put(w, x + k, d, plus(get(w, to_c + k, d), plus(qg, qg)))
-        put(w, next_x + k, d, plus(get(w, next_x + k, d), product(c, plan.f2m + k, e, g)))
-    z = taped(w, d, plan, c, e, tape + 3 * m)
-    for k in range(0, modes, 8):
-        g = rfft_pack(w, z, d, m, factors, k, c, e)
-        put(w, x + k, d, plus(get(w, next_x + k, d), product(c, plan.f3m + k, e, g)))
+def record(state: int, action: int, w: int, d: int, plan: Any, c: int, e: int) -> None:
+    """A sampling time from a state, as `kernel.advance`, with g'(u) of every stage on the tape."""
+    force(action, w, d, plan, c, e)
+    analyse(state, w, d, plan, c, e)
+    for n in range(plan.steps):
+        integrate_taped(w, d, plan, c, e, plan.tape + n * 4 * plan.fine.m)
 
 
 @jit
@@ -189,6 +168,7 @@ def compile_pull_back(sources: str) -> Any:
         states: Array,
         actions: Array,
         covectors: Array,
+        after: Array,
         on_states: Array,
         on_actions: Array,
         plans: NDArray[np.void],
@@ -196,17 +176,17 @@ def compile_pull_back(sources: str) -> Any:
         begin: int,
         end: int,
     ) -> None:
-        """Environments begin..end, with the scratch of plans[which]; writes on_states, on_actions."""
+        """Environments begin..end, with the scratch of plans[which]; writes after, on_states and
+        on_actions: f(z, a) and the two products with its transposed derivatives.
+        """
         sources  # noqa: B018  # closed over to be part of the key on disk
         plan = plans[which]
         w, d, c, e = plan.scratch, plan.scratch_apart, plan.constants, plan.constants_apart
         last, block = plan.n_z // 2, 4 * plan.fine.m
         for i in range(begin, end):
             state = states.ctypes.data + 8 * plan.n_z * i
-            force(actions.ctypes.data + 8 * plan.n_a * i, w, d, plan, c, e)
-            analyse(state, w, d, plan, c, e)
-            for n in range(plan.steps):
-                integrate_taped(w, d, plan, c, e, plan.tape + n * block)
+            record(state, actions.ctypes.data + 8 * plan.n_a * i, w, d, plan, c, e)
+            synthesise(after.ctypes.data + 8 * plan.n_z * i, w, d, plan, c, e)
             # Synthesis transposed is analysis, but for the last mode, of weight 1 on the published
             # grid and 2 on the fine one.
             analyse(covectors.ctypes.data + 8 * plan.n_z * i, w, d, plan, c, e)
@@ -281,6 +261,13 @@ class Adjoint:
         self._plans["scratch"] = [scratch.ctypes.data for scratch in self._scratch]
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
 
+    def step(self, states: Array, actions: Array) -> Array:
+        """f(z, a) as it is recorded for the way back: the plant's own step, to the bit.
+
+        Whatever diverges is not held back, as the plant does.
+        """
+        return self._run(states, actions, np.zeros_like(states))[0]
+
     def pull_back(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array]:
         """(df/dz)^T y and (df/da)^T y of every environment.
 
@@ -296,7 +283,15 @@ class Adjoint:
         Returns
         -------
         (M, n_z), (M, n_a)
+
+        Raises
+        ------
+        ValueError
+            Shapes that do not fit.
         """
+        return self._run(states, actions, covectors)[1:]
+
+    def _run(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array, Array]:
         z, a, y = (np.ascontiguousarray(x, dtype=np.float64) for x in (states, actions, covectors))
         batch, plant = len(z), self._plant
         for what, given, size in (("states", z, plant.n_z), ("actions", a, plant.n_a)):
@@ -304,18 +299,18 @@ class Adjoint:
                 raise ValueError(f"{what} must have shape ({batch}, {size}), got {given.shape}")
         if y.shape != z.shape:
             raise ValueError(f"covectors must have the states' shape {z.shape}, got {y.shape}")
-        on_states, on_actions = np.empty_like(z), np.empty_like(a)
+        after, on_states, on_actions = np.empty_like(z), np.empty_like(z), np.empty_like(a)
         count = len(self._scratch)
 
         def work(part: int) -> None:
             begin, end = batch * part // count, batch * (part + 1) // count
-            _pull_back(z, a, y, on_states, on_actions, self._plans, part, begin, end)
+            _pull_back(z, a, y, after, on_states, on_actions, self._plans, part, begin, end)
 
         if self._pool is None:
             work(0)
         else:
             list(self._pool.map(work, range(count)))
-        return on_states, on_actions
+        return after, on_states, on_actions
 
 
 def derivative_loop(equation: Equation) -> Any:

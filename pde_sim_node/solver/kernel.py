@@ -12,6 +12,7 @@ the multiplier m is contained in the coefficients (names with an m).
 """
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -87,7 +88,7 @@ PLAN = np.dtype(
 
 
 @jit
-def nonlinear(w: int, d: int, plan: Any, c: int, e: int) -> int:
+def nonlinear(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> int:
     """Where the transform of g(u) stands, u being the field of the spectrum x on the fine grid."""
     t = plan.fine
     rfft_unpack(w, plan.x, plan.z1, d, t, c, e)
@@ -97,39 +98,50 @@ def nonlinear(w: int, d: int, plan: Any, c: int, e: int) -> int:
     return forward(w, z, plan.z1 + plan.z2 - z, d, t, c, e)
 
 
-@jit
-def integrate(w: int, d: int, plan: Any, c: int, e: int) -> None:
-    """One internal step of the spectrum x."""
-    # Read here, as the compiler cannot know that what is stored below is not the plan.
-    m, factors, modes = plan.fine.m, plan.fine.split, plan.modes
-    x, next_x, to_b, to_c = plan.x, plan.next, plan.b, plan.c
-    e1, e2, qm, f2m = plan.e, plan.e2, plan.qm, plan.f2m
-    f1m, f3m, qfs, ffs = plan.f1m, plan.f3m, plan.qf, plan.ff
-    z = nonlinear(w, d, plan, c, e)
-    for k in range(0, modes, 8):
-        g, v, qf = rfft_pack(w, z, d, m, factors, k, c, e), get(w, x + k, d), get(w, qfs + k, d)
-        half, qg = plus_product(qf, c, e2 + k, e, v), product(c, qm + k, e, g)
-        a = plus(half, qg)
-        put(w, x + k, d, a)
-        put(w, to_b + k, d, half)
-        put(w, to_c + k, d, minus(plus_product(qf, c, e2 + k, e, a), qg))
-        whole = plus_product(get(w, ffs + k, d), c, e1 + k, e, v)
-        put(w, next_x + k, d, plus_product(whole, c, f1m + k, e, g))
-    z = nonlinear(w, d, plan, c, e)
-    for k in range(0, modes, 8):
-        g = rfft_pack(w, z, d, m, factors, k, c, e)
-        put(w, x + k, d, plus_product(get(w, to_b + k, d), c, qm + k, e, g))
-        put(w, next_x + k, d, plus_product(get(w, next_x + k, d), c, f2m + k, e, g))
-    z = nonlinear(w, d, plan, c, e)
-    for k in range(0, modes, 8):
-        g = rfft_pack(w, z, d, m, factors, k, c, e)
-        qg = product(c, qm + k, e, g)
-        put(w, x + k, d, plus(get(w, to_c + k, d), plus(qg, qg)))
-        put(w, next_x + k, d, plus_product(get(w, next_x + k, d), c, f2m + k, e, g))
-    z = nonlinear(w, d, plan, c, e)
-    for k in range(0, modes, 8):
-        g = rfft_pack(w, z, d, m, factors, k, c, e)
-        put(w, x + k, d, plus_product(get(w, next_x + k, d), c, f3m + k, e, g))
+def internal_step(nonlinear: Callable[..., int]) -> Callable[..., None]:
+    """One internal step of the spectrum x, compiled: integrate(w, d, plan, c, e, tape).
+
+    nonlinear(w, d, plan, c, e, tape): the transform of g(u) of a stage; may keep plan.fine.m numbers
+    of the stage at `tape`, of which the stages have consecutive ones.
+    """
+
+    @jit
+    def integrate(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> None:
+        # Read here, as the compiler cannot know that what is stored below is not the plan.
+        m, factors, modes = plan.fine.m, plan.fine.split, plan.modes
+        x, next_x, to_b, to_c = plan.x, plan.next, plan.b, plan.c
+        e1, e2, qm, f2m = plan.e, plan.e2, plan.qm, plan.f2m
+        f1m, f3m, qfs, ffs = plan.f1m, plan.f3m, plan.qf, plan.ff
+        z = nonlinear(w, d, plan, c, e, tape)
+        for k in range(0, modes, 8):
+            g, v, qf = rfft_pack(w, z, d, m, factors, k, c, e), get(w, x + k, d), get(w, qfs + k, d)
+            half, qg = plus_product(qf, c, e2 + k, e, v), product(c, qm + k, e, g)
+            a = plus(half, qg)
+            put(w, x + k, d, a)
+            put(w, to_b + k, d, half)
+            put(w, to_c + k, d, minus(plus_product(qf, c, e2 + k, e, a), qg))
+            whole = plus_product(get(w, ffs + k, d), c, e1 + k, e, v)
+            put(w, next_x + k, d, plus_product(whole, c, f1m + k, e, g))
+        z = nonlinear(w, d, plan, c, e, tape + m)
+        for k in range(0, modes, 8):
+            g = rfft_pack(w, z, d, m, factors, k, c, e)
+            put(w, x + k, d, plus_product(get(w, to_b + k, d), c, qm + k, e, g))
+            put(w, next_x + k, d, plus_product(get(w, next_x + k, d), c, f2m + k, e, g))
+        z = nonlinear(w, d, plan, c, e, tape + 2 * m)
+        for k in range(0, modes, 8):
+            g = rfft_pack(w, z, d, m, factors, k, c, e)
+            qg = product(c, qm + k, e, g)
+            put(w, x + k, d, plus(get(w, to_c + k, d), plus(qg, qg)))
+            put(w, next_x + k, d, plus_product(get(w, next_x + k, d), c, f2m + k, e, g))
+        z = nonlinear(w, d, plan, c, e, tape + 3 * m)
+        for k in range(0, modes, 8):
+            g = rfft_pack(w, z, d, m, factors, k, c, e)
+            put(w, x + k, d, plus_product(get(w, next_x + k, d), c, f3m + k, e, g))
+
+    return integrate
+
+
+integrate = internal_step(nonlinear)
 
 
 @jit
@@ -151,7 +163,7 @@ def advance(state: int, action: int, w: int, d: int, plan: Any, c: int, e: int) 
     force(action, w, d, plan, c, e)
     analyse(state, w, d, plan, c, e)
     for _ in range(plan.steps):
-        integrate(w, d, plan, c, e)
+        integrate(w, d, plan, c, e, 0)
     synthesise(w + 8 * plan.state, w, d, plan, c, e)
 
 
