@@ -15,6 +15,7 @@ from pdeloop.in_process import LocalPair
 from tests.small import SMALL, parameters
 from tuner_node.build import build_training
 from tuner_node.narration import Narration, closing_lines, failed, warnings
+from tuner_node.training import CHECK, CHECK_FIELDS
 
 
 def phase(name: str, rollouts: list[int], budget: int = 20) -> dict[str, Any]:
@@ -85,7 +86,7 @@ def test_a_real_training_with_a_law_that_diverges_never_says_a_billion(capsys):
     display = Display(0, 2, stream)
     while (batch := training.next_batch()) is not None:
         if training.phase == "check":
-            batch.policies[4:8] = 1e6  # the first law of the first seed
+            batch.policies[CHECK_FIELDS:CHECK] = 1e6  # the first law of the first seed
         for row in training.finish(pair.run(batch)):
             display.row(row)
         pair.follow(training)
@@ -130,6 +131,12 @@ def test_what_adapted_nothing_is_no_gain():
     lines = closing_lines("kdv", summary(changed=[False, False]), "")
     assert not any("LQT;" in line or "% below" in line for line in lines)
     assert "  nothing was adapted: the policies are those that the adaptation began with" in lines
+
+
+def test_a_law_that_became_worse_is_no_improvement():
+    for seeds, words in ((1, "did not improve on the LQT law"), (2, "the LQT law for every seed")):
+        lines = closing_lines("kdv", summary(seeds=seeds, improved=False), "")
+        assert lines[-1].endswith(words)
 
 
 def test_a_cost_above_no_control_is_a_warning_that_names_the_seeds():

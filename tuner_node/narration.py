@@ -135,7 +135,8 @@ def closing_lines(problem: str, summary: Row, folder: object) -> list[str]:
     if not any(summary["changed"]):
         lines.append("  nothing was adapted: the policies are those that the adaptation began with")
     elif not summary["improved"]:
-        lines.append("  the adaptation did not improve on the LQT law for every seed")
+        where = " for every seed" if seeds > 1 else ""
+        lines.append(f"  the adaptation did not improve on the LQT law{where}")
     return [*lines, f"  results in {folder}"] if folder else lines
 
 
