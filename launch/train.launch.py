@@ -67,6 +67,7 @@ def generate_launch_description() -> LaunchDescription:
                 for name, description in (
                     ("record", "record all topics to a rosbag2 bag in the folder"),
                     ("record_or_stop", "as record, and end if the recording fails"),
+                    ("record_views", "as record, with the topics of a viewer_node"),
                     ("view", "a viewer_node, for RViz, Foxglove and PlotJuggler"),
                 )
             ),
@@ -111,7 +112,8 @@ def training(context: LaunchContext) -> list[Any]:
             **options,
         )
 
-    required, recorded = given["record_or_stop"] == "true", given["record"] == "true"
+    required, views = given["record_or_stop"] == "true", given["record_views"] == "true"
+    recorded = required or views or given["record"] == "true"
     serving = {"pairs": namespaces(pairs)}
     tuner = node(
         "tuner_node",
@@ -131,14 +133,14 @@ def training(context: LaunchContext) -> list[Any]:
         tuner,
         RegisterEventHandler(OnProcessExit(target_action=tuner, on_exit=end_with_tuner)),
     ]
-    if recorded or required:
+    if recorded:
         grace = str(RECORDER_GRACE)  # it has a bag to finish
-        bag = {"bag": str(unused(folder / "bag")), **serving}
+        bag = {"bag": str(unused(folder / "bag")), "record_views": views, **serving}
         recorder = node(
             "recorder_node", parameters=bag, sigterm_timeout=grace, sigkill_timeout=grace
         )
         actions.insert(1, recorder)
-    if given["view"] == "true":
+    if views or given["view"] == "true":
         actions.append(node("viewer_node", namespaces(pairs)[0], respawn=True))
     return actions
 

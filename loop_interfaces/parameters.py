@@ -398,9 +398,8 @@ TUNER = _section(
 RECORDER = _section(
     "R",
     Spec("bag", "", "new folder of the bag; empty: bags/ and the time"),
-    Spec("bag_storage", "mcap", "format of the bag", choices=("mcap", "sqlite3")),
-    Spec("bag_per_episode", False, "one bag an episode instead of one for all"),
     Spec("record_clock", True, "record /clock, too"),
+    Spec("record_views", False, "record the topics of a viewer_node, too"),
 )
 
 VIEWER = _section(

@@ -62,11 +62,10 @@ PAIR = ("pde_sim_node", "controller_node")
 
 @dataclass(frozen=True)
 class Recording:
-    """How a run is recorded; required: it stops if the recorder does."""
+    """How a run is recorded; required: it stops if the recorder does; views: with a viewer's topics."""
 
-    storage: str = "mcap"
-    bag_per_episode: bool = False
     required: bool = False
+    views: bool = False
 
 
 def namespaces(pairs: int) -> list[str]:
@@ -153,16 +152,13 @@ class Layout:
         cores = pair_cores(self.pairs, self.placement)
         nodes = pair_nodes(cores, self.remaps, solver_polls=self.placement == "pinned")
         others = tuple(core for core in usable_cores() if core not in cores)
-        if self.view:
+        if self.view or (self.recording is not None and self.recording.views):
             first = namespaces(self.pairs)[0]
             nodes.append(LoopNode("viewer_node", "viewer_node", namespace=first, cores=others))
         recording = self.recording
         if recording is not None:
             own = [] if bag is None else [f"bag:={quoted(bag.resolve())}"]
-            own += [
-                f"bag_storage:={recording.storage}",
-                f"bag_per_episode:={str(recording.bag_per_episode).lower()}",
-            ]
+            own += ["record_views:=true"] * recording.views
             nodes.insert(
                 0, LoopNode("recorder_node", "recorder_node", [*own, *serving], cores=others)
             )

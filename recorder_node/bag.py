@@ -1,40 +1,29 @@
-"""One rosbag2 bag that is written as it grows: MCAP or sqlite3, from serialised bytes. No ROS import.
+"""A rosbag2 bag that is written as it grows: one MCAP file and metadata.yaml. No ROS import.
 
-What `flush` has written survives SIGKILL: an MCAP file is whole chunks up to there (readable record
-by record without its footer), a sqlite3 file is committed up to there. The message definitions are
-in the bag, so that it is read without ROS.
+What `flush` has written survives SIGKILL: the MCAP file is whole chunks up to there. The message
+definitions are in the bag, so that it is read without ROS.
 """
 
 from __future__ import annotations
 
-import os
-import sqlite3
-import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-from rosbags.interfaces import (
-    Connection,
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
-from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
-from rosbags.rosbag2.enums import CompressionMode
-from rosbags.rosbag2.storage_mcap import McapWriter
-from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
+import yaml
 from rosbags.typesys import Stores, get_typestore
 
-STORAGES = ("mcap", "sqlite3")
-_MESSAGE = struct.Struct("<BQHIQQ")
-"""An MCAP message record up to its data: opcode, length, channel, sequence, log and publish time."""
+from recorder_node.mcap_file import McapFile
+
+FILE, METADATA = "bag.mcap", "metadata.yaml"
+VERSION = 9
+"""Of metadata.yaml: that of ROS 2 Jazzy."""
 LARGE, LARGEST = 2**20, 2**26
-"""Bytes of an MCAP chunk that is closed at the next pause, and of one that is closed at once."""
+"""Bytes of a chunk that is closed at the next pause, and of one that is closed at once."""
+QOS, HASH = "offered_qos_profiles", "topic_type_hash"
+"""Keys of a channel's metadata in the MCAP file."""
 
 
 class BagError(RuntimeError):
@@ -42,225 +31,178 @@ class BagError(RuntimeError):
 
 
 @dataclass(frozen=True)
+class Definition:
+    """A message type: the text that defines it and all it refers to, its language, its RIHS01 hash."""
+
+    text: str
+    encoding: str = "ros2msg"
+    hash: str = ""
+
+
+@dataclass(frozen=True)
 class Channel:
-    """A recorded topic: its full name, its type, and whether its publisher is transient local."""
+    """A recorded topic: its full name, its type, and what its publisher offers.
+
+    definition: None for a type that ROS 2 Jazzy brings along.
+    """
 
     topic: str
     type: str
-    latched: bool
+    latched: bool = False
+    reliable: bool = True
+    depth: int = 1
+    definition: Definition | None = None
+
+    def qos(self) -> dict[str, Any]:
+        """The offered quality of service, as rosbag2 writes it."""
+        forever = {"sec": 9223372036, "nsec": 854775807}
+        return {
+            "history": "keep_last",
+            "depth": self.depth,
+            "reliability": "reliable" if self.reliable else "best_effort",
+            "durability": "transient_local" if self.latched else "volatile",
+            "deadline": forever,
+            "lifespan": forever,
+            "liveliness": "automatic",
+            "liveliness_lease_duration": forever,
+            "avoid_ros_namespace_conventions": False,
+        }
+
+
+@cache
+def definition(kind: str) -> Definition:
+    """The definition of a message type of ROS 2 Jazzy. KeyError for another one."""
+    types = _jazzy()
+    text, _ = types.generate_msgdef(kind, ros_version=2)
+    return Definition(text, hash=types.hash_rihs01(kind))
+
+
+@cache
+def _jazzy() -> Any:
+    return get_typestore(Stores.ROS2_JAZZY)
 
 
 class BagWriter:
-    """Writes one bag into the new folder `path`.
+    """Writes one bag into the new folder `path`; BagError, at any time, when the disk refuses."""
 
-    storage: one of STORAGES. Raises BagError, at any time, when the disk refuses.
-    """
-
-    def __init__(self, path: Path, storage: str, channels: Sequence[Channel]) -> None:
+    def __init__(self, path: Path, channels: Iterable[Channel]) -> None:
         if path.exists():
             raise BagError(f"{path} already exists; choose another folder for the bag")
         self.path = path
-        self.messages = 0
-        self._writer = _Writer(path, storage)
+        self._schemas: dict[str, int] = {}
+        self._channels: list[Channel] = []
+        self._numbers: dict[str, int] = {}
         try:
-            self._writer.open()
-            self._connections = {
-                channel.topic: self._writer.add_connection(
-                    channel.topic,
-                    channel.type,
-                    typestore=_TYPES,
-                    offered_qos_profiles=[_offered(channel)],
-                )
-                for channel in channels
-            }
-            self._storage.flush()
-        except (OSError, sqlite3.Error, WriterError) as error:
+            path.mkdir(parents=True)
+            self._file = McapFile(path / FILE)
+            for channel in channels:
+                self._add(channel)
+        except OSError as error:
             raise BagError(f"cannot write a bag to {path}: {_reason(error)}") from error
+
+    def add(self, channel: Channel) -> None:
+        """Declare a topic."""
+        try:
+            self._add(channel)
+        except OSError as error:
+            raise self._stopped(error) from error
 
     def write(self, topic: str, when: int, data: bytes) -> None:
         """Append a serialised message; when: time of its arrival, ns since the epoch."""
-        try:
-            self._writer.write(self._connections[topic], when, data)
-        except (OSError, sqlite3.Error) as error:
-            raise self._stopped(error) from error
-        self.messages += 1
+        self._file.add_message(self._numbers[topic], when, data)
+        if self._file.pending > LARGEST:
+            self.flush()
 
     def pause(self) -> None:
         """Between two batches of messages, each of which is kept as a whole or not at all: write what
         has become large.
         """
-        try:
-            self._storage.pause()
-        except OSError as error:
-            raise self._stopped(error) from error
+        if self._file.pending > LARGE:
+            self.flush()
 
     def flush(self) -> None:
         """Hand everything to the operating system, in a form that can be read back."""
         try:
-            self._storage.flush()
-        except (OSError, sqlite3.Error) as error:
+            self._file.close_chunk()
+        except OSError as error:
             raise self._stopped(error) from error
 
     def close(self, notes: Mapping[str, str]) -> None:
         """Finish the bag: indices, and metadata.yaml with `notes` as its custom data."""
-        for key, value in notes.items():
-            self._writer.set_custom_data(key, value)
+        self.flush()
+        information = self._information(notes)
         try:
-            self._storage.flush()
-            self._writer.close()
-        except (OSError, sqlite3.Error) as error:
+            # As rosbag2 does it: a file without its folder says as much.
+            self._file.add_metadata("rosbag2", {"serialized_metadata": _yaml(information)})
+            self._file.finish()
+            part = self.path / f"{METADATA}.part"
+            part.write_text(_yaml({"rosbag2_bagfile_information": information}))
+            part.replace(self.path / METADATA)
+        except OSError as error:
             raise self._stopped(error) from error
 
-    def abandon(self) -> None:
-        """Give up; what was flushed stays."""
-        try:
-            self._writer.abort()
-        except (OSError, sqlite3.Error):
-            return
+    def _add(self, channel: Channel) -> None:
+        known = channel.definition or definition(channel.type)
+        if channel.type not in self._schemas:
+            number = self._file.add_schema(channel.type, known.text, known.encoding)
+            self._schemas[channel.type] = number
+        metadata = {QOS: _yaml([channel.qos()]), HASH: known.hash}
+        schema = self._schemas[channel.type]
+        self._numbers[channel.topic] = self._file.add_channel(channel.topic, schema, metadata)
+        self._channels.append(channel)
 
-    @property
-    def _storage(self) -> _Mcap | _Sqlite3:
-        storage = self._writer.storage
-        assert isinstance(storage, (_Mcap, _Sqlite3))
-        return storage
+    def _information(self, notes: Mapping[str, str]) -> dict[str, Any]:
+        """The content of metadata.yaml, without its outermost key."""
+        found = self._file.statistics()
+        extent = {
+            "duration": {"nanoseconds": found.message_end_time - found.message_start_time},
+            "starting_time": {"nanoseconds_since_epoch": found.message_start_time},
+            "message_count": found.message_count,
+        }
+        topics = [
+            {
+                "topic_metadata": {
+                    "name": channel.topic,
+                    "type": channel.type,
+                    "serialization_format": "cdr",
+                    "offered_qos_profiles": [channel.qos()],
+                    "type_description_hash": (channel.definition or definition(channel.type)).hash,
+                },
+                "message_count": found.channel_message_counts.get(self._numbers[channel.topic], 0),
+            }
+            for channel in self._channels
+        ]
+        return {
+            "version": VERSION,
+            "storage_identifier": "mcap",
+            "relative_file_paths": [FILE],
+            **extent,
+            "topics_with_message_count": topics,
+            "compression_format": "",
+            "compression_mode": "",
+            "files": [{"path": FILE, **extent}],
+            "custom_data": dict(notes) or None,
+            "ros_distro": "jazzy",
+        }
 
-    def _stopped(self, error: Exception) -> BagError:
-        self.abandon()
+    def _stopped(self, error: OSError) -> BagError:
+        self._file.close()
         return BagError(
             f"cannot write to {self.path}: {_reason(error)}; recording stopped, what was written "
             f"before can be read (pdeloop bag recover {self.path} makes it an ordinary bag)"
         )
 
 
-class _File:
-    """A file without a buffer that writes all or raises, and can forget an unfinished end."""
-
-    def __init__(self, path: Path) -> None:
-        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-        self._position = 0
-        self._open = True
-
-    def write(self, data: bytes | memoryview) -> int:
-        rest = memoryview(data).cast("B")
-        while rest:
-            count = os.write(self._descriptor, rest)
-            rest = rest[count:]
-            self._position += count
-        return len(data)
-
-    def tell(self) -> int:
-        return self._position
-
-    def truncate(self, size: int) -> None:
-        os.ftruncate(self._descriptor, size)
-
-    def close(self) -> None:
-        if self._open:
-            self._open = False
-            os.close(self._descriptor)
+def _yaml(content: Any) -> str:
+    return yaml.dump(content, Dumper=_Plain, sort_keys=False, width=2**16)
 
 
-class _Mcap(McapWriter):
-    """MCAP whose chunks can be closed at any time; a chunk that does not fit the disk is removed."""
+class _Plain(yaml.SafeDumper):
+    """Writes what occurs twice twice: rosbag2's reader may not follow YAML's references."""
 
-    def __init__(self, path: Path, compression: CompressionMode) -> None:
-        super().__init__(path, compression)
-        head = self.bio.tell()
-        self.bio.flush()
-        start = self.path.read_bytes()[:head]
-        self.bio.close()
-        self.path.unlink()
-        self.bio: Any = _File(self.path)
-        self.bio.write(start)
-
-    def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
-        # As in the parent class, with one struct instead of seven writes.
-        chunk, channel = self.chunk, connection.id
-        if timestamp < chunk.message_start_time:
-            chunk.message_start_time = timestamp
-            self.message_start_time = min(timestamp, self.message_start_time)
-        if timestamp > chunk.message_end_time:
-            chunk.message_end_time = timestamp
-            self.message_end_time = max(timestamp, self.message_end_time)
-        self.channel_stats[channel] += 1
-        content = chunk.bio
-        position = content.tell()
-        chunk.msgs[channel].append((timestamp, position))
-        content.write(_MESSAGE.pack(5, 22 + len(data), channel, 0, timestamp, timestamp))
-        content.write(data)
-        if position > LARGEST:
-            self.close_chunk()
-
-    def close_chunk(self) -> None:
-        begin = self.bio.tell()
-        try:
-            super().close_chunk()
-        except OSError:
-            self.bio.truncate(begin)
-            raise
-
-    def pause(self) -> None:
-        if self.chunk.bio.tell() > LARGE:
-            self.close_chunk()
-
-    def flush(self) -> None:
-        if self.chunk.msgs:
-            self.close_chunk()
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
 
 
-class _Sqlite3(Sqlite3Writer):
-    """sqlite3 that can be committed at any time."""
-
-    def __init__(self, path: Path, compression: CompressionMode) -> None:
-        super().__init__(path, compression)
-        self.conn.execute("PRAGMA synchronous=NORMAL")
-
-    def pause(self) -> None:
-        pass
-
-    def flush(self) -> None:
-        self.conn.commit()
-
-
-class _Writer(Writer):
-    def write(self, connection: Connection, timestamp: int, data: bytes | memoryview) -> None:
-        # The parent class compares the connection with every one it has.
-        assert self.storage is not None
-        self.storage.write(connection, timestamp, data)
-        self.counts[connection.id] += 1
-        if timestamp < self.min_timestamp:
-            self.min_timestamp = timestamp
-        if timestamp > self.max_timestamp:
-            self.max_timestamp = timestamp
-
-    STORAGE_PLUGINS: Mapping[StoragePlugin, Any] = {  # as in the parent class
-        StoragePlugin.MCAP: _Mcap,
-        StoragePlugin.SQLITE3: _Sqlite3,
-    }
-
-    def __init__(self, path: Path, storage: str) -> None:
-        super().__init__(  # metadata.yaml as ROS 2 Jazzy writes it
-            path, version=9, storage_plugin=StoragePlugin[storage.upper()]
-        )
-
-
-_TYPES = get_typestore(Stores.ROS2_JAZZY)
-
-
-def _offered(channel: Channel) -> Qos:
-    forever = QosTime(9223372036, 854775807)
-    return Qos(
-        QosHistory.KEEP_LAST,
-        1,
-        QosReliability.RELIABLE,
-        QosDurability.TRANSIENT_LOCAL if channel.latched else QosDurability.VOLATILE,
-        forever,
-        forever,
-        QosLiveliness.AUTOMATIC,
-        forever,
-        False,
-    )
-
-
-def _reason(error: Exception) -> str:
-    return (error.strerror if isinstance(error, OSError) else None) or str(error)
+def _reason(error: OSError) -> str:
+    return error.strerror or str(error)

@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from loop_interfaces.frames import Frame
-from loop_interfaces.topics import VOID, CostColumn, StartColumn
+from loop_interfaces.topics import (
+    ACTION,
+    COST,
+    MODEL_IDENTIFIED,
+    POLICY,
+    START,
+    STATE,
+    VOID,
+    CostColumn,
+    StartColumn,
+    Topic,
+)
 
 SETTLING = 0.3
 """Seconds after an episode's cost in which its other messages may still come in."""
@@ -38,6 +48,7 @@ class Episode:
     actions: set[int] = field(default_factory=set)
     repeats: int = 0
     cost_at: int | None = None
+    over: bool = False
 
     @property
     def key(self) -> Key:
@@ -71,10 +82,24 @@ class Episode:
         waits = self.exploratory and not self.model and not self.void
         return now - self.cost_at > (MODEL_SETTLING if waits else SETTLING) * 1e9
 
+    def given_up(self, now: int, newest: int) -> bool:
+        """Whether it got no cost and has a successor, with number `newest`, of some age at `now` (ns).
+
+        Episodes of a pair follow each other.
+        """
+        unended = self.cost_at is None and self.episode < newest
+        return unended and now - self.last > MODEL_SETTLING * 1e9
+
+    def add(self, steps: set[int], step: int) -> None:
+        """Note a sample among the `steps` that there are."""
+        if step in steps:
+            self.repeats += 1
+        steps.add(step)
+
     def row(self) -> dict[str, Any]:
         """Its line in the index."""
         content = asdict(self)
-        for name in ("started", "policy", "model", "cost_at"):
+        for name in ("started", "policy", "model", "cost_at", "over"):
             del content[name]
         content |= {"states": len(self.states), "actions": len(self.actions)}
         return content | {"complete": not self.missing, "missing": self.missing}
@@ -86,7 +111,47 @@ class EpisodeIndex:
     def __init__(self) -> None:
         self._open: dict[Key, Episode] = {}
 
-    def see(self, key: Key, when: int) -> Episode:
+    def note(self, key: Key, when: int, topic: Topic, frame: Frame) -> Episode:
+        """Note a message that arrived at `when` (ns) in its episode, and return that."""
+        episode = self._see(key, when)
+        if topic is STATE:
+            episode.add(episode.states, frame.step)
+        elif topic is ACTION:
+            episode.add(episode.actions, frame.step)
+        elif topic is START:
+            episode.started = True
+            episode.environments = len(frame.values)
+            episode.exploratory = bool((frame.values[:, StartColumn.EXCITATION] >= 0).any())
+        elif topic is COST:
+            episode.cost_at = when
+            episode.horizon = frame.step
+            episode.void = bool((frame.values[:, CostColumn.ENDED] == VOID).any())
+        elif topic is POLICY:
+            episode.policy = True
+        elif topic is MODEL_IDENTIFIED:
+            episode.model = True
+        return episode
+
+    def note_model(self, key: Key, when: int) -> Episode:
+        """Note that an episode's model came, or why there is none."""
+        episode = self._see(key, when)
+        episode.model = True
+        return episode
+
+    def take_over(self, now: int | None) -> list[Episode]:
+        """Take out the episodes of which nothing more is expected at time `now` (ns); None: all."""
+        newest = max((e.episode for e in self._open.values()), default=-1)
+        done = [
+            episode
+            for episode in self._open.values()
+            if now is None or episode.settled(now) or episode.given_up(now, newest)
+        ]
+        for episode in done:
+            episode.over = True
+            del self._open[episode.key]
+        return sorted(done, key=lambda episode: episode.first)
+
+    def _see(self, key: Key, when: int) -> Episode:
         """The episode a message belongs to, a new one if it is the first of it."""
         found = self._open.get(key)
         if found is None:
@@ -96,48 +161,3 @@ class EpisodeIndex:
         elif when > found.last:
             found.last = when
         return found
-
-    def find(self, key: Key) -> Episode | None:
-        """An episode that is not over."""
-        return self._open.get(key)
-
-    def start(self, key: Key, when: int, frame: Frame) -> Episode:
-        """Note an episode's start."""
-        episode = self.see(key, when)
-        episode.started = True
-        episode.environments = len(frame.values)
-        episode.exploratory = bool((frame.values[:, StartColumn.EXCITATION] >= 0).any())
-        return episode
-
-    def sample(self, key: Key, when: int, step: int, *, is_state: bool) -> Episode:
-        """Note a state or an action."""
-        episode = self.see(key, when)
-        steps = episode.states if is_state else episode.actions
-        if step in steps:
-            episode.repeats += 1
-        steps.add(step)
-        return episode
-
-    def cost(self, key: Key, when: int, frame: Frame) -> Episode:
-        """Note an episode's cost."""
-        episode = self.see(key, when)
-        episode.cost_at = when
-        episode.horizon = frame.step
-        episode.void = bool((frame.values[:, CostColumn.ENDED] == VOID).any())
-        return episode
-
-    def over(self, now: int | None) -> Iterator[Episode]:
-        """Take out the episodes of which nothing more is expected; None: all."""
-        done = [e for e in self._open.values() if now is None or e.settled(now)]
-        newest = max((e.episode for e in self._open.values()), default=-1)
-        if now is not None:
-            # Episodes of a pair follow each other: one that got no cost and has a successor of some
-            # age was given up.
-            done += [
-                e
-                for e in self._open.values()
-                if e.cost_at is None and e.episode < newest and now - e.last > MODEL_SETTLING * 1e9
-            ]
-        for episode in sorted(done, key=lambda e: e.first):
-            del self._open[episode.key]
-            yield episode

@@ -1,6 +1,6 @@
-"""A recording: the loop's messages in one bag, or in one bag an episode, with their index. No ROS.
+"""A recording: the loop's messages in one bag, with an index of its episodes. No ROS.
 
-bag/bag.mcap, bag/metadata.yaml    the bag (or bag/episode-N/... with one bag an episode)
+bag/bag.mcap, bag/metadata.yaml    the bag
 bag/episodes.jsonl                 one line an episode: where it is, and what is missing of it
 bag/parameters.json                the nodes' parameters by run, as far as the nodes told them
 """
@@ -15,6 +15,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from loop_interfaces.frames import ArrayCodec, FrameError
 from loop_interfaces.protocol import ModelFailure
 from loop_interfaces.topics import (
     ACTION,
@@ -22,7 +23,6 @@ from loop_interfaces.topics import (
     COST,
     MODEL,
     MODEL_FAILED,
-    MODEL_IDENTIFIED,
     POLICY,
     START,
     STATE,
@@ -30,67 +30,66 @@ from loop_interfaces.topics import (
     Topic,
 )
 from recorder_node.bag import BagError, BagWriter, Channel
-from recorder_node.episodes import SETTLING, Episode, EpisodeIndex, Key
-from recorder_node.headers import HeaderReader
+from recorder_node.episodes import SETTLING, Episode, EpisodeIndex
 
 INDEX = "episodes.jsonl"
 PARAMETERS = "parameters.json"
 ARRAY_TYPE = "std_msgs/msg/Float64MultiArray"
 TEXT_TYPE = "std_msgs/msg/String"
-CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
-CLOCK = "/clock"
 
 
 @dataclass(frozen=True)
 class Source:
     """A topic that is recorded: its channel in the bag, and what it is in the loop.
 
-    array: its entry in loop_interfaces.topics, None for the others; namespace: its pair's.
+    array: its entry in loop_interfaces.topics, None for the others; namespace: its pair's, '' for
+    what belongs to no pair.
     """
 
     channel: Channel
-    array: Topic | None
-    namespace: str
+    array: Topic | None = None
+    namespace: str = ""
 
     @cached_property
-    def sampled(self) -> bool:
-        """Whether it is what comes by the hundred: states or actions."""
-        return self.array in (STATE, ACTION)
+    def codec(self) -> ArrayCodec:
+        """Decodes its messages, if it has arrays."""
+        assert self.array is not None
+        return ArrayCodec(self.array.labels)
+
+    @cached_property
+    def ordered(self) -> bool:
+        """Whether it may have to wait for what belongs before it in the bag."""
+        return bool(self.namespace) and self.array not in (STATE, ACTION)
+
+
+CLOCK = Source(Channel("/clock", "rosgraph_msgs/msg/Clock"))
+"""Simulated time, one topic for all pairs."""
+DIAGNOSTICS = Source(Channel("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"))
+ROSOUT = Source(Channel("/rosout", "rcl_interfaces/msg/Log", latched=True, depth=1000))
 
 
 def sources(namespace: str) -> list[Source]:
     """The topics of a pair in the absolute `namespace` ('/' or '/left')."""
     base = namespace.rstrip("/")
-    namespace = base or "/"
     found = [
-        Source(Channel(f"{base}/{topic.name}", ARRAY_TYPE, topic.latched), topic, namespace)
+        Source(Channel(f"{base}/{topic.name}", ARRAY_TYPE, topic.latched), topic, base or "/")
         for topic in ARRAYS
     ]
-    failed = Channel(f"{base}/{MODEL_FAILED}", TEXT_TYPE, True)
-    return [*found, Source(failed, None, namespace)]
-
-
-def clock() -> Source:
-    """Simulated time, one topic for all pairs."""
-    return Source(Channel(CLOCK, CLOCK_TYPE, False), None, "")
+    return [*found, Source(Channel(f"{base}/{MODEL_FAILED}", TEXT_TYPE, True), None, base or "/")]
 
 
 class _Taken(NamedTuple):
-    """A message to be written.
-
-    key: of the episode whose bag it is for; episode: the one it is about, if that is not over.
-    """
+    """A message to be written; episode: the one it is about, if any."""
 
     source: Source
     when: int
     raw: bytes
-    key: Key | None
     episode: Episode | None
 
     @property
     def early(self) -> bool:
         """Whether something should stand before it in the bag that has not come yet."""
-        if self.episode is None:
+        if self.episode is None or self.episode.over:
             return False
         if self.source.array is POLICY:
             return not self.episode.started
@@ -98,82 +97,43 @@ class _Taken(NamedTuple):
 
 
 class Recording:
-    """Writes what `take` is given.
+    """Writes the messages that `take` is given into the bag at `path`, a new folder.
 
     A plant sends its samples after the cost they make up, and a tuner the policies of an episode as
     soon as it has them. In the bag a cost stands behind its samples and policies behind the start:
     they wait, and what the pair says next waits behind them. So whenever this process may be killed,
-    all episodes of a pair but the last are whole.
-
-    path: a new folder; storage: 'mcap' or 'sqlite3'. Raises BagError when it cannot be written.
+    all episodes of a pair but the last are whole. Raises BagError when the bag cannot be written.
     """
 
-    def __init__(
-        self, path: Path, what: Sequence[Source], *, storage: str, bag_per_episode: bool
-    ) -> None:
+    def __init__(self, path: Path, what: Sequence[Source]) -> None:
         self.path = path
         self.messages = 0
         self.episodes = 0
         self.incomplete = 0
-        self._storage, self._split = storage, bag_per_episode
-        self._channels = [source.channel for source in what]
-        self._headers = {s.channel.topic: HeaderReader(s.array.labels) for s in what if s.array}
+        self.run = 0
+        """That of the newest episode; 0 before the first."""
         self._index = EpisodeIndex()
         self._notes: dict[str, Any] = {}
-        self._bag: BagWriter | None = None
-        self._bags: dict[Key, BagWriter] = {}
-        self._latched: dict[str, bytes] = {}
-        self._newest: Key | None = None
+        self._bag = BagWriter(path, [source.channel for source in what])
         self._waiting: defaultdict[str, deque[_Taken]] = defaultdict(deque)
         """By namespace: one that came early, and what came after it."""
-        if path.exists():
-            raise BagError(f"{path} already exists; choose another folder for the bag")
-        try:
-            if bag_per_episode:
-                path.mkdir(parents=True)
-            else:
-                self._bag = BagWriter(path, storage, self._channels)
-            (path / INDEX).touch()
-        except OSError as error:
-            raise BagError(f"cannot write a bag to {path}: {error.strerror}") from error
+        self._append_index("")
+
+    def add(self, source: Source) -> None:
+        """Record one more topic."""
+        self._bag.add(source.channel)
 
     def take(self, source: Source, when: int, raw: bytes) -> None:
         """Record one message that arrived at `when` (ns since the epoch)."""
-        key = self._attribute(source, when, raw) or self._newest
         self.messages += 1
+        episode = self._note(source, when, raw)
         waiting = self._waiting[source.namespace]
-        if source.sampled:
-            self._write(source, when, raw, key)
+        if source.ordered:
+            waiting.append(_Taken(source, when, raw, episode))
         else:
-            episode = self._index.find(key) if key else None
-            waiting.append(_Taken(source, when, raw, key, episode))
-        if waiting:
-            self._let_go(waiting, when)
-
-    def _let_go(self, waiting: deque[_Taken], now: int | None) -> None:
-        """Write what need not wait at time `now` (ns); None: all."""
-        while waiting:
-            first = waiting[0]
-            if now is not None and first.early and now - first.when <= SETTLING * 1e9:
-                return
-            waiting.popleft()
-            self._write(first.source, first.when, first.raw, first.key)
-
-    def _write(self, source: Source, when: int, raw: bytes, key: Key | None) -> None:
-        if self._bag is not None:
             self._bag.write(source.channel.topic, when, raw)
-            return
-        if source.array in (MODEL, TARGET):
-            self._latched[source.channel.topic] = raw
-            for bag in self._bags.values():
-                bag.write(source.channel.topic, when, raw)
-        if key is not None:
-            self._bag_of(key, when).write(source.channel.topic, when, raw)
-
-    @property
-    def run(self) -> int:
-        """The run of the newest episode; 0 before the first."""
-        return self._newest[1] if self._newest else 0
+        if waiting:
+            self._write_waiting(waiting, when)
 
     def note(self, run: int, parameters: Mapping[str, Any]) -> None:
         """Keep the parameters of a run, beside what is already known of them."""
@@ -187,106 +147,64 @@ class Recording:
 
     def pause(self) -> None:
         """All that arrived up to some moment was taken."""
-        for bag in self._open_bags():
-            bag.pause()
+        self._bag.pause()
 
     def flush(self) -> None:
         """Make everything so far survive a crash."""
-        for bag in self._open_bags():
-            bag.flush()
+        self._bag.flush()
 
-    def _open_bags(self) -> list[BagWriter]:
-        return [*self._bags.values()] if self._bag is None else [self._bag]
-
-    def index(self, now: int) -> None:
-        """Index the episodes that are over at time `now` (ns): nothing more is expected of them."""
+    def index(self, now: int | None) -> None:
+        """Index the episodes that are over at time `now` (ns), None: all; nothing more is expected of
+        them.
+        """
         for waiting in self._waiting.values():
-            self._let_go(waiting, now)
-        self._finish_episodes(now)
+            self._write_waiting(waiting, now)
+        rows = [episode.row() for episode in self._index.take_over(now)]
+        self.episodes += len(rows)
+        self.incomplete += sum(not row["complete"] for row in rows)
+        if rows:
+            self._append_index("".join(json.dumps(row) + "\n" for row in rows))
 
     def close(self) -> None:
-        """Finish the bag or bags."""
-        for waiting in self._waiting.values():
-            self._let_go(waiting, None)
-        self._finish_episodes(None)
-        for bag in self._bags.values():
-            bag.close(self._custom())
-        self._bags.clear()
-        if self._bag is not None:
-            self._bag.close(self._custom())
+        """Finish the bag."""
+        self.index(None)
+        self._bag.close({"pdeloop.parameters": json.dumps(self._notes)} if self._notes else {})
 
-    def _custom(self) -> dict[str, str]:
-        return {"pdeloop.parameters": json.dumps(self._notes)} if self._notes else {}
+    def _write_waiting(self, waiting: deque[_Taken], now: int | None) -> None:
+        """Write what need not wait any more at time `now` (ns); None: all."""
+        while waiting:
+            first = waiting[0]
+            if now is not None and first.early and now - first.when <= SETTLING * 1e9:
+                return
+            waiting.popleft()
+            self._bag.write(first.source.channel.topic, first.when, first.raw)
 
-    def _attribute(self, source: Source, when: int, raw: bytes) -> Key | None:
-        """The episode a message belongs to, noted in the index; None if it belongs to none."""
-        if source.array is None:
-            return self._failed(source, when, raw) if source.channel.type == TEXT_TYPE else None
-        headers = self._headers[source.channel.topic]
-        ids = headers.ids(raw)
-        if ids is None:
+    def _note(self, source: Source, when: int, raw: bytes) -> Episode | None:
+        """Note a message in the index; the episode that it is about, if any."""
+        topic = source.array
+        if topic is None:
+            return self._note_failure(source, when, raw) if source.ordered else None
+        if topic in (MODEL, TARGET):
             return None
-        run, number, step = ids
-        key = (source.namespace, run, number)
-        if source.sampled:
-            self._index.sample(key, when, step, is_state=source.array is STATE)
-        elif source.array in (MODEL, TARGET):
-            return None
-        elif source.array in (START, COST):
-            frame = headers.frame(raw)
-            if frame is None or not len(frame.values):
-                return None  # the run is over: no episode
-            note = self._index.start if source.array is START else self._index.cost
-            note(key, when, frame)
-        elif source.array is POLICY:
-            self._index.see(key, when).policy = True
-        elif source.array is MODEL_IDENTIFIED:
-            self._index.see(key, when).model = True
-        if self._newest is None or number >= self._newest[2] or run != self._newest[1]:
-            self._newest = key
-        return key
+        try:
+            frame = source.codec.decode(raw)
+        except FrameError:
+            return None  # the reader of the bag will not take it for one either
+        if topic in (START, COST) and not len(frame.values):
+            return None  # the run is over: no episode
+        self.run = frame.run
+        return self._index.note((source.namespace, frame.run, frame.episode), when, topic, frame)
 
-    def _failed(self, source: Source, when: int, raw: bytes) -> Key | None:
+    def _note_failure(self, source: Source, when: int, raw: bytes) -> Episode | None:
         try:
             failure = ModelFailure.from_json(raw[8:].rstrip(b"\0").decode())
         except ValueError:
             return None
-        key = (source.namespace, failure.run, failure.episode)
-        self._index.see(key, when).model = True
-        return key
+        return self._index.note_model((source.namespace, failure.run, failure.episode), when)
 
-    def _bag_of(self, key: Key, when: int) -> BagWriter:
-        bag = self._bags.get(key)
-        if bag is None:
-            path = self.path / _bag_name(key)
-            if path.exists():  # a straggler of an episode that is over
-                path = path.with_name(f"{path.name}-late-{when}")
-            bag = self._bags[key] = BagWriter(path, self._storage, self._channels)
-            for topic, raw in self._latched.items():
-                bag.write(topic, when, raw)
-        return bag
-
-    def _finish_episodes(self, now: int | None) -> None:
-        lines = []
-        for episode in self._index.over(now):
-            row = episode.row()
-            bag = self._bags.pop(episode.key, None)
-            if bag is not None:
-                bag.close(self._custom())
-                row["bag"] = bag.path.name
-            lines.append(json.dumps(row) + "\n")
-            self.episodes += 1
-            self.incomplete += not row["complete"]
-        if not lines:
-            return
+    def _append_index(self, lines: str) -> None:
         try:
             with (self.path / INDEX).open("a") as file:
-                file.write("".join(lines))
+                file.write(lines)
         except OSError as error:
             raise BagError(f"cannot write to {self.path}: {error.strerror}") from error
-
-
-def _bag_name(key: Key) -> str:
-    namespace, run, episode = key
-    place = namespace.strip("/").replace("/", "-")
-    return "-".join(filter(None, (place, f"run-{run}-episode-{episode:012d}")))

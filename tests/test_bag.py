@@ -2,31 +2,46 @@
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import shutil
 import sqlite3
+import struct
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
+import zstandard
+from mcap.data_stream import RecordBuilder
 from mcap.reader import make_reader
+from mcap.records import Channel as McapChannel
+from mcap.records import Chunk, Header, McapRecord, Schema
+from mcap.writer import MCAP0_MAGIC as MAGIC
+from mcap.writer import CompressionType, Writer
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
+from rosbags.interfaces import QosDurability
 
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.topics import ACTION, COST, POLICY, START, STATE
+from pdeloop.bags.identification import identify
+from pdeloop.bags.playback import Playback
 from pdeloop.bags.reader import Bag
 from pdeloop.bags.tools import recover
-from recorder_node.bag import STORAGES, BagError
-from recorder_node.headers import HeaderReader
-from recorder_node.recording import Recording, Source, clock, sources
+from pdeloop.bags.verify import verify
+from recorder_node.bag import BagError, BagWriter, Channel, Definition, definition
+from recorder_node.recording import CLOCK, DIAGNOSTICS, ROSOUT, Recording, Source, sources
 from tests.small_disk import read_only_folder, small_disk
 
 RUN = 2**52 + 1
+ROOT = Path(__file__).resolve().parent.parent
 SECOND = 10**9
-WHAT = [*sources("/left"), clock()]
+WHAT = [*sources("/left"), CLOCK]
 BY_TOPIC = {source.array: source for source in WHAT if source.array}
 
 
@@ -59,9 +74,9 @@ def recorded_episode(
     take(COST, Frame(RUN, episode, steps, 0.0, np.array([(1.0, 5.0, -1.0)]), 99))
 
 
-def written(folder: Path, storage: str, split: bool = False, **how: int) -> Path:
+def written(folder: Path, **how: int) -> Path:
     path = folder / "bag"
-    recording = Recording(path, WHAT, storage=storage, bag_per_episode=split)
+    recording = Recording(path, WHAT)
     recording.take(WHAT[-1], SECOND, bytes.fromhex("00010000") + bytes(8))
     for episode in (7, 8):
         recorded_episode(recording, episode, **how)
@@ -70,9 +85,16 @@ def written(folder: Path, storage: str, split: bool = False, **how: int) -> Path
     return path
 
 
-@pytest.mark.parametrize("storage", STORAGES)
-def test_rosbags_reads_what_was_written_with_its_definitions(tmp_path, storage):
-    path = written(tmp_path, storage)
+def killed(bag: Path) -> Path:
+    """What a recorder that is killed now leaves behind."""
+    copy = bag.with_name("killed")
+    shutil.rmtree(copy, ignore_errors=True)
+    shutil.copytree(bag, copy)
+    return copy
+
+
+def test_rosbags_reads_what_was_written_with_its_definitions(tmp_path):
+    path = written(tmp_path)
     with AnyReader([path]) as reader:
         assert reader.message_count == 1 + 2 * (1 + 6 + 6 + 1)
         states = [c for c in reader.connections if c.topic == "/left/state"]
@@ -87,7 +109,7 @@ def test_rosbags_reads_what_was_written_with_its_definitions(tmp_path, storage):
 
 
 def test_mcap_reads_what_was_written_with_its_definitions(tmp_path):
-    path = written(tmp_path, "mcap")
+    path = written(tmp_path)
     with (path / "bag.mcap").open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
         summary = reader.get_summary()
@@ -102,58 +124,77 @@ def test_mcap_reads_what_was_written_with_its_definitions(tmp_path):
         assert seen == 12
 
 
-def test_sqlite3_holds_the_schema_of_jazzy(tmp_path):
-    path = written(tmp_path, "sqlite3")
-    with sqlite3.connect(path / "bag.db3") as connection:
-        assert connection.execute("SELECT schema_version FROM schema").fetchone() == (4,)
-        (text,) = connection.execute(
-            "SELECT encoded_message_definition FROM message_definitions "
-            "WHERE topic_type = 'std_msgs/msg/Float64MultiArray'"
-        ).fetchone()
-        assert "float64[] data" in text
-    connection.close()
+def test_metadata_tells_of_every_topic_what_rosbag2_tells(tmp_path):
+    path = written(tmp_path)
+    content = yaml.safe_load((path / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert (content["version"], content["storage_identifier"]) == (9, "mcap")
+    assert (content["message_count"], content["relative_file_paths"]) == (29, ["bag.mcap"])
+    known = {
+        t["topic_metadata"]["name"]: t["topic_metadata"]
+        for t in content["topics_with_message_count"]
+    }
+    # As `ros2 topic info --verbose` of ROS 2 Jazzy prints them.
+    hashes = {
+        "/left/model/failed": "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
+        "/left/state": "1025ddc6b9552d191f89ef1a8d2f60f3d373e28b283d8891ddcc974e8c55397f",
+        "/clock": "692f7a66e93a3c83e71765d033b60349ba68023a8c689a79e48078bcb5c58564",
+    }
+    with (path / "bag.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    assert {index.compression for index in summary.chunk_indexes} == {"zstd"}
+    channels = {channel.topic: channel for channel in summary.channels.values()}
+    with AnyReader([path]) as reader:
+        for connection in reader.connections:
+            assert connection.digest == known[connection.topic]["type_description_hash"]
+            assert channels[connection.topic].metadata["topic_type_hash"] == connection.digest
+            (offered,) = connection.ext.offered_qos_profiles
+            durable = offered.durability is QosDurability.TRANSIENT_LOCAL
+            assert durable == (connection.topic not in ("/left/state", "/left/action", "/clock"))
+    for topic, digest in hashes.items():
+        assert known[topic]["type_description_hash"] == f"RIHS01_{digest}"
 
 
-@pytest.mark.parametrize("storage", STORAGES)
-@pytest.mark.parametrize("split", [False, True], ids=["one bag", "one an episode"])
-def test_an_episode_is_found_through_the_index(tmp_path, storage, split):
-    bag = Bag(written(tmp_path, storage, split))
+@pytest.mark.parametrize("source", [*WHAT, DIAGNOSTICS, ROSOUT], ids=lambda s: s.channel.topic)
+def test_the_hash_of_a_type_is_that_of_the_installed_ros(source):
+    package, _, kind = source.channel.type.partition("/msg/")
+    (installed,) = Path(sys.prefix).glob(f"share/{package}/msg/{kind}.json")
+    hashes = json.loads(installed.read_text())["type_hashes"]
+    assert {
+        "type_name": source.channel.type,
+        "hash_string": definition(source.channel.type).hash,
+    } in hashes
+
+
+def test_an_episode_is_found_through_the_index(tmp_path):
+    bag = Bag(written(tmp_path))
     assert [(row["episode"], row["complete"]) for row in bag.index()] == [(7, True), (8, True)]
     (found,) = bag.find(8)
     assert found.missing == []
     states, actions = found.trajectory()
     assert states.shape == (6, 1, 16) and actions.shape == (5, 1, 4)
     assert np.array_equal(states[3], frame(3, 1, 16, episode=8).values)
-    if not split:
-        row = bag.index()[1]
-        between = list(bag.messages(row["first"], row["last"] + 1))
-        assert len(between) == 14  # nothing else had to be read
+    row = bag.index()[1]
+    between = list(bag.messages(row["first"], row["last"] + 1))
+    assert len(between) == 14  # nothing else had to be read
     assert bag.parameters() == {RUN: {"n_z": 16}}
-    with AnyReader(bag.parts) as reader:
-        assert reader.message_count >= 28
 
 
-@pytest.mark.parametrize("storage", STORAGES)
-def test_a_lost_sample_makes_the_episode_incomplete(tmp_path, storage):
-    bag = Bag(written(tmp_path, storage, skip=2))
+def test_a_lost_sample_makes_the_episode_incomplete(tmp_path):
+    bag = Bag(written(tmp_path, skip=2))
     assert [row["missing"] for row in bag.index()] == [["1 of 6 states"]] * 2
     assert [episode.missing for episode in bag.episodes()] == [["1 of 6 states"]] * 2
 
 
-@pytest.mark.parametrize("storage", STORAGES)
-def test_what_was_flushed_is_readable_without_an_end_and_can_be_recovered(tmp_path, storage):
+def test_what_was_flushed_is_readable_without_an_end_and_can_be_recovered(tmp_path):
     path = tmp_path / "bag"
-    recording = Recording(path, WHAT, storage=storage, bag_per_episode=False)
+    recording = Recording(path, WHAT)
     recorded_episode(recording, 7)
     recording.flush()
     recording.index(7 * SECOND)
     recorded_episode(recording, 8)  # never flushed: as if killed now
-    if storage == "sqlite3":
-        copy = tmp_path / "killed"
-        copy.mkdir()
-        for file in path.iterdir():
-            (copy / file.name).write_bytes(file.read_bytes())
-        path = copy
+    path = killed(path)
+    recording.close()
     bag = Bag(path)
     assert not bag.finished
     assert [episode.number for episode in bag.episodes()] == [7]
@@ -164,10 +205,9 @@ def test_what_was_flushed_is_readable_without_an_end_and_can_be_recovered(tmp_pa
     assert Bag(target).finished
 
 
-@pytest.mark.parametrize("storage", STORAGES)
 @pytest.mark.parametrize("lost", [False, True])
-def test_a_cost_waits_for_the_samples_that_it_is_about(tmp_path, storage, lost):
-    recording = Recording(tmp_path / "bag", WHAT, storage=storage, bag_per_episode=False)
+def test_a_cost_waits_for_the_samples_that_it_is_about(tmp_path, lost):
+    recording = Recording(tmp_path / "bag", WHAT)
     early, samples = [], []
 
     def take(topic, content: Frame, when: int) -> None:
@@ -201,15 +241,12 @@ def test_a_cost_waits_for_the_samples_that_it_is_about(tmp_path, storage, lost):
         assert reader.message_count == recording.messages
 
 
-@pytest.mark.parametrize("storage", STORAGES)
-def test_of_a_batch_all_survives_or_nothing(tmp_path, storage):
-    recording = Recording(tmp_path / "bag", WHAT, storage=storage, bag_per_episode=False)
+def test_of_a_batch_all_survives_or_nothing(tmp_path):
+    recording = Recording(tmp_path / "bag", WHAT)
     raw = encode(STATE, frame(0, 8, 1024))  # 64 kB
 
     def survivors() -> int:
-        shutil.rmtree(tmp_path / "killed", ignore_errors=True)
-        shutil.copytree(tmp_path / "bag", tmp_path / "killed")
-        return sum(1 for _ in Bag(tmp_path / "killed").messages())
+        return sum(1 for _ in Bag(killed(tmp_path / "bag")).messages())
 
     for batch in range(3):
         for when in range(40):
@@ -225,38 +262,36 @@ def test_of_a_batch_all_survives_or_nothing(tmp_path, storage):
 @pytest.mark.parametrize("cut", [1, 50, 333])
 def test_a_file_that_ends_within_a_record_is_read_up_to_there(tmp_path, cut):
     path = tmp_path / "bag"
-    recording = Recording(path, WHAT, storage="mcap", bag_per_episode=False)
+    recording = Recording(path, WHAT)
     for episode in (7, 8):
         recorded_episode(recording, episode)
+        whole = (path / "bag.mcap").stat().st_size
         recording.flush()
         recording.index(episode * SECOND)
-    file = path / "bag.mcap"
-    os.truncate(file, file.stat().st_size - 2000 - cut)
-    assert next(Bag(path).episodes()).number == 7
+    file = killed(path) / "bag.mcap"
+    recording.close()
+    os.truncate(file, whole + cut)
+    assert next(Bag(file.parent).episodes()).number == 7
 
 
-@pytest.mark.parametrize("storage", STORAGES)
-@pytest.mark.parametrize("split", [False, True], ids=["one bag", "one an episode"])
-def test_an_existing_bag_is_not_touched(tmp_path, storage, split):
+def test_an_existing_bag_is_not_touched(tmp_path):
     (tmp_path / "bag").mkdir()
     with pytest.raises(BagError, match="already exists; choose another folder"):
-        Recording(tmp_path / "bag", WHAT, storage=storage, bag_per_episode=split)
+        Recording(tmp_path / "bag", WHAT)
     assert list((tmp_path / "bag").iterdir()) == []
 
 
-@pytest.mark.parametrize("storage", STORAGES)
-def test_a_folder_that_cannot_be_written_is_a_clear_error(tmp_path, storage):
+def test_a_folder_that_cannot_be_written_is_a_clear_error(tmp_path):
     with (
         read_only_folder(tmp_path / "locked") as folder,
         pytest.raises(BagError, match=r"cannot write a bag to .*(Read-only|Permission)"),
     ):
-        Recording(folder / "bag", WHAT, storage=storage, bag_per_episode=False)
+        Recording(folder / "bag", WHAT)
 
 
-@pytest.mark.parametrize("storage", STORAGES)
-def test_a_full_disk_stops_the_recording_and_keeps_what_was_written(tmp_path, storage):
+def test_a_full_disk_stops_the_recording_and_keeps_what_was_written(tmp_path):
     with small_disk(tmp_path / "disk", megabytes=1) as disk:
-        recording = Recording(disk / "bag", WHAT, storage=storage, bag_per_episode=False)
+        recording = Recording(disk / "bag", WHAT)
 
         def fill() -> None:
             for episode in range(1000):
@@ -264,7 +299,7 @@ def test_a_full_disk_stops_the_recording_and_keeps_what_was_written(tmp_path, st
                 recording.flush()
                 recording.index(episode * SECOND)
 
-        with pytest.raises(BagError, match=r"(No space left|disk is full).*; recording stopped"):
+        with pytest.raises(BagError, match=r"No space left.*; recording stopped"):
             fill()
         episodes = [e for e in Bag(disk / "bag").episodes() if not e.missing]
         assert len(episodes) > 5
@@ -273,27 +308,236 @@ def test_a_full_disk_stops_the_recording_and_keeps_what_was_written(tmp_path, st
             assert reader.message_count >= len(episodes) * 104
 
 
-def test_headers_are_read_without_decoding():
-    reader = HeaderReader(STATE.labels)
-    for step in range(3):
-        raw = encode(STATE, frame(step, 2, 16))
-        for bytes_ in (raw, raw + b"\0\0"):  # RTPS may pad
-            assert reader.ids(bytes_) == (RUN, 7, step)
-    assert reader.ids(b"nonsense") is None
-    assert reader.ids(encode(STATE, frame(4, 1, 16))) == (RUN, 7, 4)
-
-
 def test_what_is_no_bag_is_a_clear_error(tmp_path):
     for path, words in (
         (tmp_path / "none", "no bag at"),
-        (tmp_path, "there is neither a metadata"),
+        (tmp_path, "there is no .mcap file"),
     ):
         with pytest.raises(BagError, match=words):
             Bag(path)
     (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information: [1")
     (tmp_path / "x.mcap").write_bytes(b"nonsense")
-    with pytest.raises(BagError, match="cannot be read"):
+    with pytest.raises(
+        BagError, match="cannot be read, it is damaged: it is empty or no MCAP file"
+    ):
         list(Bag(tmp_path).messages())
+
+
+def test_bags_of_another_storage_are_refused_with_what_converts_them(tmp_path):
+    sqlite = tmp_path / "old"
+    sqlite.mkdir()
+    with sqlite3.connect(sqlite / "old.db3") as connection:
+        connection.execute("CREATE TABLE messages (id INTEGER)")
+    connection.close()
+    with pytest.raises(BagError, match=r"is a sqlite3 bag; expected MCAP .*rosbags-convert --src"):
+        Bag(sqlite)
+    whole = tmp_path / "whole"
+    whole.mkdir()
+    (whole / "a.mcap.zstd").touch()
+    with pytest.raises(BagError, match="is compressed by rosbag2; expected MCAP"):
+        Bag(whole)
+    single = written(tmp_path)
+    text = (single / "metadata.yaml").read_text()
+    (single / "metadata.yaml").write_text(
+        text.replace("compression_mode: ''", "compression_mode: MESSAGE")
+    )
+    with pytest.raises(BagError, match="is compressed by rosbag2; expected MCAP"):
+        Bag(single)
+
+
+def test_what_rosbags_convert_makes_of_a_sqlite3_bag_is_read(tmp_path):
+    """The command that the refusal names."""
+    source, converted = tmp_path / "sqlite", tmp_path / "sqlite-mcap"
+    convert = [sys.executable, "-m", "rosbags.convert", "--src", written(tmp_path), "--dst", source]
+    subprocess.run([*convert, "--dst-storage", "sqlite3"], check=True, timeout=60)
+    with pytest.raises(BagError, match="sqlite3") as refused:
+        Bag(source)
+    words = str(refused.value).split("Convert it: ")[1].split()
+    assert words[0] == "rosbags-convert"
+    subprocess.run([sys.executable, "-m", "rosbags.convert", *words[1:]], check=True, timeout=60)
+    assert [e.missing for e in Bag(converted).episodes()] == [[], []]
+
+
+@pytest.mark.parametrize("finished", [False, True])
+def test_bags_of_other_writers_are_read(tmp_path, finished):
+    """As rosbag2 writes them: topics declared within chunks; lz4, or messages outside chunks."""
+    original = list(Bag(written(tmp_path)).messages())
+    for number, how in enumerate(
+        (
+            {"compression": CompressionType.LZ4},
+            {"compression": CompressionType.NONE},
+            {"use_chunking": False},
+        )
+    ):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        with (folder / "x.mcap").open("wb") as file:
+            writer = Writer(file, chunk_size=1000, **how)
+            writer.start("ros2")
+            schema = writer.register_schema("a/msg/B", "ros2msg", b"float64 c")
+            channels = {
+                topic: writer.register_channel(topic, "cdr", schema)
+                for topic in {message.topic for message in original}
+            }
+            for message in original:
+                writer.add_message(
+                    channels[message.topic], message.when, message.data, message.when
+                )
+            writer.finish() if finished else writer.flush()
+        again = list(Bag(folder).messages())
+        assert [(m.topic, m.when, m.data) for m in again] == [
+            (m.topic, m.when, m.data) for m in original
+        ]
+        assert {channel.topic for channel in Bag(folder).channels()} == set(channels)
+
+
+def test_a_type_that_is_not_of_ros_keeps_its_definition_when_it_is_recovered(tmp_path):
+    own = Channel("/own", "mine/msg/Own", definition=Definition("float64 x", hash="RIHS01_0"))
+    writer = BagWriter(tmp_path / "bag", [own])
+    writer.write("/own", SECOND, b"\0\1\0\0" + bytes(8))
+    writer.flush()
+    target, count = recover(tmp_path / "bag", None)
+    writer.close({})
+    (channel,) = Bag(target).channels()
+    assert (count, channel) == (1, own)
+
+
+def record_bytes(record: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    record.write(builder)
+    return builder.end()
+
+
+def chunk(content: bytes, size: int) -> Chunk:
+    return Chunk(
+        compression="zstd",
+        data=content,
+        message_start_time=1,
+        message_end_time=2,
+        uncompressed_crc=0,
+        uncompressed_size=size,
+    )
+
+
+def crafted(folder: Path, *records: bytes) -> Path:
+    """A bag of these records."""
+    folder.mkdir()
+    header = record_bytes(Header("ros2", ""))
+    (folder / "x.mcap").write_bytes(MAGIC + header + b"".join(records) + MAGIC)
+    return folder
+
+
+@cache
+def zeros(gigabytes: int) -> bytes:
+    """So many, compressed."""
+    compressor = zstandard.ZstdCompressor(level=1).compressobj()
+    return (
+        b"".join(compressor.compress(bytes(2**20)) for _ in range(1024 * gigabytes))
+        + compressor.flush()
+    )
+
+
+MEMORY = """
+import resource, sys
+from pathlib import Path
+from pdeloop.cli import main
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+code = main(sys.argv[1:])
+print(code, (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024, file=sys.stderr)
+"""
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [(2 * 2**30, "decompresses to more than 100 times"), (1000, "a chunk is not")],
+)
+@pytest.mark.parametrize(
+    "command", [("bag", "info"), ("bag", "verify"), ("bag", "recover"), ("identify", "--bag")]
+)
+def test_a_small_file_that_becomes_gigabytes_is_refused_in_one_sentence(
+    tmp_path, told, words, command
+):
+    bag = crafted(tmp_path / "bomb", record_bytes(chunk(zeros(2), told)))
+    assert (bag / "x.mcap").stat().st_size < 2**20
+    ended = subprocess.run(
+        [sys.executable, "-c", MEMORY, *command, str(bag)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        cwd=ROOT,
+    )
+    *lines, last = ended.stderr.strip().splitlines()
+    code, megabytes = map(int, last.split())
+    assert code == 1 and len(lines) == 1 and words in lines[0], ended.stderr
+    assert megabytes < 300
+
+
+def test_many_chunks_are_bounded_together(tmp_path):
+    size = 30 * 2**20
+    message = struct.pack("<BQHIQQ", 5, 22 + size, 1, 0, 1, 1) + bytes(size)
+    schema = record_bytes(Schema(id=1, name="a/msg/B", encoding="ros2msg", data=b""))
+    topic = McapChannel(id=1, topic="/a", message_encoding="cdr", metadata={}, schema_id=1)
+    chunks = [record_bytes(chunk(zstandard.compress(message), len(message)))]
+    bag = Bag(crafted(tmp_path / "two", schema, record_bytes(topic), *chunks * 2))
+    assert [len(found.data) for found in bag.messages()] == [size, size]
+    bag = Bag(crafted(tmp_path / "twenty", schema, record_bytes(topic), *chunks * 20))
+    with pytest.raises(BagError, match=r"decompresses to more than 100 times its size"):
+        list(bag.messages())
+
+
+@pytest.mark.parametrize("opcode", range(1, 16))
+@pytest.mark.parametrize("length", [0, 1, 5, 23, 2**40, 2**64 - 1])
+def test_hostile_records_are_one_sentence_or_no_messages(tmp_path, opcode, length):
+    record = struct.pack("<BQ", opcode, length) + b"\xff" * min(length, 100)
+    try:
+        assert list(Bag(crafted(tmp_path / "bag", record)).messages()) == []
+    except BagError as error:
+        assert "cannot be read, it is damaged" in str(error) and "\n" not in str(error)
+
+
+def test_every_flipped_byte_is_noticed_or_harmless(tmp_path):
+    path = written(tmp_path) / "bag.mcap"
+    whole, content = list(Bag(path.parent).messages()), path.read_bytes()
+    place = content.index(b"zstd") + 12
+    noticed = 0
+    for at in range(0, len(content), 61):
+        path.write_bytes(content[:at] + bytes([content[at] ^ 0x10]) + content[at + 1 :])
+        try:
+            found = list(Bag(path.parent).messages())
+            list(Bag(path.parent).episodes())
+        except BagError as error:
+            noticed += 1
+            assert "\n" not in str(error)
+        else:
+            same = [(m.when, m.data) for m in found] == [(m.when, m.data) for m in whole]
+            assert same or len(found) < len(whole), at
+    assert noticed > 10
+    path.write_bytes(content[:place] + b"\0" + content[place + 1 :])
+    with pytest.raises(BagError, match=r"checksum|damaged"):
+        list(Bag(path.parent).messages())
+
+
+OLD = Path(__file__).parent / "data" / "bag_0_1"
+
+
+def test_a_bag_of_the_version_before_is_read_verified_and_identified_from(tmp_path):
+    bag = Bag(OLD)
+    assert bag.finished and len(bag.index()) == len(list(bag.episodes())) == 5
+    report = verify(OLD)
+    assert (report.incomplete, len(report.notes)) == ([], 2), report.text()
+    assert "another fingerprint of the plant" in report.notes[0]
+    assert "the tuner's rollouts not known" in report.notes[1]  # its budget had other parts
+    assert report.compared["costs"] == 1 + 8 + 2 * 2 + 3
+    assert report.compared["steps"] == 30 * report.compared["costs"]
+    for text in report.differences:  # on another machine than that which recorded it
+        recorded, again = map(float, re.findall(r"re(?:corded|computed) (\S+?)(?:,|$)", text))
+        assert again == pytest.approx(recorded, rel=1e-6), text
+    assert identify(OLD, rank=None, order=None).live is not None
+    playback = Playback(bag, rate=1.0, again=False)
+    playback.begin(0.0)
+    assert len(list(playback.take(1e6))) == len(list(bag.messages()))
+    topics = {channel.topic: channel for channel in bag.channels()}
+    assert topics["/target"].latched and not topics["/state"].latched
 
 
 def test_a_bag_is_written_without_ros(tmp_path):
@@ -302,8 +546,7 @@ def test_a_bag_is_written_without_ros(tmp_path):
         "for name in ('rclpy', 'std_msgs', 'rosgraph_msgs'): sys.modules[name] = None\n"
         "from recorder_node.recording import *\n"
         "from pathlib import Path\n"
-        f"Recording(Path({str(tmp_path / 'bag')!r}), sources('/'), storage='mcap',"
-        " bag_per_episode=False).close()\n"
+        f"Recording(Path({str(tmp_path / 'bag')!r}), sources('/')).close()\n"
     )
     root = Path(__file__).resolve().parent.parent
     subprocess.run([sys.executable, "-c", program], cwd=root, check=True, timeout=60)

@@ -202,7 +202,7 @@ def test_a_tuner_tells_how_far_it_is_who_is_missing_and_what_holds_it():
 
 def test_a_recorder_warns_until_it_is_matched_and_once_for_what_it_missed(tmp_path):
     what = sources("/")
-    recording = Recording(tmp_path / "bag", what, storage="sqlite3", bag_per_episode=False)
+    recording = Recording(tmp_path / "bag", what)
     health = RecorderHealth(recording)
     assert health.report(0.0, matched=False).level is Level.WARN
     good = health.report(1.0, matched=True)

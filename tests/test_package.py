@@ -253,9 +253,8 @@ def test_what_train_takes_is_a_launch_argument_too(tmp_path: Path) -> None:
         ROOT / "launch/loop.launch.py"
     ).read_text()
     known = {spec.name for spec in flags()} | set(re.findall(r'"([a-z_]+)"', text))
-    # About processes that `pdeloop train` starts itself, and about bags.
+    # About processes that `pdeloop train` starts itself.
     others = {"help", "in_process", "faulty_line", "json", "spread"}
-    others |= {"bag_storage", "bag_per_episode"}
     assert {action.dest for action in actions} - others <= known
 
 

@@ -1,70 +1,12 @@
-"""What is published when a bag is played, on which topics, and when. Pure.
-
-The messages are the recorded bytes, on topics of the recorded names, types and quality of service.
-"""
+"""When each message of a bag is published when it is played. Pure."""
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
 
-from rosbags.interfaces import QosDurability, QosReliability
-from rosbags.rosbag2 import Reader, ReaderError
-
-from loop_interfaces.topics import ARRAYS, MODEL_FAILED, RECORDER_STATUS
-from pdeloop.bags.reader import Bag, Message
+from pdeloop.bags.mcap_messages import Message
+from pdeloop.bags.reader import Bag
 from recorder_node.bag import BagError
-
-LATCHED = (*(topic.name for topic in ARRAYS if topic.latched), MODEL_FAILED, RECORDER_STATUS)
-
-
-@dataclass(frozen=True)
-class Channel:
-    """A topic of a bag: full name, type, and the quality of service that its publisher offered."""
-
-    topic: str
-    type: str
-    reliable: bool = True
-    latched: bool = False
-    depth: int = 1
-
-
-def channels(bag: Bag) -> list[Channel]:
-    """The topics of `bag`; of one that was not finished with the loop's own quality of service."""
-    found: dict[str, Channel] = {}
-    for part in bag.parts:
-        if (part / "metadata.yaml").exists():
-            found |= {channel.topic: channel for channel in _finished(part)}
-        else:
-            for message in Bag(part).messages():
-                if message.topic not in found:
-                    latched = message.topic.endswith(tuple(f"/{name}" for name in LATCHED))
-                    found[message.topic] = Channel(message.topic, message.type, latched=latched)
-    return [found[topic] for topic in sorted(found)]
-
-
-def _finished(part: Any) -> list[Channel]:
-    found = []
-    try:
-        with Reader(part) as reader:
-            for connection in reader.connections:
-                # One topic may have had several publishers; the strictest offer serves every reader.
-                offers = getattr(connection.ext, "offered_qos_profiles", [])
-                found.append(
-                    Channel(
-                        connection.topic,
-                        connection.msgtype,
-                        any(o.reliability != QosReliability.BEST_EFFORT for o in offers)
-                        or not offers,
-                        any(o.durability == QosDurability.TRANSIENT_LOCAL for o in offers),
-                        max([1, *(o.depth for o in offers)]),
-                    )
-                )
-    except (ReaderError, OSError, KeyError, TypeError, struct.error) as error:
-        raise BagError(f"{part} cannot be read: {error}") from error
-    return found
 
 
 class Playback:

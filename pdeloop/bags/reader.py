@@ -1,28 +1,19 @@
-"""Reads the loop's messages back from a bag: finished or not, one or one an episode, anybody's.
+"""Reads the loop's messages back from an MCAP bag, finished or not, anybody's, and sorts them into
+episodes.
 
-A finished bag is read with `rosbags`. One without metadata.yaml was not finished (its recorder was
-killed, or the disk was full): an MCAP file is then read record by record up to its last whole one,
-and a sqlite3 file up to its last commit.
+A bag was not finished if its recorder was killed, or the disk was full.
 """
 
 from __future__ import annotations
 
 import json
-import sqlite3
-import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.exceptions import McapError
-from mcap.records import Channel as McapChannel
-from mcap.records import Message as McapMessage
-from mcap.records import Schema as McapSchema
-from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
-from rosbags.rosbag2 import Reader, ReaderError
 
 from loop_interfaces.frames import ArrayCodec, Frame, FrameError
 from loop_interfaces.protocol import ModelFailure
@@ -40,24 +31,14 @@ from loop_interfaces.topics import (
     StartColumn,
     Topic,
 )
-from recorder_node.bag import BagError
+from pdeloop.bags.mcap_messages import MAX_TEXT, McapMessages, Message, files
+from recorder_node.bag import METADATA, BagError, Channel
 from recorder_node.episodes import MODEL_SETTLING, SETTLING, Key
 from recorder_node.recording import INDEX, PARAMETERS
 
 Array = NDArray[np.float64]
-MAX_TEXT = 100_000_000
 _ATTRIBUTES = {START: "start", POLICY: "policy", COST: "cost", MODEL_IDENTIFIED: "model"}
 _BY_NAME = sorted(ARRAYS, key=lambda topic: -len(topic.name))
-
-
-@dataclass(frozen=True)
-class Message:
-    """One recorded message: full topic name, type, time of arrival (ns), serialised bytes."""
-
-    topic: str
-    type: str
-    when: int
-    data: bytes
 
 
 @dataclass
@@ -120,32 +101,40 @@ class Bag:
     def __init__(self, path: Path) -> None:
         if not path.is_dir():
             raise BagError(f"no bag at {path}; give the folder of a rosbag2 bag")
-        if not _is_bag(path) and _is_bag(path / "bag"):
+        found = files(path)
+        if not found and (path / "bag").is_dir():
             path = path / "bag"
-        if not _is_bag(path):
-            raise BagError(
-                f"no bag in {path}: there is neither a metadata.yaml nor an .mcap or .db3 file"
-            )
+            found = files(path)
+        if not found:
+            raise BagError(f"no bag in {path}: there is no .mcap file")
         self.path = path
-        self.parts = [path] if _storage_files(path) else _parts(path)
+        self.files = found
 
     @property
     def finished(self) -> bool:
-        """Whether every part was closed properly."""
-        return all((part / "metadata.yaml").exists() for part in self.parts)
+        """Whether it was closed properly."""
+        complete = all(McapMessages(file).finished for file in self.files)
+        return complete and (self.path / METADATA).exists()
+
+    def channels(self) -> list[Channel]:
+        """Its topics, by name."""
+        found = [channel for file in self.files for channel in McapMessages(file).channels.values()]
+        return sorted(
+            {channel.topic: channel for channel in found}.values(),
+            key=lambda channel: channel.topic,
+        )
 
     def messages(self, start: int | None = None, stop: int | None = None) -> Iterator[Message]:
         """The messages in the order of their arrival, those in [start, stop) ns if given."""
-        for part in self.parts:
-            yield from _messages(part, start, stop)
+        for file in self.files:
+            yield from McapMessages(file).messages(start, stop)
 
     def find(self, episode: int) -> Iterator[RecordedEpisode]:
         """The episodes of this number: through the index, without a scan, if the bag has one."""
         rows = [row for row in self.index() if row.get("episode") == episode]
         for row in rows:
-            part = Bag(self.path / row["bag"]) if "bag" in row else self
-            window = (None, None) if "bag" in row else (int(row["first"]), int(row["last"]) + 1)
-            yield from (e for e in part.episodes(*window) if e.number == episode)
+            window = int(row["first"]), int(row["last"]) + 1
+            yield from (e for e in self.episodes(*window) if e.number == episode)
         if not rows:
             yield from (e for e in self.episodes() if e.number == episode)
 
@@ -283,74 +272,6 @@ def _recognise(name: str) -> tuple[Topic, str, ArrayCodec] | None:
         if name.endswith(f"/{topic.name}"):
             return topic, name.removesuffix(f"/{topic.name}") or "/", ArrayCodec(topic.labels)
     return None
-
-
-def _storage_files(path: Path) -> list[Path]:
-    return sorted([*path.glob("*.mcap"), *path.glob("*.db3")])
-
-
-def _parts(path: Path) -> list[Path]:
-    return sorted(p for p in path.iterdir() if p.is_dir() and _storage_files(p))
-
-
-def _is_bag(path: Path) -> bool:
-    return path.is_dir() and bool(
-        _storage_files(path) or ((path / INDEX).exists() and _parts(path))
-    )
-
-
-def _messages(part: Path, start: int | None, stop: int | None) -> Iterator[Message]:
-    if (part / "metadata.yaml").exists():
-        try:
-            with Reader(part) as reader:
-                for connection, when, data in reader.messages(start=start, stop=stop):
-                    yield Message(connection.topic, connection.msgtype, when, bytes(data))
-        except (ReaderError, OSError, KeyError, TypeError, struct.error) as error:
-            raise BagError(f"{part} cannot be read: {error}") from error
-        return
-    for file in _storage_files(part):
-        read = _unfinished_mcap if file.suffix == ".mcap" else _unfinished_sqlite3
-        for message in read(file):
-            if (start is None or message.when >= start) and (stop is None or message.when < stop):
-                yield message
-
-
-def _unfinished_mcap(file: Path) -> Iterator[Message]:
-    channels: dict[int, McapChannel] = {}
-    types: dict[int, str] = {}
-    try:
-        with file.open("rb") as stream:
-            for record in StreamReader(stream).records:
-                if isinstance(record, McapSchema):
-                    types[record.id] = record.name
-                elif isinstance(record, McapChannel):
-                    channels[record.id] = record
-                elif isinstance(record, McapMessage):
-                    channel = channels[record.channel_id]
-                    kind = types[channel.schema_id]
-                    yield Message(channel.topic, kind, record.log_time, record.data)
-    except (McapError, struct.error, ValueError, KeyError):
-        return  # the end of what was written
-    except OSError as error:
-        raise BagError(f"{file} cannot be read: {error.strerror}") from error
-
-
-def _unfinished_sqlite3(file: Path) -> Iterator[Message]:
-    try:
-        # Not read-only: opening it takes back the transaction that was under way.
-        connection = sqlite3.connect(file)
-        try:
-            yield from (
-                Message(*row)
-                for row in connection.execute(
-                    "SELECT name, type, timestamp, data FROM messages "
-                    "JOIN topics ON topics.id == topic_id ORDER BY timestamp, messages.id"
-                )
-            )
-        finally:
-            connection.close()
-    except sqlite3.Error as error:
-        raise BagError(f"{file} cannot be read: {error}") from error
 
 
 def _text(path: Path) -> str:

@@ -7,9 +7,8 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from loop_interfaces.topics import ARRAYS
-from pdeloop.bags.reader import Bag, Message
-from recorder_node.bag import BagError, BagWriter, Channel
+from pdeloop.bags.reader import Bag
+from recorder_node.bag import BagError, BagWriter
 from recorder_node.recording import INDEX, PARAMETERS
 
 
@@ -39,9 +38,9 @@ def describe(path: Path) -> dict[str, Any]:
         )
     return {
         "bag": str(bag.path),
-        "files": len(bag.parts),
+        "files": len(bag.files),
         "finished": bag.finished,
-        "bytes": sum(f.stat().st_size for part in bag.parts for f in part.iterdir()),
+        "bytes": sum(file.stat().st_size for file in bag.files),
         "messages": sum(counts.values()),
         "first": first,
         "last": last,
@@ -59,7 +58,7 @@ def info_text(content: dict[str, Any]) -> str:
     """`describe` for people."""
     episodes = content["episodes"]
     incomplete = [episode for episode in episodes if episode["missing"]]
-    files = "" if content["files"] == 1 else f" in {content['files']} bags"
+    files = "" if content["files"] == 1 else f" in {content['files']} files"
     lines = [
         f"{content['bag']}: {content['messages']} messages{files}, "
         f"{content['bytes'] / 1e6:.1f} MB, {content['seconds']:.1f} s"
@@ -95,35 +94,14 @@ def recover(path: Path, out: Path | None) -> tuple[Path, int]:
     target = out or bag.path.with_name(f"{bag.path.name}-recovered")
     if target.exists():
         raise BagError(f"{target} already exists; give another folder with --out")
-    split = bag.parts != [bag.path]
+    writer = BagWriter(target, bag.channels())
     count = 0
-    if split:
-        try:
-            target.mkdir(parents=True)
-        except OSError as error:
-            raise BagError(f"cannot write to {target}: {error.strerror}") from error
-    for part in bag.parts:
-        messages = list(Bag(part).messages())
-        _write(target / part.name if split else target, _storage_of(part), messages)
-        count += len(messages)
+    for message in bag.messages():
+        count += 1
+        writer.write(message.topic, message.when, message.data)
+        writer.pause()
+    writer.close({})
     for name in (INDEX, PARAMETERS):
         if (bag.path / name).exists():
             shutil.copyfile(bag.path / name, target / name)
     return target, count
-
-
-def _storage_of(part: Path) -> str:
-    return "mcap" if any(part.glob("*.mcap")) else "sqlite3"
-
-
-def _write(target: Path, storage: str, messages: list[Message]) -> None:
-    types = {message.topic: message.type for message in messages}
-    latched = {f"/{topic.name}" for topic in ARRAYS if topic.latched}
-    channels = [
-        Channel(topic, kind, any(topic.endswith(name) for name in latched))
-        for topic, kind in sorted(types.items())
-    ]
-    writer = BagWriter(target, storage, channels)
-    for message in sorted(messages, key=lambda m: m.when):
-        writer.write(message.topic, message.when, message.data)
-    writer.close({})

@@ -144,6 +144,7 @@ class _Run:
         self._values = with_budget({**check(table(), {}), **as_recorded(values)})
         self._plant = build_plant(self._values)
         self._fingerprint = fingerprint(self._values)
+        self._other = False
         self._settings = DesignSettings.of(self._values)
 
     def episode(self, episode: RecordedEpisode) -> None:
@@ -159,12 +160,13 @@ class _Run:
             report.incomplete.append(f"{where} lacks {', '.join(missing)}")
         if self._values is None or episode.start is None or episode.cost is None or void:
             return
-        if episode.cost.plant != self._fingerprint:
-            report.differs(
-                f"{where}: recorded with another plant (fingerprint {episode.cost.plant}, "
-                f"these parameters give {self._fingerprint})"
+        if episode.cost.plant != self._fingerprint and not self._other:
+            self._other = True
+            report.notes.append(
+                f"run {self._number}: recorded with another fingerprint of the plant "
+                f"({episode.cost.plant}; here it is {self._fingerprint}): its parameters or the source "
+                "of its equation are others. What it computes is compared all the same"
             )
-            return
         self._keep(episode, where)
         if not missing:
             self._trajectory(episode, where)
@@ -185,7 +187,7 @@ class _Run:
                 "followed (give all bags of the run)"
             )
             return
-        training = build_training(self._values)
+        training = build_training({**self._values, "plant": self._fingerprint})
         used: set[bytes] = set()
         report = self._report
         while (batch := training.next_batch()) is not None:

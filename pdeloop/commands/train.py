@@ -63,8 +63,11 @@ def add(commands: Commands) -> None:
         action="store_true",
         help="as --record, and stop the training if the recording fails",
     )
-    add("--bag-storage", choices=("mcap", "sqlite3"), help="format of the bag [mcap]")
-    add("--bag-per-episode", action="store_true", help="one bag an episode instead of one")
+    add(
+        "--record-views",
+        action="store_true",
+        help="as --record, with the topics of the viewer (--view), for Foxglove and PlotJuggler",
+    )
     add(
         "--view",
         action="store_true",
@@ -97,13 +100,10 @@ def _train(options: argparse.Namespace) -> int:
     from pdeloop.training_run import Recording, Transport, run_again, run_new
 
     recording = None
-    if options.record or options.record_or_stop:
+    if options.record or options.record_or_stop or options.record_views:
         import recorder_node.bag  # noqa: F401  # the recorder would only say so in its log
 
-        storage = options.bag_storage or "mcap"
-        recording = Recording(storage, options.bag_per_episode, options.record_or_stop)
-    elif options.bag_storage or options.bag_per_episode:
-        raise ParameterError("--bag-storage and --bag-per-episode go with --record")
+        recording = Recording(options.record_or_stop, options.record_views)
     transport = Transport(
         options.in_process,
         recording,

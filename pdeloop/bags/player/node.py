@@ -7,7 +7,6 @@ Parameters  those of the recorded run, read-only, so that who watches can ask fo
 
 from __future__ import annotations
 
-import importlib
 import os
 import time
 from collections.abc import Callable
@@ -21,23 +20,26 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.ros.introspection import NAMELESS
-from loop_interfaces.ros.node_loop import NodeLoop
+from loop_interfaces.ros.message_types import message_class
 from loop_interfaces.ros.node_main import ConfigurationError, ros_node
-from pdeloop.bags.playback import Channel, Playback, channels
+from loop_interfaces.ros.observer import Observer
+from pdeloop.bags.playback import Playback
 from pdeloop.bags.reader import Bag
 from pdeloop.domain import own_domain
 from pdeloop.live import announced
+from recorder_node.bag import Channel
+from recorder_node.recording import DIAGNOSTICS, ROSOUT
 from tuner_node.results import TRANSIENT
 
 NAME = "bag_player"
 LOOK_FOR = 2.5
 """Seconds in which a live loop in this domain is found."""
-LOOK = 1.0
-"""Seconds between two looks for one while playing."""
+START_LOOK, LOOK = 0.1, 1.0
+"""Seconds between two looks for one before playing, and while playing."""
 UNKNOWN = 1.0
 """Seconds in which the name of a publisher's node should come."""
-NAP = 0.02
-"""Longest sleep, so that signals are noticed."""
+TICK = 0.005
+"""Seconds between two looks at which messages are due."""
 LINGER = 0.5
 """Seconds after the last message in which it arrives everywhere."""
 
@@ -54,40 +56,39 @@ class PlayerNode:
 
     def __init__(self, bag: Bag, playback: Playback, *, wait: bool) -> None:
         self._bag, self._playback = bag, playback
-        self._channels = channels(bag)
+        self._channels = bag.channels()
         self._waiting = wait
         self._left: float | None = None
 
     def run(self) -> str:
         """Play to the end, or until a signal comes; the reason."""
         while True:
-            with ros_node(NAME, ["--ros-args", "--disable-external-lib-logs"]) as (node, loop):
+            arguments = ["--ros-args", "--disable-external-lib-logs"]
+            with ros_node(NAME, arguments, Observer) as (node, loop):
                 self._join(node, loop)
-                reason: str = loop.run(
-                    tick=self._tick, deadline=lambda: 0.0, housekeeping=self._housekeeping
-                )
+                reason: str = loop.run()
                 if not loop.suspended:
                     return reason
-                self._left = loop.now()
+                self._left = time.monotonic()
 
-    def _join(self, node: Node, loop: NodeLoop) -> None:
+    def _join(self, node: Node, loop: Observer) -> None:
         self._node, self._loop = node, loop
         self._publishers: dict[str, Publisher] = {}
-        self._until = loop.now() + LOOK_FOR
+        self._until = time.monotonic() + LOOK_FOR
         self._look_at = 0.0
         self._seen_at: float | None = None
         self._linger: float | None = None
         for name, value in self._recorded_parameters().items():
             node.declare_parameter(name, value, ParameterDescriptor(read_only=True))
+        loop.every(TICK, self._play)
+        loop.every(START_LOOK, self._look)
 
-    def _tick(self, now: float) -> None:
-        playback = self._playback
+    def _play(self) -> None:
+        now, playback = time.monotonic(), self._playback
         if not self._publishers:
-            time.sleep(NAP)
             return
         if self._waiting:
             self._waiting = not any(p.get_subscription_count() for p in self._publishers.values())
-            time.sleep(NAP)
             return
         if playback.due is None and not playback.over:
             playback.begin(now)
@@ -99,10 +100,9 @@ class PlayerNode:
             self._linger = self._linger or now + LINGER
             if now >= self._linger:
                 self._loop.stop("end")
-        due = playback.due
-        time.sleep(NAP if due is None else min(NAP, max(0.0, due - time.monotonic())))
 
-    def _housekeeping(self, now: float) -> None:
+    def _look(self) -> None:
+        now = time.monotonic()
         if not self._publishers:
             self._refuse_company(now)
             if now >= self._until and self._seen_at is None:
@@ -116,7 +116,7 @@ class PlayerNode:
 
     def _create(self) -> None:
         for channel in self._channels:
-            kind = _message_type(channel.type)
+            kind = message_class(channel.type)
             if kind is None:
                 self._node.get_logger().warning(
                     f"{channel.topic} is not played: its type {channel.type} is not installed"
@@ -130,8 +130,9 @@ class PlayerNode:
 
     def _refuse_company(self, now: float) -> None:
         """A live loop must not be told what happened long ago."""
-        for channel in self._channels:
-            topic = channel.topic
+        for topic in (channel.topic for channel in self._channels):
+            if topic in (DIAGNOSTICS.channel.topic, ROSOUT.channel.topic):
+                continue  # every node publishes there
             if self._node.count_publishers(topic) <= (topic in self._publishers):
                 continue
             names = [
@@ -156,15 +157,6 @@ class PlayerNode:
         runs = list(self._bag.parameters().values())
         known = {} if not runs else {k: v for k, v in runs[-1].items() if k not in TRANSIENT}
         return {k: v for k, v in known.items() if isinstance(v, str | bool | int | float)}
-
-
-def _message_type(name: str) -> Any:
-    """The class of a message type like std_msgs/msg/String; None if it is not installed."""
-    package, _, kind = name.partition("/msg/")
-    try:
-        return getattr(importlib.import_module(f"{package}.msg"), kind, None)
-    except ImportError:
-        return None
 
 
 def _qos(channel: Channel) -> QoSProfile:
