@@ -22,7 +22,7 @@ Anderson, Moore, "Optimal Control: Linear Quadratic Methods", chapter 4.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,9 +46,8 @@ class DesignError(ValueError):
     """The reduced model admits no tracking law."""
 
 
-@dataclass(frozen=True, eq=False)
-class Gains:
-    """The gains of a = K_a s + K_b s_r.
+class Gains(NamedTuple):
+    """The gains of a = K_a s + K_b s_r, and what they follow from.
 
     Attributes
     ----------
@@ -56,10 +55,16 @@ class Gains:
         Feedback of the reduced state.
     K_b : (n_a, n_s) array
         Feedforward of the reduced target.
+    P : (n_s, n_s) array
+        Solution of the Riccati equation: s^T P s is the cost of regulating s to 0.
+    poles : (n_s,) complex array
+        Eigenvalues of the closed loop A + B K_a, all inside of the unit circle.
     """
 
     K_a: Array
     K_b: Array
+    P: Array
+    poles: NDArray[np.complex128]
 
     @property
     def policy(self) -> Array:
@@ -77,6 +82,11 @@ def track(model: ReducedModel, *, state_weight: float, action_weight: float) -> 
     state_weight, action_weight : float
         Positive; Q = state_weight I on the full state and R = action_weight I.
 
+    Returns
+    -------
+    Gains
+        K_a, K_b, P and the poles of the closed loop.
+
     Raises
     ------
     ValueError
@@ -84,6 +94,22 @@ def track(model: ReducedModel, *, state_weight: float, action_weight: float) -> 
     DesignError
         A mode on or outside the unit circle that no actuator reaches, or a Riccati equation or a
         steady-state map without a usable solution.
+
+    See Also
+    --------
+    scipy.linalg.solve_discrete_are : the Riccati equation.
+
+    Examples
+    --------
+    An unstable mode that one actuator reaches; with costly actions its pole is mirrored into the
+    unit circle:
+
+    >>> model = ReducedModel(A=[[2.0]], B=[[1.0]], U=[[1.0]])
+    >>> gains = track(model, state_weight=1e-9, action_weight=1.0)
+    >>> gains.poles.round(6)
+    array([0.5+0.j])
+    >>> gains.K_a.round(6)
+    array([[-1.5]])
     """
     for name, weight in (("state_weight", state_weight), ("action_weight", action_weight)):
         if not (np.isfinite(weight) and weight > 0.0):
@@ -105,14 +131,16 @@ def track(model: ReducedModel, *, state_weight: float, action_weight: float) -> 
         S = R + B.T @ P @ B
         K_a = -linalg.solve(S, B.T @ P @ A, assume_a="pos")
         closed_loop = A + B @ K_a
-        if not _spectral_radius(closed_loop) < 1.0:
+        poles = linalg.eigvals(closed_loop)
+        radius = float(np.abs(poles).max())
+        if not radius < 1.0:
             raise DesignError(
                 f"the closed loop must have a spectral radius below 1, but it is "
-                f"{_spectral_radius(closed_loop):.17g}; the reduced model is barely stabilisable, "
+                f"{radius:.17g}; the reduced model is barely stabilisable, "
                 "so identify with another seed or another n_s."
             )
         K_b = linalg.solve(S, B.T @ _steady_state_map(closed_loop) @ Q, assume_a="pos")
-    return Gains(K_a=K_a, K_b=K_b)
+    return Gains(K_a=K_a, K_b=K_b, P=P, poles=poles)
 
 
 def _spectral_radius(matrix: Array) -> float:

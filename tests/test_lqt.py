@@ -145,3 +145,19 @@ def test_refuses_weights_that_are_not_positive(weight: float) -> None:
         track(model(), state_weight=weight, action_weight=1.0)
     with pytest.raises(ValueError, match="action_weight must be positive"):
         track(model(), state_weight=1.0, action_weight=weight)
+
+
+def test_it_returns_the_cost_to_go_and_the_closed_loops_poles() -> None:
+    m = model()
+    gains = track(m, state_weight=Q_WEIGHT, action_weight=R_WEIGHT)
+    closed = m.A + m.B @ gains.K_a
+    expected = np.sort_complex(np.linalg.eigvals(closed))
+    np.testing.assert_allclose(np.sort_complex(gains.poles), expected, atol=1e-12)
+    # s^T P s is what regulating s to 0 costs: the sum of the stage costs along the closed loop.
+    s = np.random.default_rng(3).standard_normal(m.n_s)
+    cost_to_go, total = s @ gains.P @ s, 0.0
+    for _ in range(2000):
+        a = gains.K_a @ s
+        total += Q_WEIGHT * (s @ s) + R_WEIGHT * (a @ a)
+        s = m.A @ s + m.B @ a
+    np.testing.assert_allclose(total, cost_to_go, rtol=1e-9)

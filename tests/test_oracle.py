@@ -54,14 +54,22 @@ def test_field_seeds_fit_a_float_and_are_their_own_stream() -> None:
     assert oracle.field_seed(1, 0) != shared
 
 
-def test_estimate_and_update_to_the_last_factor() -> None:
-    theta = oracle.unit_direction(0, 0, SHAPE)
-    n_a, n_s, radius = 3, 2, 0.1
-    expected = (n_a * n_s) / radius * (2.5 - 1.25) * theta
-    estimate = oracle.gradient(2.5, 1.25, theta, radius)
-    np.testing.assert_array_equal(estimate, expected)
-    policy = np.arange(12.0).reshape(SHAPE)
-    np.testing.assert_array_equal(oracle.update(policy, estimate, 1e-2), policy - 1e-2 * expected)
+def test_estimates_of_a_linear_cost_average_to_its_gradient_and_a_step_descends_along_it() -> None:
+    """J = <G, pi>: J(pi - eta G) = J(pi) - eta |G|^2."""
+    G = np.random.default_rng(1).standard_normal(SHAPE)
+    policy, radius = np.arange(12.0).reshape(SHAPE), 0.1
+
+    def cost(pi: np.ndarray) -> float:
+        return float(np.sum(G * pi))
+
+    directions = oracle.orthonormal_directions(0, 0, SHAPE, G.size)
+    estimates = [
+        oracle.gradient(cost(policy + radius * d), cost(policy - radius * d), d, radius)
+        for d in directions
+    ]
+    np.testing.assert_allclose(np.mean(estimates, axis=0), G, rtol=1e-9)
+    stepped = oracle.update(policy, G, 1e-2)
+    assert cost(stepped) == pytest.approx(cost(policy) - 1e-2 * np.sum(G * G), rel=1e-12)
 
 
 def quadratic(seed: int) -> tuple[np.ndarray, np.ndarray]:
