@@ -16,7 +16,7 @@ from controller_node.fast_path import ControllerFastPath
 from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
 from loop_interfaces import model_rows
-from loop_interfaces.frames import HEADER, ArrayCodec, Frame
+from loop_interfaces.frames import HEADER, ArrayCodec, Frame, FrameError
 from loop_interfaces.topics import ACTION, COST, STATE, VOID, CostColumn
 from pde_sim_node.fast_path import PlantFastPath
 from tests.test_lockstep import PLANT, RUN, plant_protocol
@@ -184,18 +184,24 @@ def test_a_responder_knows_what_was_answered_and_what_it_was_told_since_counts()
     assert fast(controller.path, controller.state(5, 1)) is None
     controller.begin(7)
     controller.ordinary(controller.state(7, 0))
-    policies = RNG.standard_normal((2, N_A, 2 * N_S))
+    assert fast(controller.path, raw := controller.state(7, 1)) == controller.expected(raw)
+    with pytest.raises(FrameError, match="two different policies"):
+        controller.responder.policy(Frame(RUN, 7, 0, 0.0, np.zeros((2, N_A, 2 * N_S))))
+    assert fast(controller.path, controller.state(7, 2)) is None
+    # A new target changes the law; the first state after it prepares that.
+    controller.begin(8)
+    controller.ordinary(controller.state(8, 0))
     for responder in (controller.responder, controller.judge):
-        responder.policy(Frame(RUN, 7, 0, 0.0, policies))
-    assert fast(controller.path, raw := controller.state(7, 1)) is None
+        responder.target(Frame(0, 0, 0, 0.0, np.sin(np.arange(N_Z)), PLANT))
+    assert fast(controller.path, raw := controller.state(8, 1)) is None
     assert controller.ordinary(raw) == controller.expected(raw)
-    assert fast(controller.path, raw := controller.state(7, 2)) == controller.expected(raw)
+    assert fast(controller.path, raw := controller.state(8, 2)) == controller.expected(raw)
     # Where the controller explores there is no law.
     rows = np.array([[0.0, 3.0, 0.1, 0.0]] * 2)
-    controller.responder.start(Frame(RUN, 8, 0, 0.0, rows))
-    controller.ordinary(controller.state(8, 0))
-    assert fast(controller.path, controller.state(8, 1)) is None
-    assert controller.responder.answered == 13
+    controller.responder.start(Frame(RUN, 9, 0, 0.0, rows))
+    controller.ordinary(controller.state(9, 0))
+    assert fast(controller.path, controller.state(9, 1)) is None
+    assert controller.responder.answered == 15
 
 
 class NoSamples:
@@ -274,7 +280,7 @@ def test_a_plant_goes_on_with_the_same_bytes(overrides: dict, at_once: int) -> N
         assert topic is COST
         # All but the last, and the first from a peer that has not sent such an action before.
         assert taken == plant.lockstep.horizon - (episode in (1, 7))
-    assert plant.lockstep.tally == plant.judge.tally
+    assert plant.lockstep.counters == plant.judge.counters
     assert (plant.lockstep.steps_total, plant.lockstep.rounds_total, plant.lockstep.time) == (
         plant.judge.steps_total,
         plant.judge.rounds_total,
