@@ -23,7 +23,7 @@ from loop_interfaces.diagnostics import Health
 from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.parameters import model_order, taken_by
-from loop_interfaces.protocol import ModelFailure, Send
+from loop_interfaces.protocol import ModelFailure, Publication
 from loop_interfaces.ros.endpoints import writer_qos
 from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.node_main import node_main
@@ -42,7 +42,7 @@ from loop_interfaces.topics import (
     Topic,
 )
 
-Handler = Callable[[Frame], Sequence[Send | ModelFailure]]
+Handler = Callable[[Frame], Sequence[Publication | ModelFailure]]
 
 
 class ControllerNode:
@@ -89,9 +89,9 @@ class ControllerNode:
     def _on_other(self, handler: Handler, frame: Frame) -> None:
         self._perform(handler(frame))
 
-    def _perform(self, sends: Sequence[Send | ModelFailure]) -> None:
+    def _perform(self, sends: Sequence[Publication | ModelFailure]) -> None:
         for send in sends:
-            if isinstance(send, Send):
+            if isinstance(send, Publication):
                 self._senders[send.topic].send(send.frame)
             else:
                 self._failed.publish(String(data=send.to_json()))

@@ -19,7 +19,7 @@ from controller_node.identification import DesignSettings, design
 from controller_node.policy import ProjectedLaw, excitation
 from loop_interfaces import model_rows
 from loop_interfaces.frames import Frame, FrameError
-from loop_interfaces.protocol import ModelFailure, Send, Tally
+from loop_interfaces.protocol import Counters, ModelFailure, Publication
 from loop_interfaces.topics import (
     ACTION,
     COMPLETED,
@@ -62,7 +62,7 @@ class _Run:
     """Why no model can come out of the exploratory episode, whatever its cost is."""
     disputed: int = -1
     """The episode for which two different policies came."""
-    identified: dict[int, Send | ModelFailure] = field(default_factory=dict)
+    identified: dict[int, Publication | ModelFailure] = field(default_factory=dict)
     """What came out of an exploratory episode, by plant."""
 
     @property
@@ -95,7 +95,7 @@ class Responder:
         self._served = (-1, -1)
         """Run and plant of the last answer."""
         self._pending: Frame | None = None
-        self.tally = Tally()
+        self.counters = Counters()
         self.answered = 0
         self.episode = self.step = -1
         """Of the last answer."""
@@ -124,7 +124,7 @@ class Responder:
         start = run.start if run else None
         return start is not None and bool(start.values[0, StartColumn.EXCITATION] >= 0)
 
-    def target(self, frame: Frame) -> list[Send]:
+    def target(self, frame: Frame) -> list[Publication]:
         """Take the target z_r of a plant."""
         self._targets[frame.plant] = frame.values.copy()
         _forget(self._targets, frame.plant, self._served[1])
@@ -133,7 +133,7 @@ class Responder:
             run.laws = {plant: run.laws[plant] for plant in known}
         return self._answer_pending()
 
-    def start(self, frame: Frame) -> Sequence[Send | ModelFailure]:
+    def start(self, frame: Frame) -> Sequence[Publication | ModelFailure]:
         """Learn of an episode: who explores, which model each environment uses."""
         rows = frame.values
         if rows.shape[1] not in (START_COLUMNS, len(StartColumn)):
@@ -161,7 +161,7 @@ class Responder:
             )  # asked again: what was answered may have been lost
         return self._answer_pending()
 
-    def policy(self, frame: Frame) -> list[Send]:
+    def policy(self, frame: Frame) -> list[Publication]:
         """Take the policies [K_a K_b] of an episode's environments."""
         n_a = self._settings.n_a
         if frame.values.shape[1] != n_a:
@@ -184,26 +184,26 @@ class Responder:
         run.laws = {plant: (law, -1) for plant, (law, _) in run.laws.items()}
         return self._answer_pending()
 
-    def model(self, frame: Frame) -> list[Send]:
+    def model(self, frame: Frame) -> list[Publication]:
         """Take a run's reduced models."""
         run = self._run(frame.run, 2 * frame.values.nbytes)
         run.models = [model_rows.unpack(rows.copy(), self._settings.n_a) for rows in frame.values]
         run.generation, run.laws = frame.step, {}
         return self._answer_pending()
 
-    def state(self, frame: Frame) -> list[Send]:
+    def state(self, frame: Frame) -> list[Publication]:
         """The action that answers a state; the state is kept until what it needs has arrived."""
         actions = self._actions(frame)
         if actions is None:
             self._pending = replace(frame, values=frame.values.copy())
-            self.tally["states that had to wait"] += 1
+            self.counters["states that had to wait"] += 1
             return []
         self._pending = None
         self._served = (frame.run, frame.plant)
         self.episode = frame.episode
         self.advance_counters(1, frame.step)
         answer = Frame(frame.run, frame.episode, frame.step, frame.time, actions, frame.plant)
-        return [Send(ACTION, answer)]
+        return [Publication(ACTION, answer)]
 
     def advance_counters(self, answers: int, step: int) -> None:
         """Account for states of the present episode, up to `step`, that were answered."""
@@ -226,7 +226,7 @@ class Responder:
         explores = start.values[0, StartColumn.EXCITATION] >= 0
         return None if explores or episode != state.episode else law
 
-    def cost(self, frame: Frame) -> list[Send | ModelFailure]:
+    def cost(self, frame: Frame) -> list[Publication | ModelFailure]:
         """At the end of an exploratory episode: reduce and design."""
         self._ended = (frame.run, frame.episode)
         if frame.values.shape[1] == len(CostColumn) and len(frame.values):
@@ -245,7 +245,7 @@ class Responder:
             found = run.identified[frame.plant] = self._identify(run, start, frame)
             failed = isinstance(found, ModelFailure)
             self.failure = found.reason if isinstance(found, ModelFailure) else ""
-            self.tally["identifications failed" if failed else "models identified"] += 1
+            self.counters["identifications failed" if failed else "models identified"] += 1
         return [run.identified[frame.plant]] if frame.plant in run.identified else []
 
     def waits_for(self) -> list[str]:
@@ -367,7 +367,7 @@ class Responder:
         settings = self._settings
         return excitation(seed, step, settings.n_a, variance, settings.action_limit)
 
-    def _identify(self, run: _Run, start: Frame, cost: Frame) -> Send | ModelFailure:
+    def _identify(self, run: _Run, start: Frame, cost: Frame) -> Publication | ModelFailure:
         def failure(retry: bool, reason: str) -> ModelFailure:
             return ModelFailure(start.run, start.episode, retry, reason)
 
@@ -402,9 +402,9 @@ class Responder:
         except ValueError as error:
             return failure(False, str(error))
         rows = np.stack([model_rows.pack(model) for model in models])
-        return Send(MODEL_IDENTIFIED, replace(cost, step=0, values=rows))
+        return Publication(MODEL_IDENTIFIED, replace(cost, step=0, values=rows))
 
-    def _answer_pending(self) -> list[Send]:
+    def _answer_pending(self) -> list[Publication]:
         return self.state(self._pending) if self._pending is not None else []
 
 

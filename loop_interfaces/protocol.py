@@ -20,7 +20,7 @@ NO_CONTROLLER = 65
 
 
 @dataclass(slots=True)
-class Send:
+class Publication:
     """Publish `frame` on `topic`. Never changed once it is made (see `Frame`)."""
 
     topic: Topic
@@ -60,7 +60,7 @@ class ModelFailure:
             raise ValueError(f"expected the JSON of a model failure, got {text[:80]!r}") from error
 
 
-class Tally(Counter[str]):
+class Counters(Counter[str]):
     """Counts of messages that were dropped, late, repeated or foreign, by reason."""
 
     def summary(self) -> str:

@@ -41,13 +41,13 @@ class PlantHealth:
                 "steps/s": self._rounds.per_second(lockstep.rounds_total, now),
                 "environment steps/s": self._steps.per_second(lockstep.steps_total, now),
                 "episodes": lockstep.episodes_total,
-                "episodes void": lockstep.tally["episodes void"],
+                "episodes void": lockstep.counters["episodes void"],
                 "last cost": _mean(costs) if completed and costs is not None else None,
                 "last diverged": (
                     int((costs[:, CostColumn.ENDED] >= 0).sum()) if costs is not None else None
                 ),
                 "simulated time": lockstep.time,
-                "states repeated": lockstep.tally["states repeated"],
+                "states repeated": lockstep.counters["states repeated"],
                 "stale messages": lockstep.stale,
                 "missed deadlines": pacer.missed if pacer else None,
                 "jitter p99 (us)": 1e6 * pacer.quantile(0.99) if pacer else None,

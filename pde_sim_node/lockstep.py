@@ -23,7 +23,7 @@ from dataclasses import replace
 import numpy as np
 
 from loop_interfaces.frames import MAX_VALUES, Frame, FrameError
-from loop_interfaces.protocol import Send, Tally
+from loop_interfaces.protocol import Counters, Publication
 from loop_interfaces.samples import MAX_TIME
 from loop_interfaces.topics import (
     COMPLETED,
@@ -81,7 +81,7 @@ class Lockstep:
         self._action_timeout = action_timeout
         self._max_repeats = max_repeats
         self._run_hold = run_hold
-        self.tally = Tally()
+        self.counters = Counters()
         self.time = 0.0
         self.run = 0
         self.episode = -1
@@ -94,7 +94,7 @@ class Lockstep:
         self._active = False
         self._state = np.empty((0, 0))
         """What was measured last."""
-        self._cost: Send | None = None
+        self._cost: Publication | None = None
         """What the last episode that ended came to; None once another run has the plant."""
         self._taken: list[int] = []
         """A digest of the action that was taken at each step of the episode."""
@@ -139,7 +139,7 @@ class Lockstep:
         return self.last_state
 
     @property
-    def _reply(self) -> Send | None:
+    def _reply(self) -> Publication | None:
         """What is to be sent again: the state that is not answered, or the cost."""
         return self._stamped(STATE, self._state) if self._active else self._cost
 
@@ -164,32 +164,32 @@ class Lockstep:
     @property
     def stale(self) -> int:
         """Messages that came too late, too early or for somebody else."""
-        return sum(count for reason, count in self.tally.items() if reason in _STALE)
+        return sum(count for reason, count in self.counters.items() if reason in _STALE)
 
     def overdue(self) -> bool:
         """Whether the awaited action has been missing for many repeats."""
         awaited = self._active and not self._held and self._deadline is not None
         return awaited and self._repeats * self._action_timeout > 2.0
 
-    def announcement(self) -> Send:
+    def announcement(self) -> Publication:
         """The target z_r, sent once at the start and latched."""
-        return Send(TARGET, Frame(0, 0, 0, 0.0, self.plant.target, self._fingerprint))
+        return Publication(TARGET, Frame(0, 0, 0, 0.0, self.plant.target, self._fingerprint))
 
-    def paused_report(self) -> Send:
+    def paused_report(self) -> Publication:
         """Whether the plant is paused, latched."""
         episode = max(self.episode, 0)  # -1 before the first
         paused = np.array([float(self.paused)])
-        return Send(
+        return Publication(
             PAUSED, Frame(self.run, episode, self.step, self.time, paused, self._fingerprint)
         )
 
-    def pause(self, now: float) -> list[Send]:
+    def pause(self, now: float) -> list[Publication]:
         """Hold every further state back."""
         self.paused, self._stepping = True, False
         self._deadline = now + PAUSED_REPORT
         return [self.paused_report()]
 
-    def resume(self, now: float) -> list[Send]:
+    def resume(self, now: float) -> list[Publication]:
         """Go on: send the state that was held back, or again the one that is not answered."""
         if not self.paused:
             return []
@@ -210,7 +210,7 @@ class Lockstep:
         max_repeats: int,
         run_hold: float,
         real_time_factor: float,
-    ) -> list[Send]:
+    ) -> list[Publication]:
         """Take other times from now on. They decide when messages go out, never what is in them."""
         self._action_timeout, self._max_repeats = action_timeout, max_repeats
         self._run_hold = run_hold
@@ -224,7 +224,7 @@ class Lockstep:
             return []
         return self._send_state(now)  # it waited for an instant of the former pace
 
-    def step_once(self, now: float) -> list[Send]:
+    def step_once(self, now: float) -> list[Publication]:
         """Send one state although the plant is paused, and take its action.
 
         Raises ValueError, one sentence, when there is nothing to step.
@@ -238,7 +238,7 @@ class Lockstep:
         self._stepping = True
         return self._send_state(now)
 
-    def start(self, frame: Frame, now: float) -> list[Send]:
+    def start(self, frame: Frame, now: float) -> list[Publication]:
         """Begin an episode, or answer again for one that is known.
 
         Raises FrameError for a malformed seed list or another run's episode while one is under way.
@@ -261,7 +261,7 @@ class Lockstep:
             self._idle(now)
             return []
         if frame.episode < self.episode:
-            self.tally["starts of an earlier episode"] += 1
+            self.counters["starts of an earlier episode"] += 1
             return []
         if frame.episode == self.episode:
             if not np.array_equal(rows, self._rows):
@@ -269,7 +269,7 @@ class Lockstep:
                     f"episode {frame.episode} was started with other seeds; "
                     "a new episode needs a new number"
                 )
-            self.tally["starts repeated"] += 1
+            self.counters["starts repeated"] += 1
             reply = self._reply
             return [reply] if reply and not self._held else []
         states = self.plant.reset(rows[:, StartColumn.SEED].astype(np.int64), noise_seeds(rows))
@@ -282,21 +282,21 @@ class Lockstep:
             self.pacer.begin(now)
         return self._publish_state(now)
 
-    def action(self, frame: Frame, now: float) -> list[Send]:
+    def action(self, frame: Frame, now: float) -> list[Publication]:
         """Advance on the awaited action; ignore any other.
 
         Raises FrameError when the awaited action has the wrong shape.
         """
         plant = self.plant
         if not self._active or frame.run != self.run or frame.episode != self.episode:
-            self.tally["actions of another episode"] += 1
+            self.counters["actions of another episode"] += 1
             return self._judge_late(frame)
         if frame.plant != self._fingerprint:
-            self.tally["actions for another plant"] += 1
+            self.counters["actions for another plant"] += 1
             return []
         expected = (plant.batch, plant.n_a)
         if frame.step != plant.step_index:
-            self.tally["actions of another step"] += 1
+            self.counters["actions of another step"] += 1
             # One of another shape could never have been taken: it puts nothing in doubt.
             past = frame.step < plant.step_index and frame.values.shape == expected
             if past and frame.digest() != self._taken[frame.step]:
@@ -307,7 +307,7 @@ class Lockstep:
                 f"expected an action of shape {expected} (env, actuator), got {frame.values.shape}"
             )
         if self._held:
-            self.tally["actions before their state"] += 1
+            self.counters["actions before their state"] += 1
             return []
         if plant.step_index == plant.horizon:
             self._tuner_heard = now
@@ -330,7 +330,7 @@ class Lockstep:
             and frame.values.shape == (self.plant.batch, self.plant.n_a)
         )
 
-    def _judge_late(self, frame: Frame) -> list[Send]:
+    def _judge_late(self, frame: Frame) -> list[Publication]:
         """Take back the cost of one of the last episodes, if this action contradicts one of its own."""
         if frame.run != self.run or frame.plant != self._fingerprint:
             return []
@@ -342,10 +342,10 @@ class Lockstep:
             return []
         del self._past[frame.episode]
         self.contradiction = _contradiction(frame)
-        self.tally["costs taken back"] += 1
+        self.counters["costs taken back"] += 1
         values = cost.values.copy()
         values[:, CostColumn.ENDED] = VOID
-        return [Send(COST, replace(cost, values=values))]
+        return [Publication(COST, replace(cost, values=values))]
 
     def advance_counters(self, digests: Sequence[int], now: float) -> None:
         """Account for awaited actions, the last of them at `now`, that the plant has taken.
@@ -361,7 +361,7 @@ class Lockstep:
         self._repeats = 0
         self._deadline = now + self._action_timeout
 
-    def tick(self, now: float) -> list[Send]:
+    def tick(self, now: float) -> list[Publication]:
         """Send the state again when its answer is overdue; give the episode up after max_repeats.
 
         With a pace also: send the next state at its instant. Call it once right after `action`,
@@ -376,24 +376,24 @@ class Lockstep:
         if self._repeats >= self._max_repeats and not self.paused:
             return [self._finish(now, void=True)]
         self._repeats += 1
-        self.tally["states repeated"] += 1
+        self.counters["states repeated"] += 1
         self._deadline = now + self._action_timeout
         state = self._stamped(STATE, self._state)
         return [state, self.paused_report()] if self.paused else [state]
 
-    def _publish_state(self, now: float) -> list[Send]:
+    def _publish_state(self, now: float) -> list[Publication]:
         if self.paused:
             self._held, self._stepping = True, False
             self._deadline = now + PAUSED_REPORT
             return []
         return self._send_state(now)
 
-    def _send_state(self, now: float) -> list[Send]:
+    def _send_state(self, now: float) -> list[Publication]:
         self._held, self._repeats = False, 0
         self._deadline = now + self._action_timeout
         return [self._stamped(STATE, self._state)]
 
-    def _still_paused(self, now: float) -> list[Send]:
+    def _still_paused(self, now: float) -> list[Publication]:
         if self._deadline is not None and now < self._deadline:
             return []
         self._deadline = now + PAUSED_REPORT
@@ -404,13 +404,13 @@ class Lockstep:
         self._active = self._held = self._stepping = False
         self._deadline = now + PAUSED_REPORT if self.paused else None
 
-    def _finish(self, now: float, *, void: bool, contradiction: str = "") -> Send:
+    def _finish(self, now: float, *, void: bool, contradiction: str = "") -> Publication:
         self.contradiction = contradiction
         costs = self.plant.episode_costs()
         ended = np.where(costs.diverged_step >= 0, costs.diverged_step, COMPLETED)
         if void:
             ended = np.full(self.plant.batch, VOID)
-            self.tally["episodes void"] += 1
+            self.counters["episodes void"] += 1
         values = np.column_stack([costs.mean, costs.total, ended.astype(np.float64)])
         self.last_cost = values
         self._cost = self._stamped(COST, values)
@@ -422,10 +422,10 @@ class Lockstep:
         self.episodes_total += not void
         return self._cost
 
-    def _stamped(self, topic: Topic, values: np.ndarray) -> Send:
+    def _stamped(self, topic: Topic, values: np.ndarray) -> Publication:
         step = self.plant.step_index
         frame = Frame(self.run, self.episode, step, self.time, values, self._fingerprint)
-        return Send(topic, frame)
+        return Publication(topic, frame)
 
     def _check_rows(self, frame: Frame) -> np.ndarray:
         rows = frame.values

@@ -20,7 +20,7 @@ from loop_interfaces.affinity import core_list
 from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.parameters import PLANT, taken_by
-from loop_interfaces.protocol import Send
+from loop_interfaces.protocol import Publication
 from loop_interfaces.ros.introspection import offer
 from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.node_main import node_main
@@ -171,7 +171,7 @@ class PlantNode:
             self._node.get_logger().info(f"real time: {pacer.summary()}")
             pacer.clear()
 
-    def _send(self, sends: list[Send]) -> None:
+    def _send(self, sends: list[Publication]) -> None:
         for send in sends:
             if send.topic is STATE and send.frame.step == 0:
                 self._batcher.begin(self._loop.now())

@@ -200,7 +200,7 @@ def plant_on_topics(*, timed: bool = False, helped: bool = False, **overrides: o
             assert answer_for(path) is None
         peer.say(last := plant.action(state))
         assert answer_for(path) == last
-        for name in ("steps_total", "rounds_total", "time", "step", "tally"):
+        for name in ("steps_total", "rounds_total", "time", "step", "counters"):
             assert getattr(plant.lockstep, name) == getattr(plant.judge, name), name
         (cost,) = plant.lockstep.action(plant.own.decode(last), 0.0)
         topic, expected = plant.expected(last)

@@ -31,8 +31,8 @@ def batch(count: int) -> Batch:
     return Batch(rows, np.arange(count, dtype=float)[:, None, None] * np.ones((1, 2, 4)))
 
 
-def starts(orders):
-    return [(pair, send.frame) for pair, send in orders if send.topic is START]
+def starts(publications):
+    return [(pair, send.frame) for pair, send in publications if send.topic is START]
 
 
 def costs_of(frame: Frame) -> Frame:
@@ -70,9 +70,9 @@ def test_any_number_of_pairs_and_any_order_of_arrival_gives_the_batch_in_order(p
 
 def test_the_policy_goes_out_before_the_start_and_with_its_rows():
     served = dispatcher()
-    orders = served.assign(batch(2), 0.0)
-    assert [send.topic for _, send in orders] == [POLICY, START]
-    policy, start = (send.frame for _, send in orders)
+    publications = served.assign(batch(2), 0.0)
+    assert [send.topic for _, send in publications] == [POLICY, START]
+    policy, start = (send.frame for _, send in publications)
     assert policy.episode == start.episode == 2**32 + 1
     assert policy.values[:, 0, 0].tolist() == start.values[:, 0].tolist()
 
@@ -88,7 +88,7 @@ def test_answers_of_other_runs_episodes_and_shapes_change_nothing():
     assert served.result() is None
     served.cost(0, good, 0.0)
     assert served.result() is not None
-    assert sum(served.tally.values()) == 2
+    assert sum(served.counters.values()) == 2
 
 
 @pytest.mark.parametrize("cost_first", [True, False])

@@ -99,7 +99,7 @@ def test_foreign_late_repeated_and_malformed_messages_change_no_number():
     noisy_protocol = plant_protocol()
     noisy = run_episode(noisy_protocol, 1, disturb=disturb)
     assert [f.values.tobytes() for f in noisy[-1:]] == [f.values.tobytes() for f in quiet[-1:]]
-    assert noisy_protocol.tally["actions of another step"] > 0
+    assert noisy_protocol.counters["actions of another step"] > 0
 
 
 def test_two_different_actions_for_one_state_void_the_episode():

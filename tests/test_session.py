@@ -30,7 +30,7 @@ def undisturbed() -> Training:
 
 
 class Loop:
-    """A session and a plant and controller that answer its orders, one episode a call."""
+    """A session and a plant and controller that answer its publications, one episode a call."""
 
     def __init__(self, training: Training, incarnation: int = 0) -> None:
         dispatcher = Dispatcher.create(
@@ -53,8 +53,8 @@ class Loop:
         self.take(self.session.begin(self.now))
         self.take(self.session.presence(0, (), self.now))
 
-    def take(self, orders) -> None:
-        for _, send in orders:
+    def take(self, publications) -> None:
+        for _, send in publications:
             if send.topic is MODEL:
                 self.pair.use_models(send.frame.values)
             elif send.topic is POLICY:

@@ -24,7 +24,9 @@ class TunerHealth:
         """Level, sentence and values at time `now` (monotonic s); absent: nodes that are waited for."""
         session, dispatcher = self._session, self._session.dispatcher
         training = session.training
-        repeated = dispatcher.tally["episodes repeated"] + dispatcher.tally["episodes taken over"]
+        repeated = (
+            dispatcher.counters["episodes repeated"] + dispatcher.counters["episodes taken over"]
+        )
         if repeated > self._repeated:
             self._repeated, self._repeated_at = repeated, now
         level, message = self._state(now, absent)
@@ -48,8 +50,8 @@ class TunerHealth:
                 "cost with LQT": session.baseline("lqt"),
                 "episodes repeated": repeated,
                 "stale messages": (
-                    dispatcher.tally["answers of another run"]
-                    + dispatcher.tally["answers of another episode"]
+                    dispatcher.counters["answers of another run"]
+                    + dispatcher.counters["answers of another episode"]
                 ),
                 "paused": dispatcher.held,
                 "paused plants": len(dispatcher.paused_pairs(now)),

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.frames import Frame, FrameError
-from loop_interfaces.protocol import ModelFailure, Send, Tally
+from loop_interfaces.protocol import Counters, ModelFailure, Publication
 from loop_interfaces.topics import (
     COST,
     MODEL,
@@ -34,7 +34,7 @@ from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult
 from tuner_node.dispatch_state import Chunk, Pair
 
 Array = NDArray[np.float64]
-Order = tuple[int, Send]
+PairPublication = tuple[int, Publication]
 """(pair, message): publish the message in that pair's namespace."""
 EPISODES_PER_INCARNATION = 2**32
 STRANGE = 20.0
@@ -67,7 +67,7 @@ class Dispatcher:
     episode_timeout: float
     max_attempts: int
     pairs: list[Pair]
-    tally: Tally = field(default_factory=Tally)
+    counters: Counters = field(default_factory=Counters)
     notes: list[str] = field(default_factory=list)
     sim_time: float = 0.0
     plant: int = UNKNOWN_PLANT
@@ -105,7 +105,7 @@ class Dispatcher:
             pairs=[Pair() for _ in range(pairs)],
         )
 
-    def assign(self, batch: Batch, now: float) -> list[Order]:
+    def assign(self, batch: Batch, now: float) -> list[PairPublication]:
         """Begin a batch; the previous one must be complete."""
         count = len(batch.rows)
         parts = max(-(-count // self.max_batch), min(len(self._present()), count), 1)
@@ -115,21 +115,21 @@ class Dispatcher:
         self._waiting = list(self._chunks)
         return self._hand_out(now)
 
-    def models(self, models: Array, generation: int) -> list[Order]:
+    def models(self, models: Array, generation: int) -> list[PairPublication]:
         """Give every pair the run's reduced models.
 
         generation: their number; episodes name the one that they are about, so that a policy never
         meets the models before it.
         """
         frame = self._models = Frame(self.run, 0, generation, self.sim_time, models.copy())
-        return [(pair, Send(MODEL, frame)) for pair in range(len(self.pairs))]
+        return [(pair, Publication(MODEL, frame)) for pair in range(len(self.pairs))]
 
-    def release(self) -> list[Order]:
+    def release(self) -> list[PairPublication]:
         """Tell every pair that the run is over."""
         frame = Frame(self.run, 0, 0, self.sim_time, np.empty((0, START_COLUMNS)))
-        return [(pair, Send(START, frame)) for pair in range(len(self.pairs))]
+        return [(pair, Publication(START, frame)) for pair in range(len(self.pairs))]
 
-    def presence(self, pair: int, missing: Sequence[str], now: float) -> list[Order]:
+    def presence(self, pair: int, missing: Sequence[str], now: float) -> list[PairPublication]:
         """Learn which nodes of a pair are on the network."""
         known = self.pairs[pair]
         known.missing = tuple(missing)
@@ -137,7 +137,7 @@ class Dispatcher:
             known.paused_until = -math.inf
         return self._hand_out(now)
 
-    def cost(self, pair: int, frame: Frame, now: float) -> list[Order]:
+    def cost(self, pair: int, frame: Frame, now: float) -> list[PairPublication]:
         """Take an episode's costs. Raises FrameError when their shape is not the episode's."""
         known = self._answering(pair, frame, COST)
         if known is None or known.chunk is None or self._batch is None:
@@ -181,12 +181,12 @@ class Dispatcher:
         """Hand out no new episode; those under way go on."""
         self.held = True
 
-    def resume(self, now: float) -> list[Order]:
+    def resume(self, now: float) -> list[PairPublication]:
         """Hand out episodes again."""
         self.held = False
         return self._hand_out(now)
 
-    def paused(self, pair: int, frame: Frame, now: float) -> list[Order]:
+    def paused(self, pair: int, frame: Frame, now: float) -> list[PairPublication]:
         """Learn whether a pair's plant is paused: it is not silent then.
 
         It gets a new episode only if no other pair can take it, so that it can be stepped through.
@@ -212,7 +212,7 @@ class Dispatcher:
         newest = max(pair.episode for pair in self.pairs)
         return newest if newest >= 0 else None
 
-    def target(self, pair: int, frame: Frame, now: float) -> list[Order]:
+    def target(self, pair: int, frame: Frame, now: float) -> list[PairPublication]:
         """Learn the target z_r of a plant."""
         if len(self._targets) < MAX_TARGETS or frame.plant in self._targets:
             self._targets[frame.plant] = frame.values.copy()
@@ -233,7 +233,7 @@ class Dispatcher:
         if self._is_sample(self.pairs[pair], frame, self.n_a):
             self.pairs[pair].observer.action(frame)
 
-    def model(self, pair: int, frame: Frame, now: float) -> list[Order]:
+    def model(self, pair: int, frame: Frame, now: float) -> list[PairPublication]:
         """Take the reduced models of an exploratory episode."""
         known = self._answering(pair, frame, MODEL_IDENTIFIED)
         if known is None or known.chunk is None or self._batch is None:
@@ -249,7 +249,7 @@ class Dispatcher:
         self._release_if_done(known)
         return self._hand_out(now)
 
-    def failure(self, pair: int, failure: ModelFailure, now: float) -> list[Order]:
+    def failure(self, pair: int, failure: ModelFailure, now: float) -> list[PairPublication]:
         """Take the news that an exploratory episode gave no model."""
         known = self.pairs[pair]
         if known.chunk is None or (failure.run, failure.episode) != (self.run, known.episode):
@@ -259,17 +259,17 @@ class Dispatcher:
         self._retry(known, failure.reason)
         return self._hand_out(now)
 
-    def tick(self, now: float) -> list[Order]:
+    def tick(self, now: float) -> list[PairPublication]:
         """Ask again for what is not answered; start again what has been silent for too long.
 
         A pair that is at work ignores being asked again, one that was done answers again.
         """
-        orders: list[Order] = []
+        publications: list[PairPublication] = []
         for number, pair in enumerate(self.pairs):
             if pair.chunk is None:
                 if self.held and pair.last is not None and now - pair.sent > ASK_AGAIN:
                     pair.sent = now
-                    orders.append((number, pair.last))
+                    publications.append((number, pair.last))
                 continue
             if pair.held is not None:
                 self._collect(pair)
@@ -284,7 +284,7 @@ class Dispatcher:
             elif now < pair.paused_until:
                 pair.heard = now  # neither is a paused one
                 if now - pair.sent > ASK_AGAIN:  # keeps the plant for this run
-                    orders += self._ask(number, pair, now)
+                    publications += self._ask(number, pair, now)
             elif now - pair.heard > self.episode_timeout:
                 self._retry(
                     pair,
@@ -292,10 +292,10 @@ class Dispatcher:
                     f"in episode {pair.episode}",
                 )
             elif now - pair.sent > ASK_AGAIN:
-                orders += self._ask(number, pair, now)
-        return orders + self._hand_out(now)
+                publications += self._ask(number, pair, now)
+        return publications + self._hand_out(now)
 
-    def ask_again(self, now: float) -> list[Order]:
+    def ask_again(self, now: float) -> list[PairPublication]:
         """Everything that is under way, once more."""
         busy = [(number, pair) for number, pair in enumerate(self.pairs) if pair.chunk]
         return [order for number, pair in busy for order in self._ask(number, pair, now)]
@@ -336,7 +336,7 @@ class Dispatcher:
         """
         known = self.pairs[pair]
         if frame.run != self.run:
-            self.tally["answers of another run"] += 1
+            self.counters["answers of another run"] += 1
             return None
         taken = known.answers.get(topic.name, {}).get(frame.episode)
         void = topic is COST and bool((frame.values[:, -1:] == VOID).any())
@@ -354,7 +354,7 @@ class Dispatcher:
                 "a new run"
             )
         if known.chunk is None or frame.episode != known.episode:
-            self.tally["answers of another episode"] += 1
+            self.counters["answers of another episode"] += 1
             return None
         return known
 
@@ -392,7 +392,7 @@ class Dispatcher:
         chunk = pair.chunk
         assert chunk is not None
         self.notes.append(f"{reason}; starting it again with the same seeds")
-        self.tally["episodes repeated"] += 1
+        self.counters["episodes repeated"] += 1
         chunk.attempts += 1
         if chunk.attempts >= self.max_attempts:
             raise DispatchError(f"gave up after {chunk.attempts} attempts: {reason}")
@@ -400,10 +400,10 @@ class Dispatcher:
         pair.chunk = pair.held = None
         self._waiting.append(chunk)
 
-    def _hand_out(self, now: float) -> list[Order]:
-        orders: list[Order] = []
+    def _hand_out(self, now: float) -> list[PairPublication]:
+        publications: list[PairPublication] = []
         if self.held:
-            return orders
+            return publications
         others = any(now >= pair.paused_until for pair in self._present())
         for number, pair in enumerate(self.pairs):
             if pair.chunk is not None or pair.missing or (others and now < pair.paused_until):
@@ -411,8 +411,8 @@ class Dispatcher:
             if not self._waiting:
                 self._take_from_the_absent()
             if self._waiting:
-                orders += self._begin(number, pair, self._waiting.pop(0), now)
-        return orders
+                publications += self._begin(number, pair, self._waiting.pop(0), now)
+        return publications
 
     def _take_from_the_absent(self) -> None:
         """Let go of an absent pair's episode, for a pair that is free to run it."""
@@ -422,20 +422,22 @@ class Dispatcher:
                     f"pair {number} lost its {' and '.join(pair.missing)} in episode "
                     f"{pair.episode}; another pair starts it again with the same seeds"
                 )
-                self.tally["episodes taken over"] += 1
+                self.counters["episodes taken over"] += 1
                 pair.chunk.forget()
                 self._waiting.append(pair.chunk)
                 pair.chunk = pair.held = None
                 return
 
-    def _begin(self, number: int, pair: Pair, chunk: Chunk, now: float) -> list[Order]:
+    def _begin(self, number: int, pair: Pair, chunk: Chunk, now: float) -> list[PairPublication]:
         self._issued += 1
         pair.chunk, pair.heard = chunk, now
         pair.episode = self.incarnation * EPISODES_PER_INCARNATION + self._issued
         pair.observer.begin(self.run, pair.episode)
         return self._ask(number, pair, now, again=False)
 
-    def _ask(self, number: int, pair: Pair, now: float, *, again: bool = True) -> list[Order]:
+    def _ask(
+        self, number: int, pair: Pair, now: float, *, again: bool = True
+    ) -> list[PairPublication]:
         chunk = pair.chunk
         assert self._batch is not None and chunk is not None
         pair.sent = now
@@ -446,9 +448,9 @@ class Dispatcher:
             return Frame(self.run, pair.episode, generation, self.sim_time, values)
 
         # The policy first: it is then mostly there when the first state arrives.
-        sends = [Send(MODEL, self._models)] if again and self._models is not None else []
+        sends = [Publication(MODEL, self._models)] if again and self._models is not None else []
         if self._batch.policies is not None:
-            sends.append(Send(POLICY, frame(self._batch.policies[chunk.rows])))
-        pair.last = Send(START, frame(self._batch.rows[chunk.rows]))
+            sends.append(Publication(POLICY, frame(self._batch.policies[chunk.rows])))
+        pair.last = Publication(START, frame(self._batch.rows[chunk.rows]))
         sends.append(pair.last)
         return [(number, send) for send in sends]

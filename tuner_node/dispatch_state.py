@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.frames import Frame
-from loop_interfaces.protocol import Send
+from loop_interfaces.protocol import Publication
 from tuner_node.batch import Batch
 from tuner_node.optimizers import Trajectory
 from tuner_node.trajectory_collector import Observer
@@ -59,7 +59,7 @@ class Pair:
     """How long what its plant said of being paused holds."""
     answers: dict[str, dict[int, int]] = field(default_factory=dict)
     """By topic and episode, of the last REMEMBERED: a digest of the answer that was taken."""
-    last: Send | None = None
+    last: Publication | None = None
     """The last start, which keeps the plant for this run while nothing new is handed out."""
 
     def remember(self, topic: str, answer: Frame) -> None:

@@ -47,7 +47,7 @@ from loop_interfaces.topics import (
 from tuner_node import narration
 from tuner_node.build import build_training
 from tuner_node.diagnostics import TunerHealth
-from tuner_node.dispatch import Dispatcher, DispatchError, Order
+from tuner_node.dispatch import Dispatcher, DispatchError, PairPublication
 from tuner_node.narration import Narration
 from tuner_node.results import RunFolder, RunIdentity, summarise
 from tuner_node.run_store import Recorder
@@ -221,7 +221,7 @@ class TunerNode:
             self._guarded(self._session.tick)
 
     def _handler(
-        self, handle: Callable[[int, Frame, float], list[Order]], pair: int
+        self, handle: Callable[[int, Frame, float], list[PairPublication]], pair: int
     ) -> Callable[[Frame], None]:
         return lambda frame: self._guarded(lambda now: handle(pair, frame, now))
 
@@ -233,19 +233,19 @@ class TunerNode:
             return
         self._guarded(lambda now: self._session.failure(pair, failure, now))
 
-    def _guarded(self, event: Callable[[float], list[Order]]) -> None:
+    def _guarded(self, event: Callable[[float], list[PairPublication]]) -> None:
         try:
             with self._loop.working(self._session.training.computation):
-                orders = event(self._loop.now())
-            self._perform(orders)
+                publications = event(self._loop.now())
+            self._perform(publications)
         except DispatchError as error:
             self._failure = str(error)
             self._loop.stop("failure")
         finally:
             self._tell()
 
-    def _perform(self, orders: list[Order]) -> None:
-        self._send(orders)
+    def _perform(self, publications: list[PairPublication]) -> None:
+        self._send(publications)
         self._tell()
         if self._recorder:
             with self._loop.working("writing the checkpoint"):
@@ -253,9 +253,9 @@ class TunerNode:
         if self._session.done or self._session.stopped:
             self._loop.stop("done")
 
-    def _send(self, orders: list[Order]) -> None:
-        for pair, send in orders:
-            self._senders[pair][send.topic.name].send(send.frame)
+    def _send(self, publications: list[PairPublication]) -> None:
+        for pair, publication in publications:
+            self._senders[pair][publication.topic.name].send(publication.frame)
 
     def _housekeeping(self, now: float) -> None:
         if self._loop.stopped:  # by a service, in this round

@@ -11,7 +11,7 @@ from typing import Any
 
 from loop_interfaces.frames import Frame
 from loop_interfaces.protocol import ModelFailure
-from tuner_node.dispatch import Dispatcher, DispatchError, Order
+from tuner_node.dispatch import Dispatcher, DispatchError, PairPublication
 from tuner_node.training import Training
 
 Report = Callable[[Mapping[str, Any]], None]
@@ -35,7 +35,7 @@ class Session:
         self._checked: dict[int, Mapping[str, Any]] = {}
         self._generation = 0
 
-    def begin(self, now: float) -> list[Order]:
+    def begin(self, now: float) -> list[PairPublication]:
         """The first messages; after a resume with the models that are already there.
 
         Called again when the network was joined again: what is under way is asked for once more.
@@ -53,11 +53,11 @@ class Session:
         """Begin no new episode; those under way go on. Nothing times out meanwhile."""
         self.dispatcher.hold()
 
-    def resume(self, now: float) -> list[Order]:
+    def resume(self, now: float) -> list[PairPublication]:
         """Go on after a pause."""
         return self._advance(self.dispatcher.resume(now), now)
 
-    def stop(self) -> list[Order]:
+    def stop(self) -> list[PairPublication]:
         """End when the rollouts under way are over; at once in a pause, where none goes on.
 
         What an unfinished batch of them has is dropped, and computed again by who continues,
@@ -66,34 +66,34 @@ class Session:
         self.stopping = True
         return self._end() if self.dispatcher.held else []
 
-    def paused(self, pair: int, frame: Frame, now: float) -> list[Order]:
+    def paused(self, pair: int, frame: Frame, now: float) -> list[PairPublication]:
         return self._advance(self.dispatcher.paused(pair, frame, now), now)
 
-    def presence(self, pair: int, missing: Sequence[str], now: float) -> list[Order]:
+    def presence(self, pair: int, missing: Sequence[str], now: float) -> list[PairPublication]:
         return self._advance(self.dispatcher.presence(pair, missing, now), now)
 
-    def cost(self, pair: int, frame: Frame, now: float) -> list[Order]:
+    def cost(self, pair: int, frame: Frame, now: float) -> list[PairPublication]:
         return self._advance(self.dispatcher.cost(pair, frame, now), now)
 
-    def model(self, pair: int, frame: Frame, now: float) -> list[Order]:
+    def model(self, pair: int, frame: Frame, now: float) -> list[PairPublication]:
         return self._advance(self.dispatcher.model(pair, frame, now), now)
 
-    def target(self, pair: int, frame: Frame, now: float) -> list[Order]:
+    def target(self, pair: int, frame: Frame, now: float) -> list[PairPublication]:
         return self.dispatcher.target(pair, frame, now)
 
-    def failure(self, pair: int, failure: ModelFailure, now: float) -> list[Order]:
+    def failure(self, pair: int, failure: ModelFailure, now: float) -> list[PairPublication]:
         return self._advance(self.dispatcher.failure(pair, failure, now), now)
 
-    def tick(self, now: float) -> list[Order]:
+    def tick(self, now: float) -> list[PairPublication]:
         return self._advance(self.dispatcher.tick(now), now)
 
-    def _advance(self, orders: list[Order], now: float) -> list[Order]:
+    def _advance(self, publications: list[PairPublication], now: float) -> list[PairPublication]:
         for note in self.dispatcher.notes:
             self._report({"event": "repeated", "reason": note})
         self.dispatcher.notes.clear()
         result = self.dispatcher.result()
         if result is None:
-            return orders
+            return publications
         self.established = True
         training = self.training
         try:
@@ -104,12 +104,12 @@ class Session:
             if row["event"] == "checked":
                 self._checked[row["seed"]] = row
             self._report(row)
-        orders = orders + self._hand_out_models()
+        publications = publications + self._hand_out_models()
         if self.stopping and training.phase != "done":
-            return orders + self._end()
-        return orders + self._next(now)
+            return publications + self._end()
+        return publications + self._next(now)
 
-    def _hand_out_models(self) -> list[Order]:
+    def _hand_out_models(self) -> list[PairPublication]:
         """The models, if they are others than before."""
         training = self.training
         if not training.ready or self._generation == training.generation:
@@ -118,11 +118,11 @@ class Session:
         self._generation = training.generation
         return self.dispatcher.models(training.models, training.generation)
 
-    def _end(self) -> list[Order]:
+    def _end(self) -> list[PairPublication]:
         self.stopped = True
         return self.dispatcher.release()
 
-    def _next(self, now: float) -> list[Order]:
+    def _next(self, now: float) -> list[PairPublication]:
         batch = self.training.next_batch()
         if self.training.phase != self._phase:
             self._phase = self.training.phase

@@ -23,7 +23,7 @@ def test_plant_and_controller_answer_with_the_bytes_of_the_ordinary_path(loop: P
 RESTLESS = """
 import gc, math, sys, time
 from loop_interfaces.fast_path.handler import FastPath
-from loop_interfaces.protocol import Tally
+from loop_interfaces.protocol import Counters
 from loop_interfaces.ros.node_loop import NodeLoop
 from {0}.node import main
 interrupted, disarm, run = [], FastPath.disarm, NodeLoop.run
@@ -39,8 +39,9 @@ def counted(self):
     return count
 FastPath.disarm, NodeLoop.run = counted, restless
 code = main()
-tallies = [found for found in gc.get_objects() if isinstance(found, Tally)]
-print("interrupted", len(interrupted), "times,", sum(t["states repeated"] for t in tallies), "repeated")
+counters = [found for found in gc.get_objects() if isinstance(found, Counters)]
+repeated = sum(found["states repeated"] for found in counters)
+print("interrupted", len(interrupted), "times,", repeated, "repeated")
 sys.exit(code)
 """
 
