@@ -139,7 +139,7 @@ def spectrum(problem: ProblemData) -> Figure:
     for name, run in problem.runs.items():
         groups[name] = [_closed_loop(m, p) for m, p in zip(run.models, run.policies, strict=True)]
     everything = np.concatenate([values for found in groups.values() for values in found])
-    near = everything[(np.abs(everything) > 0.8) & (everything.real > 0.5)]
+    near = everything[(np.abs(np.abs(everything) - 1) < 0.2) & (everything.real > 0.5)]
     reach = 1.08 * max(1.0, float(np.abs(everything).max()))
     width = float(np.maximum(1 - near.real, np.abs(near.imag) / 0.6).max(initial=0.01)) * 1.12
     figure = Figure(figsize=(1.9 * len(groups) + 0.5, 4.5))

@@ -51,6 +51,8 @@ def _band(ax: Axes, curve: Curve) -> tuple[float, float]:
     colour = COLOURS[name]
     ax.fill_between(used, below, mean + std, color=colour, alpha=0.2, linewidth=0, step="post")
     ax.step(used, mean, where="post", color=colour, linestyle=LINES.get(name), label=NAMES[name])
+    if len(used) == 1:
+        ax.plot(used, mean, "o", color=colour)
     return float(below.min()), float((mean + std).max())
 
 

@@ -40,9 +40,9 @@ SAVE_PERIOD = 2.0
 LEARNED = {
     "lqt_po": {"start": "lqt", "optimizer": "two_point"},
     "pure_po": {"start": "zero", "optimizer": "two_point"},
-    "gauss_newton": {"start": "lqt", "optimizer": "gauss_newton"},
+    "gauss_newton": {"start": "lqt", "optimizer": "gauss_newton", "identification": "dmdc"},
 }
-"""The adapted controllers of the experiment, and how each is trained."""
+"""The adapted controllers of the experiment, and how each is trained: all on the paper's models."""
 
 
 @dataclass(frozen=True)

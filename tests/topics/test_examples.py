@@ -71,6 +71,9 @@ def test_a_controller_of_ones_own_is_tuned(loop: Processes, tmp_path: Path) -> N
     assert result["controller"] == {"nodes": ["/saturated_controller"], "law": "not seen"}
     refused = loop.wait(loop.pdeloop("evaluate", str(out)), LIMIT, code=1)
     assert "had another control law than the built-in one (its controller: /saturated" in refused
+    shown = loop.wait(loop.pdeloop("report", str(out)), LIMIT)
+    assert "not shown: Behaviour" in shown and "(its controller: /saturated_controller)" in shown
+    assert (out / "report" / "training-curves.png").exists()
 
     with np.load(out / "policy.npz") as arrays:
         first, adapted = arrays["lqt"][0], arrays["policy"][0]
