@@ -102,7 +102,8 @@ def test_the_monitor_shows_a_bag_that_is_played(loop: Processes, tmp_path, bag):
         page.until(f"{STATE} === 'running'", LIMIT)
         page.until(f"{ROLLOUTS} >= 2", LIMIT)
         page.wait_for(lambda: page.ask(PAINTED % "field") > 250, LIMIT, "picture of the field")
-        page.until(f"/episode \\d+ \\((policy|exploration)\\)/.test({FIELD})", LIMIT)
+        who = "(adapted|LQT|no control|exploration)"
+        page.until(f"/episode \\d+ \\({who}\\)/.test({FIELD})", LIMIT)
         assert "/bag_player" in card(page, "plant")
         assert page.ask("document.querySelector('#problem').textContent") == "small"
         assert page.ask("document.querySelector('#plant-pause').disabled")
