@@ -65,7 +65,11 @@ def arrays_like(good: np.ndarray) -> Iterator[np.ndarray]:
     if good.dtype.kind in "if":
         yield from (good.astype(str), good.astype(complex), good.astype("S3"), good > 0)
     if good.dtype.kind == "f":
-        yield from (good * np.nan, good * np.inf, good.astype(np.int64))
+        yield from (
+            np.full_like(good, np.nan),
+            np.full_like(good, np.inf),
+            np.zeros(good.shape, np.int64),
+        )
     yield np.zeros(good.shape, dtype=[("a", float)])
 
 
