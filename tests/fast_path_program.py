@@ -95,7 +95,7 @@ def plant_on_topics(*, timed: bool = False, helped: bool = False, **overrides: o
     loop.batcher.timed = timed
     plant = Plant(loop.batcher, horizon=14, **overrides)
     path = plant.path
-    receiver = loop.receive(ACTION, lambda frame: None, sampled=True)
+    receiver = loop.receive(ACTION, lambda frame: None)
     sender = loop.sender(STATE, sampled=True)
     with opened(loop, receiver, sender, path):
         peer.meet("state")
