@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from loop_interfaces.protocol import NO_CONTROLLER
 from loop_interfaces.spec import yaml_text
 from loop_interfaces.topics import MAX_GAIN
 from tests.loop_harness import Processes, until
@@ -201,7 +202,7 @@ def test_gains_beyond_what_the_topics_take_end_the_same_as_in_one_process(loop, 
     loop.node("controller_node", "--params-file", str(SMALL))
     arguments = tuner_arguments(tmp_path / "run", iterations=3, learning_rate=1e13)
     tuner = loop.node("tuner_node", "--params-file", str(SMALL), *arguments)
-    loop.wait(tuner, LIMIT)
+    loop.wait(tuner, LIMIT, code=NO_CONTROLLER)  # no law with such gains is stable
     training = train_here(parameters(iterations=3, learning_rate=1e13))
     assert np.abs(training.policies()).max() > MAX_GAIN
     assert_same_training(tmp_path / "run", training)
@@ -229,7 +230,7 @@ DIVERGING = {
             "reduced_order:=0",
             "'reduced_order' is 0; expected a whole number from 1",
         ),
-        ("tuner_node", "rollouts:=3", "'rollouts' is 3; expected at least 5"),
+        ("tuner_node", "rollouts:=3", "'rollouts' is 3; expected at least 9: 1 for"),
         ("tuner_node", "start:=lqg", "'start' is 'lqg'; expected one of lqt, zero"),
         ("tuner_node", "smoothing_radius:=-0.1", "'smoothing_radius' is -0.1; expected"),
     ],

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tuner_node.optimizers.base import Array, Context, Row
-from tuner_node.optimizers.convolution import fit_convolutions
+from tuner_node.optimizers.convolution import ConvolutionModel, fit_convolutions
 from tuner_node.optimizers.fit import LocalModel, extended_basis, fit
 from tuner_node.optimizers.selection import KAPPAS, LOCAL, RIDGES, Pair, choices, mismatches
 from tuner_node.optimizers.sensitivity import Path, damped_step
@@ -184,7 +184,10 @@ class Proposer:
             Whether the last candidate was accepted.
         """
         data = [record for record in (*self._before, *records) if len(record.states) > 1]
-        simulated = self._simulated(data, incumbents, damping)
+        rejected = (
+            [] if accepted else [(i, o) for i, o in zip(incumbents, others, strict=True) if o]
+        )
+        simulated = self._simulated(data, incumbents, rejected, damping)
         if simulated is not None:
             return simulated
         V = extended_basis(self._U, [record.states for record in data], self._modes)
@@ -217,9 +220,17 @@ class Proposer:
         return proposal
 
     def _simulated(
-        self, data: Sequence[Record], incumbents: Sequence[Record], damping: float
+        self,
+        data: Sequence[Record],
+        incumbents: Sequence[Record],
+        rejected: Sequence[tuple[Record, Record]],
+        damping: float,
     ) -> Proposal | None:
-        """A law that was improved on a convolution model; None if none reproduces the rollouts."""
+        """A law that was improved on a convolution model.
+
+        None if none reproduces the rollouts, or if it takes a candidate for better that was rejected:
+        rejected has rollouts of the incumbent and of that candidate on the same fields.
+        """
         level = self._level(incumbents)
         z, a, after, weights = [], [], [], []
         for record in data:
@@ -240,6 +251,8 @@ class Proposer:
         best = int(np.argmin(errors))
         if not (measured and errors[best] <= _REPRODUCED):
             return None
+        if rejected and not self._ranks(models[best], rejected):
+            return None
         policy = incumbents[0].policy
         fields = list({record.states[0].tobytes(): record.states[0] for record in data}.values())
         modes = max(self._modes, min(_SENSITIVITY_MODES, self.n_z))
@@ -253,6 +266,15 @@ class Proposer:
         )
         candidate = self.moved(policy, improved.theta - self.theta(policy))
         return Proposal(candidate, improved.fall, 1, 0.0, errors[best], "convolution")
+
+    def _ranks(self, model: ConvolutionModel, rejected: Sequence[tuple[Record, Record]]) -> bool:
+        """Whether the rejected candidate costs more than the incumbent on the model, too."""
+        fields = np.stack([incumbent.states[0] for incumbent, _ in rejected])
+        incumbent, candidate = (
+            self._loop.simulate(model, self.theta(record.policy), fields).cost
+            for record in rejected[0]
+        )
+        return bool(candidate > incumbent)
 
     def _fit(
         self, data: Sequence[Record], V: Array, incumbents: Sequence[Record]
