@@ -22,7 +22,9 @@ class Role:
     subscribes: tuple[str, ...]
     services: tuple[str, ...] = ()
     of_others: tuple[str, ...] = ()
-    """What it subscribes only where the plant is another one, that publishes no `samples`."""
+    """What it subscribes only sometimes: where the plant is another one, that publishes no `samples`,
+    and where views are recorded.
+    """
 
 
 _ARRAYS = tuple(topic.name for topic in topics.ARRAYS)
@@ -64,8 +66,11 @@ ROLES = (
     Role(
         "recorder_node",
         (topics.RECORDER_STATUS,),
-        (*(n for n in _ARRAYS if n not in _SAMPLED), topics.SAMPLES, topics.MODEL_FAILED),
-        of_others=(*_SAMPLED, "/clock"),
+        (
+            *(n for n in _ARRAYS if n not in _SAMPLED),
+            *(topics.SAMPLES, topics.MODEL_FAILED, "/diagnostics", "/rosout"),
+        ),
+        of_others=(*_SAMPLED, "/clock", *VIEWS),
     ),
     Role(
         "viewer_node",

@@ -283,7 +283,7 @@ def test_a_terminal_shows_a_bar_with_cost_and_time_left(tmp_path: Path, colour: 
     with terminal(*PDELOOP, *words, cwd=tmp_path, **environment) as shown:
         assert shown.wait() == 0, shown.plain
     assert re.search(
-        r"adapting [━╺╸]+ +\d+ of 809 rollouts cost [\d.]+ +\d:\d\d:\d\d", shown.plain
+        r"adapting [━╺╸]+ +\d+ of 803 rollouts cost [\d.]+ +\d:\d\d:\d\d", shown.plain
     ), shown.plain
     assert bool(COLOUR.search(shown.shown)) == colour
     assert "results in run" in shown.plain
@@ -295,8 +295,8 @@ def test_a_pipe_gets_plain_lines(tmp_path: Path) -> None:
         environment={"TERM": "xterm-256color"},
         cwd=tmp_path,
     )
-    assert done.stdout.count(" of 41 rollouts, cost ") >= 6
-    assert re.search(r"^  41 rollouts: cost [\d.]+$", done.stdout, flags=re.MULTILINE)
+    assert done.stdout.count(" of 35 rollouts, cost ") >= 6
+    assert re.search(r"^  35 rollouts: cost [\d.]+$", done.stdout, flags=re.MULTILINE)
     assert "\x1b" not in done.stdout
     assert "\r" not in done.stdout
 

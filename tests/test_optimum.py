@@ -190,7 +190,9 @@ def test_the_shipped_limits_hold_for_the_shipped_problems():
     names = sorted(path.stem for path in (config_folder() / "optimum").glob("*.json"))
     assert names
     for name in names:
-        found = reference.find(load_parameters(name, {"optimizer": "two_point"}))
+        found = reference.find(
+            load_parameters(name, {"optimizer": "two_point", "identification_attempts": 10})
+        )
         assert found is not None, (
             f"{name}: python -m benchmarks optimum {name} --save config/optimum"
         )
