@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_interfaces.frames import Frame
-from loop_interfaces.topics import COMPLETED, VOID
+from loop_interfaces.frames import ArrayCodec, Frame
+from loop_interfaces.topics import COMPLETED, COST, START, STATE, VOID
 from pdeloop.live import Live
-from pdeloop.monitor.finder import Finder
+from pdeloop.monitor.finder import Finder, run_id
 from pdeloop.monitor.read_budget import ReadBudget
 from pdeloop.monitor.replay import replay
+from recorder_node.recording import Recording, sources
 from tests.small import parameters
 from tuner_node.results import RunFolder
 from viewer_node.episode_samples import COLUMNS, MAX_COMPONENTS, ROWS, EpisodeSamples, rows_of
@@ -28,7 +29,7 @@ from viewer_node.rollout_costs import RolloutCosts
 from viewer_node.sliding_rate import SlidingRate
 from viewer_node.web.messages import Cursor
 from viewer_node.web.page import Page
-from viewer_node.web.requests import Requests
+from viewer_node.web.requests import Requests, ShowEpisode
 
 PLANT = 7
 
@@ -591,6 +592,35 @@ def test_a_run_that_was_interrupted_is_shown_until_it_goes_on(tmp_path, own_sign
 
     assert replay(folder.path, Finder(folder.path, None, look), page, Requests())
     assert found
+
+
+def test_an_episode_that_is_shown_already_is_not_begun_again(tmp_path, own_signals):
+    folder = RunFolder(tmp_path / "run")
+    folder.create(parameters())
+    run = run_id(folder.path)
+    assert run is not None
+    by_topic = {source.array: source for source in sources("/")}
+    recording = Recording(folder.path / "bag", list(by_topic.values()))
+    for episode in (1, 2):
+        ids = {"episode": episode, "run": run}
+        sent = [(START, start([[3.0, 4.0, 0.1, 0.0]], **ids))]
+        sent += [(STATE, state(step, batch=1, **ids)) for step in range(4)]
+        sent += [(COST, cost([1.0], **ids))]
+        for topic, content in sent:
+            raw = ArrayCodec(topic.labels).encode(content)
+            recording.take(by_topic[topic], episode * 10**9, raw)
+    recording.close()
+    page, cursor, requests, begun = Page(), Cursor(), Requests(), []
+    for index in (1, 0, 0, 1):
+        requests.put(ShowEpisode(index))
+
+    def look() -> list[Live]:
+        told = [unpacked(m)[0] for m in page.updates(cursor, 0.0)]
+        begun.append([m["episode"] for m in told if m["part"] == "episode" and m["new"]])
+        return [Live(17, folder.path, 1.0)] if requests.empty() else []
+
+    assert replay(folder.path, Finder(folder.path, None, look), page, requests)
+    assert begun == [[2], [], [1], [], [2]]
 
 
 def test_a_stop_signal_ends_the_replay(tmp_path, own_signals):

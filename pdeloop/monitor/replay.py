@@ -57,8 +57,13 @@ class Replay:
             self.show(len(self._bag.rows) - 1)
         page.refresh(time.monotonic())
 
+    @property
+    def index(self) -> int:
+        """The recorded episode that is shown."""
+        return self._recorded.chosen
+
     def show(self, index: int) -> None:
-        """Show the recorded episode of this index."""
+        """Show the recorded episode of this index, from its newest state."""
         episode, view, now = self._bag.read(index), self._view, time.monotonic()
         with self._page.lock:
             view.current = view.finished = None
@@ -139,6 +144,7 @@ def replay(folder: Path, finder: Finder, page: Page, requests: Requests) -> bool
             request = requests.get(timeout=REFRESH)
         except queue.Empty:
             continue
-        if isinstance(request, ShowEpisode):
+        # Shown again, it would move every page that looks at a time in it to its newest state.
+        if isinstance(request, ShowEpisode) and request.index != shown.index:
             shown.show(request.index)
     return False
