@@ -42,6 +42,8 @@ def test_every_number_is_that_of_the_trainings(loop, tmp_path):
             assert same_bits(curve["costs"][0], start.copy())
             assert curve["rollouts"][-1].tolist() == training.budget.paid.tolist()
         assert same_bits(runs[name].costs["adapted"], training.evaluation[:, 2].copy())
+        assert same_bits(runs[name].warm, runs["lqt_po"].warm)
+        assert same_bits(runs[name].costs["lqt"], runs["lqt_po"].costs["lqt"])
     (row,) = rows_of(tmp_path / "out", ["small"])
     lqt, adapted = (runs["lqt_po"].costs[name].mean(axis=1) for name in ("lqt", "adapted"))
     below = row["lqt_po"]["below_lqt_percent"]

@@ -38,8 +38,8 @@ Array = NDArray[np.float64]
 SAVE_PERIOD = 2.0
 """Seconds between two savings: what an interruption may lose."""
 LEARNED = {
-    "lqt_po": {"start": "lqt", "optimizer": "two_point"},
-    "pure_po": {"start": "zero", "optimizer": "two_point"},
+    "lqt_po": {"start": "lqt", "optimizer": "two_point", "identification": "dmdc"},
+    "pure_po": {"start": "zero", "optimizer": "two_point", "identification": "dmdc"},
     "gauss_newton": {"start": "lqt", "optimizer": "gauss_newton", "identification": "dmdc"},
 }
 """The adapted controllers of the experiment, and how each is trained: all on the paper's models."""
