@@ -50,7 +50,7 @@ class Recorder:
             self.identity = self._folder.create(parameters)
 
     def note(self, row: Mapping[str, Any]) -> None:
-        """One line of progress, stamped with the time and the iteration."""
+        """One line of progress, stamped with the time."""
         self._changed = True
         try:
             self._folder.note({"time": time.time(), **row})

@@ -18,7 +18,7 @@ def add(commands: Commands) -> None:
         _train,
         help="identify, design, adapt and evaluate",
         description="Train a controller: identify a reduced model, design LQ-tracking gains, adapt "
-        "them by policy gradient, evaluate. The plant, the controller and the tuner run as ROS 2 "
+        "them from rollouts, evaluate. The plant, the controller and the tuner run as ROS 2 "
         "nodes in processes of their own.",
         example="pdeloop train burgers --rollouts 80 --seed 0",
     )
