@@ -104,9 +104,31 @@ def test_a_model_is_judged_by_the_rollouts_that_it_reproduces() -> None:
     theta = 0.1 * np.random.default_rng(9).standard_normal((N_A, 5))
     field = episode(model, 10)[0][:1]
     states = closed.simulate(model, theta, field).states[:, 0]
-    assert mismatch(closed, model, [(theta, states)]) == 0.0
-    other = mismatch(closed, plant(cubic=-0.2), [(theta, states)])
+    assert mismatch(closed, model, [(theta, states)], 9.0) == 0.0
+    other = mismatch(closed, plant(cubic=-0.2), [(theta, states)], 9.0)
     assert 1e-6 < other < 1.0
     # One that grows without bound counts as the worst.
     unstable = ConvolutionModel(1.5 * model.symbols, model.B, model.constant)
-    assert mismatch(closed, unstable, [(theta, states)]) == 2.0
+    assert mismatch(closed, unstable, [(theta, states)], 9.0) == 2.0
+
+
+def test_a_model_that_is_known_to_be_too_far_off_is_not_simulated_further(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    model, closed = plant(), loop()
+    theta = np.zeros((N_A, 5))
+    fields = [episode(model, seed)[0][:1] for seed in range(8)]
+    measured = [(theta, closed.simulate(model, theta, f).states[:, 0]) for f in fields]
+    unstable = ConvolutionModel(1.5 * model.symbols, model.B, model.constant)
+    simulated = []
+    simulate = Loop.simulate
+
+    def counted(*what: object) -> object:
+        simulated.append(what)
+        return simulate(*what)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Loop, "simulate", counted)
+    assert 0.05 < mismatch(closed, unstable, measured, 0.05) <= 2.0
+    assert len(simulated) == 1
+    assert mismatch(closed, unstable, measured, 9.0) == 2.0
+    assert len(simulated) == 1 + len(measured)

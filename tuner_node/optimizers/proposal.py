@@ -247,7 +247,7 @@ class Proposer:
         )
         usable = [record for record in data if record.usable][-_COMPARED:]
         measured = [(self.theta(r.policy), r.states[: len(r.actions)]) for r in usable]
-        errors = [mismatch(self._loop, model, measured) for model in models]
+        errors = [mismatch(self._loop, model, measured, _REPRODUCED) for model in models]
         best = int(np.argmin(errors))
         if not (measured and errors[best] <= _REPRODUCED):
             return None
