@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import Plant
-from pdeloop.rollout import Law, rollout
+from pdeloop.episode import Law, rollout
 from tuner_node.seeds import Purpose, derive
 
 SMALL = 1e-6

@@ -29,9 +29,9 @@ from controller_node.policy import ProjectedLaw, excitation
 from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import Plant
+from pdeloop.episode import Law, rollout
 from pdeloop.reference import Reference, find
 from pdeloop.reproduce.table import PAPER
-from pdeloop.rollout import Law, rollout
 from tuner_node.optimizers import (
     OPTIMIZERS,
     Context,

@@ -30,10 +30,10 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from benchmarks.descent import WINDOW, Descent, descend
-from benchmarks.gradients import Gradients, features
 from benchmarks.optimizers import warm_start
 from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
+from pdeloop.gradients import Gradients, features
 from pdeloop.reference import FORMAT, bound_parameters, no_control_cost
 from pdeloop.reproduce.table import PAPER
 from tuner_node.results import RunFolderError, versions

@@ -18,7 +18,7 @@ from loop_interfaces import model_rows
 from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn, noise_seeds
 from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.plant import Plant
-from pdeloop.rollout import Law, rollout
+from pdeloop.episode import Law, rollout
 from tuner_node.batch import Batch, BatchResult
 from tuner_node.training import Training
 from tuner_node.trajectory_collector import cut

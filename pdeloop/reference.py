@@ -21,7 +21,7 @@ from loop_interfaces.parameters import PROBLEM, as_recorded, model_order
 from loop_interfaces.problem import config_folder
 from pde_sim_node.build import build_equation, build_plant
 from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD
-from pdeloop.rollout import rollout
+from pdeloop.episode import rollout
 from tuner_node.results import RunFolderError
 
 __all__ = ["FORMAT", "Reference", "bound_parameters", "find", "no_control_cost"]

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from benchmarks.gradients import Gradients
 from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from pde_sim_node.equations import Burgers
 from pde_sim_node.plant import Plant
 from pde_sim_node.solver.adjoint import Adjoint
+from pdeloop.gradients import Gradients
 
 PROBLEMS = ("burgers", "allen-cahn", "kdv")
 

@@ -10,13 +10,13 @@ import pytest
 from benchmarks import optimum
 from benchmarks.__main__ import parser
 from benchmarks.descent import descend
-from benchmarks.gradients import Gradients
 from loop_interfaces.problem import config_folder, load_parameters
 from pde_sim_node.build import build_plant
 from pde_sim_node.equations import Burgers
 from pde_sim_node.plant import DIVERGED_COST, Plant
 from pdeloop import reference
 from pdeloop.cli import run
+from pdeloop.gradients import Gradients
 from tests.small import SMALL
 from tuner_node.results import RunFolderError
 

@@ -15,11 +15,11 @@ from loop_interfaces.array_files import read_arrays
 from loop_interfaces.model_rows import ModelRows
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD, Plant
+from pdeloop.episode import rollout
 from pdeloop.finished_run import FinishedRun, field_means, load
 from pdeloop.reference import Reference, find
 from pdeloop.reproduce.experiment import ASKED, asked
 from pdeloop.reproduce.table import runs_of
-from pdeloop.rollout import rollout
 from tuner_node.checkpoint import taken
 from tuner_node.noise import evaluation_noise
 from tuner_node.results import RunFolderError

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pde_sim_node.build import build_plant
-from pdeloop.rollout import rollout
+from pdeloop.episode import rollout
 from tests.small import parameters
 
 GAIN = 0.1

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from pde_sim_node.measurement import InstrumentedPlant
 from pde_sim_node.plant import Plant
 from pde_sim_node.solver.adjoint import Adjoint
-from pdeloop.rollout import Law, rollout
+from pdeloop.episode import Law, rollout
 
 __all__ = ["Gradients", "features"]
 
