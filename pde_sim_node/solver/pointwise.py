@@ -1,5 +1,6 @@
 """The nonlinearity of an equation, a scalar function, as machine code over an array."""
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -35,11 +36,25 @@ def pointwise_loop(function: Callable[[float], float]) -> tuple[int, bool]:
     try:
         return LOOPS.setdefault(function, code)()
     except NumbaError as error:
-        reason = str(error).strip().splitlines()[-1]
         raise ValueError(
             f"the nonlinearity {function.__qualname__} must be a scalar function u -> g(u) "
-            f"that Numba can compile for a float64: {reason}"
+            f"that Numba can compile for a float64: {reason(function)}"
         ) from error
+
+
+def reason(function: Callable[[float], float]) -> str:
+    """Why Numba cannot compile a function by itself, in one line, with the line of the source."""
+    alone: Any = numba.njit(function)
+    try:
+        alone.compile((types.float64,))
+    except NumbaError as error:
+        text = str(error).partition("\n")[2] or str(error)  # after "Failed in nopython mode ..."
+        words = re.split(r"\n\s*(?:There are|File |During)", text)[0].replace(">>>", "").split()
+        code = function.__code__
+        line = getattr(getattr(error, "loc", None), "line", code.co_firstlineno)
+        return f"{code.co_filename}, line {line}: {' '.join(words)}"
+    (signature,) = alone.nopython_signatures
+    return f"it returns {signature.return_type}, expected a float64"
 
 
 def compile_loop(scalar: Callable[[float], float], sources: str) -> Any:
