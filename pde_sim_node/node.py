@@ -21,7 +21,6 @@ from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.parameters import PLANT, taken_by
 from loop_interfaces.protocol import Publication
-from loop_interfaces.ros.introspection import offer
 from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.node_main import node_main
 from loop_interfaces.ros.parameters import declare, given_parameters, on_change
@@ -112,9 +111,9 @@ class PlantNode:
             self._fast_path = PlantFastPath(self._lockstep, actions.codec, self._batcher)
             loop.answer_fast(actions, self._senders[STATE], self._fast_path)
         loop.diagnose("lock-step", self._health.report)
-        offer(node, "~/pause", self._pause)
-        offer(node, "~/resume", self._resume)
-        offer(node, "~/step", self._step)
+        loop.offer("~/pause", self._pause)
+        loop.offer("~/resume", self._resume)
+        loop.offer("~/step", self._step)
         on_change(node, PLANT, self._adjust)
         self._send([self._lockstep.announcement(), self._lockstep.paused_report()])
 

@@ -26,7 +26,6 @@ from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.parameters import TUNER, taken_by, with_budget
 from loop_interfaces.protocol import NO_CONTROLLER, STOPPED, ModelFailure
 from loop_interfaces.ros.endpoints import Sender, reader_qos, scoped
-from loop_interfaces.ros.introspection import offer
 from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.node_main import ConfigurationError, node_main
 from loop_interfaces.ros.parameters import declare, given_parameters, on_change
@@ -186,9 +185,9 @@ class TunerNode:
             )
             loop.listen(PAUSED, self._handler(session.paused, number), namespace)
         loop.diagnose("training", lambda now: self._health.report(now, self._absent(now)))
-        offer(node, "~/pause", self._pause)
-        offer(node, "~/resume", self._resume)
-        offer(node, "~/stop", self._stop)
+        loop.offer("~/pause", self._pause)
+        loop.offer("~/resume", self._resume)
+        loop.offer("~/stop", self._stop)
         on_change(node, TUNER, self._adjust)
 
     def _pause(self) -> str:

@@ -48,6 +48,7 @@ class Introspection:
         self._health: Callable[[float], Health] = lambda now: Health(Level.OK, "")
         self._status = DiagnosticStatus(hardware_id=socket.gethostname())
         self._due = 0.0
+        self._working_due = 0.0
         self._began: float | None = None
         self._refused_before = 0
         self._namesake_since: float | None = None
@@ -76,6 +77,23 @@ class Introspection:
             self._last = self._health_now(namesakes, now - self._began, now)
             self._publish(self._publisher, self._last)
 
+    def offer(self, name: str, act: Callable[[], str]) -> None:
+        """A std_srvs/Trigger service, after which the node reports at once.
+
+        act: does it and says what it did; a ValueError says why not.
+        """
+
+        def answer(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            try:
+                response.success, response.message = True, act()
+            except ValueError as error:
+                response.success, response.message = False, str(error)
+            self._due = 0.0
+            self._node.get_logger().info(f"{name}: {response.message}")
+            return response
+
+        self._node.create_service(Trigger, name, answer)
+
     @contextmanager
     def working(self, what: str) -> Iterator[None]:
         """The node's thread computes `what` for the time of the block, and may not come to `round`."""
@@ -91,12 +109,12 @@ class Introspection:
         Publishes the last report with the values `activity` and `activity for` (s) added.
         """
         working, publisher = self._working, self._publisher
-        if working is None or publisher is None or now < self._due:
+        if working is None or publisher is None or now < self._working_due:
             return
         what, since = working
         if now - since < WORKING:
             return
-        self._due = now + PERIOD
+        self._working_due = now + PERIOD
         seconds = now - since
         values = {**self._last.values, "activity": what, "activity for": round(seconds, 1)}
         self._publish(publisher, Health(self._last.level, f"{what} for {seconds:.0f} s", values))
@@ -161,17 +179,3 @@ class Introspection:
             throttle_duration_sec=10.0,
         )
         return others
-
-
-def offer(node: Node, name: str, act: Callable[[], str]) -> None:
-    """A std_srvs/Trigger service. act() does it and says what it did; a ValueError says why not."""
-
-    def answer(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        try:
-            response.success, response.message = True, act()
-        except ValueError as error:
-            response.success, response.message = False, str(error)
-        node.get_logger().info(f"{name}: {response.message}")
-        return response
-
-    node.create_service(Trigger, name, answer)

@@ -160,6 +160,10 @@ class NodeLoop:
         """Publish what `health(now)` says on /diagnostics, once a second."""
         self._introspection.report(task, health)
 
+    def offer(self, name: str, act: Callable[[], str]) -> None:
+        """A std_srvs/Trigger service. act() does it and says what it did; a ValueError says why not."""
+        self._introspection.offer(name, act)
+
     def working(self, what: str) -> AbstractContextManager[None]:
         """Say on /diagnostics that the node computes `what`, if the block takes long."""
         return self._introspection.working(what)

@@ -277,3 +277,32 @@ def test_a_node_that_computes_for_long_tells_what_and_since_when(loop: Processes
         )
         assert values["activity"] == "fitting models" and values["run"] == "1"
         assert float(values["activity for"]) >= 2.0
+
+
+COMPUTES_AGAIN_AND_AGAIN = """
+import time
+from loop_interfaces.diagnostics import Health, Level
+from loop_interfaces.ros.node_main import ros_node
+fits = 0
+def housekeeping(now):
+    global fits
+    with loop.working("fitting models"):
+        end = time.monotonic() + 1.6
+        while time.monotonic() < end:
+            sum(range(10_000))
+    fits += 1
+with ros_node("busy_node", ["--ros-args"]) as (node, loop):
+    loop.diagnose("work", lambda now: Health(Level.OK, "idle", {"fits": fits}))
+    loop.run(tick=lambda now: None, deadline=lambda: None, housekeeping=housekeeping)
+"""
+
+
+def test_a_node_that_hardly_does_anything_but_compute_reports_what_has_changed(loop: Processes):
+    loop.start("-c", COMPUTES_AGAIN_AND_AGAIN, name="busy")
+    with operator(loop) as desk:
+
+        def fits_in_a_report_during_a_fit() -> bool:
+            values = desk.values("busy_node")
+            return "activity" in values and int(values.get("fits", 0)) >= 2
+
+        until(fits_in_a_report_during_a_fit, 60.0, "report that counts the fits")
