@@ -29,6 +29,7 @@ PLAN = plan_type(
     ("batch", np.int64),
     ("actions", np.int64),  # address of room for them
     ("step", np.int64),  # that was answered last
+    ("signature", np.float64),  # 0 where the tuner asks for none
 )
 
 
@@ -41,7 +42,8 @@ def respond(plan: Any, head: int, message: int, length: int) -> bool:
     act(plan.law, head + 8 * FIRST, plan.actions, plan.batch)
     plan.step = int(step)
     numbers = plan.batch * plan.law.n_a
-    write_answer(plan.answer, plan.step, load_unaligned(head, TIME), plan.actions, numbers)
+    time = plan.signature if plan.signature < 0.0 else load_unaligned(head, TIME)
+    write_answer(plan.answer, plan.step, time, plan.actions, numbers)
     return True
 
 
@@ -90,6 +92,7 @@ class ControllerFastPath(FastPath):
         self._law = law  # the record has addresses of what it owns
         plan["law"], plan["batch"] = law.plan, batch
         plan["actions"] = self._actions.ctypes.data
+        plan["signature"] = self._responder.signature_for(state)
         return True
 
     def synchronise(self, answers: int, last: float) -> None:

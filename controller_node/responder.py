@@ -20,6 +20,7 @@ from controller_node.policy import ProjectedLaw, excitation
 from loop_interfaces import model_rows
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import Counters, ModelFailure, Publication
+from loop_interfaces.signature import NOT_SIGNED, digest_of, signature
 from loop_interfaces.topics import (
     ACTION,
     COMPLETED,
@@ -48,10 +49,13 @@ class _Run:
     start: Frame | None = None
     policy: Frame | None = None
     models: list[model_rows.ModelRows] = field(default_factory=list)
+    models_digest: int = 0
     generation: int = -1
     """Number of these models; an episode names the one that its policies belong to."""
     laws: dict[int, tuple[ProjectedLaw, int]] = field(default_factory=dict)
     """The law for each plant, and the episode it is set for."""
+    signatures: dict[int, float] = field(default_factory=dict)
+    """What the actions of the episode carry, by plant."""
     ahead: dict[int, np.ndarray] = field(default_factory=dict)
     """Exploratory actions of some steps of the episode, by step."""
     samples: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)
@@ -77,7 +81,7 @@ class _Run:
         """An episode begins."""
         self.start = start
         self.samples, self.sampled, self.unusable = {}, 0, None
-        self.identified, self.ahead = {}, {}
+        self.identified, self.ahead, self.signatures = {}, {}, {}
 
     def episode_start(self, frame: Frame) -> Frame | None:
         """The start of the frame's episode, if it is the one this run is in."""
@@ -131,6 +135,7 @@ class Responder:
         for run in self._runs.values():
             known = set(run.laws) & set(self._targets) - {frame.plant}
             run.laws = {plant: run.laws[plant] for plant in known}
+            run.signatures = {}
         return self._answer_pending()
 
     def start(self, frame: Frame) -> Sequence[Publication | ModelFailure]:
@@ -180,7 +185,7 @@ class Responder:
                 f"two different policies came for episode {frame.episode}, which is therefore not "
                 "answered; expected one tuner"
             )
-        run.policy = replace(frame, values=frame.values.copy())
+        run.policy, run.signatures = replace(frame, values=frame.values.copy()), {}
         run.laws = {plant: (law, -1) for plant, (law, _) in run.laws.items()}
         return self._answer_pending()
 
@@ -188,7 +193,8 @@ class Responder:
         """Take a run's reduced models."""
         run = self._run(frame.run, 2 * frame.values.nbytes)
         run.models = [model_rows.unpack(rows.copy(), self._settings.n_a) for rows in frame.values]
-        run.generation, run.laws = frame.step, {}
+        run.models_digest = digest_of(frame.values)
+        run.generation, run.laws, run.signatures = frame.step, {}, {}
         return self._answer_pending()
 
     def state(self, frame: Frame) -> list[Publication]:
@@ -202,13 +208,27 @@ class Responder:
         self._served = (frame.run, frame.plant)
         self.episode = frame.episode
         self.advance_counters(1, frame.step)
-        answer = Frame(frame.run, frame.episode, frame.step, frame.time, actions, frame.plant)
+        time = self.signature_for(frame) or frame.time
+        answer = Frame(frame.run, frame.episode, frame.step, time, actions, frame.plant)
         return [Publication(ACTION, answer)]
 
     def advance_counters(self, answers: int, step: int) -> None:
         """Account for states of the present episode, up to `step`, that were answered."""
         self.answered += answers
         self.step = step
+
+    def signature_for(self, state: Frame) -> float:
+        """What the actions carry that answer the states of an episode, like one that was answered."""
+        run = self._runs[state.run]
+        start = run.episode_start(state)
+        if start is None or not start.plant:
+            return NOT_SIGNED
+        if state.plant not in run.signatures:
+            told: list[Any] = [start.values, self._settings.action_limit]
+            if start.values[0, StartColumn.EXCITATION] < 0 and run.policy is not None:
+                told += [run.policy.values, run.models_digest]
+            run.signatures[state.plant] = signature(digest_of(*told), self._targets[state.plant])
+        return run.signatures[state.plant]
 
     def law_for(self, state: Frame) -> ProjectedLaw | None:
         """The law that answers the states of an episode, like one that was answered before.

@@ -16,6 +16,7 @@ from loop_interfaces.fast_path.messages import (
     FIRST,
     SAMPLE_BATCH,
     STEP,
+    TIME,
     append,
     full,
     write_answer,
@@ -25,6 +26,7 @@ from loop_interfaces.jit.cache import jit
 from loop_interfaces.jit.native import CLOCK, MonotonicClock, monotonic_ns
 from loop_interfaces.jit.simd import load_unaligned, write
 from loop_interfaces.samples import ACTION_KIND, NO_TIME, SAMPLE_HEADER, STATE_KIND
+from loop_interfaces.signature import NOT_SIGNED
 from loop_interfaces.topics import STATE
 from pde_sim_node.lockstep import Lockstep
 from pde_sim_node.solver import step_context, work_queue
@@ -41,6 +43,7 @@ PLAN = plan_type(
     ("log", np.int64),  # address of room for the actions that were applied
     ("steps", np.int64),  # done since the log was read
     ("limit", np.int64),  # how many may be
+    ("signature", np.float64),  # of the actions
     ("time", np.float64),  # simulated, in s
     ("sample_time", np.float64),
     ("timed", np.int64),  # whether samples of states tell it
@@ -67,6 +70,8 @@ def advance(plan: Any, head: int, message: int, length: int) -> bool:
     """Apply the awaited action, and fill in the next state."""
     context = plan.context
     if load_unaligned(head, STEP) != context.step or plan.steps == plan.limit:
+        return False
+    if min(load_unaligned(head, TIME), NOT_SIGNED) != plan.signature:
         return False
     if full(plan.batches[0]) or full(plan.batches[1]):
         return False
@@ -121,7 +126,8 @@ class PlantFastPath(FastPath):
         state = lockstep.awaiting
         code = plant.parallel.compiled_step(plant.batch)
         action = plant.batch, plant.n_a
-        if self.suspended or state is None or code is None:
+        signature = lockstep.signature
+        if self.suspended or state is None or code is None or signature is None:
             return False
         if not self.expect(state, action, state.values.shape):
             return False
@@ -136,6 +142,7 @@ class PlantFastPath(FastPath):
             self._log = np.zeros((max(LOG // plant.actions.size, 1), plant.actions.size))
         plan["values"], plan["log"] = state.values.size, self._log.ctypes.data
         plan["steps"], plan["limit"] = 0, min(lockstep.horizon - lockstep.step, len(self._log))
+        plan["signature"] = signature
         plan["time"], plan["sample_time"] = lockstep.time, lockstep.sample_time
         plan["timed"] = self._batcher.timed
         plan["begin"], plan["length"] = self.answer.begin, len(self.answer.raw)

@@ -11,6 +11,10 @@ already comes from somebody else, or from a controller that cannot be relied on:
 taken is chance, and the episode is void. When it comes after the end of one of the last episodes, the
 cost of that episode is taken back: it is sent again, void.
 
+Where the tuner asks for it (loop_interfaces.signature), the first action of a run says whether its
+controller signs. If so, only actions with the signature of their episode are taken; if not, a signed
+one comes from a second controller, and contradicts.
+
 A paused plant takes the answer it waits for and holds the next state back. Nothing is sent again and
 nothing is given up meanwhile; `episode/paused` tells everybody who waits for the plant.
 """
@@ -25,6 +29,7 @@ import numpy as np
 from loop_interfaces.frames import MAX_VALUES, Frame, FrameError
 from loop_interfaces.protocol import Counters, Publication
 from loop_interfaces.samples import MAX_TIME
+from loop_interfaces.signature import NOT_SIGNED, signature, signature_in
 from loop_interfaces.topics import (
     COMPLETED,
     COST,
@@ -98,8 +103,12 @@ class Lockstep:
         """What the last episode that ended came to; None once another run has the plant."""
         self._taken: list[int] = []
         """A digest of the action that was taken at each step of the episode."""
-        self._past: dict[int, tuple[list[int], Frame]] = {}
-        """The same of the last episodes that came to a cost, and that cost."""
+        self._past: dict[int, tuple[list[int], float, Frame]] = {}
+        """The same of the last episodes that came to a cost, their signature, and that cost."""
+        self._signature = NOT_SIGNED
+        """What an action of the episode carries if its controller signs."""
+        self._signs: bool | None = None
+        """Whether the run's controller signs; None before its first action."""
         self.contradiction = ""
         """Why the last cost that was sent is void, if two answers to one state came."""
         self._repeats = 0
@@ -253,7 +262,7 @@ class Lockstep:
                     f"(until it ends, or is silent for {self._run_hold:g} s)"
                 )
             self.run, self.episode, self._cost = frame.run, -1, None
-            self._past = {}
+            self._past, self._signs = {}, None
             self._idle(now)
         self._tuner_heard = now
         if not len(rows):
@@ -276,6 +285,7 @@ class Lockstep:
         self.episode, self._rows, self._active = frame.episode, rows.copy(), True
         self._state = states
         self._taken, self.contradiction = [], ""
+        self._signature = signature(frame.plant, self.plant.target)
         self.time = max(self.time, frame.time) + self._sample_time
         self._stepping = False
         if self.pacer:
@@ -285,7 +295,7 @@ class Lockstep:
     def action(self, frame: Frame, now: float) -> list[Publication]:
         """Advance on the awaited action; ignore any other.
 
-        Raises FrameError when the awaited action has the wrong shape.
+        Raises FrameError when the awaited action has the wrong shape or signature.
         """
         plant = self.plant
         if not self._active or frame.run != self.run or frame.episode != self.episode:
@@ -295,6 +305,13 @@ class Lockstep:
             self.counters["actions for another plant"] += 1
             return []
         expected = (plant.batch, plant.n_a)
+        if not self._is_signed(frame):
+            if self._signs is False:
+                return [self._finish(now, void=True, contradiction=_TWO_CONTROLLERS)]
+            raise FrameError(
+                f"the action for step {frame.step} was not computed from the policy, model and target "
+                "of its episode; expected one controller and one tuner"
+            )
         if frame.step != plant.step_index:
             self.counters["actions of another step"] += 1
             # One of another shape could never have been taken: it puts nothing in doubt.
@@ -312,6 +329,7 @@ class Lockstep:
         if plant.step_index == plant.horizon:
             self._tuner_heard = now
             return [self._finish(now, void=False)]
+        self._signs = frame.time < 0.0
         self._state = plant.step(frame.values)
         self.advance_counters([frame.digest()], now)
         if self.pacer and not self.paused:
@@ -328,16 +346,31 @@ class Lockstep:
             and not self._held
             and (frame.run, frame.episode, frame.step, frame.plant) == ids
             and frame.values.shape == (self.plant.batch, self.plant.n_a)
+            and self._is_signed(frame)
         )
+
+    @property
+    def signature(self) -> float | None:
+        """What the actions of the episode carry; None before the run's first one."""
+        if self._signs is None:
+            return None
+        return self._signature if self._signs else NOT_SIGNED
+
+    def _is_signed(self, frame: Frame) -> bool:
+        """Whether an action of the episode is signed as the run's controller signs."""
+        found, expected = signature_in(frame.time), self.signature
+        return found in (NOT_SIGNED, self._signature) if expected is None else found == expected
 
     def _judge_late(self, frame: Frame) -> list[Publication]:
         """Take back the cost of one of the last episodes, if this action contradicts one of its own."""
         if frame.run != self.run or frame.plant != self._fingerprint:
             return []
-        taken, cost = self._past.get(frame.episode, ([], frame))
+        taken, signed, cost = self._past.get(frame.episode, ([], NOT_SIGNED, frame))
         shape = len(cost.values), self.plant.n_a
         if frame.step >= len(taken) or frame.values.shape != shape:
             return []
+        if self._signs and signature_in(frame.time) != signed:
+            return []  # it could never have been taken
         if frame.digest() == taken[frame.step]:
             return []
         del self._past[frame.episode]
@@ -415,7 +448,7 @@ class Lockstep:
         self.last_cost = values
         self._cost = self._stamped(COST, values)
         if not void:
-            self._past[self.episode] = self._taken, self._cost.frame
+            self._past[self.episode] = self._taken, self._signature, self._cost.frame
             if len(self._past) > REMEMBERED:
                 del self._past[min(self._past)]
         self._idle(now)
@@ -443,6 +476,11 @@ class Lockstep:
         if noise.size and (noise.min() < 0 or (noise != np.floor(noise)).any()):
             raise FrameError("expected noise seeds that are whole numbers of at least 0")
         return rows
+
+
+_TWO_CONTROLLERS = (
+    "a signed action came in a run whose controller does not sign; expected one controller"
+)
 
 
 def _contradiction(action: Frame) -> str:

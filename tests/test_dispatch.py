@@ -101,9 +101,9 @@ def test_trajectories_are_complete_with_the_last_sample_or_the_cost(cost_first):
     def samples() -> list[bool]:
         told = []
         for k in range(cost.step + 1):
-            told.append(served.state(0, replace(start, step=k, values=np.full((2, 3), k))))
+            told.append(served.state(0, replace(start, plant=0, step=k, values=np.full((2, 3), k))))
             if k < cost.step:
-                served.action(0, replace(start, step=k, values=np.zeros((2, 2))))
+                served.action(0, replace(start, plant=0, step=k, values=np.zeros((2, 2))))
         return told
 
     if cost_first:

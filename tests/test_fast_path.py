@@ -17,6 +17,7 @@ from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
 from loop_interfaces import model_rows
 from loop_interfaces.frames import HEADER, ArrayCodec, Frame, FrameError
+from loop_interfaces.signature import signature
 from loop_interfaces.topics import ACTION, COST, STATE, VOID, CostColumn
 from pde_sim_node.fast_path import PlantFastPath
 from tests.test_lockstep import PLANT, RUN, plant_protocol
@@ -103,7 +104,8 @@ class Controller:
         policies = RNG.standard_normal((self.batch, N_A, 2 * N_S))
         for responder in (self.responder, self.judge):
             responder.policy(Frame(RUN, episode, 0, 0.0, policies))
-            responder.start(Frame(RUN, episode, 0, 0.0, rows))
+            # In every other episode the actions are to be signed.
+            responder.start(Frame(RUN, episode, 0, 0.0, rows, 123 * (episode % 2)))
 
     def state(self, episode: int, step: int, run: int = RUN) -> bytes:
         values = RNG.standard_normal((self.batch, N_Z))
@@ -229,11 +231,11 @@ class Plant:
         )
         self.path = PlantFastPath(self.lockstep, self.own, batcher or NoSamples())
 
-    def begin(self, episode: int, seeds: tuple[int, ...]) -> Frame:
+    def begin(self, episode: int, seeds: tuple[int, ...], told: int = 0) -> Frame:
         rows = np.zeros((len(seeds), 4))
         rows[:, 0], rows[:, 1] = seeds, -1
         for lockstep in (self.lockstep, self.judge):
-            (send,) = lockstep.start(Frame(RUN, episode, 0, 0.0, rows), self.now)
+            (send,) = lockstep.start(Frame(RUN, episode, 0, 0.0, rows, told), self.now)
         return send.frame
 
     def action(self, state: Frame) -> bytes:
@@ -342,6 +344,21 @@ def test_a_plant_leaves_everything_else_to_the_lockstep() -> None:
     late = with_number(good, 8, STEP_AT, 0.0)
     assert fast(plant.path, late) is None
     assert plant.lockstep.step == 0
+
+
+def test_a_plant_takes_only_actions_with_the_signature_of_their_episode() -> None:
+    plant = Plant()
+    for episode, told in ((1, 8), (2, 9)):
+        state = plant.begin(episode, (3, 4), told)
+        time = signature(told, plant.lockstep.plant.target)
+        state = plant.ordinary(plant.action(replace(state, time=time)))
+        for wrong in (state.time, 0.0, signature(10, plant.lockstep.plant.target)):
+            raw = plant.action(replace(state, time=wrong))
+            assert fast(plant.path, raw) is None
+            with pytest.raises(FrameError, match="not computed from the policy"):
+                plant.lockstep.action(plant.own.decode(raw), 0.0)
+        assert fast(plant.path, plant.action(replace(state, time=time))) is not None
+        assert plant.lockstep.step == 2
 
 
 def test_the_fast_path_of_a_plant_ends_where_its_log_does() -> None:

@@ -15,10 +15,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import Counters, ModelFailure, Publication
+from loop_interfaces.signature import digest_of
 from loop_interfaces.topics import (
     COST,
     MODEL,
@@ -71,12 +72,14 @@ class Dispatcher:
     notes: list[str] = field(default_factory=list)
     sim_time: float = 0.0
     plant: int = UNKNOWN_PLANT
+    action_limit: float = 0.0
     held: bool = False
     """Whether an operator lets no new episode begin."""
     last_costs: Array | None = None
     """Mean stage costs of the last episode that was answered."""
     _batch: Batch | None = None
     _models: Frame | None = None
+    _models_digest: int = 0
     _targets: dict[int, Array] = field(default_factory=dict)
     _chunks: list[Chunk] = field(default_factory=list)
     _waiting: list[Chunk] = field(default_factory=list)
@@ -93,6 +96,7 @@ class Dispatcher:
         episode_timeout: float,
         max_attempts: int,
         plant: int = UNKNOWN_PLANT,
+        action_limit: float = 0.0,
     ) -> Dispatcher:
         return Dispatcher(
             run=run,
@@ -102,6 +106,7 @@ class Dispatcher:
             episode_timeout=episode_timeout,
             max_attempts=max_attempts,
             plant=plant,
+            action_limit=action_limit,
             pairs=[Pair() for _ in range(pairs)],
         )
 
@@ -122,6 +127,7 @@ class Dispatcher:
         meets the models before it.
         """
         frame = self._models = Frame(self.run, 0, generation, self.sim_time, models.copy())
+        self._models_digest = digest_of(models)
         return [(pair, Publication(MODEL, frame)) for pair in range(len(self.pairs))]
 
     def release(self) -> list[PairPublication]:
@@ -444,13 +450,17 @@ class Dispatcher:
 
         generation = self._models.step if self._models is not None else 0
 
-        def frame(values: Array) -> Frame:
-            return Frame(self.run, pair.episode, generation, self.sim_time, values)
+        def frame(values: Array, plant: int = 0) -> Frame:
+            return Frame(self.run, pair.episode, generation, self.sim_time, values, plant)
 
         # The policy first: it is then mostly there when the first state arrives.
         sends = [Publication(MODEL, self._models)] if again and self._models is not None else []
+        rows = self._batch.rows[chunk.rows]
+        told: list[ArrayLike] = [rows, self.action_limit]
         if self._batch.policies is not None:
-            sends.append(Publication(POLICY, frame(self._batch.policies[chunk.rows])))
-        pair.last = Publication(START, frame(self._batch.rows[chunk.rows]))
+            policies = self._batch.policies[chunk.rows]
+            sends.append(Publication(POLICY, frame(policies)))
+            told += [policies, self._models_digest]
+        pair.last = Publication(START, frame(rows, digest_of(*told)))
         sends.append(pair.last)
         return [(number, send) for send in sends]

@@ -109,6 +109,7 @@ class TunerNode:
             episode_timeout=values["episode_timeout"],
             max_attempts=values["max_attempts"],
             plant=training.plant,
+            action_limit=values["action_limit"],
         )
         self._news: deque[Mapping[str, Any]] = deque()
         self._problem, self._out = values["problem"], values["out"]

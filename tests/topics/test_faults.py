@@ -330,28 +330,18 @@ while True:
 
 
 def test_a_second_controller_that_answers_otherwise_never_mixes_in(loop, tmp_path):
-    """It listens to the loop and so has all the right ids."""
+    """It listens to the loop and so has all the right ids; what it does not have is the signature."""
     running = start_pair(loop)
     out = tmp_path / "run"
-    tuner = start_tuner(loop, out, iterations=2000, max_attempts=1000)
+    tuner = start_tuner(loop, out, iterations=2000)
     until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
     with held_training(loop, "/second_controller"):
         second = loop.start("-c", SECOND_CONTROLLER, name="second")
-    until(
-        lambda: "two different actions came for step" in loop.output(running["plant"]),
-        LIMIT,
-        "contradiction",
-    )
+    refused = "was not computed from the policy, model and target of its episode"
+    until(lambda: refused in loop.output(running["plant"]), LIMIT, "refusal")
+    loop.wait(tuner, LIMIT)
     second.kill()
-    tuner.wait(LIMIT)
-    if tuner.returncode == 0:  # each contradiction came before its episode had ended
-        assert "the plant declared episode" in loop.output(tuner)
-        assert_same_training(out, in_process(iterations=2000))
-    else:
-        last = loop.wait(tuner, LIMIT, code=1).strip().splitlines()[-1]
-        assert "the plant took back the cost of episode" in last
-        assert "stop the second controller and start a new run" in last
-        assert not (out / "result.json").exists()
+    assert_same_training(out, in_process(iterations=2000))
 
 
 SECOND_CONTROLLER = """

@@ -1,0 +1,161 @@
+"""Signatures: only a controller that was told what the tuner published moves the plant."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from controller_node.identification import DesignSettings
+from controller_node.responder import Responder
+from loop_interfaces.frames import Frame, FrameError
+from loop_interfaces.model_rows import ModelRows, pack
+from loop_interfaces.topics import COST, MODEL, POLICY, START, TARGET, VOID, CostColumn, Topic
+from tests.test_lockstep import plant_protocol
+from tuner_node.batch import Batch
+from tuner_node.dispatch import Dispatcher, DispatchError
+
+N_Z, N_A, N_S = 32, 4, 3
+RNG = np.random.default_rng(0)
+ROWS = np.array([[3.0, -1.0, 0.0, 0.0], [4.0, -1.0, 0.0, 0.0]])
+EXPLORING = np.array([[3.0, 8.0, 0.1, 0.0], [4.0, 9.0, 0.1, 0.0]])
+POLICIES = 0.1 * RNG.standard_normal((2, N_A, 2 * N_S))
+GAINS = np.zeros((N_A, N_S))
+MODELS = np.stack(
+    [
+        pack(
+            ModelRows(
+                A=np.zeros((N_S, N_S)),
+                B=np.zeros((N_S, N_A)),
+                U=np.linalg.qr(RNG.standard_normal((N_Z, N_S)))[0],
+                K_a=GAINS,
+                K_b=GAINS,
+                s_r=np.zeros(N_S),
+            )
+        )
+    ]
+)
+REFUSED = "not computed from the policy, model and target"
+
+
+class Loop:
+    """A tuner, a plant and a controller: the pure protocols as the nodes have them."""
+
+    def __init__(self, rows: np.ndarray = ROWS) -> None:
+        self.plant, self.rows = plant_protocol(), rows
+        self.tuner = Dispatcher.create(
+            run=5, n_a=N_A, pairs=1, incarnation=1, max_batch=4, episode_timeout=9.0, max_attempts=3
+        )
+        self.tuner.presence(0, (), 0.0)
+        self.told: dict[Topic, Frame] = {TARGET: self.plant.announcement().frame}
+        self.take(self.tuner.models(MODELS, 1))
+        self.begin()
+        self.controller = self.controller_told()
+
+    def begin(self) -> None:
+        exploring = bool(self.rows[0, 1] >= 0)
+        self.take(self.tuner.assign(Batch(self.rows, None if exploring else POLICIES), 0.0))
+
+    def take(self, publications) -> None:
+        for _, send in publications:
+            self.told[send.topic] = send.frame
+            if send.topic is START:
+                (state,) = self.plant.start(send.frame, 0.0)
+                self.state = state.frame
+
+    def controller_told(self, limit: float = 0.0, **others: object) -> Responder:
+        """A controller that was told of the episode what the tuner published, but for `others`."""
+        made = Responder(DesignSettings(N_A, N_S, 1.0, 1.0, action_limit=limit))
+        handlers = {
+            TARGET: made.target, MODEL: made.model, POLICY: made.policy, START: made.start,
+        }  # fmt: skip
+        for topic, handle in handlers.items():
+            if topic in self.told:
+                frame = self.told[topic]
+                handle(replace(frame, values=others.get(topic.name.split("/")[-1], frame.values)))
+        return made
+
+    def act(self, controller: Responder):
+        """What the plant makes of a controller's answer to its state."""
+        (action,) = controller.state(self.state)
+        return self.plant.action(action.frame, 0.0)
+
+    def finish(self, disturb=lambda: None) -> np.ndarray:
+        """The costs of the episode, which the loop's own controller answers to the end."""
+        while True:
+            disturb()
+            (send,) = self.act(self.controller)
+            if send.topic is COST:
+                return send.frame.values
+            self.state = send.frame
+
+
+def unsigned(frame: Frame) -> Frame:
+    """The answer of a controller that knows nothing of signatures."""
+    return replace(frame, values=np.full((len(frame.values), N_A), 0.5))
+
+
+OTHERS = {
+    "a policy": {"policy": POLICIES + 1e-9},
+    "a model": {"model": MODELS * 1.5},
+    "a target": {"target": np.full(N_Z, 0.25)},
+    "rows": {"start": ROWS + np.array([0.0, 0.0, 0.5, 0.0])},
+    "a limit": {"limit": 0.01},
+}
+
+
+@pytest.mark.parametrize("others", OTHERS.values(), ids=OTHERS)
+def test_a_controller_that_was_told_something_else_never_moves_the_plant(others):
+    expected = Loop().finish()
+    loop = Loop()
+    foreign = loop.controller_told(**others)
+
+    def disturb() -> None:
+        with pytest.raises(FrameError, match=REFUSED):
+            loop.act(foreign)
+
+    assert loop.finish(disturb).tobytes() == expected.tobytes()
+
+
+@pytest.mark.parametrize("rows", [ROWS, EXPLORING], ids=["policy", "exploration"])
+def test_once_an_action_was_signed_no_unsigned_one_is_taken_for_the_whole_run(rows):
+    expected = Loop(rows).finish()
+    loop = Loop(rows)
+    assert loop.finish().tobytes() == expected.tobytes()
+    late = unsigned(loop.state)
+    assert loop.plant.action(replace(late, step=2), 0.0) == []  # of an episode that is over
+    (cost,) = loop.plant.start(loop.told[START], 0.0)
+    loop.tuner.cost(0, cost.frame, 0.0)
+    for send in loop.controller.cost(cost.frame):
+        loop.tuner.model(0, send.frame, 0.0)
+
+    # Nobody contradicts in the next one: the run's controller is silent all along.
+    loop.rows = ROWS
+    loop.begin()
+    for time in (loop.state.time, 0.0, -1.0):
+        with pytest.raises(FrameError, match=REFUSED):
+            loop.plant.action(replace(unsigned(loop.state), time=time), 0.0)
+    assert loop.plant.step == 0
+
+
+def test_a_run_with_a_controller_that_does_not_sign_is_void_as_soon_as_another_signs():
+    loop = Loop()
+    for attempt in (1, 2, 3):
+        for _ in range(3):
+            (state,) = loop.plant.action(unsigned(loop.state), 0.0)
+            loop.state = state.frame
+        (cost,) = loop.act(loop.controller_told())
+        assert (cost.frame.values[:, CostColumn.ENDED] == VOID).all()
+        assert "does not sign; expected one controller" in loop.plant.contradiction
+        if attempt < 3:
+            loop.take(loop.tuner.cost(0, cost.frame, 0.0))
+    with pytest.raises(DispatchError, match="gave up after 3 attempts"):
+        loop.tuner.cost(0, cost.frame, 0.0)
+
+
+def test_a_tuner_that_asks_for_no_signature_gets_the_time_of_the_state():
+    loop = Loop()
+    loop.told[START] = replace(loop.told[START], plant=0)
+    (action,) = loop.controller_told().state(loop.state)
+    assert action.frame.time == loop.state.time > 0.0
