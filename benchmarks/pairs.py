@@ -126,7 +126,7 @@ def _pair(
         return running.start(
             package,
             *parameters,
-            problem=None if package == "pdeloop.relay" else str(problem),
+            problem=None if package == "tests.relay" else str(problem),
             namespace=namespace,
             prefix=on(host),
             environment=environment(),
@@ -139,7 +139,7 @@ def _pair(
         start("controller_node", "action:=action_sent"),
     ]
     if faults:
-        start("pdeloop.relay", "", *faults, f"seed:={seed}")
+        start("tests.relay", "", *faults, f"seed:={seed}")
     return nodes
 
 

@@ -6,8 +6,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,32 +28,33 @@ polling on the others; or wherever the scheduler puts them."""
 
 @dataclass(frozen=True)
 class LoopNode:
-    """A node of a run: name of its process, package, parameters NAME:=VALUE, remaps FROM:=TO.
+    """A node of a run.
 
-    namespace: relative to that of the run; empty: the run's own. cores: of all its threads, from its
-    start; empty: any.
+    Attributes
+    ----------
+    name : str
+        Of its process.
+    package : str
+    parameters : sequence of str
+        As NAME:=VALUE.
+    namespace : str
+        Relative to that of the run; empty: the run's own.
+    cores : sequence of int
+        The cores that all its threads may use; empty: any.
     """
 
     name: str
     package: str
     parameters: Sequence[str] = ()
-    remaps: Sequence[str] = ()
     namespace: str = ""
     cores: Sequence[int] = ()
 
-    def arguments(self, parameter_file: Path) -> list[str]:
-        """Parameters and remaps as ROS arguments, without the namespace."""
+    def ros_arguments(self, parameter_file: Path) -> list[str]:
+        """All that follows `--ros-args` in its command."""
         words = ["--params-file", str(parameter_file)]
         for value in self.parameters:
             words += ["-p", value]
-        for remap in self.remaps:
-            words += ["-r", remap]
-        return words
-
-    def ros_arguments(self, parameter_file: Path) -> list[str]:
-        """All that follows `--ros-args` in its command, for a run without a namespace."""
-        own = ["-r", f"__ns:=/{self.namespace}"] if self.namespace else []
-        return [*self.arguments(parameter_file), *own]
+        return [*words, "-r", f"__ns:=/{self.namespace}"] if self.namespace else words
 
 
 PAIR = ("pde_sim_node", "controller_node")
@@ -102,15 +103,10 @@ def core_parameters(package: str, core: int | None, *, solver_polls: bool) -> di
     return {"pin": core, **(solver if package == "pde_sim_node" else {})}
 
 
-def pair_nodes(
-    cores: Sequence[int | None],
-    remaps: Mapping[str, Sequence[str]] | None = None,
-    *,
-    solver_polls: bool = False,
-) -> list[LoopNode]:
+def pair_nodes(cores: Sequence[int | None], *, solver_polls: bool = False) -> list[LoopNode]:
     """The nodes of as many pairs as there are `cores` (see `pair_cores`).
 
-    remaps: by package; solver_polls: the plant's helpers look for work all the time.
+    solver_polls: the plant's helpers look for work all the time.
     """
     nodes = []
     for number, (namespace, core) in enumerate(zip(namespaces(len(cores)), cores, strict=True)):
@@ -120,51 +116,56 @@ def pair_nodes(
             if number and package == "pde_sim_node":  # /clock is one topic for all
                 parameters.append("publish_clock:=false")
             name = f"{package}-{namespace}" if namespace else package
-            more = (remaps or {}).get(package, ())
-            nodes.append(LoopNode(name, package, parameters, more, namespace))
+            nodes.append(LoopNode(name, package, parameters, namespace))
     return nodes
 
 
-@dataclass(frozen=True)
-class Layout:
-    """The nodes of one training: `pairs` pairs, their tuner, perhaps a recorder.
+def training_nodes(
+    folder: Path,
+    *,
+    pairs: int = 1,
+    placement: str = "shared",
+    recording: Recording | None = None,
+    view: bool = False,
+) -> list[LoopNode]:
+    """The nodes of one training: `pairs` pairs, their tuner, perhaps a recorder and a viewer.
 
-    placement: one of PLACEMENTS; remaps: of plants and controllers, by package; view: with a viewer
-    of the first pair. Recorder and viewer leave the cores of the pairs to them, if there are others.
+    Parameters
+    ----------
+    folder : Path
+        Holds a run that was begun (RunFolder.create), so that a tuner that is started again goes on
+        where it was.
+    pairs : int
+        How many.
+    placement : str
+        One of PLACEMENTS.
+    recording : Recording, optional
+        How the run is recorded; None: not at all.
+    view : bool
+        With a viewer of the first pair.
+
+    Returns
+    -------
+    list of LoopNode
+        The recorder, if any, comes first; it is told its bag when it is started. Recorder and viewer
+        leave the cores of the pairs to them, if there are others.
     """
-
-    pairs: int = 1
-    placement: str = "shared"
-    recording: Recording | None = None
-    remaps: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    view: bool = False
-
-    def nodes(self, folder: Path, bag: Path | None = None) -> list[LoopNode]:
-        """Who is started for the training in `folder`; the recorder, if any, comes first.
-
-        The folder holds a run that was begun (RunFolder.create), so that a tuner that is started
-        again goes on where it was. bag: the new folder of a recording; None: it is given when the
-        recorder starts.
-        """
-        serving = tuner_parameter(self.pairs)
-        tuner = [f"out:={quoted(folder.resolve())}", "resume:=true"]
-        tuner.append(f"plant:={fingerprint(RunFolder(folder).values())}")
-        cores = pair_cores(self.pairs, self.placement)
-        nodes = pair_nodes(cores, self.remaps, solver_polls=self.placement == "pinned")
-        others = tuple(core for core in usable_cores() if core not in cores)
-        if self.view or (self.recording is not None and self.recording.views):
-            first = namespaces(self.pairs)[0]
-            nodes.append(LoopNode("viewer_node", "viewer_node", namespace=first, cores=others))
-        recording = self.recording
-        if recording is not None:
-            own = [] if bag is None else [f"bag:={quoted(bag.resolve())}"]
-            own += ["record_views:=true"] * recording.views
-            nodes.insert(
-                0, LoopNode("recorder_node", "recorder_node", [*own, *serving], cores=others)
-            )
-        wait = "none" if recording is None else "required" if recording.required else "start"
-        nodes.append(LoopNode("tuner_node", "tuner_node", [*tuner, f"recorder:={wait}", *serving]))
-        return nodes
+    serving = tuner_parameter(pairs)
+    cores = pair_cores(pairs, placement)
+    nodes = pair_nodes(cores, solver_polls=placement == "pinned")
+    others = tuple(core for core in usable_cores() if core not in cores)
+    if view or (recording is not None and recording.views):
+        first = namespaces(pairs)[0]
+        nodes.append(LoopNode("viewer_node", "viewer_node", namespace=first, cores=others))
+    wait = "none"
+    if recording is not None:
+        wait = "required" if recording.required else "start"
+        own = [*serving, *["record_views:=true"] * recording.views]
+        nodes.insert(0, LoopNode("recorder_node", "recorder_node", own, cores=others))
+    tuner = [f"out:={quoted(folder.resolve())}", "resume:=true", f"recorder:={wait}", *serving]
+    tuner.append(f"plant:={fingerprint(RunFolder(folder).values())}")
+    nodes.append(LoopNode("tuner_node", "tuner_node", tuner))
+    return nodes
 
 
 def tuner_parameter(pairs: int) -> list[str]:

@@ -28,7 +28,7 @@ from pdeloop.domain import own_domain
 from pdeloop.in_process import LocalPair, train
 from pdeloop.live import announced
 from pdeloop.output import print_json
-from pdeloop.pairs import Layout, Recording, check_pairs, quoted
+from pdeloop.pairs import LoopNode, Recording, check_pairs, quoted, training_nodes
 from pdeloop.supervisor import Child, NodeError, Supervisor, node_command
 from tuner_node import narration
 from tuner_node.build import build_training
@@ -67,26 +67,34 @@ def resolve(problem: str, options: Mapping[str, Any]) -> dict[str, Any]:
 class Transport:
     """How a training is carried out; nothing of this changes its results.
 
-    in_process: without ROS; network: let the messages leave this machine; faulty_line: 'LOSS,
-    DUPLICATION,DELAY' of a relay between plant and controller; pairs: of plant and controller; pin:
-    keep each pair on a core of its own, and its solver's helpers polling; view: a viewer_node of the
-    first pair beside them; spread: leave the cores to the scheduler (pdeloop.pairs.PLACEMENTS).
+    Attributes
+    ----------
+    in_process : bool
+        Without ROS.
+    recording : Recording, optional
+    network : bool
+        Let the messages leave this machine.
+    pairs : int
+        Of plant and controller.
+    pin : bool
+        Keep each pair on a core of its own, and its solver's helpers polling.
+    view : bool
+        With a viewer_node of the first pair.
+    spread : bool
+        Leave the cores to the scheduler (pdeloop.pairs.PLACEMENTS).
     """
 
     in_process: bool = False
     recording: Recording | None = None
     network: bool = False
-    faulty_line: str | None = None
     pairs: int = 1
     pin: bool = False
     view: bool = False
     spread: bool = False
 
     def __post_init__(self) -> None:
-        if self.in_process and (self.recording or self.network or self.faulty_line):
-            raise ParameterError(
-                "--record, --network and --faulty-line are about topics; leave out --in-process"
-            )
+        if self.in_process and (self.recording or self.network):
+            raise ParameterError("--record and --network are about topics; leave out --in-process")
         if self.network and os.environ.get(PROFILE):
             raise ParameterError(
                 f"--network and {PROFILE}={os.environ[PROFILE]} both say where messages go; leave "
@@ -100,37 +108,22 @@ class Transport:
             raise ParameterError(
                 "--pin keeps each pair on a core, --spread on none; leave out one of them"
             )
-        if self.pairs > 1 and self.faulty_line:
-            raise ParameterError("--faulty-line is the line of one pair; leave out --pairs")
         check_pairs(self.pairs, self.placement)
-        if self.faulty_line is not None:
-            self.line_arguments()
 
-    def layout(self) -> Layout:
-        """The nodes of the training."""
-        remaps = {"pde_sim_node": ["state:=state_sent"], "controller_node": ["action:=action_sent"]}
-        remaps = remaps if self.faulty_line else {}
-        return Layout(self.pairs, self.placement, self.recording, remaps, self.view)
+    def nodes(self, folder: Path) -> list[LoopNode]:
+        """The nodes of the training in `folder`."""
+        return training_nodes(
+            folder,
+            pairs=self.pairs,
+            placement=self.placement,
+            recording=self.recording,
+            view=self.view,
+        )
 
     @property
     def placement(self) -> str:
         """One of PLACEMENTS."""
         return "pinned" if self.pin else "any" if self.spread else "shared"
-
-    def line_arguments(self) -> list[str]:
-        """The relay's ROS parameters."""
-        words = (self.faulty_line or "").split(",")
-        try:
-            numbers = [float(word) for word in words]
-        except ValueError:
-            numbers = []
-        if len(numbers) != 3:
-            raise ParameterError(
-                f"--faulty-line is {self.faulty_line!r}; expected LOSS,DUPLICATION,DELAY "
-                "like 0.01,0.02,0.005 (two probabilities and seconds)"
-            )
-        names = ("loss", "duplicate", "delay")
-        return [f"{name}:={number}" for name, number in zip(names, numbers, strict=True)]
 
 
 def begin(
@@ -253,12 +246,8 @@ def _train_over_topics(
             optional=node.package in ("recorder_node", "viewer_node"),
             cores=node.cores,
         )
-        for node in transport.layout().nodes(folder)
+        for node in transport.nodes(folder)
     }
-    if transport.faulty_line is not None:
-        arguments = [word for value in transport.line_arguments() for word in ("-p", value)]
-        command = node_command("pdeloop.relay", *arguments)
-        children["relay"] = Child("relay", command, logs / "relay.log")
     recorder = children.get("recorder_node")
     bags: list[Path] = []
     if recorder is not None:
@@ -350,15 +339,3 @@ def interruptible() -> Iterator[Callable[[], None]]:
     finally:
         for number, handler in known.items():
             signal.signal(number, handler)
-
-
-__all__ = [
-    "Interruption",
-    "NodeError",
-    "Recording",
-    "Transport",
-    "interruptible",
-    "resolve",
-    "run_again",
-    "run_new",
-]

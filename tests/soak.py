@@ -29,11 +29,10 @@ from rich.console import Console
 from pdeloop.in_process import LocalPair, train
 from pdeloop.progress import Progress
 from pdeloop.training_run import resolve
+from tests.relay.train import FAULTS
 from tuner_node.build import build_training
 
 NODES = ("pde_sim_node", "controller_node", "tuner_node", "relay")
-LINE = "0.01,0.02,0.002"
-"""Loss, duplication and largest delay (s) on the line between plant and controller."""
 KINDS, SHARES = ("kill", "stop", "supervisor", "checkpoint"), (0.4, 0.4, 0.1, 0.1)
 """What is done to processes, and how often."""
 PAUSE = (0.1, 2.5)
@@ -165,7 +164,7 @@ class _Training:
         return same and costs.transpose(1, 0, 2).tobytes() == quiet.evaluation.tobytes()
 
     def _start(self, *arguments: str) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", "pdeloop.cli", "train", *arguments, "--faulty-line", LINE]
+        command = [sys.executable, "-m", "tests.relay.train", *arguments]
         with self._log.open("ab") as log:
             return subprocess.Popen(
                 command,
@@ -314,7 +313,7 @@ def text(result: dict[str, Any]) -> str:
         f"nodes restarted: {result['restarts']}, trainings resumed: {result['resumes']}",
         "faults:",
         *(f"  {count:5d}  {kind}" for kind, count in sorted(result["faults"].items())),
-        f"  and on the line between plant and controller: loss, repeats, delay {LINE}",
+        f"  and on the line between plant and controller: {', '.join(FAULTS)}",
         "memory in MB, after the start and last, of the process that grew most:",
         *(f"  {n:<16} {a:8.1f} {b:8.1f}" for n, (a, b) in sorted(result["memory_mb"].items())),
     ]

@@ -332,13 +332,12 @@ def test_a_terminal_that_closes_ends_a_training_unless_nohup_was_asked_for(
     assert "stopped by SIGHUP; continue with: pdeloop train --resume run" in shown.plain
 
 
-def test_the_help_of_train_is_in_groups_and_without_the_tests_own_option() -> None:
+def test_the_help_of_train_is_in_groups() -> None:
     text = run("train", "--help").stdout
     groups = ("problem:", "budget and method:", "run:", "recording:", "machine:")
     assert [line for line in text.splitlines() if line in groups] == list(groups)
     (options,) = re.findall(r"^options:\n(.*?)\n\n", text, flags=re.MULTILINE | re.DOTALL)
     assert options.count("--") == 1  # --help
-    assert "--faulty-line" not in text
 
 
 def test_every_optional_part_that_is_not_installed_is_named_in_one_line(tmp_path: Path) -> None:

@@ -91,13 +91,12 @@ def add(commands: Commands) -> None:
         action="store_true",
         help="plant and controller on any cores, instead of one for both (docs/performance.md)",
     )
-    # A relay between plant and controller, with LOSS,DUPLICATION,DELAY: for tests.
-    add("--faulty-line", help=argparse.SUPPRESS)
 
 
 def _train(options: argparse.Namespace) -> int:
     from pde_sim_node.equations import allow
-    from pdeloop.training_run import Recording, Transport, run_again, run_new
+    from pdeloop.pairs import Recording
+    from pdeloop.training_run import Transport, run_again, run_new
 
     recording = None
     if options.record or options.record_or_stop or options.record_views:
@@ -108,7 +107,6 @@ def _train(options: argparse.Namespace) -> int:
         options.in_process,
         recording,
         options.network,
-        options.faulty_line,
         options.pairs,
         options.pin,
         options.view,

@@ -57,7 +57,7 @@ def test_lost_repeated_delayed_and_reordered_messages_change_nothing(loop, tmp_p
     loop.node("pde_sim_node", *PARAMETERS, "-r", "state:=state_sent", "-p", "action_timeout:=0.02")
     loop.node("controller_node", *PARAMETERS, "-r", "action:=action_sent")
     arguments = [word for name, value in faults.items() for word in ("-p", f"{name}:={value}")]
-    relay = loop.start("-m", "pdeloop.relay.node", "--ros-args", *arguments, name="relay")
+    relay = loop.start("-m", "tests.relay.node", "--ros-args", *arguments, name="relay")
     tuner = start_tuner(loop, tmp_path / "run", iterations=8)
     loop.wait(tuner, LIMIT)
     assert_same_training(tmp_path / "run", in_process(iterations=8))

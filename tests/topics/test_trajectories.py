@@ -28,7 +28,7 @@ def test_gauss_newton_ends_with_the_policy_of_one_process(loop: Processes, tmp_p
     }
     if faults:
         relay = ("--ros-args", "-p", "loss:=0.002", "-p", "delay:=0.002")
-        loop.start("-m", "pdeloop.relay.node", *relay, name="relay")
+        loop.start("-m", "tests.relay.node", *relay, name="relay")
     options = {"rollouts": ROLLOUTS, "optimizer": "gauss_newton", "seeds": 2}
     tuner = loop.node("tuner_node", *start, *tuner_arguments(out, **options, max_attempts=50))
     if faults:
