@@ -112,7 +112,7 @@ def optimise_law(job: LawJob) -> dict[str, Any]:
             """J and its gradient at theta = scale x."""
 
             def function(x: Array) -> tuple[float, Array]:
-                value, gradient = gradients.of_law(U, (scale @ x).reshape(theta.shape), chosen)
+                value, gradient, _ = gradients.of_law(U, (scale @ x).reshape(theta.shape), chosen)
                 return value, scale.T @ gradient.ravel()
 
             return function
@@ -167,7 +167,7 @@ def optimise_inputs(job: InputJob) -> dict[str, Any]:
             inputs = path.actions if path.whole else inputs
 
         found = descend(
-            lambda given: gradients.of_inputs(given, [job.field_seed]),
+            lambda given: gradients.of_actions(given, [job.field_seed])[:2],
             inputs,
             tolerance=job.tolerance,
             iterations=job.iterations,

@@ -46,7 +46,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pde_sim_node.equations import Equation
-from pde_sim_node.plant import Plant
+from pde_sim_node.plant import MEAN_FIELD, Plant
 
 __all__ = ["InstrumentedPlant", "Instruments", "Noise", "standard_normal"]
 
@@ -141,9 +141,12 @@ class InstrumentedPlant(Plant):
     ) -> NDArray[np.float64]:
         """Begin an episode; without seeds of the noise they are 0."""
         super().reset(seeds)
+        fields = np.asarray(seeds)
+        if fields.ndim == 2:  # given, not drawn
+            fields = np.full(self.batch, MEAN_FIELD)
         if noise is None:
             noise = np.zeros(self.batch, dtype=np.int64)
-        self._seeds = [(int(n), int(s)) for n, s in zip(noise, np.asarray(seeds), strict=True)]
+        self._seeds = [(int(n), int(s)) for n, s in zip(noise, fields, strict=True)]
         self._published = np.tile(self._measure(), (1, self._delays))
         return self._published
 

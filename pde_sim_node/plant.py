@@ -3,6 +3,7 @@
 import math
 import operator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -169,9 +170,9 @@ class Plant:
 
         Parameters
         ----------
-        seeds : (M,) int
+        seeds : (M,) int, or (M, n_z)
             One seed for each environment: 0 or more draws the initial field from its distribution,
-            equal seeds giving equal fields; -1 is the mean field.
+            equal seeds giving equal fields; -1 is the mean field. Or the initial fields themselves.
         noise : (M,) int, optional
             Seeds of the noise of each environment. This plant has none; see InstrumentedPlant.
 
@@ -183,9 +184,29 @@ class Plant:
         Raises
         ------
         ValueError
-            The seeds have another shape or type, or one is below -1. The plant is left as it was.
+            The seeds have another shape or type, or one is below -1; or a field is not finite. The
+            plant is left as it was.
         """
-        seeds = np.asarray(seeds)
+        fields = self._initial_fields(np.asarray(seeds))
+        if self.batch != len(fields):
+            self._allocate(len(fields))
+        self.step_index = 0
+        self.totals.fill(0.0)
+        self.diverged_step.fill(-1)
+        self.states[:] = fields
+        return self.states
+
+    def _initial_fields(self, seeds: NDArray[Any]) -> NDArray[np.float64]:
+        """The fields that seeds stand for, or that are given."""
+        if seeds.ndim == 2:
+            if seeds.shape[1] != self.n_z or not len(seeds):
+                raise ValueError(
+                    f"initial fields must have shape (M, {self.n_z}), one for each environment, got "
+                    f"{seeds.shape}"
+                )
+            if not np.isfinite(seeds).all():
+                raise ValueError("initial fields must be finite, got NaN or infinity")
+            return seeds
         if seeds.ndim != 1 or seeds.size == 0 or not np.issubdtype(seeds.dtype, np.integer):
             raise ValueError(
                 f"seeds must be a one-dimensional array of integers, one for each environment, "
@@ -196,14 +217,7 @@ class Plant:
                 f"seeds must be 0 or more, or -1 for the mean field, got {seeds.min()}"
             )
         fields = {seed: self._initial_field(seed) for seed in set(seeds.tolist())}
-        if self.batch != seeds.size:
-            self._allocate(seeds.size)
-        self.step_index = 0
-        self.totals.fill(0.0)
-        self.diverged_step.fill(-1)
-        for state, seed in zip(self.states, seeds.tolist(), strict=True):
-            state[:] = fields[seed]
-        return self.states
+        return np.stack([fields[seed] for seed in seeds.tolist()])
 
     def _initial_field(self, seed: int) -> NDArray[np.float64]:
         rng = None if seed == MEAN_FIELD else np.random.default_rng(seed)

@@ -1,1 +1,57 @@
-"""What starts and observes the nodes: command line, supervisor, in-process runner."""
+"""Control of PDEs from Python: what the command line does, on arrays (docs/python.md).
+
+>>> import pdeloop
+>>> burgers = pdeloop.problem("burgers")
+>>> model = pdeloop.identify(burgers.explore(seed=0), n_s=8)
+>>> gains = pdeloop.track(model, state_weight=1.0, action_weight=1.0)
+>>> plant = burgers.plant()
+>>> episode = pdeloop.rollout(plant, pdeloop.projected_law(plant, model.U, gains.policy), [0, 1])
+>>> episode.states.shape
+(301, 2, 128)
+
+Every name is imported when it is used first, so that `import pdeloop` costs nothing; none needs ROS
+but `train(..., over_topics=True)`.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from controller_node.lqt import track as track
+    from controller_node.reduced_model import ReducedModel as ReducedModel
+    from pde_sim_node.plant import Plant as Plant
+    from pdeloop.api import Problem as Problem
+    from pdeloop.api import identify as identify
+    from pdeloop.api import load_run as load_run
+    from pdeloop.api import problem as problem
+    from pdeloop.api import train as train
+    from pdeloop.episode import projected_law as projected_law
+    from pdeloop.episode import rollout as rollout
+    from pdeloop.finished_run import FinishedRun as FinishedRun
+    from pdeloop.gradients import Gradients as Gradients
+
+_MODULES = {
+    "FinishedRun": "pdeloop.finished_run",
+    "Gradients": "pdeloop.gradients",
+    "Plant": "pde_sim_node.plant",
+    "Problem": "pdeloop.api",
+    "ReducedModel": "controller_node.reduced_model",
+    "identify": "pdeloop.api",
+    "load_run": "pdeloop.api",
+    "problem": "pdeloop.api",
+    "projected_law": "pdeloop.episode",
+    "rollout": "pdeloop.episode",
+    "track": "controller_node.lqt",
+    "train": "pdeloop.api",
+}
+__all__ = list(_MODULES)
+
+
+if not TYPE_CHECKING:  # a type checker knows the names above, and that there are no others
+
+    def __getattr__(name: str) -> Any:
+        if name not in _MODULES:
+            raise AttributeError(f"module 'pdeloop' has no attribute {name!r}")
+        return getattr(importlib.import_module(_MODULES[name]), name)

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from controller_node.policy import ProjectedLaw
 from pde_sim_node.measurement import InstrumentedPlant
 from pde_sim_node.plant import EpisodeCosts, Plant
 
-__all__ = ["EpisodeRecord", "Law", "rollout"]
+__all__ = ["EpisodeRecord", "Law", "finite_array", "projected_law", "rollout"]
 
 Array = NDArray[np.float64]
 Law: TypeAlias = Callable[[int, Array], Array]
@@ -58,8 +59,8 @@ def rollout(
         Whose episode it is; one that is under way there ends.
     law
         Is called once a step, in order, with the plant's own array, which it must not change.
-    seeds : (M,) int
-        Of the initial fields: 0 or more draws one, -1 is the mean field.
+    seeds : (M,) int, or (M, n_z)
+        Of the initial fields: 0 or more draws one, -1 is the mean field. Or the fields themselves.
     noise : (M,) int, optional
         Of the noise of each environment, where the plant has noise.
     keep
@@ -77,10 +78,9 @@ def rollout(
     Examples
     --------
     >>> import numpy as np
-    >>> from loop_interfaces.problem import load_parameters
-    >>> from pde_sim_node.build import build_plant
-    >>> plant = build_plant(load_parameters("burgers", {}))
-    >>> episode = rollout(plant, lambda k, z: np.zeros((2, plant.n_a)), [0, 1])
+    >>> import pdeloop
+    >>> plant = pdeloop.problem("burgers").plant()
+    >>> episode = pdeloop.rollout(plant, lambda k, z: np.zeros((2, plant.n_a)), [0, 1])
     >>> episode.states.shape, episode.actions.shape
     ((301, 2, 128), (300, 2, 6))
     >>> (episode.costs.diverged_step < 0).all()
@@ -103,3 +103,65 @@ def rollout(
             if keep:
                 actions[k] = a
     return EpisodeRecord(states, fields, actions, plant.episode_costs())
+
+
+def projected_law(plant: Plant, U: ArrayLike, policy: ArrayLike) -> Law:
+    """The law a = K_a U^T z + K_b U^T z_r, saturated where the plant's actions are.
+
+    Parameters
+    ----------
+    plant
+        Whose target z_r and limit of the actions it has.
+    U : (state_size, n_s)
+        Basis of the reduced state, that of a reduced model.
+    policy : (n_a, 2 n_s), or (M, n_a, 2 n_s)
+        [K_a K_b], one for all environments or one for each of M.
+
+    Returns
+    -------
+    Law
+
+    Raises
+    ------
+    ValueError
+        Shapes that do not fit the plant, NaN or infinity.
+
+    See Also
+    --------
+    controller_node.policy.ProjectedLaw : the same to the bit, with a model for each environment.
+
+    Examples
+    --------
+    >>> import pdeloop
+    >>> problem = pdeloop.problem("burgers")
+    >>> plant, model = problem.plant(), pdeloop.identify(problem.explore(0), n_s=4)
+    >>> gains = pdeloop.track(model, state_weight=1.0, action_weight=1.0)
+    >>> law = pdeloop.projected_law(plant, model.U, gains.policy)
+    >>> pdeloop.rollout(plant, law, [0, 1, 2]).costs.mean.round(1)
+    array([0.6, 0.7, 0.6])
+    """
+    basis = np.asarray(U, dtype=np.float64)
+    basis = finite_array("U", U, (plant.state_size, *basis.shape[1:2]))
+    gains = np.asarray(policy, dtype=np.float64)
+    gains = finite_array("policy", policy, (*gains.shape[:-2], plant.n_a, 2 * basis.shape[1]))
+    limit = plant.instruments.action_limit if isinstance(plant, InstrumentedPlant) else 0.0
+    projected, batch = ProjectedLaw([basis], plant.target, limit), 0
+
+    def actions(k: int, states: Array) -> Array:
+        nonlocal batch
+        if batch != len(states):
+            batch = len(states)
+            projected.set(np.broadcast_to(gains, (batch, *gains.shape[-2:])))
+        return projected.actions(states)
+
+    return actions
+
+
+def finite_array(name: str, values: ArrayLike, shape: Sequence[int]) -> Array:
+    """The values as float64; a ValueError unless they are finite and of this shape."""
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape != tuple(shape):
+        raise ValueError(f"{name} must have shape {tuple(shape)}, got {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} must be finite, got NaN or infinity")
+    return array

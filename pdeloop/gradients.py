@@ -1,4 +1,4 @@
-"""Mean stage costs with their exact gradients: of the projected law's gains, and of open inputs.
+"""Mean stage costs with their exact gradients: of actions, of policies, and of the initial fields.
 
 With the adjoint eta_k = dJ/dz_k, eta_T = 0, of J = 1/(MT) sum (q |z_k - z_r|^2 + r |a_k|^2) and
 the transposed derivative of the plant's own step (`pde_sim_node.solver.adjoint`),
@@ -6,26 +6,44 @@ the transposed derivative of the plant's own step (`pde_sim_node.solver.adjoint`
     g_k   = (df/da)^T eta_{k+1} + 2r/(MT) a_k
     eta_k = (df/dz)^T eta_{k+1} + 2q/(MT) (z_k - z_r) + U K_a^T g_k
 
-dJ/da_k = g_k for open inputs (without the last term), and dJ/dtheta = sum_k g_k [s_k; 1]^T for the
-law a = K_a s + b = theta [s; 1], s = U^T z.
+dJ/da_k = g_k for given actions (without the last term), dJ/dz_0 = eta_0, and
+dJ/dtheta = sum_k g_k [s_k; 1]^T for the law a = K_a s + b = theta [s; 1], s = U^T z.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pde_sim_node.measurement import InstrumentedPlant
 from pde_sim_node.plant import Plant
-from pde_sim_node.solver.adjoint import Adjoint
-from pdeloop.episode import Law, rollout
+from pde_sim_node.solver.adjoint import adjoint_of
+from pdeloop.episode import Law, finite_array, rollout
 
-__all__ = ["Gradients", "features"]
+__all__ = ["CostGradient", "Gradients", "features"]
 
 Array = NDArray[np.float64]
+
+
+class CostGradient(NamedTuple):
+    """A cost and its derivatives.
+
+    Attributes
+    ----------
+    cost : float
+        J, the mean stage cost, averaged over the M initial fields; infinite if a rollout diverges.
+    gradient : array
+        dJ/da or dJ/dpolicy, of its argument's shape; zero if a rollout diverges.
+    of_fields : (M, n_z) array
+        dJ/dz_0.
+    """
+
+    cost: float
+    gradient: Array
+    of_fields: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +74,8 @@ def features(U: Array, target: Array, states: Array) -> Array:
 class Gradients:
     """Costs and gradients on one plant.
 
+    Initial fields are given as to `Plant.reset`: seeds (M,), or the fields themselves (M, n_z).
+
     Parameters
     ----------
     plant
@@ -64,7 +84,16 @@ class Gradients:
     Raises
     ------
     ValueError
-        The plant has noise, limits or sensors, or an equation without an adjoint.
+        The plant has noise, limits or sensors, or its equation's nonlinearity no derivative.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import pdeloop
+    >>> plant = pdeloop.problem("burgers", horizon=20).plant()
+    >>> cost, gradient, of_fields = pdeloop.Gradients(plant).of_actions(np.zeros((20, 1, 6)), [0])
+    >>> gradient.shape, of_fields.shape
+    ((20, 1, 6), (1, 128))
     """
 
     def __init__(self, plant: Plant) -> None:
@@ -74,45 +103,57 @@ class Gradients:
                 "measurement_noise, process_noise, action_limit and sensors at 0"
             )
         self.plant = plant
-        self._adjoint = Adjoint(plant)
+        self._adjoint = adjoint_of(plant)
 
-    def of_law(self, U: Array, theta: Array, fields: Sequence[int]) -> tuple[float, Array]:
-        """J and dJ/dtheta, averaged over initial fields.
+    def of_actions(self, actions: ArrayLike, fields: ArrayLike) -> CostGradient:
+        """J and dJ/da of given actions.
+
+        Parameters
+        ----------
+        actions : (T, M, n_a)
+            a_k from each of the M fields, for the T steps of an episode.
+        fields : (M,) int, or (M, n_z)
+            Initial fields.
+        """
+        shape = self.plant.horizon, len(np.asarray(fields)), self.plant.n_a
+        given = finite_array("actions", actions, shape)
+        path = self._roll(fields, lambda k, _: given[k])
+        return self._gradient(path, given)
+
+    def of_policy(self, U: ArrayLike, policy: ArrayLike, fields: ArrayLike) -> CostGradient:
+        """J and dJ/dpolicy of the law a = K_a U^T z + K_b U^T z_r.
 
         Parameters
         ----------
         U : (n_z, n_s)
-            Basis.
-        theta : (n_a, n_s + 1)
-            [K_a b].
-        fields
-            Seeds of the initial fields.
-
-        Returns
-        -------
-        Infinite cost and zeros if a rollout diverges.
+            Basis, that of a reduced model.
+        policy : (n_a, 2 n_s)
+            [K_a K_b].
+        fields : (M,) int, or (M, n_z)
+            Initial fields.
         """
-        path = self.law(U, theta, fields)
-        if not path.whole:
-            return np.inf, np.zeros_like(theta)
-        _, gradient = self._backwards(path, U, theta)
-        return float(path.costs.mean()), gradient
+        basis = np.asarray(U, dtype=np.float64)
+        basis = finite_array("U", U, (self.plant.n_z, *basis.shape[1:2]))
+        n_s = basis.shape[1]
+        gains = finite_array("policy", policy, (self.plant.n_a, 2 * n_s))
+        s_r = basis.T @ self.plant.target
+        theta = np.column_stack([gains[:, :n_s], gains[:, n_s:] @ s_r])
+        found = self.of_law(basis, theta, fields)
+        by_theta = found.gradient
+        by_policy = np.hstack([by_theta[:, :n_s], np.outer(by_theta[:, n_s], s_r)])
+        return found._replace(gradient=by_policy)
 
-    def of_inputs(self, actions: Array, fields: Sequence[int]) -> tuple[float, Array]:
-        """J and dJ/da, (T, M, n_a), of open inputs a_k from each field; as `of_law` otherwise."""
-        path = self._roll(fields, lambda k, _: actions[k])
-        if not path.whole:
-            return np.inf, np.zeros_like(actions)
-        gradient, _ = self._backwards(path)
-        return float(path.costs.mean()), gradient
+    def of_law(self, U: Array, theta: Array, fields: ArrayLike) -> CostGradient:
+        """J and dJ/dtheta of the law a = theta [U^T z; 1], theta (n_a, n_s + 1)."""
+        return self._gradient(self.law(U, theta, fields), theta, U)
 
-    def law(self, U: Array, theta: Array, fields: Sequence[int]) -> Path:
+    def law(self, U: Array, theta: Array, fields: ArrayLike) -> Path:
         """The trajectories under a law."""
         return self._roll(
             fields, lambda _, states: features(U, self.plant.target, states) @ theta.T
         )
 
-    def _roll(self, fields: Sequence[int], law: Law) -> Path:
+    def _roll(self, fields: ArrayLike, law: Law) -> Path:
         def finite(k: int, z: Array) -> Array:
             a = law(k, z)
             if not np.isfinite(a).all():
@@ -123,27 +164,26 @@ class Gradients:
         try:
             episode = rollout(plant, finite, fields)
         except FloatingPointError:  # gains so large that the actions overflow
-            nothing = np.empty((plant.horizon, len(fields), 0))
-            return Path(nothing, nothing, np.full(len(fields), np.inf), False)
+            nothing = np.empty((plant.horizon, plant.batch, 0))
+            return Path(nothing, nothing, np.full(plant.batch, np.inf), False)
         whole = not (episode.costs.diverged_step >= 0).any()
         return Path(episode.states[:-1], episode.actions, episode.costs.mean, whole)
 
-    def _backwards(
-        self, path: Path, U: Array | None = None, theta: Array | None = None
-    ) -> tuple[Array, Array]:
-        """dJ/da_k along the path, (T, M, n_a), and with a law dJ/dtheta."""
+    def _gradient(self, path: Path, argument: Array, U: Array | None = None) -> CostGradient:
+        """Of the path's cost, by its actions or, with U, by the law theta."""
         plant, (T, M, _) = self.plant, path.states.shape
+        gradient, eta = np.zeros_like(argument), np.zeros((M, plant.n_z))
+        if not path.whole:
+            return CostGradient(np.inf, gradient, eta)
         q, r = 2 * plant.state_weight / (M * T), 2 * plant.action_weight / (M * T)
-        on_inputs = np.empty_like(path.actions)
-        on_theta = np.zeros_like(theta) if theta is not None else np.zeros((0, 0))
-        eta = np.zeros(path.states.shape[1:])
         for k in range(T - 1, -1, -1):
             z, a = path.states[k], path.actions[k]
             eta, g = self._adjoint.pull_back(z, a, eta)
             g += r * a
-            on_inputs[k] = g
             eta += q * (z - plant.target)
-            if U is not None and theta is not None:
-                eta += g @ theta[:, :-1] @ U.T
-                on_theta += g.T @ features(U, plant.target, z)
-        return on_inputs, on_theta
+            if U is None:
+                gradient[k] = g
+            else:
+                eta += g @ argument[:, :-1] @ U.T
+                gradient += g.T @ features(U, plant.target, z)
+        return CostGradient(float(path.costs.mean()), gradient, eta)

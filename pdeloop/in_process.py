@@ -18,7 +18,7 @@ from loop_interfaces import model_rows
 from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn, noise_seeds
 from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.plant import Plant
-from pdeloop.episode import Law, rollout
+from pdeloop.episode import EpisodeRecord, Law, rollout
 from tuner_node.batch import Batch, BatchResult
 from tuner_node.training import Training
 from tuner_node.trajectory_collector import cut
@@ -70,12 +70,22 @@ class LocalPair:
             self.plant.target,
         )
 
-    def _episode(self, batch: Batch) -> BatchResult:
-        plant, settings = self.plant, self._settings
+    def roll_out(self, batch: Batch) -> EpisodeRecord:
+        """The episode of a batch; states and actions of one that is exploratory or asks for them."""
         law = self._exploration(batch) if batch.exploratory else self._policies(batch)
         seeds = batch.rows[:, StartColumn.SEED].astype(np.int64)
         keep = batch.exploratory or batch.trajectories
-        episode = rollout(plant, law, seeds, noise_seeds(batch.rows), keep=keep)
+        episode = rollout(self.plant, law, seeds, noise_seeds(batch.rows), keep=keep)
+        lost = episode.costs.diverged_step
+        if batch.exploratory and (lost >= 0).any():
+            raise ValueError(
+                f"no reduced model: the plant diverged under exploration at step {int(lost.max())}; "
+                "lower exploration_variance"
+            )
+        return episode
+
+    def _episode(self, batch: Batch) -> BatchResult:
+        episode = self.roll_out(batch)
         costs = episode.costs
         ended = np.where(costs.diverged_step >= 0, costs.diverged_step, COMPLETED)
         table = np.column_stack([costs.mean, costs.total, ended.astype(np.float64)])
@@ -84,15 +94,12 @@ class LocalPair:
             seen = cut(episode.states, episode.actions, table[:, CostColumn.ENDED])
         if not batch.exploratory:
             return BatchResult(table, trajectories=seen)
-        if (ended != COMPLETED).any():
-            raise ValueError(
-                f"no reduced model: the plant diverged under exploration at step "
-                f"{int(ended.max())}; lower exploration_variance"
-            )
         states, actions = episode.states, episode.actions
         models = [
-            model_rows.pack(design([(states[:, m], actions[:, m])], plant.target, settings))
-            for m in range(len(seeds))
+            model_rows.pack(
+                design([(states[:, m], actions[:, m])], self.plant.target, self._settings)
+            )
+            for m in range(len(table))
         ]
         return BatchResult(table, np.stack(models), trajectories=seen)
 

@@ -173,10 +173,7 @@ def _run(folder: Path, values: dict[str, Any], transport: Transport, as_json: bo
     started = time.monotonic()
     try:
         with interruptible() as check:
-            if transport.in_process:
-                _train_here(folder, values, display, check)
-            else:
-                _train_over_topics(folder, display, transport, check)
+            carry_out(folder, values, transport, display, check)
     except Interruption as signal_name:
         display.close()
         display.line(
@@ -196,6 +193,20 @@ def _run(folder: Path, values: dict[str, Any], transport: Transport, as_json: bo
     for text in narration.warnings(summary):
         display.warn(text)
     return int(narration.failed(summary))
+
+
+def carry_out(
+    folder: Path,
+    values: dict[str, Any],
+    transport: Transport,
+    display: Display,
+    check: Callable[[], None],
+) -> None:
+    """Train in `folder` to the end; `check`, called now and then, may raise to stop it."""
+    if transport.in_process:
+        _train_here(folder, values, display, check)
+    else:
+        _train_over_topics(folder, display, transport, check)
 
 
 def _train_here(

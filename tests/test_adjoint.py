@@ -144,24 +144,33 @@ def test_a_nonlinearity_without_a_derivative_is_refused_with_the_reason():
             Adjoint(plant)
 
 
-@pytest.mark.parametrize("problem", PROBLEMS)
+@pytest.mark.parametrize("problem", [*PROBLEMS, "wave"])
 def test_gradients_of_whole_episodes_agree_with_finite_differences(problem):
+    """By the law, the policy, the actions and the initial fields; of a linear plant, too."""
     plant = plant_of(problem, horizon=25)
     rng = np.random.default_rng(2)
     gradients = Gradients(plant)
     U = np.linalg.qr(rng.standard_normal((plant.n_z, 4)))[0]
+    seeds = [3, 1, 4]
+    fields = plant.reset(seeds).copy()
+
+    def check(function, at, gradient, h=1e-4):
+        direction = rng.standard_normal(at.shape)
+        slope = derivative(lambda s: function(at + s * direction).cost, h)
+        assert slope == pytest.approx((gradient * direction).sum(), rel=1e-8)
+
     theta = 0.1 * rng.standard_normal((plant.n_a, 5))
-    fields = [3, 1, 4]
-    direction = rng.standard_normal(theta.shape)
-    cost, gradient = gradients.of_law(U, theta, fields)
-    assert cost == gradients.law(U, theta, fields).costs.mean()
-    slope = derivative(lambda s: gradients.of_law(U, theta + s * direction, fields)[0], 1e-4)
-    assert slope == pytest.approx((gradient * direction).sum(), rel=1e-8)
-    inputs = 0.1 * rng.standard_normal((plant.horizon, 3, plant.n_a))
-    direction = rng.standard_normal(inputs.shape)
-    _, gradient = gradients.of_inputs(inputs, fields)
-    slope = derivative(lambda s: gradients.of_inputs(inputs + s * direction, fields)[0], 1e-4)
-    assert slope == pytest.approx((gradient * direction).sum(), rel=1e-8)
+    found = gradients.of_law(U, theta, seeds)
+    assert found.cost == gradients.law(U, theta, seeds).costs.mean()
+    check(lambda t: gradients.of_law(U, t, seeds), theta, found.gradient)
+    policy = 0.1 * rng.standard_normal((plant.n_a, 8))
+    found = gradients.of_policy(U, policy, seeds)
+    check(lambda p: gradients.of_policy(U, p, seeds), policy, found.gradient)
+    check(lambda z: gradients.of_policy(U, policy, z), fields, found.of_fields, h=1e-5)
+    actions = 0.1 * rng.standard_normal((plant.horizon, 3, plant.n_a))
+    found = gradients.of_actions(actions, seeds)
+    check(lambda a: gradients.of_actions(a, seeds), actions, found.gradient)
+    check(lambda z: gradients.of_actions(actions, z), fields, found.of_fields, h=1e-5)
 
 
 def test_the_law_of_a_policy_costs_what_the_controller_makes_it_cost():
@@ -182,5 +191,5 @@ def test_a_rollout_that_diverges_costs_infinity():
     plant = plant_of("kdv", horizon=30)
     theta = np.full((plant.n_a, 5), 1e3)
     U = np.linalg.qr(np.random.default_rng(0).standard_normal((plant.n_z, 4)))[0]
-    cost, gradient = Gradients(plant).of_law(U, theta, [0])
+    cost, gradient, _ = Gradients(plant).of_law(U, theta, [0])
     assert cost == np.inf and not gradient.any()

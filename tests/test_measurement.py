@@ -83,6 +83,22 @@ def run(plant: Plant, seeds: list[int], noise: list[int], actions: float = 0.0) 
 # Noise
 
 
+def test_fields_instead_of_seeds_begin_the_same_episode() -> None:
+    for changes in ({}, {"measurement_noise": 0.1, "sensors": 4}):
+        drawn, given = (build_plant(parameters(**changes)) for _ in range(2))
+        drawn.reset([7, -1])
+        fields = drawn.states.copy()
+        z = given.reset(fields)
+        assert same_bits(given.states, fields)
+        assert z.shape == (2, given.state_size)
+        for plant in (drawn, given):
+            plant.step(np.ones((2, plant.n_a)))
+        assert same_bits(given.states, drawn.states)
+        for refused in (fields[:, 1:], fields[:0], np.nan * fields):
+            with pytest.raises(ValueError, match=r"initial fields must"):
+                given.reset(refused)
+
+
 def test_measurement_noise_is_white_gaussian_of_the_stated_deviation_and_moves_no_field() -> None:
     sigma = 0.3
     plant = instrumented(measurement_noise=sigma)

@@ -67,7 +67,7 @@ def test_open_inputs_of_a_linear_plant_are_those_of_the_least_squares_problem():
     least = float(np.sum((matrix @ exact - vector) ** 2)) / T
     gradients = Gradients(plant)
     found = descend(
-        lambda a: gradients.of_inputs(a, [4]),
+        lambda a: gradients.of_actions(a, [4])[:2],
         np.zeros((T, 1, n_a)),
         tolerance=1e-12,
         iterations=200,

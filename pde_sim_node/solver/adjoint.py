@@ -39,7 +39,7 @@ from loop_interfaces.jit import cache, native, simd
 from loop_interfaces.jit.cache import cached_njit, fingerprint, jit
 from loop_interfaces.jit.native import call_c
 from loop_interfaces.jit.simd import load, read, splat, write
-from pde_sim_node.equations import Equation
+from pde_sim_node.equations import Equation, LinearEquation
 from pde_sim_node.plant import Plant
 from pde_sim_node.solver import fft, kernel, spectra
 from pde_sim_node.solver.integrator import Integrator
@@ -58,7 +58,7 @@ from pde_sim_node.solver.spectra import (
     synthesise,
 )
 
-__all__ = ["Adjoint"]
+__all__ = ["Adjoint", "LinearAdjoint", "adjoint_of"]
 
 Array = NDArray[np.float64]
 COMPLEX_STEP = 1e-30
@@ -311,6 +311,24 @@ class Adjoint:
         else:
             list(self._pool.map(work, range(count)))
         return after, on_states, on_actions
+
+
+class LinearAdjoint:
+    """The same of a plant that is linear in state and action, z' = A z + B a: A^T y and B^T y."""
+
+    def __init__(self, plant: Plant) -> None:
+        n_z, n_a = plant.n_z, plant.n_a
+        self._A_transposed, _ = plant.evaluate(np.eye(n_z), np.zeros((n_z, n_a)))
+        self._B_transposed, _ = plant.evaluate(np.zeros((n_a, n_z)), np.eye(n_a))
+
+    def pull_back(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array]:
+        """A^T y and B^T y of every environment, (M, n_z) and (M, n_a)."""
+        return covectors @ self._A_transposed.T, covectors @ self._B_transposed.T
+
+
+def adjoint_of(plant: Plant) -> Adjoint | LinearAdjoint:
+    """What pulls covectors back through a plant's step."""
+    return LinearAdjoint(plant) if isinstance(plant.equation, LinearEquation) else Adjoint(plant)
 
 
 def derivative_loop(equation: Equation) -> Any:

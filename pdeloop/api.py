@@ -1,0 +1,241 @@
+"""The Python API: problems, their plants and explorations, identification and training."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from io import StringIO
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, TextIO
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from controller_node import dmdc, regression
+from controller_node.reduced_model import ReducedModel
+from loop_interfaces.problem import load_parameters
+from pde_sim_node.build import build_equation, build_plant
+from pde_sim_node.equations import allow
+from pde_sim_node.plant import Plant
+from pdeloop.display import Display
+from pdeloop.finished_run import FinishedRun, load
+from pdeloop.in_process import LocalPair
+from pdeloop.training_run import Transport, begin, carry_out
+from tuner_node.build import build_training
+
+__all__ = ["Problem", "identify", "load_run", "problem", "train"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A PDE with its grid, actuators, cost and horizon, and the settings of the method for it.
+
+    Attributes
+    ----------
+    source : str
+        Name or YAML file that it was made from.
+    given : dict
+        The parameters that replace those of the file.
+    values : dict
+        All parameters, by the names of docs/interfaces.md.
+    """
+
+    source: str
+    given: Mapping[str, Any]
+    values: Mapping[str, Any]
+
+    def plant(self, batch: int = 1) -> Plant:
+        """A plant of M = `batch` environments at the start of an episode, with the fields of seeds 0 ..
+
+        `Plant.reset` begins another episode, of any M. `states` (M, n_z) are the fields, `step`
+        takes actions (M, n_a), and `episode_costs` has what it cost so far.
+
+        Raises
+        ------
+        ValueError
+            The parameters do not fit together, or `batch` is less than 1.
+        """
+        plant = build_plant(self.values)
+        plant.reset(np.arange(batch))
+        return plant
+
+    def explore(self, seed: int = 0) -> tuple[Array, Array]:
+        """The exploratory episode that a training with this seed begins with.
+
+        Returns
+        -------
+        states : (T + 1, state_size) array
+            z_0 .. z_T as they are measured.
+        actions : (T, n_a) array
+            Drawn from N(0, exploration_variance), whatever the states.
+
+        Raises
+        ------
+        ValueError
+            The plant diverged.
+        """
+        training = build_training({**self.values, "seed": seed, "seeds": 1, "model": ""})
+        batch = training.next_batch()
+        assert batch is not None
+        episode = LocalPair(self.values).roll_out(batch)
+        return episode.states[:, 0], episode.actions[:, 0]
+
+
+def problem(
+    source: str | Path = "burgers",
+    *,
+    physical: Mapping[str, float] | None = None,
+    **parameters: Any,
+) -> Problem:
+    """A shipped problem or one from a YAML file, with other parameters where they are given.
+
+    Parameters
+    ----------
+    source
+        A name that `pdeloop problems` lists, or the path of a YAML file.
+    physical
+        The equation's own parameters, like {"viscosity": 1e-3}.
+    parameters
+        Any parameter of docs/interfaces.md by name: n_z, n_a, horizon, measurement_noise, ... Code of
+        an own equation ('file.py:Class') is run if it is named here as `equation`.
+
+    Raises
+    ------
+    ValueError
+        There is no such problem or parameter, or a value is out of range.
+
+    Examples
+    --------
+    >>> import pdeloop
+    >>> burgers = pdeloop.problem("burgers", n_z=64, horizon=100, physical={"viscosity": 1e-3})
+    >>> plant = burgers.plant(batch=3)
+    >>> plant.states.shape
+    (3, 64)
+    >>> states, actions = burgers.explore(seed=0)
+    >>> states.shape, actions.shape
+    ((101, 64), (100, 6))
+    """
+    given = parameters | {f"physical.{name}": value for name, value in (physical or {}).items()}
+    if "equation" in given:
+        given["equation"] = allow(given["equation"])
+    values = load_parameters(str(source), given)
+    build_equation(values)  # refuses physical parameters that it does not have
+    return Problem(str(source), given, values)
+
+
+def identify(
+    *trajectories: tuple[ArrayLike, ArrayLike], n_s: int, method: str = "regression", p: int = 0
+) -> ReducedModel:
+    """A reduced linear model s_{k+1} = A s_k + B a_k, s = U^T z, from trajectories of one plant.
+
+    Parameters
+    ----------
+    trajectories : (states (N + 1, n_z), actions (N, n_a)) each
+        As `Problem.explore` gives them; a_k is held from z_k to z_{k+1}.
+    n_s
+        Order of the model.
+    method : {"regression", "dmdc"}
+        Least squares in reduced coordinates with the inputs whole, or the truncated regression of
+        Proctor, Brunton and Kutz (2016).
+    p
+        Rank of dmdc; 0: n_s + n_a.
+
+    Returns
+    -------
+    ReducedModel
+        A (n_s, n_s), B (n_s, n_a), U (n_z, n_s).
+
+    Raises
+    ------
+    ValueError
+        Shapes that do not fit, NaN or infinity, or data that allow no model of this order.
+
+    Examples
+    --------
+    >>> import pdeloop
+    >>> burgers = pdeloop.problem("burgers")
+    >>> model = pdeloop.identify(burgers.explore(0), burgers.explore(1), n_s=4)
+    >>> model.A.shape, model.B.shape, model.U.shape
+    ((4, 4), (4, 6), (128, 4))
+    """
+    if not trajectories:
+        raise ValueError("identify needs one trajectory or more, each a pair (states, actions)")
+    if method == "regression":
+        return regression.identify_from(trajectories, n_s=n_s)
+    if method == "dmdc":
+        n_a = np.shape(trajectories[0][1])[-1]
+        return dmdc.identify_from(trajectories, p=p or n_s + n_a, n_s=n_s)
+    raise ValueError(f"method is {method!r}; expected 'regression' or 'dmdc'")
+
+
+def train(
+    problem: Problem | str,
+    *,
+    out: str | Path | None = None,
+    over_topics: bool = False,
+    progress: TextIO | None = None,
+    **parameters: Any,
+) -> FinishedRun:
+    """Identify, design, adapt and evaluate, as `pdeloop train` does, to the same bits.
+
+    Parameters
+    ----------
+    problem
+        A problem, or its name.
+    out
+        Folder of the results, as the command line keeps them; none is kept if not given.
+    over_topics
+        With the nodes in processes of their own, over ROS 2 topics, instead of in this process.
+    progress
+        Where to show it, like sys.stdout; it is silent if not given.
+    parameters
+        As of `problem`: seed, seeds, rollouts, optimizer, ...
+
+    Returns
+    -------
+    FinishedRun
+        With S seeds: `policies` and `warm` (S, n_a, 2 n_s), `models`, and `costs` by controller,
+        (S, fields).
+
+    Raises
+    ------
+    ValueError
+        The parameters do not fit together, or the folder cannot be used.
+    RuntimeError
+        A node cannot be started or ends.
+
+    Examples
+    --------
+    >>> import pdeloop
+    >>> run = pdeloop.train(
+    ...     "burgers", n_z=64, horizon=100, optimizer="two_point", rollouts=5, evaluation_fields=2
+    ... )
+    >>> run.policies.shape, run.costs["adapted"].shape
+    ((1, 6, 8), (1, 2))
+    """
+    with TemporaryDirectory() as temporary:
+        source, given = (
+            (problem.source, problem.given) if isinstance(problem, Problem) else (problem, {})
+        )
+        where = Path(temporary) / "run" if out is None else Path(out)
+        folder, values = begin(source, {**given, **parameters}, where)
+        display = Display(values["seed"], values["seeds"], progress or StringIO())
+        try:
+            carry_out(folder, values, Transport(not over_topics), display, lambda: None)
+        finally:
+            display.close()
+        return load(folder)
+
+
+def load_run(folder: str | Path) -> FinishedRun:
+    """A finished run from its folder: costs, policies and models as arrays.
+
+    Raises
+    ------
+    ValueError
+        There is no run, or it is not finished; the message says how to go on.
+    """
+    return load(Path(folder))

@@ -1,0 +1,107 @@
+"""`import pdeloop`: the same bits as the command line, arrays in and out, refusals in one sentence."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pdeloop
+from pdeloop.cli import main
+from tests.small import SMALL, same_bits
+from tuner_node.seeds import Purpose, derive
+
+TWO_POINT = {"optimizer": "two_point", "rollouts": 7, "evaluation_fields": 3, "seed": 5}
+
+
+@pytest.fixture(scope="module")
+def run() -> pdeloop.FinishedRun:
+    return pdeloop.train(str(SMALL), **TWO_POINT)
+
+
+@pytest.fixture(scope="module")
+def small() -> pdeloop.Problem:
+    return pdeloop.problem(SMALL)
+
+
+def test_importing_it_is_cheap_and_needs_no_ros() -> None:
+    program = (
+        "import sys; sys.modules['rclpy'] = None\n"
+        "import pdeloop\n"
+        "assert not {'numpy', 'numba', 'scipy', 'pdeloop.api'} & set(sys.modules)\n"
+        "for name in pdeloop.__all__: assert getattr(pdeloop, name).__doc__, name\n"
+        "pdeloop.problem('burgers', n_z=32, horizon=5).explore()\n"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        pdeloop.nothing  # noqa: B018
+
+
+def test_a_training_has_the_bits_of_the_command_line(run, tmp_path: Path) -> None:
+    words = ["--optimizer", "two-point", "--rollouts", "7", "--seed", "5", "--in-process"]
+    assert main(["train", str(SMALL), *words, "--out", str(tmp_path / "there")]) == 0
+    there = pdeloop.load_run(tmp_path / "there")
+    assert same_bits(run.policies, there.policies)
+    assert same_bits(run.warm, there.warm)
+    kept = pdeloop.train(pdeloop.problem(SMALL, horizon=9), out=tmp_path / "kept", **TWO_POINT)
+    assert kept.values["horizon"] == 9
+    assert same_bits(kept.policies, pdeloop.load_run(tmp_path / "kept").policies)
+    with pytest.raises(ValueError, match="already holds a run"):
+        pdeloop.train(str(SMALL), out=tmp_path / "kept")
+
+
+def test_its_parts_make_what_the_training_made(run, small) -> None:
+    """Exploration, identification, design and rollouts one by one."""
+    values = run.values
+    method = {"method": values["identification"], "p": values["dmdc_rank"]}
+    model = pdeloop.identify(small.explore(seed=5), n_s=len(run.models[0].A), **method)
+    for name in ("A", "B", "U"):
+        assert same_bits(getattr(model, name), getattr(run.models[0], name))
+    weights = {name: values[name] for name in ("state_weight", "action_weight")}
+    gains = pdeloop.track(model, **weights)
+    assert same_bits(gains.policy, run.warm[0])
+    plant = small.plant(batch=2)
+    assert plant.states.shape == (2, plant.n_z)
+    fields = [derive(0, Purpose.EVALUATION_FIELD, i) for i in range(3)]
+    for policy, costs in ((gains.policy, run.costs["lqt"]), (run.policies, run.costs["adapted"])):
+        policies = np.repeat(policy, 3, axis=0) if policy.ndim == 3 else policy
+        law = pdeloop.projected_law(plant, model.U, policies)
+        assert same_bits(pdeloop.rollout(plant, law, fields).costs.mean, costs[0])
+
+
+def test_a_law_saturates_where_the_plant_does() -> None:
+    plant = pdeloop.problem(SMALL, action_limit=0.2).plant()
+    law = pdeloop.projected_law(plant, np.eye(plant.n_z)[:, :2], np.full((plant.n_a, 4), 9.0))
+    assert np.abs(pdeloop.rollout(plant, law, [0]).actions).max() == 0.2
+
+
+def test_what_does_not_fit_is_refused_in_one_sentence(small) -> None:
+    plant, (states, actions) = small.plant(), small.explore()
+    n_z, n_a = plant.n_z, plant.n_a
+    basis, gradients = np.eye(n_z)[:, :2], pdeloop.Gradients(plant)
+    holes = np.where(np.arange(n_a) < 1, np.nan, np.zeros((plant.horizon, 1, n_a)))
+    for refused, words in (
+        (lambda: pdeloop.problem("burgerz"), "unknown problem 'burgerz'; expected one of"),
+        (lambda: pdeloop.problem(n_zz=4), "n_zz"),
+        (lambda: pdeloop.problem(physical={"viscousity": 1.0}), "unknown parameter 'physical"),
+        (lambda: small.plant(batch=0), "one for each environment"),
+        (lambda: pdeloop.identify(n_s=2), "one trajectory or more"),
+        (lambda: pdeloop.identify((states[1:], actions), n_s=2), "actions belong to"),
+        (lambda: pdeloop.identify((np.nan * states, actions), n_s=2), "must be finite"),
+        (lambda: pdeloop.identify((states, actions), n_s=2, method="dmd"), "expected 'regression'"),
+        (lambda: pdeloop.projected_law(plant, basis[1:], np.zeros((n_a, 4))), "U must have shape"),
+        (lambda: pdeloop.projected_law(plant, basis, np.zeros((n_a, 3))), "policy must have shape"),
+        (lambda: pdeloop.rollout(plant, lambda k, z: z, [0]), "actions must have shape"),
+        (lambda: gradients.of_actions(np.zeros((3, 1, n_a)), [0]), "actions must have shape"),
+        (lambda: gradients.of_actions(holes, [0]), "actions must be finite"),
+        (lambda: gradients.of_policy(basis, np.zeros((n_a, 5)), [0]), "policy must have shape"),
+        (lambda: pdeloop.Gradients(pdeloop.problem(sensors=4).plant()), "without noise, limits"),
+        (lambda: pdeloop.train(small, optimizer="adam"), "'optimizer' is 'adam'"),
+        (lambda: pdeloop.load_run("/nowhere"), "no run in /nowhere"),
+    ):
+        with pytest.raises(ValueError, match=words) as caught:
+            refused()
+        assert "\n" not in str(caught.value)
