@@ -139,6 +139,13 @@ def test_a_law_that_became_worse_is_no_improvement():
         assert lines[-1].endswith(words)
 
 
+def test_several_publishers_of_a_topic_are_a_warning():
+    found = summary(several_publishers={"/action": ["/controller_node", "/stranger"]})
+    assert warnings(found) == [
+        "2 nodes published /action: /controller_node, /stranger; expected one"
+    ]
+
+
 def test_a_cost_above_no_control_is_a_warning_that_names_the_seeds():
     worse = summary(costs={"none": [4.0, 4.0], "lqt": [2.0, 5.0], "adapted": [1.0, 4.5]})
     assert warnings(worse) == [

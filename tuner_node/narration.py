@@ -145,6 +145,8 @@ def warnings(summary: Row) -> list[str]:
     lost, rollouts = summary["diverged"], summary["evaluation_rollouts"]
     costs = summary["costs"]
     found = []
+    for topic, nodes in summary.get("several_publishers", {}).items():
+        found.append(f"{len(nodes)} nodes published {topic}: {', '.join(nodes)}; expected one")
     if lost["lqt"] == rollouts:
         found.append(
             "every rollout of the first laws diverged; likely causes: an exploration that is too weak "

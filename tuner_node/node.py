@@ -32,6 +32,7 @@ from loop_interfaces.ros.parameters import declare, given_parameters, on_change
 from loop_interfaces.ros.suspend_watchdog import nap
 from loop_interfaces.topics import (
     ACTION,
+    ARRAYS,
     COST,
     MODEL,
     MODEL_FAILED,
@@ -126,6 +127,7 @@ class TunerNode:
         self._absence_reported = float("-inf")
         self._plants_paused: list[int] = []
         self._rival_since: float | None = None
+        self._several_publishers: dict[str, list[str]] = {}
         self._log.info(f"run {identity.run} of {values['problem']}, seed {values['seed']}")
 
     def run(self) -> int:
@@ -157,6 +159,7 @@ class TunerNode:
 
     def join(self, node: Node, loop: NodeLoop) -> None:
         declare_parameters(node, self._changed)
+        self._several_publishers |= self._loop.several_publishers
         self._wire(node, loop)
 
     def _wire(self, node: Node, loop: NodeLoop) -> None:
@@ -185,6 +188,8 @@ class TunerNode:
                 reader_qos(MODEL),
             )
             loop.listen(PAUSED, self._handler(session.paused, number), namespace)
+            for topic in ARRAYS:
+                loop.supervise(topic, namespace)
         loop.diagnose("training", lambda now: self._health.report(now, self._absent(now)))
         loop.offer("~/pause", self._pause)
         loop.offer("~/resume", self._resume)
@@ -368,7 +373,12 @@ class TunerNode:
         if self._recorder:
             try:
                 summary = self._recorder.finish(
-                    {"transport": "topics", "controller": self._controller()}
+                    {
+                        "transport": "topics",
+                        "controller": self._controller(),
+                        "several_publishers": self._several_publishers
+                        | self._loop.several_publishers,
+                    }
                 )
             except OSError as error:
                 raise ConfigurationError(f"cannot write the results: {error.strerror}") from error

@@ -282,8 +282,10 @@ def check_result(content: Mapping[str, Any], seed: int, seeds: int) -> None:
         raise ValueError("its 'versions' are no table")
     controller = content.get("controller", {})
     nodes = controller.get("nodes", []) if isinstance(controller, dict) else None
-    if not isinstance(nodes, list) or not all(isinstance(node, str) for node in nodes):
-        raise ValueError("its 'controller' is no table with a list of nodes")
+    several = content.get("several_publishers", {})
+    lists = [nodes, *several.values()] if isinstance(several, dict) else [None]
+    if not all(isinstance(n, list) and all(isinstance(node, str) for node in n) for n in lists):
+        raise ValueError("its 'controller' or 'several_publishers' is no table of lists of nodes")
 
 
 def policy_arrays(training: Training) -> dict[str, NDArray[Any]]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -41,7 +41,7 @@ class Introspection:
         self,
         node: Node,
         refused: Callable[[], tuple[int, str]],
-        topics: Callable[[], Sequence[str]],
+        topics: Callable[[], Iterable[str]],
     ) -> None:
         self._node, self._refused, self._topics = node, refused, topics
         self._publisher: Publisher | None = None
@@ -55,6 +55,8 @@ class Introspection:
         self._last = Health(Level.OK, "")
         self._working: tuple[str, float] | None = None
         self._publishing = threading.Lock()
+        self.several_publishers: dict[str, list[str]] = {}
+        """The nodes that published a topic which one node should publish."""
 
     def report(self, task: str, health: Callable[[float], Health]) -> None:
         """Publish what `health(now)` says once a second, under the node's name and `task`."""
@@ -149,8 +151,11 @@ class Introspection:
             found = {
                 f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
                 for endpoint in self._node.get_publishers_info_by_topic(topic)
+                if endpoint.node_name != NAMELESS  # one that was just started again may be
             }
             if len(found) > 1:
+                known = self.several_publishers.get(topic, ())
+                self.several_publishers[topic] = sorted(found.union(known))
                 self._node.get_logger().warning(
                     f"{len(found)} nodes publish {topic}: {', '.join(sorted(found))}; "
                     "only messages of this run, episode, step and plant count",

@@ -80,6 +80,7 @@ class NodeLoop:
         self.node = node
         self.refused: Counter[str] = Counter()
         self._receivers: list[Receiver] = []
+        self._supervised: set[str] = set()
         self._batcher: SampleBatcher | None = None
         self._watched: dict[str, _Watched] = {}
         self._stop_reason: str | None = None
@@ -98,7 +99,7 @@ class NodeLoop:
         self._introspection = Introspection(
             node,
             refused=lambda: (sum(self.refused.values()), self._last_reason),
-            topics=lambda: [receiver.name for receiver in self._receivers],
+            topics=lambda: {*self._supervised, *(receiver.name for receiver in self._receivers)},
         )
 
     def sender(self, topic: Topic, namespace: str = "", *, sampled: bool = False) -> Sender:
@@ -112,6 +113,16 @@ class NodeLoop:
         receiver = Receiver(self.node, topic, callback, namespace)
         self._receivers.append(receiver)
         return receiver
+
+    def supervise(self, topic: Topic, namespace: str = "") -> None:
+        """Look for several publishers of a topic, as is done for those that are received."""
+        name = scoped(namespace, topic.name)
+        self._supervised.add(self.node.resolve_topic_name(name))
+
+    @property
+    def several_publishers(self) -> dict[str, list[str]]:
+        """The nodes that published a topic which one node should publish."""
+        return self._introspection.several_publishers
 
     def answer_fast(self, receiver: Receiver, sender: Sender, path: FastPath) -> None:
         """Let `path` answer messages of `receiver` on `sender` while this thread waits.

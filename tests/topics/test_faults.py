@@ -303,10 +303,15 @@ def test_a_strange_publisher_is_reported_by_name_and_changes_nothing(loop, tmp_p
     with held_training(loop, "/stranger"):
         stranger = loop.start("-c", STRANGER, name="stranger")
         # Strangers are looked for from time to time, whether the training is paused or not.
-        until(lambda: "/stranger" in loop.output(running["plant"]), LIMIT, "report of the stranger")
+        for node in (running["plant"], tuner):
+            until(
+                lambda node=node: "/stranger" in loop.output(node), LIMIT, "report of the stranger"
+            )
     loop.wait(tuner, LIMIT)
     assert_same_training(out, in_process(iterations=600))
     assert "2 nodes publish /action: /controller_node, /stranger" in loop.output(running["plant"])
+    told = json.loads((out / "result.json").read_text())["several_publishers"]
+    assert told == {"/action": ["/controller_node", "/stranger"]}
     stranger.kill()
 
 
