@@ -27,9 +27,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
 from threadpoolctl import threadpool_limits
 
-from controller_node.reduced_model import ReducedModel, leading_modes, steps_of
+from controller_node.reduced_model import ReducedModel, Steps, leading_modes, steps_of
 
-__all__ = ["identify", "identify_from"]
+__all__ = ["fit", "identify", "identify_from"]
 
 Array = NDArray[np.float64]
 
@@ -87,12 +87,18 @@ def identify_from(trajectories: Sequence[tuple[ArrayLike, ArrayLike]], *, n_s: i
     # One thread: a threaded LAPACK rounds differently for another number of threads.
     with threadpool_limits(limits=1):
         U, _ = leading_modes(data.after, n_s)
-        s, y = data.before @ U, data.inputs
-        # In units in which both have the norm 1, so that what counts as zero does not depend on theirs.
-        scales = np.repeat([_norm(s), _norm(y)], [n_s, n_a])
-        coefficients: Array = linalg.lstsq(np.hstack([s, y]) / scales, data.after @ U)[0]
-        coefficients /= scales[:, None]
-        return ReducedModel(A=coefficients[:n_s].T, B=coefficients[n_s:].T, U=U)
+        return fit(data, U)
+
+
+def fit(data: Steps, U: Array) -> ReducedModel:
+    """The regression on given modes U (n_z, n_s); see `identify_from`. Call with one LAPACK thread."""
+    s, y = data.before @ U, data.inputs
+    n_s = s.shape[1]
+    # In units in which both have the norm 1, so that what counts as zero does not depend on theirs.
+    scales = np.repeat([_norm(s), _norm(y)], [n_s, y.shape[1]])
+    coefficients: Array = linalg.lstsq(np.hstack([s, y]) / scales, data.after @ U)[0]
+    coefficients /= scales[:, None]
+    return ReducedModel(A=coefficients[:n_s].T, B=coefficients[n_s:].T, U=U)
 
 
 def _norm(values: Array) -> float:

@@ -88,6 +88,7 @@ def parser() -> argparse.ArgumentParser:
         bag,
         completion,
         evaluate,
+        identify,
         monitor,
         problems,
         reproduce,
@@ -102,7 +103,17 @@ def parser() -> argparse.ArgumentParser:
     )
     root.add_argument("--version", action="version", version=f"pdeloop {_version()}")
     commands = root.add_subparsers(required=True, metavar="COMMAND")
-    for module in (train, evaluate, bag, monitor, reproduce, secure, problems, completion):
+    for module in (
+        train,
+        evaluate,
+        identify,
+        bag,
+        monitor,
+        reproduce,
+        secure,
+        problems,
+        completion,
+    ):
         module.add(commands)
     root.set_defaults(root=root)  # for what is made from the parser itself
     return root

@@ -29,11 +29,11 @@ from rosbags.interfaces import QosDurability
 
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.topics import ACTION, COST, POLICY, START, STATE
-from pdeloop.bags.identification import identify
 from pdeloop.bags.playback import Playback
 from pdeloop.bags.reader import Bag
 from pdeloop.bags.tools import recover
 from pdeloop.bags.verify import verify
+from pdeloop.identification import Wanted, identify_bag
 from recorder_node.bag import BagError, BagWriter, Channel, Definition, definition
 from recorder_node.recording import CLOCK, DIAGNOSTICS, ROSOUT, Recording, Source, sources
 from tests.small_disk import read_only_folder, small_disk
@@ -532,7 +532,7 @@ def test_a_bag_of_the_version_before_is_read_verified_and_identified_from(tmp_pa
     for text in report.differences:  # on another machine than that which recorded it
         recorded, again = map(float, re.findall(r"re(?:corded|computed) (\S+?)(?:,|$)", text))
         assert again == pytest.approx(recorded, rel=1e-6), text
-    assert identify(OLD, rank=None, order=None).live is not None
+    assert identify_bag(OLD, Wanted()).live is not None
     playback = Playback(bag, rate=1.0, again=False)
     playback.begin(0.0)
     assert len(list(playback.take(1e6))) == len(list(bag.messages()))

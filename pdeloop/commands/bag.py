@@ -1,4 +1,4 @@
-"""`pdeloop bag` and `pdeloop identify`: what is done with recordings."""
+"""`pdeloop bag`: what is done with recordings."""
 
 from __future__ import annotations
 
@@ -12,12 +12,7 @@ from pdeloop.output import print_json
 
 
 def add(commands: Commands) -> None:
-    """The commands `bag` and `identify`."""
-    _add_bag(commands)
-    _add_identify(commands)
-
-
-def _add_bag(commands: Commands) -> None:
+    """The command `bag`."""
     bag = command(
         commands,
         "bag",
@@ -91,34 +86,6 @@ def _add_play(actions: Commands) -> None:
     )
 
 
-def _add_identify(commands: Commands) -> None:
-    identify = command(
-        commands,
-        "identify",
-        _identify,
-        help="reduced model from recorded episodes",
-        description="Identify a reduced model by least squares in reduced coordinates from the "
-        "exploratory episodes of a bag (all episodes if none is), of this plant or a foreign one, and "
-        "design LQ-tracking gains.",
-        example="pdeloop identify --bag runs/lab/bag --order 8 --out model.npz",
-    )
-    add = identify.add_argument
-    add("--bag", type=Path, metavar="BAG", required=True, help="folder of a bag or of a run")
-    add("--order", type=int, metavar="NS", help="order n_s of the model [that of the run]")
-    add(
-        "--identification",
-        choices=("regression", "dmdc"),
-        help="least squares with the inputs whole, or truncated DMDc [that of the run, or regression]",
-    )
-    add("--rank", type=int, metavar="P", help="p of the identification dmdc [that of the run]")
-    add("--episode", type=int, metavar="N", help="only this episode")
-    add("--environment", type=int, metavar="M", help="only this environment of each episode")
-    add("--state-weight", type=float, metavar="Q", help="q of Q = q I [that of the run, or 1]")
-    add("--action-weight", type=float, metavar="R", help="r of R = r I [that of the run, or 1]")
-    add("--out", type=Path, metavar="FILE", help="write A, B, U, K_a, K_b, s_r to this .npz")
-    add_json(identify)
-
-
 def _bag_info(options: argparse.Namespace) -> int:
     from pdeloop.bags.tools import describe, info_text
 
@@ -165,26 +132,3 @@ def _bag_play(options: argparse.Namespace) -> int:
         network=options.network,
         tell=lambda text: print(text, flush=True),
     )
-
-
-def _identify(options: argparse.Namespace) -> int:
-    from pdeloop.bags.identification import identify, save
-
-    found = identify(
-        options.bag,
-        order=options.order,
-        method=options.identification,
-        rank=options.rank,
-        episode=options.episode,
-        environment=options.environment,
-        weights=(options.state_weight, options.action_weight),
-    )
-    if options.out is not None:
-        save(found, options.out)
-    if options.json:
-        print_json(found.summary() | {"out": options.out and str(options.out)})
-        return 0
-    print(found.text())
-    if options.out is not None:
-        print(f"  written to {options.out}")
-    return 0

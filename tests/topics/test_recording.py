@@ -20,10 +20,10 @@ from rosbags.highlevel import AnyReader
 
 from loop_interfaces.frames import Frame
 from loop_interfaces.model_rows import pack
-from pdeloop.bags.identification import identify
 from pdeloop.bags.reader import Bag
 from pdeloop.bags.tools import describe, recover
 from pdeloop.bags.verify import verify
+from pdeloop.identification import Wanted, identify_bag
 from recorder_node.bag import BagWriter
 from tests.loop_harness import ROOT, Processes, until
 from tests.small import SMALL, same_bits
@@ -200,10 +200,10 @@ def test_the_command_line_informs_verifies_and_identifies(loop, recorded, tmp_pa
 def test_identify_from_a_bag_equals_the_live_model(recorded):
     with np.load(recorded / "policy.npz") as live:
         for seed in (0, 1):
-            found = identify(recorded / "bag", order=None, environment=seed)
+            found = identify_bag(recorded / "bag", Wanted(), environment=seed)
             assert same_bits(pack(found.model), live["model"][seed])
             assert found.live
-    both = identify(recorded / "bag", order=4)
+    both = identify_bag(recorded / "bag", Wanted(order=4))
     assert both.steps == 2 * STEPS and both.live is None
 
 
@@ -212,11 +212,12 @@ def test_identify_needs_nothing_but_the_topics_of_a_foreign_plant(recorded, tmp_
     shutil.copytree(recorded / "bag", copy)
     (copy / "parameters.json").unlink()
     (copy / "episodes.jsonl").unlink()
-    found = identify(copy, order=4, environment=0, weights=(1.0, 1.0))
+    found = identify_bag(copy, Wanted(order=4), environment=0)
     with np.load(recorded / "policy.npz") as live:
         assert same_bits(pack(found.model), live["model"][0])
-    with pytest.raises(RuntimeError, match="does not say which order to use; give it with --order"):
-        identify(copy, order=None)
+    suggested = identify_bag(copy, Wanted())  # the bag does not say which order it had
+    assert suggested.study is not None
+    assert suggested.model.A.shape[0] == suggested.study.suggested
     report = verify(copy)
     assert "its parameters are not in the bag" in report.notes[0]
     assert verify(copy, parameters=recorded / "parameters.yaml").count == 0

@@ -1,0 +1,188 @@
+"""Which order n_s the data support: errors of models on steps that they were not fitted to.
+
+Every trajectory is cut into pieces; each of four times every fourth piece is held out, and the others
+give U, A and B (see `controller_node.regression`). On a held-out piece z_0 .. z_N the model is away
+from the measurement by
+
+    one step    z_{k+1} - U (A U^T z_k + B a_k)
+    rollout     z_{k+1} - U s_{k+1},    s_{k+1} = A s_k + B a_k,    s_0 = U^T z_0,
+
+so that what lies outside of the modes counts, too. An error is the root of the sum of squares over all
+held-out steps, relative to that of z_{k+1} - z_k for one step and z_{k+1} - z_0 for the rollout: 1 is
+as good as a model in which nothing changes.
+
+References
+----------
+Ljung, "System Identification: Theory for the User", 2nd ed., chapter 16 (cross-validation).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import linalg
+from threadpoolctl import threadpool_limits
+
+from controller_node.reduced_model import ReducedModel, numerical_rank, steps_of
+from controller_node.regression import fit
+
+__all__ = ["OrderStudy", "study_orders"]
+
+Array = NDArray[np.float64]
+Trajectory = tuple[Array, Array]
+ORDERS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 28, 32, 40, 48, 64)
+FOLDS, PIECES = 4, 8
+SHARE = 0.8
+"""Of the fall of the logarithm of the one-step error, from the lowest order to the best one, that the
+suggested order reaches. Noise lets the error fall less, and has lower orders suggested."""
+ROUNDING = 1e-9
+"""Smaller errors are equal."""
+
+
+@dataclass(frozen=True, eq=False)
+class OrderStudy:
+    """What trajectories say about the order of a reduced model.
+
+    Attributes
+    ----------
+    singular_values : (min(N, n_z),) array
+        Of Z' = [z_1 .. z_N], all trajectories together.
+    orders : (K,) int array
+        The orders n_s that were tried, ascending.
+    one_step, rollout : (K,) arrays
+        Relative errors on held-out data; infinity where a rollout overflows.
+    suggested : int
+        The lowest order that reaches `SHARE` of what the best one gains, in digits of the one-step
+        error.
+    """
+
+    singular_values: Array
+    orders: NDArray[np.int64]
+    one_step: Array
+    rollout: Array
+    suggested: int
+
+    def rows(self) -> list[dict[str, float]]:
+        """For each order: it, its singular value relative to the largest, and its errors."""
+        relative = self.singular_values[self.orders - 1] / self.singular_values[0]
+        columns = (self.orders, relative, self.one_step, self.rollout)
+        names = ("order", "singular_value", "one_step_error", "rollout_error")
+        return [
+            dict(zip(names, (value.item() for value in row), strict=True))
+            for row in zip(*columns, strict=True)
+        ]
+
+    def text(self) -> str:
+        """A table of the orders, for people."""
+        lines = ["  order  singular value  one-step error  rollout error"]
+        for row in self.rows():
+            order, *numbers = row.values()
+            mark = "  suggested" if order == self.suggested else ""
+            lines.append("  {:>5}  {:>14.2e}  {:>14.3g}  {:>13.3g}".format(order, *numbers) + mark)
+        note = "  errors on held-out steps, relative to a model in which nothing changes"
+        return "\n".join([*lines, note])
+
+
+def study_orders(
+    trajectories: Sequence[tuple[ArrayLike, ArrayLike]], orders: Iterable[int] = ORDERS
+) -> OrderStudy:
+    """Try orders of a reduced model on held-out parts of trajectories of one plant.
+
+    Parameters
+    ----------
+    trajectories : sequence of (states (N + 1, n_z), actions (N, n_a))
+        z_0 .. z_N and a_0 .. a_{N-1}; a_k is held from z_k to z_{k+1}.
+    orders : iterable of int
+        Those to try, of which the ones remain that the data can determine: n_s + n_a steps must be
+        left without the held-out ones.
+
+    Returns
+    -------
+    OrderStudy
+
+    Raises
+    ------
+    ValueError
+        Shapes that do not fit, NaN or infinity, or too few steps for any of the orders.
+
+    Examples
+    --------
+    A plant of two states, of which three numbers are measured:
+
+    >>> rng = np.random.default_rng(0)
+    >>> A, C = np.array([[0.9, 0.3], [-0.3, 0.9]]), rng.normal(size=(3, 2))
+    >>> a, s = rng.normal(size=(60, 1)), np.zeros((61, 2))
+    >>> for k in range(60):
+    ...     s[k + 1] = A @ s[k] + a[k]
+    >>> study = study_orders([(s @ C.T, a)])
+    >>> study.orders, study.suggested
+    (array([1, 2]), 2)
+    """
+    known = [(np.asarray(z, np.float64), np.asarray(a, np.float64)) for z, a in trajectories]
+    everything = steps_of(known)
+    tried = sorted({n for n in orders if n >= 1})
+    errors, scales = [], np.zeros(2)
+    with threadpool_limits(limits=1):  # as in the identification itself
+        singular_values: Array = linalg.svdvals(everything.after)
+        for fitted, held in _folds(known):
+            data = steps_of(fitted)
+            modes, values, _ = linalg.svd(data.after.T, full_matrices=False)
+            steps, n_a = data.inputs.shape
+            most = min(numerical_rank(values, *data.after.shape), steps - n_a)
+            tried = [n for n in tried if n <= most]
+            models = [fit(data, modes[:, :n]) for n in tried]
+            errors.append([_summed(_errors(model, *piece) for piece in held) for model in models])
+            scales += _summed(_squares(z[1:] - z[:-1], z[1:] - z[0]) for z, _ in held)
+    if not (tried and errors):
+        raise ValueError(
+            f"the {len(everything.inputs)} steps with {everything.inputs.shape[1]} inputs are too few, "
+            "or vary too little, to hold some of them out; record a longer trajectory"
+        )
+    total = _summed(np.array(fold[: len(tried)]) for fold in errors)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        one_step, rollout = np.sqrt(np.nan_to_num(total / scales, nan=np.inf)).T
+    digits = -np.log10(np.maximum(one_step, ROUNDING))
+    enough = digits[0] + SHARE * (digits.max() - digits[0])
+    suggested = tried[int(np.argmax(digits >= enough))]
+    return OrderStudy(singular_values, np.array(tried), one_step, rollout, suggested)
+
+
+def _folds(
+    trajectories: Sequence[Trajectory],
+) -> Iterator[tuple[list[Trajectory], list[Trajectory]]]:
+    """Pieces to fit to and pieces that are held out."""
+    pieces = []
+    for states, actions in trajectories:
+        edges = np.unique(np.linspace(0, len(actions), PIECES + 1).astype(int))
+        pieces += [(states[a : b + 1], actions[a:b]) for a, b in pairwise(edges)]
+    for fold in range(FOLDS):
+        held = pieces[fold::FOLDS]
+        fitted = [piece for i, piece in enumerate(pieces) if i % FOLDS != fold]
+        if held and fitted:
+            yield fitted, held
+
+
+def _errors(model: ReducedModel, states: Array, actions: Array) -> Array:
+    """Sums of squared errors on one piece: of one step, and rolled out."""
+    A, B, U = model.A, model.B, model.U
+    inputs = actions @ B.T
+    rolled = np.empty((len(states), model.n_s))
+    rolled[0] = states[0] @ U
+    with np.errstate(over="ignore", invalid="ignore"):
+        for k, forced in enumerate(inputs):
+            rolled[k + 1] = A @ rolled[k] + forced
+        once = states[:-1] @ U @ A.T + inputs
+        return _squares(states[1:] - once @ U.T, states[1:] - rolled[1:] @ U.T)
+
+
+def _squares(*residuals: Array) -> Array:
+    return np.array([np.sum(residual**2) for residual in residuals])
+
+
+def _summed(parts: Iterable[Array]) -> Array:
+    total: Array = np.sum(list(parts), axis=0)
+    return total

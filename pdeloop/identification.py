@@ -1,0 +1,211 @@
+"""`pdeloop identify`: a reduced model, and its LQ-tracking gains, from recorded trajectories.
+
+Only states, actions and the target are used, so the plant may be any, this one or a real one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controller_node.identification import DesignSettings, design
+from controller_node.order import OrderStudy, study_orders
+from loop_interfaces.model_rows import ModelRows, pack
+from loop_interfaces.parameters import as_recorded
+from loop_interfaces.topics import COMPLETED, CostColumn
+from pdeloop.bags.reader import Bag, RecordedEpisode
+from pdeloop.data_file import read_measurements
+from recorder_node.bag import BagError
+
+Array = NDArray[np.float64]
+Trajectories = Sequence[tuple[Array, Array]]
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a user asks for; None: as the recorded run has it, or the default.
+
+    order: n_s, by default that of the recorded run or the suggested one; method: regression or dmdc;
+    rank: p of dmdc; state_weight, action_weight: q, r.
+    """
+
+    order: int | None = None
+    method: str | None = None
+    rank: int | None = None
+    state_weight: float | None = None
+    action_weight: float | None = None
+
+
+@dataclass(frozen=True)
+class Identified:
+    """A model from trajectories.
+
+    sources: which trajectories, by episode and environment or by number; study: the orders on held-out
+    data, None where these are too few; sample_time in s, None where it is not known; live: whether the
+    controller, from the same trajectory and the same settings, published the same model to the bit,
+    None if it did not.
+    """
+
+    model: ModelRows
+    sources: list[dict[str, int]]
+    steps: int
+    study: OrderStudy | None
+    sample_time: float | None = None
+    live: bool | None = None
+
+    def summary(self) -> dict[str, Any]:
+        """The result as data, without the arrays, which `save` writes."""
+        A, B, U, study = self.model.A, self.model.B, self.model.U, self.study
+        poles = np.linalg.eigvals(A)
+        return {
+            "reduced_order": len(A),
+            "n_z": U.shape[0],
+            "n_a": B.shape[1],
+            "steps": self.steps,
+            "sample_time": self.sample_time,
+            "trajectories": self.sources,
+            "poles": [[pole.real, pole.imag] for pole in poles],
+            "spectral_radius": float(np.abs(poles).max()),
+            "same_as_published": self.live,
+            "suggested_order": study and study.suggested,
+            "singular_values": [] if study is None else study.singular_values.tolist(),
+            "orders": [] if study is None else study.rows(),
+        }
+
+    def text(self) -> str:
+        """The result for people."""
+        known = self.summary()
+        used = ", ".join("/".join(map(str, source.values())) for source in self.sources[:6])
+        more = f" and {len(self.sources) - 6} more" if len(self.sources) > 6 else ""
+        lines = [
+            f"reduced model of order {known['reduced_order']} from {self.steps} steps of "
+            f"{len(self.sources)} trajectories ({'/'.join(self.sources[0])} {used}{more})",
+            f"  {known['n_z']} points, {known['n_a']} actuators, "
+            f"spectral radius {known['spectral_radius']:.4f}",
+        ]
+        if self.sample_time is not None:
+            rates = np.log(np.abs(np.linalg.eigvals(self.model.A))) / self.sample_time
+            lines.append(f"  modes grow at rates of {rates.min():.3g} to {rates.max():.3g} 1/s")
+        if self.live is not None:
+            same = "the same, to the bit, as" if self.live else "not the same as"
+            lines.append(f"  {same} the model that the controller published")
+        if self.study is None:
+            lines.append("  too few steps to hold some out: no order is suggested")
+        else:
+            lines += ["", self.study.text()]
+        return "\n".join(lines)
+
+
+def identify_file(path: Path, wanted: Wanted) -> Identified:
+    """The model from measurements in a file; see `pdeloop.data_file`."""
+    found = read_measurements(path)
+    sources = [{"trajectory": number} for number in range(len(found.trajectories))]
+    known = {"sample_time": found.sample_time}
+    return _identified(found.trajectories, found.target, sources, wanted, known)
+
+
+def identify_bag(
+    path: Path, wanted: Wanted, *, episode: int | None = None, environment: int | None = None
+) -> Identified:
+    """The model from the complete episodes of the bag at `path`.
+
+    episode, environment: only this one; otherwise the exploratory episodes, or all if there are none.
+    """
+    bag = Bag(path)
+    recorded = bag.episodes() if episode is None else bag.find(episode)
+    chosen = [e for e in recorded if _usable(e)]
+    if any(e.exploratory for e in chosen):
+        chosen = [e for e in chosen if e.exploratory]
+    if not chosen:
+        which = "complete episode" if episode is None else f"complete episode {episode}"
+        raise BagError(f"{bag.path} holds no {which} to identify from (see pdeloop bag info)")
+    target = bag.target()
+    if target is None:
+        raise BagError(f"{bag.path} holds no target, without which no gains can be designed")
+    trajectories, sources = [], []
+    for one in chosen:
+        states, actions = one.trajectory()
+        for env in range(states.shape[1]):
+            if environment in (None, env):
+                trajectories.append((states[:, env], actions[:, env]))
+                sources.append({"episode": one.number, "environment": env})
+    if not trajectories:
+        raise BagError(f"the chosen episodes have no environment {environment}")
+    known = as_recorded(bag.parameters().get(chosen[-1].key[1], {}))
+    found = _identified(trajectories, target, sources, wanted, known)
+    ran_with = {"identification", "reduced_order", "state_weight", "action_weight"} <= set(known)
+    if ran_with and len(sources) == 1 and not _differs(wanted, known):
+        number, env = sources[0].values()
+        published = next(e.model for e in chosen if e.number == number)
+        if published is not None:
+            same = published.values[env].tobytes() == pack(found.model).tobytes()
+            return replace(found, live=bool(same))
+    return found
+
+
+def _identified(
+    trajectories: Trajectories,
+    target: Array,
+    sources: list[dict[str, int]],
+    wanted: Wanted,
+    known: Mapping[str, Any],
+) -> Identified:
+    try:
+        study = study_orders(trajectories)
+    except ValueError:  # too few steps; the model itself may still be had
+        study = None
+    suggested = None if study is None else study.suggested
+    settings = _settings(wanted, known, trajectories[0][1].shape[1], suggested)
+    model = design(trajectories, target, settings)
+    steps = sum(len(actions) for _, actions in trajectories)
+    return Identified(model, sources, steps, study, known.get("sample_time"))
+
+
+def _settings(
+    wanted: Wanted, known: Mapping[str, Any], n_a: int, suggested: int | None
+) -> DesignSettings:
+    """What is wanted, else the recorded run's parameters, else the defaults."""
+
+    def pick(given: Any, *others: Any) -> Any:
+        return next((value for value in (given, *others) if value is not None), None)
+
+    method = pick(wanted.method, known.get("identification"), "regression")
+    dmdc_order = (method == "dmdc" and known.get("dmdc_order")) or None
+    order = pick(wanted.order, dmdc_order, known.get("reduced_order"), suggested)
+    if order is None:
+        raise BagError("there are too few steps to suggest an order; give it with --order")
+    return DesignSettings(
+        n_a=n_a,
+        reduced_order=order,
+        state_weight=pick(wanted.state_weight, known.get("state_weight"), 1.0),
+        action_weight=pick(wanted.action_weight, known.get("action_weight"), 1.0),
+        identification=method,
+        dmdc_rank=pick(wanted.rank, known.get("dmdc_rank"), 0),
+    )
+
+
+def _differs(wanted: Wanted, known: Mapping[str, Any]) -> bool:
+    """Whether anything else is wanted than what the recorded run had."""
+    return _settings(wanted, known, 1, None) != _settings(Wanted(), known, 1, None)
+
+
+def save(found: Identified, path: Path) -> None:
+    """Write the model as an .npz archive: A, B, U, K_a, K_b, s_r and `model`, the rows of the topic."""
+    model = found.model
+    arrays: dict[str, Any] = {name: getattr(model, name) for name in model.__dataclass_fields__}
+    try:
+        with path.open("wb") as file:
+            np.savez(file, model=pack(model)[np.newaxis], **arrays)
+    except OSError as error:
+        raise BagError(f"cannot write {path}: {error.strerror}") from error
+
+
+def _usable(episode: RecordedEpisode) -> bool:
+    if episode.missing or episode.contradictions or episode.cost is None:
+        return False
+    return bool((episode.cost.values[:, CostColumn.ENDED] == COMPLETED).all())
