@@ -23,14 +23,13 @@ from loop_interfaces.fast_path.messages import (
 )
 from loop_interfaces.frames import ArrayCodec, digest
 from loop_interfaces.jit.cache import jit
-from loop_interfaces.jit.native import CLOCK, MonotonicClock, monotonic_ns
+from loop_interfaces.jit.native import CLOCK, MonotonicClock, call_c, monotonic_ns
 from loop_interfaces.jit.simd import load_unaligned, write
 from loop_interfaces.samples import ACTION_KIND, NO_TIME, SAMPLE_HEADER, STATE_KIND
 from loop_interfaces.signature import NOT_SIGNED
 from loop_interfaces.topics import STATE
 from pde_sim_node.lockstep import Lockstep
-from pde_sim_node.solver import step_context, work_queue
-from pde_sim_node.solver.step_context import STEP_CONTEXT, step_environments
+from pde_sim_node.solver.step_context import step_code
 
 if TYPE_CHECKING:
     from loop_interfaces.ros.endpoints import SampleBatcher
@@ -38,7 +37,11 @@ if TYPE_CHECKING:
 __all__ = ["PlantFastPath", "load_compiled"]
 
 PLAN = plan_type(
-    ("context", STEP_CONTEXT),
+    ("code", np.int64),  # of a step of the plant, see ParallelStep.lend
+    ("context", np.int64),
+    ("states", np.int64),  # addresses
+    ("actions", np.int64),
+    ("step", np.int64),  # k, of the states
     ("values", np.int64),  # numbers of all states
     ("log", np.int64),  # address of room for the actions that were applied
     ("steps", np.int64),  # done since the log was read
@@ -68,8 +71,7 @@ def add_sample(plan: Any, kind: int, time: float, raw: int, length: int) -> None
 @register_jitable  # type: ignore[untyped-decorator, unused-ignore]
 def advance(plan: Any, head: int, message: int, length: int) -> bool:
     """Apply the awaited action, and fill in the next state."""
-    context = plan.context
-    if load_unaligned(head, STEP) != context.step or plan.steps == plan.limit:
+    if load_unaligned(head, STEP) != plan.step or plan.steps == plan.limit:
         return False
     if min(load_unaligned(head, TIME), NOT_SIGNED) != plan.signature:
         return False
@@ -79,22 +81,24 @@ def advance(plan: Any, head: int, message: int, length: int) -> bool:
     numbers = plan.expected.values
     for i in range(numbers):
         number = load_unaligned(head, FIRST + i)
-        write(context.actions, i, number)
+        write(plan.actions, i, number)
         write(plan.log, plan.steps * numbers + i, number)
-    step_environments(context)
+    call_c(plan.code, (plan.context,))
     plan.steps += 1
+    plan.step += 1
     plan.time += plan.sample_time
-    write_answer(plan.answer, context.step, plan.time, context.states, plan.values)
+    write_answer(plan.answer, plan.step, plan.time, plan.states, plan.values)
     add_sample(plan, STATE_KIND, plan.time if plan.timed else NO_TIME, plan.begin, plan.length)
     return True
 
 
-handler = fast_handler(PLAN, advance, work_queue, step_context)
+handler = fast_handler(PLAN, advance)
 
 
 def load_compiled() -> None:
     """Load what is compiled, or compile it."""
     channel.load_compiled()
+    step_code()
     handler()
 
 
@@ -123,21 +127,18 @@ class PlantFastPath(FastPath):
     def prepare(self) -> bool:
         """Within an episode of a plant whose step is compiled code alone."""
         lockstep, plant, plan = self._lockstep, self._plant, self.plan
-        state = lockstep.awaiting
-        code = plant.parallel.compiled_step(plant.batch)
-        action = plant.batch, plant.n_a
+        state, action = lockstep.awaiting, (plant.batch, plant.n_a)
         signature = lockstep.signature
-        if self.suspended or state is None or code is None or signature is None:
+        if self.suspended or state is None or signature is None:
             return False
         if not self.expect(state, action, state.values.shape):
             return False
-        context = plan["context"]
-        for name, value in zip(("code", "plan", "queue", "slices"), code, strict=True):
-            context[name] = value
-        context["states"], context["actions"] = plant.states.ctypes.data, plant.actions.ctypes.data
-        context["totals"] = plant.totals.ctypes.data
-        context["diverged_step"] = plant.diverged_step.ctypes.data
-        context["batch"], context["step"] = plant.batch, plant.step_index
+        code = plant.parallel.lend()
+        if code is None:
+            return False
+        plan["code"], plan["context"] = code
+        plan["states"], plan["actions"] = plant.states.ctypes.data, plant.actions.ctypes.data
+        plan["step"] = plant.step_index
         if self._log.shape[1] != plant.actions.size:
             self._log = np.zeros((max(LOG // plant.actions.size, 1), plant.actions.size))
         plan["values"], plan["log"] = state.values.size, self._log.ctypes.data
@@ -147,20 +148,14 @@ class PlantFastPath(FastPath):
         plan["timed"] = self._batcher.timed
         plan["begin"], plan["length"] = self.answer.begin, len(self.answer.raw)
         self._batcher.lend(plan["batches"], 2 * SAMPLE_HEADER + sum(self._lengths))
-        plant.parallel.call_workers(self._contexts)
         return True
 
     def synchronise(self, answers: int, last: float) -> None:
         plan = self.plan
-        self._plant.parallel.dismiss_workers(self._contexts)
-        self._plant.step_index = int(plan["context"]["step"])
+        self._plant.step_index = self._plant.parallel.take_back()
         if answers:
             self._lockstep.advance_counters([digest(row) for row in self._log[:answers]], last)
         self._batcher.settle(plan["batches"], self._lengths, answers)
-
-    @property
-    def _contexts(self) -> np.ndarray:
-        return self.plans["context"]
 
     @property
     def _lengths(self) -> tuple[int, int]:

@@ -2,16 +2,19 @@
 
 import math
 import operator
+import time
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from loop_interfaces.jit.native import compilations
 from pde_sim_node.equations import Equation, LinearEquation
-from pde_sim_node.solver.exact import Propagator
-from pde_sim_node.solver.integrator import Integrator
-from pde_sim_node.solver.kernel import all_finite
+from pde_sim_node.solver.exact import exact_step
+from pde_sim_node.solver.kernel import etdrk4_step
+from pde_sim_node.solver.memory import StepSettings
+from pde_sim_node.solver.pointwise import all_finite
 from pde_sim_node.solver.workers import ParallelStep
 from pde_sim_node.supports import indicator_supports
 
@@ -94,6 +97,8 @@ class Plant:
         See `EpisodeCosts`.
     step_index : int
         k, steps of the episode so far.
+    parallel : ParallelStep
+        The compiled step and the threads that do it.
     compiled_in_seconds : float
         Time the constructor spent on compiling the kernel; 0.0 if it was compiled before.
 
@@ -132,9 +137,8 @@ class Plant:
         self.x = equation.length * np.arange(n_x) / n_x
         self.field_target = self._checked("target", equation.target(self.x))
         self.target = self.field_target
-        advance = Propagator if isinstance(equation, LinearEquation) else Integrator
-        self._integrator: Integrator | Propagator = advance(
-            equation,
+        settings = StepSettings(
+            equation=equation,
             supports=self.supports,
             target=self.field_target,
             integration_time=self.integration_time,
@@ -143,13 +147,15 @@ class Plant:
             action_weight=self.action_weight,
             bound=self.divergence_bound,
         )
-        self.compiled_in_seconds = self._integrator.compiled_in_seconds
+        make_step = exact_step if isinstance(equation, LinearEquation) else etdrk4_step
+        began, before = time.perf_counter(), compilations()
+        self.parallel: ParallelStep = make_step(settings)
+        self._allocate(1)
+        all_finite(self.actions)
+        self.parallel.step()
+        seconds = time.perf_counter() - began
+        self.compiled_in_seconds = seconds if compilations() > before else 0.0
         self._allocate(0)
-
-    @property
-    def parallel(self) -> ParallelStep:
-        """The compiled step and the threads that do it."""
-        return self._integrator.parallel
 
     @property
     def state_size(self) -> int:
@@ -162,6 +168,12 @@ class Plant:
         self.actions = np.zeros((batch, self.n_a))
         self.totals = np.zeros(batch)
         self.diverged_step = np.full(batch, -1, dtype=np.int64)
+        self._bind()
+
+    def _bind(self) -> None:
+        self.parallel.bind(
+            self.states, self.actions, self.totals, self.diverged_step, self.step_index
+        )
 
     def reset(
         self, seeds: ArrayLike, noise: NDArray[np.int64] | None = None
@@ -191,6 +203,7 @@ class Plant:
         if self.batch != len(fields):
             self._allocate(len(fields))
         self.step_index = 0
+        self._bind()
         self.totals.fill(0.0)
         self.diverged_step.fill(-1)
         self.states[:] = fields
@@ -260,9 +273,7 @@ class Plant:
         if self.step_index >= self.horizon:
             raise RuntimeError(f"the episode is over after {self.horizon} steps: call reset(seeds)")
         self._hold(actions)
-        self._integrator.step(
-            self.states, self.actions, self.totals, self.diverged_step, self.step_index
-        )
+        self.parallel.step()
         self.step_index += 1
         return self.states
 
@@ -304,7 +315,9 @@ class Plant:
                 f"got {new.shape} and {held.shape}"
             )
         costs, diverged_step = np.zeros(batch), np.full(batch, -1, dtype=np.int64)
-        self._integrator.step(new, held, costs, diverged_step, 0)
+        self.parallel.bind(new, held, costs, diverged_step, 0)
+        self.parallel.step()
+        self._bind()
         return new, costs
 
     def episode_costs(self) -> EpisodeCosts:

@@ -117,8 +117,11 @@ def plant_on_topics(*, timed: bool = False, helped: bool = False, **overrides: o
         for count in (1, 3):
             peer.say(*[next_action() for _ in range(count)])
             assert answer_for(path) is None
-            assert bool(path.plan["context"]["queue"]) == helped
         assert plant.lockstep.step == plant.judge.step == 5
+        parallel = plant.lockstep.plant.parallel
+        assert parallel.lend() is not None
+        assert bool(parallel._context["polling"]) == helped
+        assert parallel.take_back() == 5
         for _ in range(2):
             assert path.arm()
             peer.say(next_action())

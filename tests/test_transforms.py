@@ -8,7 +8,7 @@ import pytest
 
 from loop_interfaces.jit.simd import WIDTH
 from pde_sim_node.solver.fft import fft, is_transform_length, plane_size
-from pde_sim_node.solver.kernel_memory import Constants, aligned, lay_out
+from pde_sim_node.solver.memory import Constants, aligned, lay_out
 from pde_sim_node.solver.spectra import TRANSFORM, analyse, synthesise
 
 PLAN = np.dtype(

@@ -16,7 +16,17 @@ from loop_interfaces.affinity import core_list, core_text, helps_solver
 from pde_sim_node.equations import Burgers
 from pde_sim_node.plant import Plant
 from pde_sim_node.solver import workers
-from pde_sim_node.solver.workers import COMPILED, ThreadPool
+from pde_sim_node.solver.memory import aligned
+from pde_sim_node.solver.work_queue import (
+    QUEUE_WORDS,
+    begin_turn,
+    claim,
+    close,
+    current_turn,
+    finish,
+    wait_until_done,
+)
+from pde_sim_node.solver.workers import ThreadPool
 
 several = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
 P1 = {
@@ -53,22 +63,33 @@ def test_plants_in_several_threads_share_the_helpers(monkeypatch: pytest.MonkeyP
 
 
 def test_who_comes_late_takes_nothing_of_the_next_step() -> None:
+    words = aligned(QUEUE_WORDS)
+    queue = words.ctypes.data
+    begin_turn(queue)
+    late = current_turn(queue)
+    assert [claim(queue, late, 3) for _ in range(4)] == [0, 1, 2, -1]
+    for _ in range(3):
+        assert not wait_until_done(queue, 3, 10)
+        finish(queue)
+    assert wait_until_done(queue, 3, 10)
+    close(queue)
+    assert claim(queue, late, 6) == -1  # a larger batch has more slices
+    begin_turn(queue)
+    assert claim(queue, late, 6) == -1
+    assert claim(queue, current_turn(queue), 6) == 0
+
+
+def test_a_worker_that_comes_late_does_not_touch_what_a_plant_evaluates() -> None:
     plant = Plant(Burgers(), **P1)
-    step = plant.parallel
-    plant.reset(np.arange(4))
+    plant.reset(np.arange(12))
+    plant.step(np.zeros((12, 6)))
     before = plant.states.copy()
-    queue, (advance, _, start, _, done) = step._queue.ctypes.data, COMPILED
-    costs, diverged = np.zeros(4), np.full(4, -1)
-    code, plan = step._code, step._addresses[0]
-    what = code, plan, plant.states, np.zeros((4, 6)), costs, diverged, 0
-    start(queue, 8)
-    for turn in (7, 9):
-        advance(*what, queue, turn, 4)
+    new, _ = plant.evaluate(before, np.ones((12, 6)))
+    for _ in range(2):
+        plant.parallel._help(0)
     assert np.array_equal(plant.states, before)
-    advance(*what, queue, 8, 4)
-    assert (plant.states != before).any(axis=1).all()
-    assert done(queue, 4)
-    assert not done(queue, 5)
+    assert (new != before).any(axis=1).all()
+    assert np.array_equal(plant.step(np.ones((12, 6))), new)
 
 
 def test_helpers_exist_from_the_first_large_batch_on_and_hold_no_plant() -> None:

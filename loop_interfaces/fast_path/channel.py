@@ -288,7 +288,7 @@ class RclChannel:
         self._held = subscription, publisher, guard
         self._announce = rcl.rcl_subscription_set_on_new_message_callback
         self._announce.argtypes = [ctypes.c_void_p] * 3
-        code, _ = on_new_message()
+        code = on_new_message()
         opened: bool = self._announce(subscription.pointer, code, self.record.ctypes.data) == 0
         if not opened:
             self._held = ()

@@ -105,7 +105,7 @@ class FastPath(ABC):
     ) -> None:
         self.plans = np.zeros(1, plan)
         self.plan = self.plans[0]
-        self.handle, _ = handler()
+        self.handle = handler()
         self.channel = RclChannel(self.handle, self.plans.ctypes.data)
         self._incoming, self._outgoing = incoming, ArrayCodec(outgoing.labels)
         self._expected = ExpectedMessage(self.plan["expected"])

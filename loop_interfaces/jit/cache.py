@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 import numba
 
-__all__ = ["cache_misses", "cached_njit", "fingerprint", "inlined_njit", "jit"]
+__all__ = ["CACHED", "cached_njit", "fingerprint", "inlined_njit", "jit"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -31,15 +31,15 @@ def inlined_njit(function: F) -> F:
     return compiled
 
 
+CACHED: list[Any] = []
+"""All functions that `cached_njit` has made."""
+
+
 def cached_njit(function: F) -> F:
     """Compile, keep on disk, and run without the interpreter's lock."""
     compiled: F = numba.njit(function, cache=True, nogil=True)
+    CACHED.append(compiled)
     return compiled
-
-
-def cache_misses(*functions: Any) -> int:
-    """How often one of these had to be compiled in this process, as it was not on disk."""
-    return sum(sum(function.stats.cache_misses.values()) for function in functions)
 
 
 def fingerprint(*sources: ModuleType | Callable[..., Any]) -> str:

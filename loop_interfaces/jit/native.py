@@ -8,10 +8,18 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 
-from loop_interfaces.jit.cache import jit
+from loop_interfaces.jit.cache import CACHED, jit
 from loop_interfaces.jit.simd import intrinsic, read_word
 
-__all__ = ["CLOCK", "MachineCode", "MonotonicClock", "address_of", "call_c", "monotonic_ns"]
+__all__ = [
+    "CLOCK",
+    "MachineCode",
+    "MonotonicClock",
+    "address_of",
+    "call_c",
+    "compilations",
+    "monotonic_ns",
+]
 
 CLOCK = np.dtype(
     [
@@ -44,16 +52,26 @@ def call_c(typing_context: Any, address: Any, arguments: Any) -> Any:
 class MachineCode:
     """One of Numba's cfuncs that is loaded, or compiled, when it is first asked for."""
 
+    compiled = 0
+    """How many of them were compiled in this process."""
+
     def __init__(self, compile_it: Callable[[], Any]) -> None:
         self._compile = compile_it
         self._code: Any = None
 
-    def __call__(self) -> tuple[int, bool]:
-        """Its address, and whether it was compiled by this call."""
-        if self._code is not None:
-            return self._code.address, False
-        self._code = self._compile()
-        return self._code.address, not self._code.cache_hits
+    def __call__(self) -> int:
+        """Its address."""
+        if self._code is None:
+            self._code = self._compile()
+            MachineCode.compiled += not self._code.cache_hits
+        address: int = self._code.address
+        return address
+
+
+def compilations() -> int:
+    """How many functions were compiled in this process because they were not on disk."""
+    misses = (int(sum(function.stats.cache_misses.values())) for function in CACHED)
+    return MachineCode.compiled + sum(misses)
 
 
 def address_of(function: Any) -> int:

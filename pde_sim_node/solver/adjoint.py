@@ -42,9 +42,8 @@ from loop_interfaces.jit.simd import load, read, splat, write
 from pde_sim_node.equations import Equation, LinearEquation
 from pde_sim_node.plant import Plant
 from pde_sim_node.solver import fft, kernel, spectra
-from pde_sim_node.solver.integrator import Integrator
 from pde_sim_node.solver.kernel import PLAN, force, internal_step
-from pde_sim_node.solver.kernel_memory import aligned
+from pde_sim_node.solver.memory import aligned
 from pde_sim_node.solver.spectra import (
     analyse,
     forward,
@@ -237,18 +236,17 @@ class Adjoint:
 
     def __init__(self, plant: Plant, threads: int = 1) -> None:
         self._plant = plant
-        integrator = plant._integrator
-        if not isinstance(integrator, Integrator):
+        if isinstance(plant.equation, LinearEquation):
             raise ValueError(
                 f"{plant.equation.name} is advanced by an exact propagator; expected an equation "
                 "that is integrated by ETDRK4"
             )
-        step = integrator.parallel
-        self._constants = step._constants  # kept alive: the plan has its address
+        step = plant.parallel
+        self._constants = step.constants  # kept alive: the plan has its address
         self._loop = derivative_loop(plant.equation)
         plan = np.zeros(1, PLAN_AND_TAPE)[0]
         for name in PLAN.names or ():
-            plan[name] = step._plans[0][name]
+            plan[name] = step.plans[0][name]
         offset = int(plan["scratch_apart"])
         sizes = {"tape": 4 * int(plan["steps"]) * int(plan["fine"]["m"])}
         sizes |= dict.fromkeys(("covector", "on_b", "on_c", "on_force"), plan["modes"])

@@ -1,20 +1,39 @@
-"""z_{k+1} = f(z_k, a_k) of a linear equation: its exact solution for a held action."""
+"""The exact step of a linear plant: a propagator for each wavenumber, no Runge-Kutta.
 
-import time
+The spectra v_f of the components f of an environment become
+
+    v_f' = sum_g E_fg v_g + sum_j B_fj a_j
+
+with E and B of `exact_propagator` for a whole sampling time and a held action. As in `kernel`, an
+environment is computed alone and by the same instructions whatever stands beside it.
+"""
+
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numba.extending import register_jitable
 
-from loop_interfaces.jit.cache import cache_misses
-from loop_interfaces.jit.simd import WIDTH, whole_lanes
-from pde_sim_node.equations import Equation, Spectrum
-from pde_sim_node.solver.exact_kernel import LINEAR_PLAN, propagate
+from loop_interfaces.jit import native, simd
+from loop_interfaces.jit.cache import jit
+from loop_interfaces.jit.simd import WIDTH, fma, read, splat, whole_lanes
+from pde_sim_node.equations import Spectrum
+from pde_sim_node.solver import fft, spectra
+from pde_sim_node.solver.batch_step import environments_of
 from pde_sim_node.solver.fft import plane_size
-from pde_sim_node.solver.kernel import all_finite
-from pde_sim_node.solver.kernel_memory import Constants, checked_operator, lay_out
-from pde_sim_node.solver.workers import COMPILED, ParallelStep
+from pde_sim_node.solver.memory import Constants, StepSettings, begin_plan, lay_out, step_plan_type
+from pde_sim_node.solver.spectra import analyse, get, plus_product, put, synthesise
+from pde_sim_node.solver.workers import ParallelStep
 
-__all__ = ["Propagator", "exact_propagator"]
+__all__ = ["exact_propagator", "exact_step"]
+
+LINEAR_PLAN = step_plan_type(
+    ("components", np.int64),
+    # Offsets in c.
+    ("e", np.int64),  # E, components by components by modes
+    ("b", np.int64),  # B, components by n_a by modes
+    # Offset in w.
+    ("spectra", np.int64),  # of all components
+)
 
 
 def exact_propagator(linear: Spectrum, time: float) -> tuple[Spectrum, Spectrum]:
@@ -60,100 +79,66 @@ def exact_propagator(linear: Spectrum, time: float) -> tuple[Spectrum, Spectrum]
     return e, f
 
 
-class Propagator:
-    """A linear equation and its grid, made ready for the compiled step; see `Integrator`.
+@jit
+def advance_component(
+    component: int, action: int, w: int, d: int, plan: Any, c: int, e: int
+) -> None:
+    """The spectrum x of a component a sampling time later."""
+    for k in range(0, plan.modes, 8):
+        total = splat(0.0), splat(0.0)
+        for g in range(plan.components):
+            at = plan.e + (component * plan.components + g) * plan.modes + k
+            total = plus_product(total, c, at, e, get(w, plan.spectra + g * plan.modes + k, d))
+        for j in range(plan.n_a):
+            a, at = splat(read(action, j)), plan.b + (component * plan.n_a + j) * plan.modes + k
+            b = get(c, at, e)
+            total = fma(a, b[0], total[0]), fma(a, b[1], total[1])
+        put(w, plan.x + k, d, total)
 
-    Parameters
-    ----------
-    equation
-        The PDE, a `LinearEquation` with c components.
-    supports : (n_x, n_a)
-        Phi_j(x_i).
-    target : (c n_x,)
-        State of the stage cost.
-    integration_time, steps
-        Their product is the sampling time, which is one step here.
-    state_weight, action_weight
-        Weights of the stage cost.
-    bound
-        Magnitude beyond which a state has diverged.
 
-    Attributes
-    ----------
-    compiled_in_seconds : float
-        Time spent on compiling, 0.0 if everything was on disk.
+@register_jitable  # type: ignore[untyped-decorator, unused-ignore]
+def advance(state: int, action: int, w: int, d: int, plan: Any, c: int, e: int) -> None:
+    """The state a sampling time later, in the scratch."""
+    for f in range(plan.components):
+        analyse(state + 8 * plan.n_x * f, w, d, plan, c, e)
+        for k in range(0, plan.modes, 8):
+            put(w, plan.spectra + f * plan.modes + k, d, get(w, plan.x + k, d))
+    for f in range(plan.components):
+        advance_component(f, action, w, d, plan, c, e)
+        synthesise(w + 8 * (plan.state + f * plan.n_x), w, d, plan, c, e)
+
+
+propagate = environments_of(LINEAR_PLAN, advance, native, simd, fft, spectra)
+
+
+def exact_step(settings: StepSettings) -> ParallelStep:
+    """The step z_{k+1} = f(z_k, a_k) of a `LinearEquation`, made ready.
 
     Raises
     ------
     ValueError
-        The equation's operator has the wrong shape or is not finite.
+        The equation's operator has the wrong shape or is not finite, or E overflows.
     """
+    equation, n_x, n_z = settings.equation, settings.n_x, settings.target.size
+    time = settings.steps * settings.integration_time
+    e, f = exact_propagator(settings.operator("linear_operator"), time)
+    forced = f[:, :, equation.actuated].T[:, None] * np.fft.rfft(settings.supports, axis=0).T / n_x
 
-    def __init__(
-        self,
-        equation: Equation,
-        *,
-        supports: NDArray[np.float64],
-        target: NDArray[np.float64],
-        integration_time: float,
-        steps: int,
-        state_weight: float,
-        action_weight: float,
-        bound: float,
-    ) -> None:
-        (n_x, n_a), components = supports.shape, len(equation.components)
-        modes = n_x // 2 + 1
-        k = 2 * np.pi * np.arange(modes) / equation.length
-        linear = checked_operator("linear_operator", equation.linear_operator(k), modes, components)
-        e, f = exact_propagator(linear, steps * integration_time)
-        forced = f[:, :, equation.actuated].T[:, None] * np.fft.rfft(supports, axis=0).T / n_x
-
-        constants = Constants()
-        plan = np.zeros(1, LINEAR_PLAN)[0]
-        plan["components"], plan["modes"] = components, whole_lanes(modes)
-        plan["n_x"], plan["n_z"], plan["n_a"] = n_x, components * n_x, n_a
-        plan["state_weight"], plan["action_weight"] = state_weight, action_weight
-        plan["bound"] = bound
-        constants.add_grid(plan, n_x)
-        plan["e"] = constants.add_spectra(np.moveaxis(e, 0, 2))
-        plan["b"] = constants.add_spectra(forced)
-        plan["target"] = constants.add(target)
-        plane = plane_size(n_x // 2)
-        size = lay_out(
-            plan,
-            {
-                "z1": plane,
-                "z2": plane,
-                "x": max(n_x // 2, int(plan["modes"])) + WIDTH,
-                "next": WIDTH,
-                "spectra": components * int(plan["modes"]),
-                "state": whole_lanes(components * n_x),
-            },
-        )
-        functions = all_finite, *COMPILED
-        began, misses = time.perf_counter(), cache_misses(*functions)
-        code, code_is_new = propagate()
-        self._parallel = ParallelStep(
-            code, plan, constants, size, points_per_step=2 * components * n_x
-        )
-        states, actions = np.zeros((1, components * n_x)), np.zeros((1, n_a))
-        all_finite(actions)
-        self.step(states, actions, np.zeros(1), np.zeros(1, dtype=np.int64), 0)
-        compiled = cache_misses(*functions) > misses or code_is_new
-        self.compiled_in_seconds = time.perf_counter() - began if compiled else 0.0
-
-    def step(
-        self,
-        states: NDArray[np.float64],
-        actions: NDArray[np.float64],
-        totals: NDArray[np.float64],
-        diverged_step: NDArray[np.int64],
-        k: int,
-    ) -> None:
-        """Advance all environments in place, see `kernel`; arrays are contiguous and writable."""
-        self._parallel.step(states, actions, totals, diverged_step, k)
-
-    @property
-    def parallel(self) -> ParallelStep:
-        """The compiled step and the threads that do it."""
-        return self._parallel
+    constants = Constants()
+    plan = begin_plan(LINEAR_PLAN, settings, constants)
+    plan["components"] = components = len(equation.components)
+    plan["e"] = constants.add_spectra(np.moveaxis(e, 0, 2))
+    plan["b"] = constants.add_spectra(forced)
+    plane, modes = plane_size(n_x // 2), int(plan["modes"])
+    size = lay_out(
+        plan,
+        {
+            "z1": plane,
+            "z2": plane,
+            "x": max(n_x // 2, modes) + WIDTH,
+            "next": WIDTH,
+            "spectra": components * modes,
+            "state": whole_lanes(n_z),
+        },
+    )
+    return ParallelStep(propagate(), plan, constants, size, points_per_step=2 * n_z)

@@ -11,20 +11,22 @@ F_a does not change within a step, so its parts Q F_a and (f1 + 4 f2 + f3) F_a a
 the multiplier m is contained in the coefficients (names with an m).
 """
 
-import math
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numba.extending import register_jitable
-from numpy.typing import NDArray
 
 from loop_interfaces.jit import native, simd
-from loop_interfaces.jit.cache import cached_njit, jit
+from loop_interfaces.jit.cache import jit
 from loop_interfaces.jit.native import call_c
-from loop_interfaces.jit.simd import fma, read, splat
+from loop_interfaces.jit.simd import WIDTH, fma, read, splat, whole_lanes
 from pde_sim_node.solver import fft, spectra
 from pde_sim_node.solver.batch_step import environments_of
+from pde_sim_node.solver.etdrk4 import etdrk4_coefficients
+from pde_sim_node.solver.fft import is_transform_length, plane_size
+from pde_sim_node.solver.memory import Constants, StepSettings, begin_plan, lay_out, step_plan_type
+from pde_sim_node.solver.pointwise import pointwise_loop
 from pde_sim_node.solver.spectra import (
     TRANSFORM,
     analyse,
@@ -40,50 +42,29 @@ from pde_sim_node.solver.spectra import (
     rfft_unpack,
     synthesise,
 )
+from pde_sim_node.solver.workers import ParallelStep
 
-__all__ = ["PLAN", "all_finite", "environments"]
+__all__ = ["PLAN", "environments", "etdrk4_step"]
 
-PLAN = np.dtype(
-    [
-        ("constants", np.int64),  # address of c
-        ("constants_apart", np.int64),  # distance e of its planes
-        ("scratch", np.int64),  # address of w
-        ("scratch_apart", np.int64),  # distance d of its planes
-        ("pointwise", np.int64),  # address of the compiled nonlinearity
-        ("n_x", np.int64),  # grid points
-        ("n_z", np.int64),  # size of the state, the same
-        ("n_a", np.int64),
-        ("steps", np.int64),  # internal steps of a sampling time
-        ("modes", np.int64),  # n_z//2 + 1, up to whole lanes
-        ("fine", TRANSFORM),  # of the dealiased grid
-        ("coarse", TRANSFORM),  # of the published grid
-        ("state_weight", np.float64),
-        ("action_weight", np.float64),
-        ("bound", np.float64),
-        # Offsets in c.
-        ("e", np.int64),
-        ("e2", np.int64),
-        ("q", np.int64),
-        ("qm", np.int64),
-        ("f1m", np.int64),
-        ("f2m", np.int64),  # twice f2
-        ("f3m", np.int64),
-        ("f", np.int64),  # f1 + 4 f2 + f3
-        ("supports", np.int64),  # their spectra, n_a by modes
-        ("target", np.int64),
-        ("analysis", np.int64),  # matrices of the coarse transform, n_z by modes
-        ("synthesis", np.int64),
-        # Offsets in w.
-        ("x", np.int64),  # the spectrum to be transformed next, zero above the modes
-        ("z1", np.int64),
-        ("z2", np.int64),
-        ("next", np.int64),
-        ("b", np.int64),
-        ("c", np.int64),
-        ("qf", np.int64),
-        ("ff", np.int64),
-        ("state", np.int64),
-    ]
+PLAN = step_plan_type(
+    ("pointwise", np.int64),  # address of the compiled nonlinearity
+    ("steps", np.int64),  # internal steps of a sampling time
+    ("fine", TRANSFORM),  # of the dealiased grid
+    # Offsets in c.
+    ("e", np.int64),
+    ("e2", np.int64),
+    ("q", np.int64),
+    ("qm", np.int64),
+    ("f1m", np.int64),
+    ("f2m", np.int64),  # twice f2
+    ("f3m", np.int64),
+    ("f", np.int64),  # f1 + 4 f2 + f3
+    ("supports", np.int64),  # their spectra, n_a by modes
+    # Offsets in w.
+    ("b", np.int64),
+    ("c", np.int64),
+    ("qf", np.int64),
+    ("ff", np.int64),
 )
 
 
@@ -170,9 +151,52 @@ def advance(state: int, action: int, w: int, d: int, plan: Any, c: int, e: int) 
 environments = environments_of(PLAN, advance, native, simd, fft, spectra)
 
 
-@cached_njit
-def all_finite(values: NDArray[np.float64]) -> bool:
-    finite = True
-    for value in values.flat:
-        finite &= math.isfinite(value)
-    return finite
+def etdrk4_step(settings: StepSettings) -> ParallelStep:
+    """The step z_{k+1} = f(z_k, a_k) of a semilinear equation, made ready.
+
+    The nonlinearity is dealiased on a grid of at least 3/2 n_z points; exactly that where 3/2 n_z
+    is 16 * 2^i * 3^j, else the next such number.
+
+    Raises
+    ------
+    ValueError
+        The equation's operators have the wrong shape or are not finite, or its nonlinearity does
+        not compile.
+    """
+    n_z, steps = settings.n_x, settings.steps
+    fine = fine_length(n_z)
+    c = etdrk4_coefficients(settings.operator("linear_operator"), settings.integration_time)
+    # The compiled transform leaves out the factor 1/4m.
+    m = settings.operator("multiplier") / (4 * fine)
+
+    constants = Constants()
+    plan = begin_plan(PLAN, settings, constants)
+    plan["steps"] = steps
+    plan["fine"] = constants.add_transform(fine, n_z // 2 + 1)
+    spectra = constants.add_spectra
+    plan["e"], plan["e2"], plan["q"] = spectra(c.e), spectra(c.e2), spectra(c.q)
+    plan["qm"], plan["f1m"] = spectra(c.q * m), spectra(c.f1 * m)
+    plan["f2m"], plan["f3m"] = spectra(2 * c.f2 * m), spectra(c.f3 * m)
+    plan["f"] = spectra(c.f1 + 4 * c.f2 + c.f3)
+    plan["supports"] = spectra(np.fft.rfft(settings.supports, axis=0).T / n_z)
+    plan["pointwise"] = pointwise_loop(settings.equation.nonlinearity)
+    plane, modes = plane_size(max(fine, n_z // 2)), int(plan["modes"])
+    size = lay_out(
+        plan,
+        {
+            "z1": plane,
+            "z2": plane,
+            "x": fine + WIDTH,
+            **dict.fromkeys(("next", "b", "c", "qf", "ff"), modes),
+            "state": whole_lanes(n_z),
+        },
+    )
+    return ParallelStep(environments(), plan, constants, size, points_per_step=8 * steps * fine)
+
+
+def fine_length(n_z: int) -> int:
+    """Complex length, half the points, of the dealiased grid."""
+    length = -(-3 * n_z // 4)
+    while not is_transform_length(length):
+        length += 1
+    return length

@@ -1,28 +1,38 @@
-"""The nonlinearity of an equation, a scalar function, as machine code over an array."""
+"""Scalar functions over an array, compiled: the nonlinearity of an equation, and a check."""
 
+import math
 import re
 from collections.abc import Callable
 from typing import Any
 
 import numba
+import numpy as np
 from numba import carray, types  # type: ignore[attr-defined, unused-ignore]
 from numba.core.errors import NumbaError
 from numba.extending import register_jitable
+from numpy.typing import NDArray
 
-from loop_interfaces.jit.cache import fingerprint
+from loop_interfaces.jit.cache import cached_njit, fingerprint
 from loop_interfaces.jit.native import MachineCode
 
-__all__ = ["pointwise_loop"]
+__all__ = ["all_finite", "pointwise_loop"]
 
 LOOPS: dict[Callable[[float], float], MachineCode] = {}
 
 
-def pointwise_loop(function: Callable[[float], float]) -> tuple[int, bool]:
-    """Machine code of u[i] = function(u[i]) over an array, a void (*)(double *, intp).
+@cached_njit
+def all_finite(values: NDArray[np.float64]) -> bool:
+    """Whether an array holds neither NaN nor infinity."""
+    finite = True
+    for value in values.flat:
+        finite &= math.isfinite(value)
+    return finite
 
-    Returns
-    -------
-    Its address, the same one for the same function, and whether it was compiled by this call.
+
+def pointwise_loop(function: Callable[[float], float]) -> int:
+    """Address of the machine code of u[i] = function(u[i]), a void (*)(double *, intp).
+
+    It is the same one for the same function.
 
     Raises
     ------

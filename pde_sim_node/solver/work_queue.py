@@ -9,13 +9,12 @@ from loop_interfaces.jit.atomics import compare_exchange, fetch_add, load_acquir
 from loop_interfaces.jit.cache import jit
 
 __all__ = [
-    "MAX_TURN",
     "QUEUE_WORDS",
     "begin_turn",
     "claim",
     "close",
     "current_turn",
-    "finish_and_claim",
+    "finish",
     "wait_until_done",
 ]
 
@@ -29,32 +28,28 @@ FINISHED = 64
 
 
 @jit
-def begin_turn(queue: int, turn: int) -> None:
-    """Offer all slices of a turn, none of them finished. Only when those of the turn before are."""
-    store_release(queue + FINISHED, 0)
-    store_release(queue, turn << SLICE_BITS)
-
-
-@jit
-def close(queue: int, turn: int) -> None:
-    """Offer no slices until the next turn. Only when those of this one are finished."""
-    store_release(queue, (turn << SLICE_BITS) | CLOSED)
-
-
-@jit
 def current_turn(queue: int) -> int:
     turn: int = load_acquire(queue) >> SLICE_BITS
     return turn
 
 
 @jit
-def claim(queue: int, turn: int, slices: int) -> int:
-    """A slice of the turn that no other thread has; -1 if there is none.
+def begin_turn(queue: int) -> None:
+    """Offer all slices of the next turn, none of them finished. Only when those of this one are."""
+    turn = (current_turn(queue) + 1) & (MAX_TURN - 1)
+    store_release(queue + FINISHED, 0)
+    store_release(queue, turn << SLICE_BITS)
 
-    queue 0: there is none, and no other thread.
-    """
-    if queue == 0:
-        return 0
+
+@jit
+def close(queue: int) -> None:
+    """Offer no slices until the next turn. Only when those of this one are finished."""
+    store_release(queue, (current_turn(queue) << SLICE_BITS) | CLOSED)
+
+
+@jit
+def claim(queue: int, turn: int, slices: int) -> int:
+    """A slice of the turn that no other thread has; -1 if there is none."""
     while True:
         ticket = load_acquire(queue)
         index: int = ticket - (turn << SLICE_BITS)
@@ -65,12 +60,9 @@ def claim(queue: int, turn: int, slices: int) -> int:
 
 
 @jit
-def finish_and_claim(queue: int, turn: int, slices: int) -> int:
-    """The slice after one that is finished; what was written for that one is visible."""
-    if queue == 0:
-        return -1
+def finish(queue: int) -> None:
+    """A slice that was claimed is done; what was written for it is visible to who waits."""
     fetch_add(queue + FINISHED, 1)
-    return claim(queue, turn, slices)
 
 
 @jit

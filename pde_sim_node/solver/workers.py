@@ -15,20 +15,15 @@ from loop_interfaces.affinity import join_solver, usable_cores
 from loop_interfaces.jit import atomics, native
 from loop_interfaces.jit.cache import cached_njit, fingerprint
 from pde_sim_node.solver import step_context, work_queue
-from pde_sim_node.solver.kernel_memory import Constants, aligned
+from pde_sim_node.solver.memory import Constants, aligned
 from pde_sim_node.solver.step_context import (
     SPINS,
     STEP_CONTEXT,
-    advance_slices,
-    help_with_steps,
+    step_code,
+    step_environments,
+    take_slices,
 )
-from pde_sim_node.solver.work_queue import (
-    MAX_TURN,
-    QUEUE_WORDS,
-    begin_turn,
-    close,
-    wait_until_done,
-)
+from pde_sim_node.solver.work_queue import QUEUE_WORDS, begin_turn, close, wait_until_done
 
 __all__ = ["COMPILED", "ParallelStep", "use_cores"]
 
@@ -49,39 +44,45 @@ class ParallelStep:
     Parameters
     ----------
     code
-        Its address, see `environments`.
+        Its address, see `batch_step.environments_of`.
     plan
         Its plan; the addresses of constants and scratch are filled in here.
     constants, scratch
         The constants, and the size of a plane of the scratch.
     points_per_step
         How much work an environment is.
+
+    Attributes
+    ----------
+    constants : array
+        The memory that the plans have the address of.
+    plans : structured array
+        The plan of each thread.
     """
 
     def __init__(
         self, code: int, plan: Any, constants: Constants, scratch: int, *, points_per_step: int
     ) -> None:
-        self._code = code
-        self._constants = constants.planes()
-        plan["constants"] = self._constants.ctypes.data
-        plan["constants_apart"] = self._constants.size // 2
+        self.constants = constants.planes()
+        plan["constants"] = self.constants.ctypes.data
+        plan["constants_apart"] = self.constants.size // 2
         self._pool = thread_pool()
         threads = 1 + self._pool.size
         self._scratch = [aligned(2 * scratch) for _ in range(threads)]
-        self._plans = np.repeat(plan, threads)
-        self._plans["scratch"] = [area.ctypes.data for area in self._scratch]
-        address, size = self._plans.ctypes.data, self._plans.itemsize
-        self._addresses = [address + thread * size for thread in range(threads)]
+        self.plans = np.repeat(plan, threads)
+        self.plans["scratch"] = [area.ctypes.data for area in self._scratch]
         self._points_per_step = points_per_step
         self._queue = aligned(QUEUE_WORDS)  # of words as long as a number
-        self._turn = 0
-        if threads > 1:  # load or compile what the first large batch would wait for
-            start(self._queue.ctypes.data, 0)
-            shut(self._queue.ctypes.data, 0)
-            done(self._queue.ctypes.data, 0)
-            help_step(np.ones(1, STEP_CONTEXT), 0)  # it is over
+        self._contexts = np.zeros(1, STEP_CONTEXT)
+        self._context = self._contexts[0]
+        self._context["code"], self._context["plan"] = code, self.plans.ctypes.data
+        self._context["queue"] = self._queue.ctypes.data
+        if self._pool.size:  # load or compile what the first large batch would wait for
+            start(self._contexts)
+            done(self._contexts)
+            self._help(0)
 
-    def step(
+    def bind(
         self,
         states: NDArray[np.float64],
         actions: NDArray[np.float64],
@@ -89,64 +90,59 @@ class ParallelStep:
         diverged_step: NDArray[np.int64],
         k: int,
     ) -> None:
-        """Advance all environments in place; arrays are contiguous and writable."""
-        code, plans = self._code, self._addresses
-        slices = self.slices(len(states))
-        if slices < MIN_SLICES or len(plans) == 1:
-            advance(code, plans[0], states, actions, totals, diverged_step, k, 0, 0, 1)
+        """Work on these arrays from now on, contiguous and writable; k: step of the states."""
+        context, batch = self._context, len(states)
+        if self._pool.size:
+            shut(self._contexts)  # for a worker that wakes up late
+        self._arrays = states, actions, totals, diverged_step  # kept alive
+        names = "states", "actions", "totals", "diverged_step"
+        for name, array in zip(names, self._arrays, strict=True):
+            context[name] = array.ctypes.data
+        self._slices = min(batch, batch * self._points_per_step // POINTS_PER_SLICE)
+        self._shared = self._pool.size > 0 and self._slices >= MIN_SLICES
+        context["batch"], context["slices"], context["step"] = batch, self._slices, k
+        context["shared"] = self._shared
+
+    def step(self) -> None:
+        """Advance all environments in place."""
+        if not self._shared:
+            step(self._contexts)
             return
-        self._turn = turn = (self._turn + 1) % MAX_TURN
-        address = self._queue.ctypes.data
-
-        def take_slices(thread: int) -> None:
-            advance(
-                code, plans[thread], states, actions, totals, diverged_step, k,
-                address, turn, slices,
-            )  # fmt: skip
-
-        start(address, turn)
-        self._pool.call(take_slices, slices - 1)
-        take_slices(0)
-        while not done(address, slices):
+        start(self._contexts)
+        self._pool.call(self._help, self._slices - 1)
+        self._help(0)
+        while not done(self._contexts):
             time.sleep(NAP)
         self._pool.dismiss()
+        self._context["step"] += 1
 
-    def compiled_step(self, batch: int) -> tuple[int, int, int, int] | None:
-        """Code, plan, board and slices of a STEP_CONTEXT for a step of a batch; None where workers
+    def _help(self, thread: int) -> None:
+        plan = self.plans.ctypes.data + thread * self.plans.itemsize
+        take(self._contexts, plan)
+
+    def lend(self) -> tuple[int, int] | None:
+        """Let compiled code make the steps until `take_back`.
+
+        Returns
+        -------
+        Addresses of a C function that makes one, and of what it is called with; None where workers
         are better that have to be called from Python.
         """
-        slices, helpers = self.slices(batch), len(self._addresses) - 1
-        if helpers and self._pool.polling and slices > 1:
-            return self._code, self._addresses[0], self._queue.ctypes.data, slices
-        if helpers and slices > MAX_SLICES_ALONE:
+        polled = self._pool.size > 0 and self._pool.polling and self._slices > 1
+        if self._pool.size and not polled and self._slices > MAX_SLICES_ALONE:
             return None
-        return self._code, self._addresses[0], 0, 1
+        self._context["shared"] = self._context["polling"] = polled
+        if polled:
+            self._pool.call(self._help, self._slices - 1)
+        return step_code(), self._contexts.ctypes.data
 
-    def call_workers(self, contexts: NDArray[np.void]) -> None:
-        """From now on workers take slices of what `step_context.step_environments` does, until they
-        are dismissed.
-
-        contexts: one entry of STEP_CONTEXT.
-        """
-        record = contexts[0]
-        if not record["queue"]:
-            return
-        record["turn"], record["over"] = self._turn, 0
-        shut(self._queue.ctypes.data, self._turn)
-        self._pool.call(
-            lambda thread: help_step(contexts, self._addresses[thread]), record["slices"] - 1
-        )
-
-    def dismiss_workers(self, contexts: NDArray[np.void]) -> None:
-        record = contexts[0]
-        if record["queue"]:
-            record["over"] = 1
+    def take_back(self) -> int:
+        """Compiled code is done with its steps; the step k of the states now."""
+        if self._context["polling"]:
+            self._context["polling"] = 0
             self._pool.dismiss()
-            self._turn = int(record["turn"])
-
-    def slices(self, batch: int) -> int:
-        """How many slices a step is shared out in."""
-        return min(batch, batch * self._points_per_step // POINTS_PER_SLICE)
+        self._context["shared"] = self._shared
+        return int(self._context["step"])
 
 
 class ThreadPool:
@@ -211,53 +207,36 @@ def use_cores(cores: Collection[int], *, polling: bool = False) -> None:
     _POOL[:] = [ThreadPool(cores, polling)]
 
 
-def compile_step() -> tuple[Any, ...]:
-    """What the threads call."""
-    sources = fingerprint(work_queue, step_context, atomics, native)
+def compile_for_threads() -> tuple[Any, ...]:
+    """What the threads call, with a STEP_CONTEXT in an array."""
+    sources = fingerprint(step_context, work_queue, atomics, native)
 
     @cached_njit
-    def advance(
-        code: int,
-        plan: int,
-        states: NDArray[np.float64],
-        actions: NDArray[np.float64],
-        totals: NDArray[np.float64],
-        diverged_step: NDArray[np.int64],
-        k: int,
-        queue: int,
-        turn: int,
-        slices: int,
-    ) -> None:
-        """Advance the environments of those slices of the turn that no other thread has; of
-        the only one without a queue.
-        """
+    def step(contexts: NDArray[np.void]) -> None:
         sources  # noqa: B018  # closed over to be part of the key on disk
-        batch = len(totals)
-        z, a = states.ctypes.data, actions.ctypes.data
-        c, ended = totals.ctypes.data, diverged_step.ctypes.data
-        advance_slices(code, plan, z, a, c, ended, k, batch, queue, turn, slices)
+        step_environments(contexts[0])
 
     @cached_njit
-    def help_step(contexts: NDArray[np.void], plan: int) -> None:
+    def start(contexts: NDArray[np.void]) -> None:
         sources  # noqa: B018
-        help_with_steps(contexts[0], plan)
+        begin_turn(contexts[0].queue)
 
     @cached_njit
-    def start(address: int, turn: int) -> None:
+    def take(contexts: NDArray[np.void], plan: int) -> None:
         sources  # noqa: B018
-        begin_turn(address, turn)
+        take_slices(contexts[0], plan)
 
     @cached_njit
-    def shut(address: int, turn: int) -> None:
+    def done(contexts: NDArray[np.void]) -> bool:
         sources  # noqa: B018
-        close(address, turn)
+        return wait_until_done(contexts[0].queue, contexts[0].slices, SPINS)
 
     @cached_njit
-    def done(address: int, slices: int) -> bool:
+    def shut(contexts: NDArray[np.void]) -> None:
         sources  # noqa: B018
-        return wait_until_done(address, slices, SPINS)
+        close(contexts[0].queue)
 
-    return advance, help_step, start, shut, done
+    return step, start, take, done, shut
 
 
-COMPILED = advance, help_step, start, shut, done = compile_step()
+COMPILED = step, start, take, done, shut = compile_for_threads()

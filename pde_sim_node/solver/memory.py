@@ -1,0 +1,185 @@
+"""What a compiled step is told: its settings, and how constants and scratch lie in memory."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from loop_interfaces.jit.simd import WIDTH, whole_lanes
+from pde_sim_node.equations import Equation, Field, Spectrum
+from pde_sim_node.solver.fft import is_transform_length, radices_of, twiddles_of
+from pde_sim_node.solver.spectra import TRANSFORM
+
+__all__ = ["Constants", "StepSettings", "aligned", "begin_plan", "lay_out", "step_plan_type"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StepSettings:
+    """A sampling time of a plant.
+
+    Attributes
+    ----------
+    equation
+        The PDE, with c components.
+    supports : (n_x, n_a)
+        Phi_j(x_i).
+    target : (c n_x,)
+        State of the stage cost.
+    integration_time, steps
+        Length and number of the internal steps.
+    state_weight, action_weight
+        Weights of the stage cost.
+    bound
+        Magnitude beyond which a state has diverged.
+    """
+
+    equation: Equation
+    supports: NDArray[np.float64]
+    target: NDArray[np.float64]
+    integration_time: float
+    steps: int
+    state_weight: float
+    action_weight: float
+    bound: float
+
+    @property
+    def n_x(self) -> int:
+        """Grid points."""
+        return len(self.supports)
+
+    @property
+    def wavenumbers(self) -> Field:
+        """2 pi j / L of the real FFT, (n_x//2 + 1,)."""
+        modes = np.arange(self.n_x // 2 + 1, dtype=np.float64)
+        return 2 * np.pi * modes / self.equation.length
+
+    def operator(self, name: str) -> Spectrum:
+        """L(k) or m(k), the equation's method of that name; ValueError for a wrong shape or NaN."""
+        values = getattr(self.equation, name)(self.wavenumbers)
+        modes, components = self.n_x // 2 + 1, len(self.equation.components)
+        shape = (modes,) if components == 1 else (modes, components, components)
+        if (
+            not isinstance(values, np.ndarray)
+            or values.shape != shape
+            or values.dtype.kind not in "iufc"
+            or not np.isfinite(values).all()
+        ):
+            raise ValueError(
+                f"{name} of the equation must return an array of {' x '.join(map(str, shape))} "
+                f"finite numbers for k of shape ({modes},), got {values!r}"
+            )
+        return values
+
+
+def step_plan_type(*own: tuple[str, Any]) -> np.dtype[np.void]:
+    """Type of the record that a compiled step reads: what all have, and the fields of its own."""
+    return np.dtype(
+        [
+            ("constants", np.int64),  # address of c
+            ("constants_apart", np.int64),  # distance e of its planes
+            ("scratch", np.int64),  # address of w
+            ("scratch_apart", np.int64),  # distance d of its planes
+            ("n_x", np.int64),  # grid points
+            ("n_z", np.int64),  # size of the state: components times grid points
+            ("n_a", np.int64),
+            ("modes", np.int64),  # n_x//2 + 1, up to whole lanes
+            ("coarse", TRANSFORM),  # of the published grid
+            ("state_weight", np.float64),
+            ("action_weight", np.float64),
+            ("bound", np.float64),
+            # Offsets in c.
+            ("target", np.int64),
+            ("analysis", np.int64),  # matrices of the coarse transform, n_x by modes
+            ("synthesis", np.int64),
+            # Offsets in w.
+            ("x", np.int64),  # the spectrum to be transformed next, zero above the modes
+            ("z1", np.int64),
+            ("z2", np.int64),
+            ("next", np.int64),
+            ("state", np.int64),
+            *own,
+        ]
+    )
+
+
+def aligned(size: int) -> NDArray[np.float64]:
+    """Zeros that begin on a boundary of whole lanes."""
+    raw = np.zeros(size + WIDTH)
+    start = -raw.ctypes.data // 8 % WIDTH
+    return raw[start : start + size]
+
+
+class Constants:
+    """Complex arrays laid one after the other, in a plane of real and a plane of imaginary parts."""
+
+    def __init__(self) -> None:
+        self._parts: list[NDArray[np.complex128]] = []
+        self._size = 0
+
+    def add(self, values: ArrayLike) -> int:
+        """Append an array, filled up to whole lanes, and return its offset."""
+        part = np.asarray(values, dtype=np.complex128).ravel()
+        self._parts.append(np.pad(part, (0, whole_lanes(part.size) - part.size)))
+        offset = self._size
+        self._size += self._parts[-1].size
+        return offset
+
+    def add_spectra(self, rows: NDArray[Any]) -> int:
+        """Append spectra (..., modes), each filled up to whole lanes, and return their offset."""
+        modes = rows.shape[-1]
+        missing = whole_lanes(modes) - modes
+        return self.add(np.pad(rows, [(0, 0)] * (rows.ndim - 1) + [(0, missing)]))
+
+    def add_transform(self, length: int, modes: int) -> tuple[int, int, int, int]:
+        """Append what a transform of that complex length needs; its entry in a plan."""
+        radices = sum(radix << 4 * i for i, radix in enumerate(radices_of(length)))
+        half_turns = np.arange(max(length, whole_lanes(modes))) / length
+        return (
+            length,
+            radices,
+            self.add(twiddles_of(length)),
+            self.add(-1j * np.exp(-1j * np.pi * half_turns)),
+        )
+
+    def add_grid(self, plan: Any, n_x: int) -> None:
+        """Append what leads from a field on n_x points to its spectrum and back, into the plan."""
+        modes = n_x // 2 + 1
+        if is_transform_length(n_x // 2):
+            plan["coarse"] = self.add_transform(n_x // 2, modes)
+        else:
+            angle = 2 * np.pi * (np.outer(np.arange(n_x), np.arange(modes)) % n_x) / n_x
+            multiplicity = np.where(np.arange(modes) % (n_x // 2) == 0, 1, 2)
+            plan["analysis"] = self.add_spectra(np.exp(-1j * angle) / n_x)
+            plan["synthesis"] = self.add_spectra(np.exp(1j * angle) * multiplicity)
+
+    def planes(self) -> NDArray[np.float64]:
+        parts = np.concatenate(self._parts)
+        planes = aligned(2 * parts.size)
+        planes[: parts.size], planes[parts.size :] = parts.real, parts.imag
+        return planes
+
+
+def lay_out(plan: Any, sizes: Mapping[str, int]) -> int:
+    """Give areas of the scratch, by name, their offsets in the plan; returns the size of a plane."""
+    # In front, and behind each plane: room for what whole lanes read and write beyond a transform.
+    offset = WIDTH
+    for name, size in sizes.items():
+        plan[name] = offset
+        offset += size
+    plan["scratch_apart"] = offset
+    return offset
+
+
+def begin_plan(kind: np.dtype[np.void], settings: StepSettings, constants: Constants) -> Any:
+    """A record of that type, with the fields that all have but the addresses and the scratch."""
+    plan: Any = np.zeros(1, kind)[0]
+    plan["n_x"], plan["n_a"] = settings.supports.shape
+    plan["n_z"] = settings.target.size
+    plan["modes"] = whole_lanes(settings.n_x // 2 + 1)
+    plan["state_weight"], plan["action_weight"] = settings.state_weight, settings.action_weight
+    plan["bound"] = settings.bound
+    plan["target"] = constants.add(settings.target)
+    constants.add_grid(plan, settings.n_x)
+    return plan
