@@ -15,12 +15,15 @@ from contextlib import contextmanager
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 
 from loop_interfaces.diagnostics import Health, Level
 
 NAMELESS = "_NODE_NAME_UNKNOWN_"
 """What the graph says of an endpoint whose node it has not heard of yet."""
+WAITING_REQUESTS = 100
+"""Requests to a service that are kept until it answers."""
 DIAGNOSTICS = "/diagnostics"
 PERIOD = 1.0
 """Seconds between two reports, and between two looks at the graph."""
@@ -94,7 +97,8 @@ class Introspection:
             self._node.get_logger().info(f"{name}: {response.message}")
             return response
 
-        self._node.create_service(Trigger, name, answer)
+        waiting = QoSProfile(depth=WAITING_REQUESTS)
+        self._node.create_service(Trigger, name, answer, qos_profile=waiting)
 
     @contextmanager
     def working(self, what: str) -> Iterator[None]:

@@ -13,12 +13,12 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import ShutdownException, SingleThreadedExecutor, TimeoutException
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
@@ -38,10 +38,12 @@ if TYPE_CHECKING:  # not every node needs the compiler
 
 HOUSEKEEPING = 0.05
 """Seconds between two rounds of the executor and of the node's slow duties."""
-BUSY_HOUSEKEEPING = 0.2
+BUSY_HOUSEKEEPING = 0.15
 """The same while messages stream through: a round of the executor costs as much as ten of them."""
 BUSY = 20
 """Messages since the last round that make a stream."""
+SERVING = 0.02
+"""Seconds in which a round begins callbacks of the executor: queued requests are answered together."""
 STUCK = 0.5
 """Seconds in which the loop goes round at least once, unless it computes."""
 SUSPENDED = 2.0
@@ -261,7 +263,7 @@ class NodeLoop:
                 if watchdog.longest() > SUSPENDED:
                     self.suspended = True
                     return "suspended"
-                self._executor.spin_once(timeout_sec=0)
+                self._serve(now)
                 if self._batcher is not None:
                     self._batcher.look(now)
                 changed = [watched.samples.look() for watched in self._watched.values()]
@@ -293,6 +295,18 @@ class NodeLoop:
                 handled += fast.path.disarm()
             handled += sum(take_from[pointer]() for pointer in ready("subscription"))
         return self._stop_reason or "shutdown"
+
+    def _serve(self, now: float) -> None:
+        """Call the executor's callbacks that are ready."""
+        served = True
+        while served and not self.stopped and self.now() < now + SERVING:
+            served = False
+            with suppress(TimeoutException, ShutdownException):
+                while True:  # what is ready now; then a TimeoutException
+                    callback, _, _ = self._executor.wait_for_ready_callbacks(timeout_sec=0)
+                    callback()
+                    callback.result()
+                    served = True
 
     def _look_after(self) -> None:
         """In another thread: report a long computation, and end a wait that takes too long.

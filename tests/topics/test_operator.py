@@ -157,6 +157,34 @@ def test_the_command_line_ends_with_a_stopped_tuner_and_continues(loop: Processe
     assert_same_training(out, in_process(iterations=ITERATIONS))
 
 
+QUEUED = """
+import rclpy
+from std_srvs.srv import Trigger
+from loop_interfaces.ros import node_loop
+rclpy.init()
+node_loop.SERVING = 60.0  # on a busy machine one call may take as long as a round has
+node, desk = rclpy.create_node("served"), rclpy.create_node("desk")
+loop, answered, rounds = node_loop.NodeLoop(node), [], []
+loop.offer("~/act", lambda: answered.append(1) or "done")
+client = desk.create_client(Trigger, "/served/act")
+assert client.wait_for_service(60)
+for _ in range(20):
+    client.call_async(Trigger.Request())
+def count(now):
+    rounds.append(len(answered))
+    if len(answered) == 20:
+        loop.stop("answered")
+loop.run(tick=lambda now: None, deadline=lambda: None, housekeeping=count)
+print(len({*rounds}), flush=True)
+"""
+
+
+def test_requests_that_wait_are_answered_together(loop: Processes):
+    """Not one a round; they may come in a few groups."""
+    groups = loop.wait(loop.start("-c", QUEUED, name="queued"), LIMIT)
+    assert int(groups.split()[-1]) < 10
+
+
 def test_services_that_do_not_fit_the_moment_say_why(loop: Processes):
     start_pair(loop)
     with operator(loop) as desk:
