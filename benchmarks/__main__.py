@@ -138,6 +138,15 @@ def parser() -> argparse.ArgumentParser:
     linearised.add_argument("problems", nargs="+", metavar="PROBLEM", help="names or YAML files")
     linearised.add_argument("--n-a", type=int, metavar="N", help="actuators [the problem's]")
     linearised.add_argument("--width", type=float, metavar="X", help="of one, as a share of L")
+    environments = _add(
+        programs,
+        "environments",
+        "steps a second of the Gymnasium environments",
+        "--problem kdv --num-envs 4 16",
+    )
+    environments.add_argument("--problem", metavar="PROBLEM", help="[burgers]")
+    environments.add_argument("--num-envs", type=int, nargs="+", metavar="M", help="[1 4 16]")
+    environments.add_argument("--turns", type=int, metavar="N", help="turns of each [3]")
     kernel = _add(
         programs, "kernel", "time of a step beside other implementations", "--batches 1 12 --json"
     )

@@ -21,6 +21,7 @@ _EXTRAS = {
     "jinja2": "report",
     "aiohttp": "monitor",
     "shtab": "completion",
+    "gymnasium": "gym",
 }
 """Modules that only some commands need, and the extra that installs them."""
 _ROS = ("rclpy", "rcl_interfaces", "rosgraph_msgs", "rosidl_runtime_py", "builtin_interfaces")

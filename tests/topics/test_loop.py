@@ -63,12 +63,15 @@ def test_nodes_started_in_any_order_find_each_other_and_train(loop: Processes, t
         loop.wait(started[name], 5.0)
 
 
-def test_the_command_line_trains_over_topics_as_in_one_process(loop: Processes, tmp_path):
+def test_command_line_and_python_train_over_topics_as_in_one_process(loop: Processes, tmp_path):
     arguments = ("train", str(SMALL), "--iterations", "6", "--seeds", "2", "--seed", "3")
     over_topics = loop.pdeloop(*arguments, "--out", str(tmp_path / "a"))
     text = loop.wait(over_topics, LIMIT)
-    here = loop.pdeloop(*arguments, "--out", str(tmp_path / "b"), "--in-process")
-    loop.wait(here, LIMIT)
+    program = (
+        f"import pdeloop; pdeloop.train({str(SMALL)!r}, iterations=6, seeds=2, seed=3,"
+        f"over_topics=True, out={str(tmp_path / 'b')!r})"
+    )
+    loop.wait(loop.start("-c", program, name="python"), LIMIT)
     for run in ("a", "b"):
         assert_same_training(tmp_path / run, in_process(seed=3, iterations=6, seeds=2))
     assert "mean stage cost after adaptation" in text
