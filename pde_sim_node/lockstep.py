@@ -65,7 +65,8 @@ class Lockstep:
 
     plant: what is stepped; fingerprint: of its parameters (see build.fingerprint); sample_time (s):
     simulated time per step; real_time_factor: simulated seconds per second, 0 as fast as
-    possible; action_timeout (s), max_repeats, run_hold (s): see
+    possible; paused_run: the run that this plant was paused in when its process ended, 0 for none:
+    it begins paused; action_timeout (s), max_repeats, run_hold (s): see
     loop_interfaces.parameters. `now` is any monotonic time in s.
     """
 
@@ -79,6 +80,7 @@ class Lockstep:
         max_repeats: int,
         run_hold: float,
         real_time_factor: float = 0.0,
+        paused_run: int = 0,
     ) -> None:
         self.plant = plant
         self._fingerprint = fingerprint
@@ -118,6 +120,7 @@ class Lockstep:
         """Whether the next state is ready and waits for its instant, or for the end of a pause."""
         self.pacer = RealTimePacer(sample_time / real_time_factor) if real_time_factor else None
         self.paused = False
+        self._paused_run = paused_run
         self._stepping = False
         """Whether a paused plant waits for the one action that it may still take."""
 
@@ -200,6 +203,7 @@ class Lockstep:
 
     def resume(self, now: float) -> list[Publication]:
         """Go on: send the state that was held back, or again the one that is not answered."""
+        self._paused_run = 0
         if not self.paused:
             return []
         self.paused, self._stepping, self._deadline = False, False, None
@@ -264,6 +268,10 @@ class Lockstep:
             self.run, self.episode, self._cost = frame.run, -1, None
             self._past, self._signs = {}, None
             self._idle(now)
+        report: list[Publication] = []
+        if frame.run == self._paused_run:
+            self._paused_run = 0
+            report = self.pause(now)
         self._tuner_heard = now
         if not len(rows):
             self.run, self.episode = 0, -1
@@ -290,7 +298,7 @@ class Lockstep:
         self._stepping = False
         if self.pacer:
             self.pacer.begin(now)
-        return self._publish_state(now)
+        return report + self._publish_state(now)
 
     def action(self, frame: Frame, now: float) -> list[Publication]:
         """Advance on the awaited action; ignore any other.

@@ -17,6 +17,7 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
 from loop_interfaces.affinity import core_list
+from loop_interfaces.files import FileError
 from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.parameters import PLANT, taken_by
@@ -32,6 +33,7 @@ from pde_sim_node.diagnostics import PlantHealth
 from pde_sim_node.equations import configured_equation
 from pde_sim_node.fast_path import PlantFastPath
 from pde_sim_node.lockstep import Lockstep
+from pde_sim_node.pause_record import PauseRecord
 from pde_sim_node.plant import Plant
 from pde_sim_node.solver.workers import use_cores
 
@@ -70,6 +72,8 @@ class PlantNode:
         plant = build_plant(values)
         if plant.compiled_in_seconds > 0.0:
             node.get_logger().info(f"compiled the kernel in {plant.compiled_in_seconds:.1f} s")
+        domain = node.context.get_domain_id()
+        self._pause_record = PauseRecord(node.get_fully_qualified_name(), domain)
         self._lockstep = Lockstep(
             plant,
             fingerprint=fingerprint(values),
@@ -78,6 +82,7 @@ class PlantNode:
             max_repeats=values["max_repeats"],
             run_hold=values["run_hold"],
             real_time_factor=values["real_time_factor"],
+            paused_run=self._pause_record.run,
         )
         self._health = PlantHealth(self._lockstep)
         self._paced = self._lockstep.pacer is not None
@@ -130,6 +135,7 @@ class PlantNode:
 
     def _pause(self) -> str:
         self._send(self._lockstep.pause(self._loop.now()))
+        self._record_pause()
         last = self._lockstep.last_state
         self._batcher.show(self._senders[STATE].encoded(last) if last else None)
         return f"paused at step {self._lockstep.step}; an answer on its way is still taken"
@@ -137,7 +143,19 @@ class PlantNode:
     def _resume(self) -> str:
         was = "resumed" if self._lockstep.paused else "was not paused"
         self._send(self._lockstep.resume(self._loop.now()))
+        self._record_pause()
         return was
+
+    def _record_pause(self) -> None:
+        """So that a plant that is started again in this run stays paused."""
+        lockstep = self._lockstep
+        try:
+            self._pause_record.keep(lockstep.run if lockstep.paused else 0)
+        except (OSError, FileError) as error:
+            self._node.get_logger().warning(
+                f"a pause does not outlive this process, as it cannot be recorded: {error}",
+                throttle_duration_sec=10.0,
+            )
 
     def _step(self) -> str:
         self._send(self._lockstep.step_once(self._loop.now()))
@@ -151,6 +169,7 @@ class PlantNode:
 
     def _on_start(self, frame: Frame) -> None:
         self._send(self._lockstep.start(frame, self._loop.now()))
+        self._record_pause()
         if not self._lockstep.run:
             self._report_pace()
 

@@ -10,7 +10,7 @@ from loop_interfaces.protocol import STOPPED
 from tests.loop_harness import Processes, until
 from tests.operator_harness import operator
 from tests.small import SMALL
-from tests.topics.test_faults import PARAMETERS, start_pair, start_tuner
+from tests.topics.test_faults import start_pair, start_tuner
 from tests.topics.test_loop import LIMIT, assert_same_training, in_process, iterations_done
 
 pytestmark = pytest.mark.topics
@@ -69,7 +69,7 @@ def test_a_paused_and_stepped_plant_gives_the_same_policy_and_nobody_complains(
     assert '"repeated"' not in (out / "progress.jsonl").read_text()
 
 
-def test_a_controller_that_restarts_while_the_plant_is_paused_changes_nothing(
+def test_a_plant_that_dies_in_a_pause_is_paused_again_and_so_is_nothing_changed(
     loop: Processes, tmp_path
 ):
     running = start_pair(loop, max_repeats=20)
@@ -78,11 +78,20 @@ def test_a_controller_that_restarts_while_the_plant_is_paused_changes_nothing(
         tuner = start_tuner(loop, out, iterations=ITERATIONS)
         until(lambda: iterations_done(out) >= 20, LONG, "iteration 20")
         desk.call("/pde_sim_node/pause")
-        running["controller"].send_signal(signal.SIGKILL)
-        running["controller"].wait()
-        desk.wait_for_reports("pde_sim_node", 5)
-        loop.node("controller_node", *PARAMETERS)
-        desk.call("/pde_sim_node/resume")
+        for process in running.values():  # the controller as well
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+        start_pair(loop, max_repeats=20)
+        until(
+            lambda: desk.status("pde_sim_node")[2].startswith("paused at step 0"),
+            LIMIT,
+            "paused plant",
+        )
+        done = iterations_done(out)
+        desk.wait_for_reports("pde_sim_node", 3)
+        assert iterations_done(out) == done
+        assert desk.status("pde_sim_node")[2].startswith("paused at step 0")
+        assert desk.call("/pde_sim_node/resume") == "resumed"
         loop.wait(tuner, LONG)
     assert_same_training(out, in_process(iterations=ITERATIONS))
 
