@@ -153,18 +153,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
     Raises ParameterError when the file cannot be read or is not in that form.
     """
-    try:
-        with path.open("rb") as file:
-            raw = file.read(MAX_YAML_BYTES + 1)
-    except OSError as error:
-        raise ParameterError(f"cannot read {path}: {error.strerror}") from error
-    if len(raw) > MAX_YAML_BYTES:
-        raise ParameterError(f"{path} is larger than {MAX_YAML_BYTES} bytes; not a parameter file")
-    try:
-        document = yaml.safe_load(raw)
-    except (yaml.YAMLError, UnicodeDecodeError, ValueError, RecursionError) as error:
-        first = str(error).splitlines()[0]
-        raise ParameterError(f"{path} is not valid YAML: {first}") from error
+    document = read_document(path)
     flat: dict[str, Any] = {}
     sections = document.values() if isinstance(document, dict) else [None]
     for section in sections:
@@ -175,6 +164,22 @@ def read_yaml(path: Path) -> dict[str, Any]:
             )
         flat.update(_flatten(body))
     return flat
+
+
+def read_document(path: Path) -> Any:
+    """The content of a YAML file of bounded size. ParameterError when it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            raw = file.read(MAX_YAML_BYTES + 1)
+    except OSError as error:
+        raise ParameterError(f"cannot read {path}: {error.strerror}") from error
+    if len(raw) > MAX_YAML_BYTES:
+        raise ParameterError(f"{path} is larger than {MAX_YAML_BYTES} bytes; not a parameter file")
+    try:
+        return yaml.safe_load(raw)
+    except (yaml.YAMLError, UnicodeDecodeError, ValueError, RecursionError) as error:
+        first = str(error).splitlines()[0]
+        raise ParameterError(f"{path} is not valid YAML: {first}") from error
 
 
 def _flatten(body: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:

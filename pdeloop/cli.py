@@ -22,6 +22,7 @@ _EXTRAS = {
     "aiohttp": "monitor",
     "shtab": "completion",
     "gymnasium": "gym",
+    "distributed": "cluster",
 }
 """Modules that only some commands need, and the extra that installs them."""
 _ROS = ("rclpy", "rcl_interfaces", "rosgraph_msgs", "rosidl_runtime_py", "builtin_interfaces")
@@ -94,6 +95,7 @@ def parser() -> argparse.ArgumentParser:
         problems,
         reproduce,
         secure,
+        study,
         train,
     )
 
@@ -111,6 +113,7 @@ def parser() -> argparse.ArgumentParser:
         bag,
         monitor,
         reproduce,
+        study,
         secure,
         problems,
         completion,

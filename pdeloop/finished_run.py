@@ -110,8 +110,8 @@ def reduction(costs: Array, lqt: Array) -> Reduction | None:
     return Reduction(
         ratio_of_means=float(_ratio_of_means(*pair)),
         mean_of_ratios=float(_mean_of_ratios(*pair)),
-        ratio_interval=_interval(pair, _ratio_of_means),
-        mean_interval=_interval(pair, _mean_of_ratios),
+        ratio_interval=interval(pair, _ratio_of_means),
+        mean_interval=interval(pair, _mean_of_ratios),
         seeds=int(whole.sum()),
     )
 
@@ -124,11 +124,12 @@ def _mean_of_ratios(own: Array, base: Array, axis: int = -1) -> Any:
     return 100 * (1 - own / base).mean(axis=axis)
 
 
-def _interval(pair: tuple[Array, Array], statistic: Any) -> tuple[float, float] | None:
-    if len(pair[0]) < 2:
+def interval(samples: tuple[Array, ...], statistic: Any) -> tuple[float, float] | None:
+    """Percentile bootstrap of `statistic` over paired samples; None of fewer than two."""
+    if len(samples[0]) < 2:
         return None
     found = bootstrap(
-        pair,
+        samples,
         statistic,
         paired=True,
         vectorized=True,

@@ -1,0 +1,7 @@
+"""Many trainings side by side: on this machine's cores, on a cluster, on any executor."""
+
+from pdeloop.study.description import Study, StudyError
+from pdeloop.study.run import Failure, run
+from pdeloop.study.table import rows
+
+__all__ = ["Failure", "Study", "StudyError", "rows", "run"]

@@ -1,0 +1,117 @@
+"""What a study consists of. Pure but for the problems' files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from loop_interfaces.problem import find_problem
+from loop_interfaces.spec import read_yaml
+from pdeloop.training_run import resolve
+from tuner_node.build import build_training
+
+_NAME = re.compile(r"[\w.+-]{1,60}")
+
+
+class StudyError(ValueError):
+    """The study cannot be run as asked; the text says why and what to do."""
+
+
+@dataclass(frozen=True)
+class Study:
+    """Trainings of every problem, by every variant, with every seed.
+
+    Parameters
+    ----------
+    problems : dict of str to str
+        Shipped name or YAML file of each problem, by the problem's name.
+    seeds : tuple of int
+        Seeds of the trainings; each is a training of its own.
+    variants : dict of str to dict
+        Parameters that a variant sets, by the variant's name.
+    settings : dict
+        Parameters that all trainings set.
+    """
+
+    problems: Mapping[str, str]
+    seeds: tuple[int, ...]
+    variants: Mapping[str, Mapping[str, Any]]
+    settings: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, content: object, folder: Path = Path()) -> Study:
+        """The study that a file describes; relative paths in it are taken relative to `folder`.
+
+        Raises
+        ------
+        StudyError
+            Something is missing, unknown or of another kind.
+
+        Examples
+        --------
+        >>> Study.of({"problems": ["kdv"], "seeds": 2, "variants": {"default": {}}}).seeds
+        (0, 1)
+        """
+        if not isinstance(content, dict):
+            raise StudyError(f"the study is {content!r}; expected a table with 'problems'")
+        unknown = sorted(set(map(str, content)) - {"problems", "seeds", "variants", "settings"})
+        if unknown:
+            raise StudyError(
+                f"unknown entries: {', '.join(unknown)}; expected problems, seeds, variants, settings"
+            )
+        problems, seeds = content.get("problems"), content.get("seeds", 1)
+        if not isinstance(problems, list) or not problems:
+            raise StudyError(f"'problems' is {problems!r}; expected a list of names or YAML files")
+        if type(seeds) is int and seeds > 0:
+            seeds = range(seeds)
+        elif not isinstance(seeds, list) or not seeds or any(type(s) is not int for s in seeds):
+            raise StudyError(f"'seeds' is {seeds!r}; expected how many, or a list of them")
+        variants, settings = content.get("variants", {"default": {}}), content.get("settings", {})
+        for name, table in (("variants", variants), ("settings", settings)):
+            if not isinstance(table, dict):
+                raise StudyError(f"'{name}' is {table!r}; expected a table")
+        for name, table in variants.items():
+            if not isinstance(name, str) or not _NAME.fullmatch(name):
+                raise StudyError(f"variant {name!r}; expected a name of letters, digits, . + - _")
+            if not isinstance(table, dict):
+                raise StudyError(f"variant '{name}' is {table!r}; expected a table of parameters")
+        files = {}
+        for word in problems:
+            beside = folder / str(word)
+            file = str(beside.resolve()) if beside.is_file() else str(word)
+            name = str(read_yaml(find_problem(file)).get("problem", Path(file).stem))
+            if not _NAME.fullmatch(name) or name in files:
+                raise StudyError(f"problem '{name}' of {file}; expected names that differ")
+            files[name] = file
+        return cls(files, tuple(sorted(set(seeds))), variants, settings)
+
+    def content(self) -> dict[str, Any]:
+        """What `of` makes this study of."""
+        return {
+            "problems": list(self.problems.values()),
+            "seeds": list(self.seeds),
+            "variants": {name: dict(table) for name, table in self.variants.items()},
+            "settings": dict(self.settings),
+        }
+
+    def trainings(self) -> dict[str, dict[str, Any]]:
+        """The resolved parameters of every training, by its folder PROBLEM/VARIANT/SEED.
+
+        Raises
+        ------
+        ValueError
+            A training cannot be built from its parameters.
+        """
+        found: dict[str, dict[str, Any]] = {}
+        for problem, file in self.problems.items():
+            for variant, table in self.variants.items():
+                values = resolve(
+                    file, {**self.settings, **table, "seed": self.seeds[0], "seeds": 1}
+                )
+                build_training(values)
+                for seed in self.seeds:
+                    found[f"{problem}/{variant}/{seed}"] = {**values, "seed": seed}
+        return found

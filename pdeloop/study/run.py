@@ -1,0 +1,182 @@
+"""Carries a study out, or on: what is not in its folder yet is trained.
+
+DIR/study.json                what was asked for
+DIR/PROBLEM/VARIANT/SEED/     parameters.yaml, policy.npz and result.json of a finished training
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    wait,
+)
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from loop_interfaces.files import make_folder, read_json, write_atomically
+from pdeloop.study.description import Study, StudyError
+from pdeloop.study.training import EnvironmentMismatchError, environment, train_one
+
+ASKED = "study.json"
+ATTEMPTS = 3
+"""Executors that may break, as when the system kills a process for its memory."""
+POLL = 0.1
+"""Seconds between two calls of `tell`."""
+
+Progress = Callable[[int, int, str], None]
+
+
+class Failure(NamedTuple):
+    """A training that cannot be carried out."""
+
+    training: str
+    reason: str
+
+
+def keep(folder: Path, study: Study) -> None:
+    """Begin a study in `folder`, or check that the one there is this one.
+
+    Raises
+    ------
+    StudyError
+        There is another one, or the folder cannot be written.
+    """
+    try:
+        if (folder / ASKED).exists():
+            if kept(folder) != study:
+                raise StudyError(
+                    f"{folder} holds another study; choose another folder, or continue the one "
+                    f"there with: pdeloop study --out {folder}"
+                )
+            return
+        make_folder(folder)
+        write_atomically(folder / ASKED, json.dumps(study.content(), indent=1).encode())
+    except OSError as error:
+        raise StudyError(f"cannot write to {folder}: {error.strerror}") from error
+
+
+def kept(folder: Path) -> Study:
+    """The study in `folder`. StudyError if there is none."""
+    try:
+        return Study.of(read_json(folder / ASKED))
+    except (OSError, ValueError, AttributeError) as error:
+        raise StudyError(f"no study in {folder}: {ASKED} cannot be used ({error})") from error
+
+
+def run(
+    study: Study,
+    folder: Path,
+    executor: Callable[[], AbstractContextManager[Executor]],
+    *,
+    any_environment: bool = False,
+    tell: Progress = lambda done, total, status: None,
+) -> list[Failure]:
+    """Train what is not finished yet.
+
+    Parameters
+    ----------
+    study : Study
+        What to train.
+    folder : Path
+        Of the results; only this process writes there, the workers need no access to it.
+    executor : callable
+        Makes the `concurrent.futures.Executor` that runs the trainings, as a context manager
+        (`pdeloop.study.executors`); called again if an executor breaks.
+    any_environment : bool
+        Take results of workers with other versions or another processor, which may differ in the
+        last bits; each result.json says which.
+    tell : callable
+        Called with the number of trainings that are done, that of all, and what was done last.
+
+    Returns
+    -------
+    list of Failure
+        The trainings that cannot be carried out; all others are in `folder`.
+
+    Raises
+    ------
+    StudyError
+        The executor broke `ATTEMPTS` times, a worker has another environment, or the folder cannot
+        be written.
+    """
+    keep(folder, study)
+    trainings = study.trainings()
+    expected = None if any_environment else environment()
+    finished = {name for name in trainings if (folder / name / "result.json").exists()}
+    if expected is not None:
+        _check_finished(folder, finished, expected)
+    failures: list[Failure] = []
+    for _ in range(ATTEMPTS):
+        try:
+            with executor() as pool:
+                todo = {n: v for n, v in trainings.items() if n not in finished}
+                waiting = {pool.submit(train_one, v, expected): n for n, v in todo.items()}
+                _collect(waiting, folder, finished, failures, len(trainings), tell)
+            return failures
+        except (BrokenExecutor, CancelledError) as error:
+            broken = error
+    raise StudyError(
+        f"the workers ended {ATTEMPTS} times before their trainings ({broken}); is there enough "
+        f"memory? {len(finished)} of {len(trainings)} are done and kept in {folder}"
+    )
+
+
+def _collect(
+    waiting: dict[Future[dict[str, bytes]], str],
+    folder: Path,
+    finished: set[str],
+    failures: list[Failure],
+    total: int,
+    tell: Progress,
+) -> None:
+    """Write every result as it comes."""
+    status = ""
+    try:
+        while waiting:
+            tell(len(finished), total, status)
+            done, _ = wait(waiting, timeout=POLL, return_when=FIRST_COMPLETED)
+            for future in done:
+                status = waiting.pop(future)
+                try:
+                    _write(folder / status, future.result())
+                except EnvironmentMismatchError as error:
+                    raise StudyError(
+                        f"{error}: its results may differ in the last bits; install the same "
+                        "everywhere, or take them with --any-environment"
+                    ) from error
+                except (BrokenExecutor, CancelledError):
+                    raise
+                except OSError as error:
+                    raise StudyError(f"cannot write to {folder}: {error.strerror}") from error
+                except (ValueError, RuntimeError) as error:
+                    failures.append(Failure(status, str(error)))
+                finished.add(status)
+        tell(len(finished), total, status)
+    except BaseException:
+        for future in waiting:
+            future.cancel()
+        raise
+
+
+def _write(folder: Path, files: Mapping[str, bytes]) -> None:
+    make_folder(folder)
+    for name, content in files.items():  # result.json last: where it is, the training is finished
+        write_atomically(folder / name, content)
+
+
+def _check_finished(folder: Path, names: set[str], expected: Mapping[str, str]) -> None:
+    """StudyError if a finished training was carried out in another environment."""
+    for name in sorted(names):
+        result: dict[str, Any] = read_json(folder / name / "result.json")
+        if result.get("environment") != expected:
+            raise StudyError(
+                f"{folder / name} was trained with other versions or on another processor: the rest "
+                "may differ from it in the last bits; continue there, or with --any-environment"
+            )

@@ -1,0 +1,76 @@
+"""One training of a study: a function of its parameters alone, wherever it runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import Lock
+from typing import Any
+
+import llvmlite.binding
+
+from pdeloop.in_process import LocalPair, train
+from pdeloop.training_run import BUILT_IN
+from tuner_node.build import build_training
+from tuner_node.results import RunFolder, versions
+
+FILES = ("parameters.yaml", "policy.npz", "result.json")
+"""The files of a run folder that a training of a study leaves, in the order of writing."""
+_ONE_AT_A_TIME = Lock()
+"""A worker that runs tasks in threads: a training uses NumPy's and Numba's own threads."""
+
+
+class EnvironmentMismatchError(ValueError):
+    """A worker has other versions or another processor than the study."""
+
+
+def environment() -> dict[str, str]:
+    """What the last bits of a result depend on: versions and the processor's type."""
+    known = versions()
+    known.pop("ros-jazzy-rclpy", None)
+    return {**known, "processor": str(llvmlite.binding.get_host_cpu_name())}
+
+
+def train_one(
+    parameters: Mapping[str, Any], expected: Mapping[str, str] | None = None
+) -> dict[str, bytes]:
+    """Train in this process.
+
+    Parameters
+    ----------
+    parameters : dict
+        Resolved parameters.
+    expected : dict, optional
+        The `environment` in which alone the result may be computed; None: any.
+
+    Returns
+    -------
+    dict of str to bytes
+        Content of each of `FILES`; `environment` is an entry of result.json. The same bytes for the
+        same parameters in the same environment.
+
+    Raises
+    ------
+    EnvironmentMismatchError
+        This process has another environment.
+    ValueError, RuntimeError
+        The training cannot be carried out.
+    """
+    here = environment()
+    if expected is not None and here != dict(expected):
+        other = [
+            f"{name} {here.get(name, 'missing')} instead of {expected.get(name, 'none')}"
+            for name in sorted({*here, *expected})
+            if here.get(name) != expected.get(name)
+        ]
+        raise EnvironmentMismatchError(f"a worker has {', '.join(other)}")
+    with _ONE_AT_A_TIME, TemporaryDirectory(prefix="pdeloop-") as place:
+        folder = RunFolder(Path(place) / "run")
+        folder.create(parameters)
+        training = build_training(parameters)
+        pair = LocalPair(parameters)
+        train(training, pair, lambda row: None, max_batch=parameters["max_batch"])
+        extra = {"transport": "in-process", "controller": BUILT_IN, "environment": here}
+        folder.finish(training, extra)
+        return {name: (folder.path / name).read_bytes() for name in FILES}
