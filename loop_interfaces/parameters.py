@@ -95,14 +95,7 @@ PROBLEM = _section(
         "PDE of the plant: a shipped or installed name; or code that the user has to allow, "
         "'package.module:Class' or 'path/to/file.py:Class'",
     ),
-    Spec(
-        "length",
-        1.0,
-        "length L of the periodic domain",
-        positive=True,
-        unit="m",
-        nodes="PTV",
-    ),
+    Spec("length", 1.0, "length L of the periodic domain", positive=True, unit="m", nodes="PTV"),
     Spec(
         "n_z",
         128,
@@ -111,14 +104,7 @@ PROBLEM = _section(
         65536,
         multiple_of=2,
     ),
-    Spec(
-        "n_a",
-        6,
-        "actuators, the size of the action",
-        1,
-        1024,
-        nodes="PCT",
-    ),
+    Spec("n_a", 6, "actuators, the size of the action", 1, 1024, nodes="PCT"),
     Spec("actuator_width", 0.15, "width of one actuator as a share of L", positive=True, maximum=1),
     Spec("sample_time", 0.05, "sampling time; the action is held over it", positive=True, unit="s"),
     Spec(
@@ -128,28 +114,9 @@ PROBLEM = _section(
         positive=True,
         unit="s",
     ),
-    Spec(
-        "horizon",
-        300,
-        "steps T of an episode",
-        1,
-        1_000_000,
-        nodes="PTV",
-    ),
-    Spec(
-        "state_weight",
-        1.0,
-        "q of Q = q I in the stage cost",
-        positive=True,
-        nodes="PCTV",
-    ),
-    Spec(
-        "action_weight",
-        1.0,
-        "r of R = r I in the stage cost",
-        positive=True,
-        nodes="PCTV",
-    ),
+    Spec("horizon", 300, "steps T of an episode", 1, 1_000_000, nodes="PTV"),
+    Spec("state_weight", 1.0, "q of Q = q I in the stage cost", positive=True, nodes="PCTV"),
+    Spec("action_weight", 1.0, "r of R = r I in the stage cost", positive=True, nodes="PCTV"),
     Spec(
         "divergence_bound",
         1e3,
