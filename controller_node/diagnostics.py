@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from controller_node.responder import Responder
-from loop_interfaces.diagnostics import Health, Level, Rate
+from loop_interfaces.diagnostics import Health, Lasting, Level, Rate
 
 SILENT = 5.0
 """Seconds without a state, within an episode, after which what is known of the plant is old."""
@@ -19,7 +19,7 @@ class ControllerHealth:
         self._answers = Rate()
         self._answered = 0
         self._heard = float("-inf")
-        self._waiting_since: float | None = None
+        self._waiting = Lasting()
         self.plant_paused = False
         """What the plant said on `episode/paused`."""
         self.plants: int | None = None
@@ -28,12 +28,7 @@ class ControllerHealth:
     def waiting(self, now: float) -> list[str]:
         """What a state has waited for, for longer than WAITING; to be called in every round."""
         lacking = self._responder.waits_for()
-        if not lacking:
-            self._waiting_since = None
-        elif self._waiting_since is None:
-            self._waiting_since = now
-        waited = self._waiting_since is not None and now - self._waiting_since > WAITING
-        return lacking if waited else []
+        return lacking if self._waiting.seconds(bool(lacking), now) > WAITING else []
 
     def report(self, now: float) -> Health:
         """Level, sentence and values at time `now` (monotonic s)."""

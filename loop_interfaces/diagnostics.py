@@ -40,6 +40,26 @@ class Health:
         return [(name, _text(value)) for name, value in self.values.items()]
 
 
+class Lasting:
+    """How long a condition has held, from one look at it to the next."""
+
+    def __init__(self) -> None:
+        self._since: float | None = None
+
+    def seconds(self, holds: bool, now: float) -> float:
+        """Seconds since the look that first saw it hold; 0 where it does not.
+
+        >>> lasting = Lasting()
+        >>> [lasting.seconds(holds, now) for holds, now in ((True, 1.0), (True, 3.5), (False, 4.0))]
+        [0.0, 2.5, 0.0]
+        """
+        if not holds:
+            self._since = None
+        elif self._since is None:
+            self._since = now
+        return now - self._since if self._since is not None else 0.0
+
+
 class Rate:
     """How fast a counter grows, from one look at it to the next."""
 

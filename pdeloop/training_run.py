@@ -220,7 +220,7 @@ def _train_holding(
     folder: Path, values: dict[str, Any], display: Display, check: Callable[[], None]
 ) -> None:
     training = build_training(values)
-    recorder = Recorder(folder, values, training, resume=True, warn=display.line)
+    recorder = Recorder(folder, values, training, warn=display.line)
 
     def report(row: Mapping[str, Any]) -> None:
         recorder.note(row)

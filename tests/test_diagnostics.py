@@ -161,11 +161,11 @@ def test_a_controller_waits_answers_grows_stale_and_is_at_rest():
 def test_a_tuner_tells_how_far_it_is_who_is_missing_and_what_holds_it():
     loop = Loop(build_training(values()))
     health = TunerHealth(loop.session)
-    first = health.report(0.0, [])
+    first = health.report(0.0)
     assert (first.level, first.message) == (Level.OK, "identify")
     while loop.iterations() < 2:
         loop.episode()
-    told = health.report(10.0, [])
+    told = health.report(10.0)
     paid, budget = (sum(counts) for counts in loop.session.training.progress.values())
     assert budget - paid == 2 * 2 * (ITERATIONS - 2)  # of two seeds
     where = f"rollout {paid} of {budget}"
@@ -176,28 +176,32 @@ def test_a_tuner_tells_how_far_it_is_who_is_missing_and_what_holds_it():
     checked = [row for row in loop.rows if row["event"] == "checked"]
     last = {row["seed"]: row["lqt"] for row in checked}
     assert told.values["cost with LQT"] == pytest.approx(np.mean(list(last.values())))
-    absent = health.report(11.0, ["plant", "controller"])
+    dispatcher = loop.session.dispatcher
+    loop.handle(dispatcher.presence(0, ["plant", "controller"], 11.0))
+    assert health.report(11.0).level is Level.OK  # it takes a moment to find them
+    absent = health.report(12.5)
     assert absent.level is Level.WARN
     assert absent.message == "waiting for plant and controller"
+    loop.handle(dispatcher.presence(0, [], 12.5))
     frame = loop.start
     void = np.full((len(frame.values), 3), float(VOID))
-    loop.take(loop.session.cost(0, Frame(7, frame.episode, 3, 0.0, void, 1), 0.0))
-    repeated = health.report(12.0, [])
+    loop.handle(dispatcher.cost(0, Frame(7, frame.episode, 3, 0.0, void, 1), 0.0))
+    repeated = health.report(13.0)
     assert repeated.level is Level.WARN
     assert "an episode had to be repeated" in repeated.message
     assert repeated.values["episodes repeated"] == 1
-    assert health.report(30.0, []).level is Level.OK
-    loop.session.pause()
-    assert health.report(31.0, []).message == f"paused in {where}"
-    loop.take(loop.session.resume(31.0))
-    loop.session.paused(0, Frame(7, 1, 0, 0.0, np.array([1.0]), 1), 31.0)
-    assert health.report(32.0, []).message == f"the plant is paused in {where}"
-    assert health.report(32.0, []).values["paused plants"] == 1
-    assert health.report(50.0, []).values["paused plants"] == 0
+    assert health.report(30.0).level is Level.OK
+    dispatcher.hold()
+    assert health.report(31.0).message == f"paused in {where}"
+    loop.handle(dispatcher.resume(31.0))
+    dispatcher.paused(0, Frame(7, 1, 0, 0.0, np.array([1.0]), 1), 31.0)
+    assert health.report(32.0).message == f"the plant is paused in {where}"
+    assert health.report(32.0).values["paused plants"] == 1
+    assert health.report(50.0).values["paused plants"] == 0
     loop.session.stop()
-    assert health.report(50.0, []).message.endswith("stopping after it")
+    assert health.report(50.0).message.endswith("stopping after it")
     restarted = Loop(build_training(values()), incarnation=3)
-    assert TunerHealth(restarted.session).report(0.0, []).values["restarts"] == 3
+    assert TunerHealth(restarted.session).report(0.0).values["restarts"] == 3
 
 
 def test_a_recorder_warns_until_it_is_matched_and_once_for_what_it_missed(tmp_path):

@@ -51,7 +51,11 @@ class Loop:
         self.start: Frame | None = None
         self.released = False
         self.take(self.session.begin(self.now))
-        self.take(self.session.presence(0, (), self.now))
+        self.handle(dispatcher.presence(0, (), self.now))
+
+    def handle(self, publications) -> None:
+        """What the dispatcher answers an event with."""
+        self.take(self.session.advance(publications, self.now))
 
     def take(self, publications) -> None:
         for _, send in publications:
@@ -67,6 +71,7 @@ class Loop:
     def episode(self) -> None:
         """Answer the last start."""
         self.now += 1.0
+        dispatcher = self.session.dispatcher
         frame, self.start = self.start, None
         exploring = frame.values[0, StartColumn.EXCITATION] >= 0
         result = self.pair.run(Batch(frame.values, None if exploring else self.policy))
@@ -74,9 +79,9 @@ class Loop:
         def answer(array):
             return Frame(frame.run, frame.episode, 30, self.now, array, self.plant)
 
-        self.take(self.session.cost(0, answer(result.costs), self.now))
+        self.handle(dispatcher.cost(0, answer(result.costs), self.now))
         if result.models is not None:
-            self.take(self.session.model(0, answer(result.models), self.now))
+            self.handle(dispatcher.model(0, answer(result.models), self.now))
 
     def iterations(self) -> int:
         return sum(row["event"] == "adapted" for row in self.rows) // 2
@@ -89,15 +94,16 @@ def same(a: Training, b: Training) -> bool:
 def test_a_paused_session_begins_no_episode_and_goes_on_with_the_same_bits():
     loop = Loop(build_training(values()))
     while not loop.session.done:
-        loop.session.pause()
+        loop.session.dispatcher.hold()
         loop.episode()
         if loop.session.done:
             break
         assert loop.start is None
         loop.now += 1000.0
-        loop.take(loop.session.tick(loop.now))  # keeps the plant: the last start, once more
+        # Keeps the plant: the last start, once more.
+        loop.handle(loop.session.dispatcher.tick(loop.now))
         loop.start = None
-        loop.take(loop.session.resume(loop.now))
+        loop.handle(loop.session.dispatcher.resume(loop.now))
         assert loop.start is not None
     assert same(loop.session.training, undisturbed())
     assert not [row for row in loop.rows if row["event"] == "repeated"]
@@ -128,7 +134,7 @@ def test_stopping_a_paused_session_ends_it_at_once():
     loop = Loop(build_training(values()))
     for _ in range(6):
         loop.episode()
-    loop.session.pause()
+    loop.session.dispatcher.hold()
     loop.take(loop.session.stop())
     assert loop.session.stopped
     assert loop.released

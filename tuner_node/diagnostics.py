@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from loop_interfaces.diagnostics import Health, Level, Rate
+from loop_interfaces.diagnostics import Health, Lasting, Level, Rate
 from tuner_node.session import Session
 
+FOUND = 1.0
+"""Seconds in which a node that is there is found."""
 RECENT = 10.0
 """Seconds for which a repeated episode is worth a warning."""
 
@@ -16,12 +18,19 @@ class TunerHealth:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._rate = Rate()
+        self._rate, self._missing = Rate(), Lasting()
         self._repeated = 0
         self._repeated_at = float("-inf")
 
-    def report(self, now: float, absent: list[str]) -> Health:
-        """Level, sentence and values at time `now` (monotonic s); absent: nodes that are waited for."""
+    def absent(self, now: float) -> tuple[list[str], float]:
+        """The nodes that are missing for longer than it takes to find them, and for how long (s)."""
+        missing = self._session.dispatcher.missing()
+        seconds = self._missing.seconds(bool(missing), now)
+        return (missing, seconds) if seconds > FOUND else ([], 0.0)
+
+    def report(self, now: float) -> Health:
+        """Level, sentence and values at time `now` (monotonic s)."""
+        absent, _ = self.absent(now)
         session, dispatcher = self._session, self._session.dispatcher
         training = session.training
         repeated = (

@@ -21,6 +21,7 @@ from typing import Any
 from rclpy.node import Node
 from std_msgs.msg import String
 
+from loop_interfaces.diagnostics import Lasting
 from loop_interfaces.frames import MAX_ID, Frame
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.parameters import TUNER, taken_by, with_budget
@@ -86,20 +87,14 @@ class TunerNode:
         self._recorder: Recorder | None = None
         identity = RunIdentity(1 + secrets.randbelow(MAX_ID - 1), 0)
         if values["out"]:
-            folder = RunFolder(Path(str(values["out"])))
+            folder = RunFolder(Path(values["out"]))
             if values["resume"]:
                 folder.parameters()
-                held.enter_context(folder.held())
-            self._recorder = Recorder(
-                folder.path,
-                values,
-                training,
-                resume=bool(values["resume"]),
-                warn=self._log.warning,
-            )
+            else:
+                folder.create(values)
+            held.enter_context(folder.held())
+            self._recorder = Recorder(folder.path, values, training, warn=self._log.warning)
             identity = self._recorder.identity
-            if not values["resume"]:
-                held.enter_context(folder.held())
         pairs: list[str] = values["pairs"]
         dispatcher = Dispatcher.create(
             run=identity.run,
@@ -123,10 +118,8 @@ class TunerNode:
         self._recording = str(values["recorder"])
         self._recorder_seen = self._recording == "none"
         self._failure: str | None = None
-        self._absent_since: float | None = None
-        self._absence_reported = float("-inf")
         self._plants_paused: list[int] = []
-        self._rival_since: float | None = None
+        self._rival = Lasting()
         self._several_publishers: dict[str, list[str]] = {}
         self._log.info(f"run {identity.run} of {values['problem']}, seed {values['seed']}")
 
@@ -167,18 +160,20 @@ class TunerNode:
         self._senders: list[dict[str, Sender]] = []
         self._cost_topics: list[str] = []
         self._model_topics: list[str] = []
-        session = self._session
+        session, dispatcher = self._session, self._session.dispatcher
         for number, namespace in enumerate(self._pairs):
             self._senders.append(
                 {t.name: loop.sender(t, namespace) for t in (POLICY, START, MODEL)}
             )
             if session.training.settings.trajectories:
                 # Before the costs: what has come in with one is then taken before it.
-                loop.receive(TARGET, self._handler(session.target, number), namespace)
+                loop.receive(TARGET, self._handler(dispatcher.target, number), namespace)
                 loop.observe(STATE, partial(self._on_state, number), namespace)
-                loop.observe(ACTION, partial(session.dispatcher.action, number), namespace)
-            cost = loop.receive(COST, self._handler(session.cost, number), namespace)
-            model = loop.receive(MODEL_IDENTIFIED, self._handler(session.model, number), namespace)
+                loop.observe(ACTION, partial(dispatcher.action, number), namespace)
+            cost = loop.receive(COST, self._handler(dispatcher.cost, number), namespace)
+            model = loop.receive(
+                MODEL_IDENTIFIED, self._handler(dispatcher.model, number), namespace
+            )
             self._cost_topics.append(cost.name)
             self._model_topics.append(model.name)
             self._node.create_subscription(
@@ -187,23 +182,23 @@ class TunerNode:
                 partial(self._on_failure, number),
                 reader_qos(MODEL),
             )
-            loop.listen(PAUSED, self._handler(session.paused, number), namespace)
+            loop.listen(PAUSED, self._handler(dispatcher.paused, number), namespace)
             for topic in ARRAYS:
                 loop.supervise(topic, namespace)
-        loop.diagnose("training", lambda now: self._health.report(now, self._absent(now)))
+        loop.diagnose("training", self._health.report)
         loop.offer("~/pause", self._pause)
         loop.offer("~/resume", self._resume)
         loop.offer("~/stop", self._stop)
         on_change(node, TUNER, self._adjust)
 
     def _pause(self) -> str:
-        self._session.pause()
+        self._session.dispatcher.hold()
         under_way = len(self._session.dispatcher.episodes())
         return "paused" + (f"; {under_way} episode(s) under way will end" if under_way else "")
 
     def _resume(self) -> str:
         was = "resumed" if self._session.dispatcher.held else "was not paused"
-        self._guarded(self._session.resume)
+        self._guarded(self._session.dispatcher.resume)
         return was
 
     def _stop(self) -> str:
@@ -223,7 +218,7 @@ class TunerNode:
 
     def _on_state(self, pair: int, frame: Frame) -> None:
         if self._session.dispatcher.state(pair, frame):
-            self._guarded(self._session.tick)
+            self._guarded(self._session.dispatcher.tick)
 
     def _handler(
         self, handle: Callable[[int, Frame, float], list[PairPublication]], pair: int
@@ -236,27 +231,30 @@ class TunerNode:
         except ValueError as error:
             self._log.warning(str(error), throttle_duration_sec=1.0)
             return
-        self._guarded(lambda now: self._session.failure(pair, failure, now))
+        self._guarded(lambda now: self._session.dispatcher.failure(pair, failure, now))
 
     def _guarded(self, event: Callable[[float], list[PairPublication]]) -> None:
+        """Perform what an event of the dispatcher or the session leads to."""
+        session = self._session
         try:
-            with self._loop.working(self._session.training.computation):
-                publications = event(self._loop.now())
-            self._perform(publications)
+            with self._loop.working(session.training.computation):
+                now = self._loop.now()
+                publications = session.advance(event(now), now)
+            self._send(publications)
         except DispatchError as error:
-            self._failure = str(error)
-            self._loop.stop("failure")
-        finally:
-            self._tell()
-
-    def _perform(self, publications: list[PairPublication]) -> None:
-        self._send(publications)
-        self._tell()
+            self._fail(str(error))
+        while self._news:  # once everybody has been told what to do next, and before it is kept
+            self._report(self._news.popleft())
         if self._recorder:
             with self._loop.working("writing the checkpoint"):
                 self._recorder.keep(now=self._loop.now())
-        if self._session.done or self._session.stopped:
+        if session.done or session.stopped:
             self._loop.stop("done")
+
+    def _fail(self, reason: str) -> None:
+        """End with an error, the first one that there is."""
+        self._failure = self._failure or reason
+        self._loop.stop("failure")
 
     def _send(self, publications: list[PairPublication]) -> None:
         for pair, publication in publications:
@@ -275,42 +273,29 @@ class TunerNode:
                 )
                 if not self._node.count_publishers(topic)
             ] + absent
-            self._guarded(partial(self._session.presence, pair, missing))
-        self._guarded(self._session.tick)
-        self._report_absence(now)
+            self._guarded(partial(self._session.dispatcher.presence, pair, missing))
+        self._guarded(self._session.dispatcher.tick)
+        missing, seconds = self._health.absent(now)
+        if missing:
+            self._log.warning(
+                f"waiting for {' and '.join(missing)} for {seconds:.0f} s",
+                throttle_duration_sec=ABSENCE_REPORT,
+            )
         self._report_pauses(now)
         self._refuse_rival(now)
 
     def _absent_recorder(self) -> list[str]:
-        """The recorder, as long as the first episode waits for it; stops if it is required."""
+        """The recorder, as long as the first episode waits for it; fails if a required one is gone."""
         if self._recording == "none" or (self._recorder_seen and self._recording == "start"):
             return []
         there = self._node.count_publishers(self._node.resolve_topic_name(RECORDER_STATUS)) > 0
-        if self._recorder_seen and not there and not self._failure:
-            self._failure = (
+        if self._recorder_seen and not there:
+            self._fail(
                 "the recorder is gone, and this training is required to be recorded; "
                 "it can be continued from its folder with resume:=true"
             )
-            self._loop.stop("failure")
         self._recorder_seen |= there
         return [] if self._recorder_seen else ["recorder"]
-
-    def _report_absence(self, now: float) -> None:
-        missing = self._session.dispatcher.missing()
-        if not missing:
-            self._absent_since = None
-            return
-        if self._absent_since is None:
-            self._absent_since = now
-        waited = now - self._absent_since
-        if self._absent(now) and now - self._absence_reported > ABSENCE_REPORT:
-            self._absence_reported = now
-            self._log.warning(f"waiting for {' and '.join(missing)} for {waited:.0f} s")
-
-    def _absent(self, now: float) -> list[str]:
-        """Who has been waited for, for longer than it takes to be found."""
-        waited = self._absent_since is not None and now - self._absent_since > 1.0
-        return self._session.dispatcher.missing() if waited else []
 
     def _report_pauses(self, now: float) -> None:
         paused = self._session.dispatcher.paused_pairs(now)
@@ -320,27 +305,15 @@ class TunerNode:
             self._log.info(f"the plant{which} is paused" if paused else "no plant is paused")
 
     def _refuse_rival(self, now: float) -> None:
+        """Fail if another tuner publishes, unless a pair serves this one already and refuses it."""
         topics = [senders[START.name].publisher.topic_name for senders in self._senders]
         shared = [topic for topic in topics if self._node.count_publishers(topic) > 1]
-        if not shared:
-            self._rival_since = None
-        elif self._rival_since is None:
-            self._rival_since = now
-        elif now - self._rival_since > RIVAL_GRACE and not self._failure:
-            found = f"another tuner publishes {shared[0]}; "
-            if self._session.established:
-                self._log.warning(
-                    f"{found}the plant serves this run, and refuses the other",
-                    throttle_duration_sec=10.0,
-                )
-                return
-            self._failure = f"{found}stop it, or start this one in another namespace or ROS domain"
-            self._loop.stop("failure")
-
-    def _tell(self) -> None:
-        """What has happened, once everybody has been told what to do next, and before it is kept."""
-        while self._news:
-            self._report(self._news.popleft())
+        rival = bool(shared) and not self._session.established
+        if self._rival.seconds(rival, now) > RIVAL_GRACE:
+            self._fail(
+                f"another tuner publishes {shared[0]}; "
+                "stop it, or start this one in another namespace or ROS domain"
+            )
 
     def _report(self, row: Mapping[str, Any]) -> None:
         if self._recorder:

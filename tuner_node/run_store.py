@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner_node import checkpoint
-from tuner_node.results import RunFolder, RunIdentity
+from tuner_node.results import RunFolder
 from tuner_node.training import Training
 
 CHECKPOINT_PERIOD = 1.0
@@ -21,7 +21,7 @@ CHECKPOINT_SHARE = 0.2
 
 
 class Recorder:
-    """Writes what `training` does into the folder `path`.
+    """Writes what `training` does into the folder `path`, going on from what is there.
 
     A file that cannot be written (full disk) is reported through `warn` and tried again; the
     training goes on and the previous checkpoint stays.
@@ -33,7 +33,6 @@ class Recorder:
         parameters: Mapping[str, Any],
         training: Training,
         *,
-        resume: bool,
         warn: Callable[[str], None],
     ) -> None:
         self._folder = RunFolder(path)
@@ -42,12 +41,8 @@ class Recorder:
         self._save_at = float("-inf")
         self._began = time.monotonic()
         self._changed = False
-        self.identity: RunIdentity
-        if resume:
-            self.identity = self._folder.reopen(parameters)
-            self._restore()
-        else:
-            self.identity = self._folder.create(parameters)
+        self.identity = self._folder.reopen(parameters)
+        self._restore()
 
     def note(self, row: Mapping[str, Any]) -> None:
         """One line of progress, stamped with the time."""

@@ -1,16 +1,14 @@
 """One training carried out by plant and controller pairs: Training and Dispatcher joined. Pure.
 
-Events of the pairs go in, messages come out; what happens on the way is handed to `report` as
-JSON-able rows.
+Events of the pairs go to the dispatcher; `advance` takes what it answers, finishes a batch whose
+results are all there, and hands out the next one. What happens is given to `report` as JSON-able rows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from loop_interfaces.frames import Frame
-from loop_interfaces.protocol import ModelFailure
 from tuner_node.dispatch import Dispatcher, DispatchError, PairPublication
 from tuner_node.training import Training
 
@@ -49,14 +47,6 @@ class Session:
         costs = [float(row[name]) for row in self._checked.values()]
         return sum(costs) / len(costs) if costs else None
 
-    def pause(self) -> None:
-        """Begin no new episode; those under way go on. Nothing times out meanwhile."""
-        self.dispatcher.hold()
-
-    def resume(self, now: float) -> list[PairPublication]:
-        """Go on after a pause."""
-        return self._advance(self.dispatcher.resume(now), now)
-
     def stop(self) -> list[PairPublication]:
         """End when the rollouts under way are over; at once in a pause, where none goes on.
 
@@ -66,28 +56,21 @@ class Session:
         self.stopping = True
         return self._end() if self.dispatcher.held else []
 
-    def paused(self, pair: int, frame: Frame, now: float) -> list[PairPublication]:
-        return self._advance(self.dispatcher.paused(pair, frame, now), now)
+    def advance(self, publications: list[PairPublication], now: float) -> list[PairPublication]:
+        """What is to be sent after an event: `publications` of the dispatcher, and what follows.
 
-    def presence(self, pair: int, missing: Sequence[str], now: float) -> list[PairPublication]:
-        return self._advance(self.dispatcher.presence(pair, missing, now), now)
+        Parameters
+        ----------
+        publications
+            What the dispatcher answered the event with.
+        now
+            Monotonic time in s.
 
-    def cost(self, pair: int, frame: Frame, now: float) -> list[PairPublication]:
-        return self._advance(self.dispatcher.cost(pair, frame, now), now)
-
-    def model(self, pair: int, frame: Frame, now: float) -> list[PairPublication]:
-        return self._advance(self.dispatcher.model(pair, frame, now), now)
-
-    def target(self, pair: int, frame: Frame, now: float) -> list[PairPublication]:
-        return self.dispatcher.target(pair, frame, now)
-
-    def failure(self, pair: int, failure: ModelFailure, now: float) -> list[PairPublication]:
-        return self._advance(self.dispatcher.failure(pair, failure, now), now)
-
-    def tick(self, now: float) -> list[PairPublication]:
-        return self._advance(self.dispatcher.tick(now), now)
-
-    def _advance(self, publications: list[PairPublication], now: float) -> list[PairPublication]:
+        Raises
+        ------
+        DispatchError
+            The training cannot use the result of a batch.
+        """
         for note in self.dispatcher.notes:
             self._report({"event": "repeated", "reason": note})
         self.dispatcher.notes.clear()

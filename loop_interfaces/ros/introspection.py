@@ -18,7 +18,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 
-from loop_interfaces.diagnostics import Health, Level
+from loop_interfaces.diagnostics import Health, Lasting, Level
 
 NAMELESS = "_NODE_NAME_UNKNOWN_"
 """What the graph says of an endpoint whose node it has not heard of yet."""
@@ -54,7 +54,7 @@ class Introspection:
         self._working_due = 0.0
         self._began: float | None = None
         self._refused_before = 0
-        self._namesake_since: float | None = None
+        self._namesake = Lasting()
         self._last = Health(Level.OK, "")
         self._working: tuple[str, float] | None = None
         self._publishing = threading.Lock()
@@ -174,12 +174,7 @@ class Introspection:
         """
         own = f"{self._node.get_fully_qualified_name()}/get_parameters"
         others = self._node.count_services(own) - 1
-        if others < 1:
-            self._namesake_since = None
-            return 0
-        if self._namesake_since is None:
-            self._namesake_since = now
-        if now - self._namesake_since <= NAMESAKE_GRACE:
+        if self._namesake.seconds(others > 0, now) <= NAMESAKE_GRACE:
             return 0
         self._node.get_logger().warning(
             f"{others} other node(s) called {self._node.get_fully_qualified_name()} in this ROS "
