@@ -24,6 +24,7 @@ FIGURES = (
     "costs",
     "small-behaviour",
     "small-gains",
+    "small-orders",
     "small-spectrum",
     "small-steps",
 )

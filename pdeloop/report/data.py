@@ -10,16 +10,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from controller_node.order import OrderStudy, study_orders
 from controller_node.policy import ProjectedLaw
 from loop_interfaces.array_files import read_arrays
-from loop_interfaces.model_rows import ModelRows
+from loop_interfaces.model_rows import ModelRows, unpack
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD, Plant
 from pdeloop.episode import rollout
 from pdeloop.finished_run import FinishedRun, field_means, load
+from pdeloop.in_process import LocalPair
 from pdeloop.reference import Reference, find
 from pdeloop.reproduce.experiment import ASKED, asked
 from pdeloop.reproduce.table import runs_of
+from tuner_node.build import build_training
 from tuner_node.checkpoint import taken
 from tuner_node.noise import evaluation_noise
 from tuner_node.results import RunFolderError
@@ -85,7 +88,8 @@ class ProblemData:
     runs: by adapted controller; costs: by controller, (S, fields); curves: while they learn;
     shown: index of the seed whose behaviour, gains and steps are shown; x (n_x,), target (n_x times
     components,), components: names of the fields that a state consists of; behaviours: empty where
-    they cannot be computed; steps: by controller, where the optimiser judges its steps; reference:
+    they cannot be computed; orders: what the shown seed's exploratory episode says about the order,
+    None where that is not known; steps: by controller, where the optimiser judges its steps; reference:
     the limits, where they are known; missing: a sentence for each thing that cannot be shown.
     """
 
@@ -97,6 +101,7 @@ class ProblemData:
     target: Array
     components: tuple[str, ...]
     behaviours: Sequence[Behaviour]
+    orders: OrderStudy | None
     steps: Mapping[str, Steps]
     reference: Reference | None
     missing: Sequence[str]
@@ -226,6 +231,7 @@ def _problem(
         target=plant.field_target,
         components=plant.equation.components,
         behaviours=[],
+        orders=None,
         steps={name: found for name, found in steps.items() if found is not None},
         reference=None,
         missing=missing,
@@ -241,7 +247,28 @@ def _problem(
         )
         return data
     reference = find(first.values, behaviours[0].cost, limits)
-    return replace(data, behaviours=behaviours, reference=reference)
+    orders = _orders(first, shown, plant)
+    return replace(data, behaviours=behaviours, orders=orders, reference=reference)
+
+
+def _orders(run: FinishedRun, shown: int, plant: Plant) -> OrderStudy | None:
+    """The orders that the exploratory episode supports from which a seed's model was identified."""
+    if run.values["model"] or not run.rollouts:
+        return None
+    training = build_training({**run.values, "seed": run.seeds[shown], "seeds": 1})
+    training.attempts = [run.rollouts[shown]["exploration"] - 1]
+    batch = training.next_batch()
+    assert batch is not None
+    again = LocalPair(run.values, plant).run(replace(batch, trajectories=True))
+    assert again.models is not None and again.trajectories is not None
+    found = unpack(again.models[0], run.values["n_a"])
+    if found.U.shape != run.models[shown].U.shape or not np.allclose(found.U, run.models[shown].U):
+        return None
+    (explored,) = again.trajectories
+    try:
+        return study_orders([(explored.states, explored.actions)])
+    except ValueError:  # too few steps to hold some out
+        return None
 
 
 def _behaviours(data: ProblemData, plant: Plant) -> list[Behaviour] | None:

@@ -11,9 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from controller_node.order import OrderStudy
 from loop_interfaces.model_rows import ModelRows
 from pdeloop.report.data import Behaviour, ProblemData
-from pdeloop.report.style import COLOURS, FIELD_MAP, GAIN_MAP, NAMES, boxed
+from pdeloop.report.style import COLOURS, FIELD_MAP, GAIN_MAP, NAMES, boxed, plain_log
 
 Array = NDArray[np.float64]
 Eigenvalues = NDArray[Any]
@@ -127,6 +128,30 @@ def gains(problem: ProblemData) -> Figure:
         grid[-1, part].set_xlabel("mode of the reduced state")
         label = f"entry of {symbol}"
         figure.colorbar(image, ax=grid[:, part].tolist(), label=label, aspect=40, pad=0.03)
+    return figure
+
+
+def orders(study: OrderStudy, used: int) -> Figure:
+    """Singular values of the exploratory states, and held-out errors of each order."""
+    figure = Figure(figsize=(6.8, 2.9))
+    left, right = figure.subplots(1, 2)
+    values = study.singular_values[: 2 * int(study.orders[-1])]
+    left.semilogy(np.arange(1, len(values) + 1), values / values[0], ".", color="0.25")
+    left.set_ylim(bottom=max(1e-12, 0.5 * float(values[-1] / values[0])))
+    left.set_ylabel("singular value of Z', relative")
+    left.set_xlabel("mode")
+    lines = ((study.one_step, "o-", "0.25", "one step"), (study.rollout, "s--", "0.6", "rollout"))
+    for errors, style, grey, label in lines:
+        right.plot(study.orders, errors, style, color=grey, ms=3.5, lw=1, label=label)
+    known = np.concatenate([study.one_step, study.rollout])
+    known = known[np.isfinite(known)]
+    plain_log(right, float(known.max() / max(known.min(), 1e-12)))
+    right.set_ylabel("held-out error")
+    right.set_xlabel("order $n_s$")
+    right.legend()
+    for ax in (left, right):
+        ax.axvline(used, color="black", linewidth=0.8)
+        ax.axvline(study.suggested, color="black", linewidth=0.8, linestyle=":")
     return figure
 
 

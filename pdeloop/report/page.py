@@ -150,6 +150,17 @@ def _of_problem(problem: ProblemData) -> Drawn:
         f"Before (LQT) and after learning (seed {seed}).",
         figures.gains(problem),
     )
+    if problem.orders is not None:
+        used = len(problem.models[problem.shown].A)
+        yield (
+            f"{name}-orders",
+            "Order of the reduced model",
+            f"Exploratory episode of seed {seed}: singular values of its states, and errors of models "
+            "on steps that they were not fitted to, relative to a model in which nothing changes. "
+            f"Line: the order of this run, {used}; dotted: the one that these errors suggest, "
+            f"{problem.orders.suggested}.",
+            figures.orders(problem.orders, used),
+        )
     yield (
         f"{name}-spectrum",
         "Eigenvalues",
