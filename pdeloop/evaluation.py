@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from loop_interfaces.parameters import noisy
 from loop_interfaces.topics import CostColumn
+from pde_sim_node.build import fingerprint
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.in_process import LocalPair
 from tuner_node.batch import Batch
@@ -47,6 +48,21 @@ def evaluate(folder: Path, *, fields: int, seed: int, mean_field: bool) -> dict[
     _refuse_another_loop(folder, values, pair, policies[:1], warm[:1])
     costs = _costs(pair, values, policies, warm, fields, seed, mean_field)
     return {name: costs[:, i].tolist() for i, name in enumerate(CONTROLLERS)}
+
+
+def another_plant(values: Mapping[str, Any], result: Mapping[str, Any]) -> str:
+    """That a run's plant has another fingerprint than the built-in one, in words; empty: it has not.
+
+    values: of the run's parameters; result: the content of its result.json. The fingerprint covers the
+    source of the equation, so a plant with another one may still compute the same costs.
+    """
+    own = fingerprint(values)
+    if result.get("plant", own) == own:
+        return ""
+    return (
+        f"the run's plant has the fingerprint {result['plant']}, the built-in one {own}: its "
+        "parameters or the source of its equation are others"
+    )
 
 
 def _costs(

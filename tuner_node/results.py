@@ -1,11 +1,12 @@
 """A training's folder and what is in it.
 
 parameters.yaml    the resolved parameters, in ROS form: what defines the training
-run.json           the run's id on the network and how often its tuner was started
+run.json           the run's id on the network, how often its tuner was started, and the plant's
+                   fingerprint if it was given (0: not)
 progress.jsonl     what happened, one JSON object a line, as it happened
 checkpoint         the training's state (tuner_node.checkpoint), and the one before
 policy.npz         policy (S, n_a, 2 n_s), lqt (the same), model rows (S, rows, n_s), seeds (S,)
-result.json        costs, reductions, history, seeds, versions, timing
+result.json        costs, reductions, history, seeds, versions, timing, the plant's fingerprint
 logs/              one file a node, when the command line started them
 """
 
@@ -185,7 +186,8 @@ class RunFolder:
 
     def finish(self, training: Training, extra: Mapping[str, Any]) -> dict[str, Any]:
         """Write policy.npz and result.json; returns the latter's content."""
-        summary = summarise(training) | dict(extra) | {"versions": versions()}
+        known = {"plant": training.plant, "versions": versions()}
+        summary = summarise(training) | dict(extra) | known
         buffer = BytesIO()
         np.savez(buffer, **policy_arrays(training))  # type: ignore[arg-type]
         write_atomically(self.path / "policy.npz", buffer.getvalue())
@@ -250,6 +252,7 @@ class RunFolder:
         content = {
             "run": identity.run,
             "incarnation": identity.incarnation,
+            "plant": parameters.get("plant", 0),
             "parameters": {k: v for k, v in parameters.items() if k not in TRANSIENT},
         }
         write_atomically(self.path / "run.json", json.dumps(content).encode())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
 from pdeloop.commands.common import DEFAULTS, Commands, add_json, command
@@ -35,7 +36,8 @@ def add(commands: Commands) -> None:
 
 
 def _evaluate(options: argparse.Namespace) -> int:
-    from pdeloop.evaluation import all_diverged, as_text, evaluate
+    from pdeloop.evaluation import all_diverged, another_plant, as_text, evaluate
+    from tuner_node.results import RunFolder
 
     spec = DEFAULTS["evaluation_fields"]
     spec.check(options.fields)
@@ -43,6 +45,9 @@ def _evaluate(options: argparse.Namespace) -> int:
     costs = evaluate(
         options.folder, fields=options.fields, seed=options.seed, mean_field=options.mean_field
     )
+    run = RunFolder(options.folder)
+    if note := another_plant(run.values(), run.result()):
+        print(f"WARNING: {note}; these are costs of the built-in one", file=sys.stderr)
     if options.json:
         print_json(costs)
     else:

@@ -17,6 +17,7 @@ from loop_interfaces.model_rows import ModelRows, unpack
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD, Plant
 from pdeloop.episode import rollout
+from pdeloop.evaluation import another_plant
 from pdeloop.finished_run import FinishedRun, field_means, load
 from pdeloop.in_process import LocalPair
 from pdeloop.reference import Reference, find
@@ -222,6 +223,8 @@ def _problem(
         missing.append(
             "Training curves: LQT diverged, or every rollout of the adaptation did, or there was none."
         )
+    if note := another_plant(first.values, first.result):
+        missing.append(f"The run's own plant: {note}. The fields shown are of the built-in one.")
     data = ProblemData(
         runs=runs,
         costs=costs,
