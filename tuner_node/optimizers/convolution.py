@@ -53,6 +53,8 @@ class ConvolutionModel:
     B: Array
     constant: Array
 
+    name = "convolution"
+
     def step(self, z: Array, a: Array) -> Array:
         """z_{k+1} of the states z (..., n_z) and the actions a (..., n_a)."""
         transform = np.zeros((*z.shape[:-1], len(self.symbols)), dtype=np.complex128)

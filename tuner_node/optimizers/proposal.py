@@ -7,17 +7,18 @@ method.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from tuner_node.optimizers.base import Array, Context, Row
-from tuner_node.optimizers.convolution import ConvolutionModel, fit_convolutions
+from tuner_node.optimizers.convolution import fit_convolutions
+from tuner_node.optimizers.differential import fit_differential
 from tuner_node.optimizers.fit import LocalModel, extended_basis, fit
 from tuner_node.optimizers.selection import KAPPAS, LOCAL, RIDGES, Pair, choices, mismatches
 from tuner_node.optimizers.sensitivity import Path, damped_step
-from tuner_node.optimizers.simulation import Loop, improve, mismatch
+from tuner_node.optimizers.simulation import FieldModel, Loop, improve, mismatch
 from tuner_node.optimizers.trajectories import Record
 
 __all__ = ["Proposal", "Proposer"]
@@ -31,7 +32,7 @@ _AGEING_FLOOR = 0.3
 _DEGREES = (2, 3)
 _CONVOLUTION_RIDGES = (1e-7, 1e-6, 1e-5, 1e-4)
 _LEAST_WEIGHT = 0.05
-# A convolution model is used that reproduces the last rollouts up to this share of their error energy.
+# A model of the whole field has to reproduce the last rollouts up to this share of their error energy.
 _REPRODUCED = 0.05
 _COMPARED = 8
 # Measured initial fields that a law is improved on, the newest, and how far from their mean further
@@ -58,9 +59,9 @@ class Proposal:
         Forgetting.
     mismatch : float
         Their smallest relative error in predicting measured differences of trajectories, or that of the
-        convolution model in reproducing the rollouts.
+        model of the whole field in reproducing the rollouts.
     kind : str
-        "local" or "convolution".
+        "local", "convolution" or "differential".
     """
 
     policy: Array
@@ -226,7 +227,7 @@ class Proposer:
         rejected: Sequence[tuple[Record, Record]],
         damping: float,
     ) -> Proposal | None:
-        """A law that was improved on a convolution model.
+        """A law that was improved on a model of the whole field.
 
         None if none reproduces the rollouts, or if it takes a candidate for better that was rejected:
         rejected has rollouts of the incumbent and of that candidate on the same fields.
@@ -240,34 +241,50 @@ class Proposer:
             a.append(record.actions[:length])
             after.append(record.states[1 : length + 1])
             weights.append(np.full(length, max(weight, _LEAST_WEIGHT)))
-        models = fit_convolutions(
-            *(np.concatenate(parts) for parts in (z, a, after, weights)),
-            degrees=_DEGREES,
-            ridges=_CONVOLUTION_RIDGES,
-        )
         usable = [record for record in data if record.usable][-_COMPARED:]
         measured = [(self.theta(r.policy), r.states[: len(r.actions)]) for r in usable]
-        errors = [mismatch(self._loop, model, measured, _REPRODUCED) for model in models]
-        best = int(np.argmin(errors))
-        if not (measured and errors[best] <= _REPRODUCED):
-            return None
-        if rejected and not self._ranks(models[best], rejected):
+        model, error = self._reproducing(
+            [np.concatenate(parts) for parts in (z, a, after, weights)], measured
+        )
+        if model is None or (rejected and not self._ranks(model, rejected)):
             return None
         policy = incumbents[0].policy
         fields = list({record.states[0].tobytes(): record.states[0] for record in data}.values())
         modes = max(self._modes, min(_SENSITIVITY_MODES, self.n_z))
         improved = improve(
             self._loop,
-            models[best],
+            model,
             self.theta(policy),
             _spread(np.stack(fields[-_FIELDS:])),
             extended_basis(self._U, [record.states for record in data], modes),
             _TRUST * damping,
         )
         candidate = self.moved(policy, improved.theta - self.theta(policy))
-        return Proposal(candidate, improved.fall, 1, 0.0, errors[best], "convolution")
+        return Proposal(candidate, improved.fall, 1, 0.0, error, model.name)
 
-    def _ranks(self, model: ConvolutionModel, rejected: Sequence[tuple[Record, Record]]) -> bool:
+    def _reproducing(
+        self, data: Sequence[Array], measured: Sequence[tuple[Array, Array]]
+    ) -> tuple[FieldModel | None, float]:
+        """A model that reproduces the measured rollouts, and how well.
+
+        data: z, a, z after, and weights of all steps. The simpler kind of model comes first.
+        """
+        z, a, after, weights = data
+        kinds: tuple[Callable[[], Sequence[FieldModel]], ...] = (
+            lambda: fit_convolutions(
+                z, a, after, weights, degrees=_DEGREES, ridges=_CONVOLUTION_RIDGES
+            ),
+            lambda: [fit_differential(z, a, after)],
+        )
+        for fitted in kinds if measured else ():
+            models = fitted()
+            errors = [mismatch(self._loop, model, measured, _REPRODUCED) for model in models]
+            best = int(np.argmin(errors))
+            if errors[best] <= _REPRODUCED:
+                return models[best], errors[best]
+        return None, np.inf
+
+    def _ranks(self, model: FieldModel, rejected: Sequence[tuple[Record, Record]]) -> bool:
         """Whether the rejected candidate costs more than the incumbent on the model, too."""
         fields = np.stack([incumbent.states[0] for incumbent, _ in rejected])
         incumbent, candidate = (

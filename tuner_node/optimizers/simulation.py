@@ -1,8 +1,8 @@
 """Improve a law on a model that reproduces the measured rollouts.
 
-With a model of the whole field (`convolution`) the closed loop can be simulated from every initial
-field that was measured, and the Gauss-Newton step repeated on the simulated trajectories until it gains
-nothing more:
+With a model of the whole field (`convolution`, `differential`) the closed loop can be simulated from
+every initial field that was measured, and the Gauss-Newton step repeated on the simulated trajectories
+until it gains nothing more:
 
     theta = argmin  mean over fields of J_model(theta) + lambda r tr(d F d^T),    d = theta - theta_0,
 
@@ -26,9 +26,10 @@ from scipy import linalg
 
 from tuner_node.optimizers.base import Array
 from tuner_node.optimizers.convolution import ConvolutionModel
+from tuner_node.optimizers.differential import DifferentialModel
 from tuner_node.optimizers.sensitivity import ISOTROPY, Path, expand
 
-__all__ = ["Improvement", "Loop", "Simulation", "improve", "mismatch"]
+__all__ = ["FieldModel", "Improvement", "Loop", "Simulation", "improve", "mismatch"]
 
 # Inner steps, and the share of the objective below which a further one is not worth its time.
 _STEPS = 10
@@ -36,6 +37,10 @@ _LEAST_GAIN = 1e-3
 # Damping of the inner steps: first, factor after a fall and after a rise, largest.
 _INNER = (1.0, 0.1, 10.0, 1e4)
 _WORST = 2.0
+
+
+FieldModel = ConvolutionModel | DifferentialModel
+"""A model of the whole field."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +59,7 @@ class Loop:
     action_limit: float
     one: float
 
-    def simulate(self, model: ConvolutionModel, theta: Array, fields: Array) -> Simulation:
+    def simulate(self, model: FieldModel, theta: Array, fields: Array) -> Simulation:
         """Roll theta = [K b] (n_a, n_s + 1) out on the model from the fields (F, n_z)."""
         K, b = theta[:, :-1], self.one * theta[:, -1]
         z = np.empty((self.horizon + 1, *fields.shape))
@@ -90,7 +95,7 @@ class Improvement:
 
 
 def mismatch(
-    loop: Loop, model: ConvolutionModel, measured: Sequence[tuple[Array, Array]], most: float
+    loop: Loop, model: FieldModel, measured: Sequence[tuple[Array, Array]], most: float
 ) -> float:
     """How far simulated rollouts are from the measured ones.
 
@@ -113,7 +118,7 @@ def mismatch(
 
 def improve(
     loop: Loop,
-    model: ConvolutionModel,
+    model: FieldModel,
     theta: Array,
     fields: Array,
     V: Array,
@@ -125,7 +130,7 @@ def improve(
     ----------
     loop : Loop
         The law's basis, the target and the weights.
-    model : ConvolutionModel
+    model : FieldModel
         One that reproduces the measured rollouts.
     theta : (n_a, n_s + 1) array
         Where to start, and what the trust region is about.
@@ -172,7 +177,7 @@ def improve(
 
 
 def _expansion(
-    loop: Loop, model: ConvolutionModel, theta: Array, simulation: Simulation, V: Array
+    loop: Loop, model: FieldModel, theta: Array, simulation: Simulation, V: Array
 ) -> tuple[Array, Array, Array]:
     """Gradient, Gauss-Newton curvature, and r (F + isotropic part), averaged over the fields."""
     n_f = theta.shape[1]

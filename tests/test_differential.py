@@ -1,0 +1,75 @@
+"""The differential equation behind a plant is found from few rollouts and reproduces them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks.optimizers import warm_start
+from loop_interfaces.problem import load_parameters
+from pde_sim_node.build import build_plant
+from tuner_node.optimizers.differential import DifferentialModel, fit_differential
+from tuner_node.optimizers.proposal import Proposer
+from tuner_node.optimizers.simulation import Loop, mismatch
+
+N_Z, N_A = 65, 2
+
+
+def equation(rate: float = 1.0, quadratic: float = -0.5) -> DifferentialModel:
+    """z_t = rate (0.02 z_xx + quadratic (z^2)_x) + B a, B of mean 0."""
+    k = np.arange(N_Z // 2 + 1)
+    B = np.random.default_rng(0).standard_normal((N_Z, N_A))
+    B -= B.mean(axis=0)
+    symbols = (rate * np.array([-0.02 * k**2, quadratic * 1j * k])).astype(np.complex128)
+    return DifferentialModel(symbols, 0.1 * B, np.zeros(N_Z))
+
+
+def test_one_episode_determines_the_equation() -> None:
+    true, rng = equation(rate=0.3), np.random.default_rng(1)
+    x = 2.0 * np.pi * np.arange(N_Z) / N_Z
+    states, actions = [np.sin(x) + 0.5 * np.cos(2.0 * x)], rng.standard_normal((60, N_A))
+    for a in actions:
+        states.append(true.step(states[-1], a))
+    z = np.array(states)
+    model = fit_differential(z[:-1], actions, z[1:])
+    np.testing.assert_allclose(model.symbols, true.symbols, atol=5e-3 * np.abs(true.symbols).max())
+    np.testing.assert_allclose(model.B, true.B, atol=0.01)
+    np.testing.assert_allclose(model.constant, true.constant, atol=0.01)
+
+
+@pytest.mark.parametrize("quadratic", [0.0, -0.5])
+def test_jacobians_are_derivatives_of_the_step_to_second_order_in_its_length(
+    quadratic: float,
+) -> None:
+    rng = np.random.default_rng(2)
+    z = np.sin(2.0 * np.pi * np.arange(N_Z) / N_Z + 1.0)
+    V = np.eye(N_Z)
+    errors = []
+    for rate in (0.02, 0.01):
+        model, a = equation(rate, quadratic), rate * rng.standard_normal(N_A)
+        model = DifferentialModel(model.symbols, rate * model.B, model.constant)
+        ends = [model.step(z + s * 1e-6 * V, a[None]) for s in (1.0, -1.0)]
+        errors.append(np.abs(model.jacobians(z[None], V)[0] - (ends[0] - ends[1]).T / 2e-6).max())
+    if quadratic:
+        assert errors[1] < 0.3 * errors[0]
+    else:
+        assert errors[0] < 1e-8
+
+
+def test_burgers_is_recognised_and_simulated_where_fronts_cross_six_points_a_sample() -> None:
+    values = load_parameters("burgers", {"optimizer": "gauss_newton"})
+    plant = build_plant(values)
+    policy, context = warm_start(plant, values, 0)
+    rollouts = [context.exploration, *(m.trajectory for m in context.measured)]
+    z, after = (
+        np.concatenate([r.states[part] for r in rollouts]) for part in (slice(-1), slice(1, None))
+    )
+    model = fit_differential(z, np.concatenate([r.actions for r in rollouts]), after)
+    k = 2.0 * np.pi * np.arange(plant.n_z // 2 + 1)
+    for found, true in zip(model.symbols, (-1e-4 * k**2, -0.5j * k), strict=True):
+        np.testing.assert_allclose(found / plant.sample_time, true, atol=0.1 * np.abs(true).max())
+    q, r = context.state_weight, context.action_weight
+    loop = Loop(context.U, context.target, q, r, context.horizon, 0.0, 1.0)
+    theta = Proposer(context, policy, 8).theta
+    measured = [(theta(m.policy), m.trajectory.states[:-1]) for m in context.measured]
+    assert mismatch(loop, model, measured, 1.0) < 0.01
