@@ -76,7 +76,6 @@ class ControllerFastPath(FastPath):
         self._law: ProjectedLaw | None = None
         self.last_state: Frame | None = None
         """What the responder was given last."""
-        load_compiled()
 
     def prepare(self) -> bool:
         """Within an episode that a law answers."""

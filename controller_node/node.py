@@ -16,7 +16,7 @@ from rclpy.node import Node
 from std_msgs.msg import String
 
 from controller_node.diagnostics import ControllerHealth
-from controller_node.fast_path import ControllerFastPath
+from controller_node.fast_path import ControllerFastPath, load_compiled
 from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
 from loop_interfaces.diagnostics import Health
@@ -55,6 +55,7 @@ class ControllerNode:
         responder = Responder(DesignSettings(**settings))
         self._responder = responder
         self._health = ControllerHealth(responder)
+        load_compiled()  # before there is a publisher: who sees one expects answers
         self._wire(node, loop)
         node.get_logger().info(f"{values['problem']}: order {model_order(values)} tracking law")
 

@@ -122,7 +122,6 @@ class PlantFastPath(FastPath):
         self._log = np.zeros((0, 0))
         self.suspended = False
         """Whether every action is left to the lock-step."""
-        load_compiled()
 
     def prepare(self) -> bool:
         """Within an episode of a plant whose step is compiled code alone."""

@@ -31,7 +31,7 @@ from loop_interfaces.topics import ACTION, COST, PAUSED, START, STATE, TARGET
 from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.diagnostics import PlantHealth
 from pde_sim_node.equations import configured_equation
-from pde_sim_node.fast_path import PlantFastPath
+from pde_sim_node.fast_path import PlantFastPath, load_compiled
 from pde_sim_node.lockstep import Lockstep
 from pde_sim_node.pause_record import PauseRecord
 from pde_sim_node.plant import Plant
@@ -72,6 +72,8 @@ class PlantNode:
         plant = build_plant(values)
         if plant.compiled_in_seconds > 0.0:
             node.get_logger().info(f"compiled the kernel in {plant.compiled_in_seconds:.1f} s")
+        if type(plant) is Plant:  # what instruments do to a step is not compiled
+            load_compiled()  # before there is a publisher: who sees one expects answers
         domain = node.context.get_domain_id()
         self._pause_record = PauseRecord(node.get_fully_qualified_name(), domain)
         self._lockstep = Lockstep(
@@ -112,7 +114,7 @@ class PlantNode:
         loop.receive(START, self._on_start)
         self._actions = actions = loop.receive(ACTION, self._on_action)
         self._fast_path: PlantFastPath | None = None
-        if type(self._lockstep.plant) is Plant:  # what instruments do to a step is not compiled
+        if type(self._lockstep.plant) is Plant:
             self._fast_path = PlantFastPath(self._lockstep, actions.codec, self._batcher)
             loop.answer_fast(actions, self._senders[STATE], self._fast_path)
         loop.diagnose("lock-step", self._health.report)

@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+from rclpy.qos import QoSProfile
 
+import controller_node.node
+import pde_sim_node.node
 from controller_node.diagnostics import ControllerHealth
 from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
 from loop_interfaces.diagnostics import Health, Level, Rate
 from loop_interfaces.frames import Frame
-from loop_interfaces.topics import COST, STATE, VOID
+from loop_interfaces.parameters import taken_by
+from loop_interfaces.ros.endpoints import writer_qos
+from loop_interfaces.ros.introspection import Introspection
+from loop_interfaces.topics import COST, STATE, TARGET, VOID
 from pde_sim_node.diagnostics import PlantHealth
 from recorder_node.diagnostics import RecorderHealth
 from recorder_node.recording import Recording, sources
+from tests.small import parameters
 from tests.test_lockstep import RUN, answer, plant_protocol, run_episode, start
 from tests.test_session import ITERATIONS, Loop, values
 from tuner_node.build import build_training
@@ -29,6 +38,50 @@ def test_texts_and_worse_levels():
     assert (worse.level, worse.message) == (Level.WARN, "odd")
     worst = worse.worsened(Level.ERROR, "broken").worsened(Level.WARN, "odd again")
     assert (worst.level, worst.message) == (Level.ERROR, "odd; broken; odd again")
+
+
+def test_a_publisher_whose_messages_do_not_arrive_is_named_with_its_topic():
+    """DDS connects no volatile publisher to a reader that asks for transient local."""
+    offered = {"/lab/mine": QoSProfile(depth=1), "/": writer_qos(TARGET)}
+    there = [
+        SimpleNamespace(node_namespace="/lab", node_name="mine", qos_profile=offered["/lab/mine"]),
+        SimpleNamespace(node_namespace="/", node_name="good", qos_profile=offered["/"]),
+    ]
+    node = MagicMock()
+    node.count_publishers.return_value = 2
+    node.get_publishers_info_by_topic.return_value = there
+    node.count_services.return_value = 1
+    found = Introspection(node, refused=lambda: (0, ""), topics={"/target": TARGET})
+    found.round(0.0)
+    ((said,), _) = node.get_logger().error.call_args
+    assert said.startswith("/lab/mine publishes /target so that it does not arrive (QoS: Volatile")
+    assert node.get_logger().error.call_count == 1
+    assert found.several_publishers == {"/target": ["/good", "/lab/mine"]}
+
+
+@pytest.mark.parametrize(
+    "module", [controller_node.node, pde_sim_node.node], ids=lambda m: m.__name__
+)
+def test_a_node_is_not_there_before_it_can_answer(module, monkeypatch):
+    """Its publishers are what it is known by; what it compiles may take long."""
+
+    class CompilingError(Exception):
+        pass
+
+    loop = MagicMock()
+    kind, declaring = (
+        (module.ControllerNode, "declare")
+        if module is controller_node.node
+        else (module.PlantNode, "declare_parameters")
+    )
+    own = {spec.name for spec in taken_by(module.__name__.split(".")[0])} | {"problem"}
+    known = {name: value for name, value in parameters().items() if name in own}
+    monkeypatch.setattr(module, declaring, lambda *given: known)
+    monkeypatch.setattr(module, "load_compiled", MagicMock(side_effect=CompilingError))
+    monkeypatch.setattr(module, "given_parameters", lambda node: {})
+    with pytest.raises(CompilingError):
+        kind(MagicMock(), loop)
+    assert not loop.sender.called and not loop.receive.called
 
 
 def test_a_rate_is_the_growth_since_the_last_look():

@@ -9,16 +9,18 @@ from __future__ import annotations
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from std_srvs.srv import Trigger
 
 from loop_interfaces.diagnostics import Health, Lasting, Level
+from loop_interfaces.ros.endpoints import reader_qos
+from loop_interfaces.topics import Topic
 
 NAMELESS = "_NODE_NAME_UNKNOWN_"
 """What the graph says of an endpoint whose node it has not heard of yet."""
@@ -36,15 +38,15 @@ NAMESAKE_GRACE = 6.0
 class Introspection:
     """Tells how a node is, and who else is there who should not be.
 
-    refused() counts the messages that were refused so far, and tells why the last one was; topics()
-    names the topics that one node should publish for this one.
+    refused() counts the messages that were refused so far, and tells why the last one was; topics
+    has the full names of those that one node should publish for this one.
     """
 
     def __init__(
         self,
         node: Node,
         refused: Callable[[], tuple[int, str]],
-        topics: Callable[[], Iterable[str]],
+        topics: Mapping[str, Topic],
     ) -> None:
         self._node, self._refused, self._topics = node, refused, topics
         self._publisher: Publisher | None = None
@@ -60,6 +62,8 @@ class Introspection:
         self._publishing = threading.Lock()
         self.several_publishers: dict[str, list[str]] = {}
         """The nodes that published a topic which one node should publish."""
+        self._known: dict[str, int] = {}
+        """Publishers of a topic that were looked at."""
 
     def report(self, task: str, health: Callable[[float], Health]) -> None:
         """Publish what `health(now)` says once a second, under the node's name and `task`."""
@@ -76,7 +80,7 @@ class Introspection:
         self._due = max(self._due + PERIOD, now + PERIOD / 2)
         if self._began is None:
             self._began = now
-        self._look_for_strangers()
+        self._look_at_publishers()
         namesakes = self._namesakes(now)
         if self._publisher is not None:
             self._last = self._health_now(namesakes, now - self._began, now)
@@ -147,16 +151,31 @@ class Introspection:
             message.header.stamp = self._node.get_clock().now().to_msg()
             publisher.publish(message)
 
-    def _look_for_strangers(self) -> None:
-        """Say who else publishes what one node of the loop should publish."""
-        for topic in self._topics():
-            if self._node.count_publishers(topic) < 2:
+    def _look_at_publishers(self) -> None:
+        """Say who publishes what one other node should publish, or so that it does not arrive."""
+        for topic, kind in self._topics.items():
+            count = self._node.count_publishers(topic)
+            if count < 2 and count == self._known.get(topic):
                 continue
-            found = {
-                f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
+            there = [
+                (
+                    f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}",
+                    endpoint.qos_profile,
+                )
                 for endpoint in self._node.get_publishers_info_by_topic(topic)
                 if endpoint.node_name != NAMELESS  # one that was just started again may be
-            }
+            ]
+            self._known[topic] = len(there)
+            for name, offered in there:
+                verdict, reason = qos_check_compatible(offered, reader_qos(kind))
+                if verdict == QoSCompatibility.ERROR:
+                    self._node.get_logger().error(
+                        f"{name} publishes {topic} so that it does not arrive (QoS: "
+                        f"{reason.removeprefix('ERROR: ').rstrip(';')}); expected a publisher as in "
+                        "docs/interfaces.md",
+                        throttle_duration_sec=10.0,
+                    )
+            found = {name for name, _ in there}
             if len(found) > 1:
                 known = self.several_publishers.get(topic, ())
                 self.several_publishers[topic] = sorted(found.union(known))

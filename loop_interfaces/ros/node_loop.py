@@ -82,7 +82,8 @@ class NodeLoop:
         self.node = node
         self.refused: Counter[str] = Counter()
         self._receivers: list[Receiver] = []
-        self._supervised: set[str] = set()
+        self._topics: dict[str, Topic] = {}
+        """Topics that one node should publish, by full name."""
         self._batcher: SampleBatcher | None = None
         self._watched: dict[str, _Watched] = {}
         self._stop_reason: str | None = None
@@ -101,7 +102,7 @@ class NodeLoop:
         self._introspection = Introspection(
             node,
             refused=lambda: (sum(self.refused.values()), self._last_reason),
-            topics=lambda: {*self._supervised, *(receiver.name for receiver in self._receivers)},
+            topics=self._topics,
         )
 
     def sender(self, topic: Topic, namespace: str = "", *, sampled: bool = False) -> Sender:
@@ -114,12 +115,12 @@ class NodeLoop:
         """Call `callback` with every frame of `topic`; a ValueError it raises refuses the message."""
         receiver = Receiver(self.node, topic, callback, namespace)
         self._receivers.append(receiver)
+        self._topics[receiver.name] = topic
         return receiver
 
     def supervise(self, topic: Topic, namespace: str = "") -> None:
-        """Look for several publishers of a topic, as is done for those that are received."""
-        name = scoped(namespace, topic.name)
-        self._supervised.add(self.node.resolve_topic_name(name))
+        """Look at the publishers of a topic, as is done for those that are received."""
+        self._topics[self.node.resolve_topic_name(scoped(namespace, topic.name))] = topic
 
     @property
     def several_publishers(self) -> dict[str, list[str]]:

@@ -35,7 +35,7 @@ class Observer:
         self._turned = self.now()
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
-        self._introspection = Introspection(node, refused=lambda: (0, ""), topics=list)
+        self._introspection = Introspection(node, refused=lambda: (0, ""), topics={})
         self.every(PERIOD, lambda: self._introspection.round(self.now()))
 
     def every(self, period: float, callback: Callable[[], None]) -> None:
