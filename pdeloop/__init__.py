@@ -31,6 +31,12 @@ if TYPE_CHECKING:
     from pdeloop.episode import rollout as rollout
     from pdeloop.finished_run import FinishedRun as FinishedRun
     from pdeloop.gradients import Gradients as Gradients
+    from pdeloop.plots import plot_behaviour as plot_behaviour
+    from pdeloop.plots import plot_costs as plot_costs
+    from pdeloop.plots import plot_episode as plot_episode
+    from pdeloop.plots import plot_gains as plot_gains
+    from pdeloop.plots import plot_spectrum as plot_spectrum
+    from pdeloop.plots import plot_training as plot_training
 
 _MODULES = {
     "FinishedRun": "pdeloop.finished_run",
@@ -40,6 +46,12 @@ _MODULES = {
     "ReducedModel": "controller_node.reduced_model",
     "identify": "pdeloop.api",
     "load_run": "pdeloop.api",
+    "plot_behaviour": "pdeloop.plots",
+    "plot_costs": "pdeloop.plots",
+    "plot_episode": "pdeloop.plots",
+    "plot_gains": "pdeloop.plots",
+    "plot_spectrum": "pdeloop.plots",
+    "plot_training": "pdeloop.plots",
     "problem": "pdeloop.api",
     "projected_law": "pdeloop.episode",
     "rollout": "pdeloop.episode",

@@ -105,3 +105,18 @@ def test_what_does_not_fit_is_refused_in_one_sentence(small) -> None:
         with pytest.raises(ValueError, match=words) as caught:
             refused()
         assert "\n" not in str(caught.value)
+
+
+def test_figures_show_what_the_arrays_hold(run, small) -> None:
+    for draw in (
+        *(pdeloop.plot_costs, pdeloop.plot_training, pdeloop.plot_behaviour),
+        *(pdeloop.plot_gains, pdeloop.plot_spectrum),
+    ):
+        assert draw(run).axes
+    plant = small.plant()
+    episode = pdeloop.rollout(plant, lambda k, z: np.full((2, plant.n_a), k), [0, 1])
+    field, actions, _ = pdeloop.plot_episode(plant, episode, environment=1).axes
+    assert np.array_equal(field.images[0].get_array(), episode.fields[:, 1].T)
+    assert np.array_equal(actions.lines[0].get_ydata()[:-1], np.arange(plant.horizon))
+    with pytest.raises(ValueError, match="environment is 2; expected one of the 2"):
+        pdeloop.plot_episode(plant, episode, environment=2)

@@ -161,9 +161,13 @@ def gather(folder: Path, limits: Path | None = None) -> ReportData:
         problems = [_reproduced(folder, name, limits) for name in content["problems"]]
         return ReportData(folder, problems, content)
     if (folder / "parameters.yaml").exists():
-        run = load(folder)
-        return ReportData(folder, [_problem({"adapted": run}, _history(run), 0, limits)])
+        return ReportData(folder, [of_run(load(folder), limits)])
     raise RunFolderError(f"{folder} holds neither a run nor a reproduction")
+
+
+def of_run(run: FinishedRun, limits: Path | None = None) -> ProblemData:
+    """A single run's part of a report; `limits` as of `gather`."""
+    return _problem({"adapted": run}, _history(run), 0, limits)
 
 
 def _reproduced(folder: Path, name: str, limits: Path | None) -> ProblemData:

@@ -1,0 +1,86 @@
+"""Figures of runs and episodes, in the style of `pdeloop report`, for notebooks and papers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from pde_sim_node.plant import Plant
+from pdeloop.episode import EpisodeRecord
+from pdeloop.finished_run import FinishedRun
+from pdeloop.report import figures, learning
+from pdeloop.report.data import ProblemData, of_run
+from pdeloop.report.style import FIELD_MAP, STYLE, boxed
+
+__all__ = [
+    "plot_behaviour",
+    "plot_costs",
+    "plot_episode",
+    "plot_gains",
+    "plot_spectrum",
+    "plot_training",
+]
+
+
+def plot_episode(plant: Plant, episode: EpisodeRecord, environment: int = 0) -> Figure:
+    """One environment of an episode: its field in space and time, and its actions.
+
+    Raises
+    ------
+    ValueError
+        The episode was not kept, or has no such environment.
+    """
+    steps, batch, _ = episode.actions.shape
+    if not steps or not 0 <= environment < batch:
+        raise ValueError(
+            f"environment is {environment}; expected one of the {batch} of an episode that was kept"
+        )
+    times = plant.sample_time * np.arange(steps + 1)
+    components, extent = plant.equation.components, (0.0, times[-1], 0.0, plant.equation.length)
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(6.4, 1.6 + 1.7 * len(components)))
+        *maps, below = figure.subplots(len(components) + 1, 1, sharex=True)
+        fields = np.split(episode.fields[:, environment], len(components), axis=1)
+        for ax, name, field in zip(maps, components, fields, strict=True):
+            boxed(ax)
+            image = ax.imshow(field.T, origin="lower", aspect="auto", cmap=FIELD_MAP, extent=extent)
+            ax.set_ylabel("x (m)")
+            figure.colorbar(image, ax=ax, label=f"{name}(x, t)", pad=0.01)
+        held = episode.actions[:, environment]
+        below.step(times, np.vstack([held, held[-1:]]), where="post", linewidth=0.9)
+        below.set_ylabel("actions $a_j$")
+        below.set_xlabel("t (s)")
+    return figure
+
+
+def plot_costs(run: FinishedRun) -> Figure:
+    """Mean stage cost of no control, LQT and the adapted policy, over seeds and fields."""
+    return _drawn(lambda data: learning.bars([data]), run)
+
+
+def plot_training(run: FinishedRun) -> Figure:
+    """Cost against rollouts, relative to LQT: mean and standard deviation over the seeds."""
+    return _drawn(lambda data: learning.training_curves([data]), run)
+
+
+def plot_behaviour(run: FinishedRun) -> Figure:
+    """Fields, actions and final profiles of the first seed's controllers from the mean field."""
+    return _drawn(figures.behaviour, run)
+
+
+def plot_gains(run: FinishedRun) -> Figure:
+    """The gains K_a and K_b of the first seed, before and after the adaptation."""
+    return _drawn(figures.gains, run)
+
+
+def plot_spectrum(run: FinishedRun) -> Figure:
+    """Eigenvalues of the reduced models, without control and with each controller's gains."""
+    return _drawn(figures.spectrum, run)
+
+
+def _drawn(draw: Callable[[ProblemData], Figure], run: FinishedRun) -> Figure:
+    with matplotlib.rc_context(STYLE):
+        return draw(of_run(run))
