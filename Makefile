@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 SHELL := /bin/bash
 
-.PHONY: setup run test packages lint types check clean
+.PHONY: setup run test packages lint types docs check clean
 
 setup: .venv/ready
 
@@ -45,7 +45,11 @@ lint: setup
 types: setup
 	$(BIN)/mypy
 
-check: test lint types
+# Pages of the Python API from its docstrings, in site/; warnings are errors.
+docs: setup
+	$(BIN)/mkdocs build --strict --quiet
+
+check: test lint types docs
 
 clean:
-	rm -rf .venv build *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf .venv build site *.egg-info .pytest_cache .mypy_cache .ruff_cache
