@@ -88,10 +88,12 @@ def parser() -> argparse.ArgumentParser:
     # Imported here, where `main` catches Ctrl-C: it takes most of a short command's time.
     from pdeloop.commands import (
         bag,
+        check,
         completion,
         evaluate,
         identify,
         monitor,
+        new,
         problems,
         reproduce,
         secure,
@@ -116,6 +118,8 @@ def parser() -> argparse.ArgumentParser:
         study,
         secure,
         problems,
+        new,
+        check,
         completion,
     ):
         module.add(commands)

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from loop_interfaces.spec import ParameterError
-from pdeloop.commands.common import Commands, add_json, command
+from pdeloop.commands.common import Commands, add_equation, add_json, allow_equation, command
 from pdeloop.output import print_json
 
 
@@ -58,6 +58,7 @@ def add(commands: Commands) -> None:
     verify.add_argument(
         "--parameters", type=Path, metavar="FILE", help="instead of those in the bag"
     )
+    add_equation(verify)
     recover.add_argument("--out", type=Path, metavar="DIR", help="new folder [BAG-recovered]")
     for action in (info, verify, recover):
         add_json(action)
@@ -100,6 +101,7 @@ def _bag_info(options: argparse.Namespace) -> int:
 def _bag_verify(options: argparse.Namespace) -> int:
     from pdeloop.bags.verify import verify
 
+    allow_equation(options)
     report = verify(*options.bag, parameters=options.parameters)
     if options.json:
         print_json(asdict(report))

@@ -38,6 +38,25 @@ def command(
     return parser
 
 
+def add_equation(parser: argparse._ActionsContainer) -> None:
+    """The flag --equation; see `allow_equation`."""
+    parser.add_argument(
+        "--equation",
+        metavar="NAME",
+        help="the problem's PDE; own code, 'file.py:Class' or 'package.module:Class', has to be named "
+        "here, too, as a file alone runs none",
+    )
+
+
+def allow_equation(options: argparse.Namespace) -> dict[str, str]:
+    """Allow the code that --equation names; the parameter, if it was given."""
+    if options.equation is None:
+        return {}
+    from pde_sim_node.equations import allow
+
+    return {"equation": allow(options.equation)}
+
+
 def add_flags(parser: argparse._ActionsContainer, group: str) -> None:
     """The flags of a group of parameters (loop_interfaces.parameters)."""
     for spec in flags(group):

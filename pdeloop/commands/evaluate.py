@@ -6,7 +6,14 @@ import argparse
 import sys
 from pathlib import Path
 
-from pdeloop.commands.common import DEFAULTS, Commands, add_json, command
+from pdeloop.commands.common import (
+    DEFAULTS,
+    Commands,
+    add_equation,
+    add_json,
+    allow_equation,
+    command,
+)
 from pdeloop.output import print_json
 
 
@@ -32,6 +39,7 @@ def add(commands: Commands) -> None:
         action="store_true",
         help="the mean of the initial distribution instead of sampled fields",
     )
+    add_equation(evaluate)
     add_json(evaluate, "print the costs as JSON: {controller: [[cost a field] a seed]}")
 
 
@@ -39,6 +47,7 @@ def _evaluate(options: argparse.Namespace) -> int:
     from pdeloop.evaluation import all_diverged, another_plant, as_text, evaluate
     from tuner_node.results import RunFolder
 
+    allow_equation(options)
     spec = DEFAULTS["evaluation_fields"]
     spec.check(options.fields)
     DEFAULTS["evaluation_seed"].check(options.seed)

@@ -6,7 +6,14 @@ import argparse
 from pathlib import Path
 
 from loop_interfaces.spec import ParameterError
-from pdeloop.commands.common import DEFAULTS, Commands, add_json, command
+from pdeloop.commands.common import (
+    DEFAULTS,
+    Commands,
+    add_equation,
+    add_json,
+    allow_equation,
+    command,
+)
 
 
 def add(commands: Commands) -> None:
@@ -38,6 +45,7 @@ def _add_reproduce(commands: Commands) -> None:
         help="exploratory episodes a seed may use until LQT beats no control; 1: the first, "
         f"unchecked, as in the paper [{DEFAULTS['identification_attempts'].default}]",
     )
+    add_equation(reproduce)
     add("--processes", type=int, metavar="N", help="jobs at the same time [one a core]")
     add("--out", type=Path, metavar="DIR", help="folder of the results [runs/reproduce-TIME]")
     add_json(reproduce, "print the table as JSON; progress goes to stderr")
@@ -55,6 +63,7 @@ def _add_report(commands: Commands) -> None:
     report.add_argument(
         "folder", type=Path, metavar="DIR", help="folder of a finished run or reproduction"
     )
+    add_equation(report)
     report.add_argument("--out", type=Path, metavar="DIR", help="[DIR/report]")
     report.add_argument(
         "--limits",
@@ -67,6 +76,7 @@ def _add_report(commands: Commands) -> None:
 def _reproduce(options: argparse.Namespace) -> int:
     from pdeloop.reproduce.experiment import reproduce
 
+    allow_equation(options)
     names = ("seeds", "iterations", "seed", "identification_attempts")
     given = {n: getattr(options, n) for n in names if getattr(options, n) is not None}
     for name, value in given.items():
@@ -79,6 +89,7 @@ def _reproduce(options: argparse.Namespace) -> int:
 def _report(options: argparse.Namespace) -> int:
     from pdeloop.report.page import report
 
+    allow_equation(options)
     page, missing = report(options.folder, options.out, options.limits)
     for sentence in missing:
         print(f"not shown: {sentence}")

@@ -7,7 +7,15 @@ from pathlib import Path
 
 from loop_interfaces.problem import shipped_problems
 from loop_interfaces.spec import ParameterError
-from pdeloop.commands.common import Commands, add_flags, add_json, command, given_flags
+from pdeloop.commands.common import (
+    Commands,
+    add_equation,
+    add_flags,
+    add_json,
+    allow_equation,
+    command,
+    given_flags,
+)
 
 
 def add(commands: Commands) -> None:
@@ -30,12 +38,7 @@ def add(commands: Commands) -> None:
         metavar="PROBLEM",
         help=f"{', '.join(shipped_problems())}, or the path of a problem's YAML file",
     )
-    add(
-        "--equation",
-        metavar="NAME",
-        help="the plant's PDE instead of that of the problem; an own one, 'file.py:Class' or "
-        "'package.module:Class', has to be named here, as a problem's file alone runs no code",
-    )
+    add_equation(problem)
     add_flags(problem, "problem")
     method = train.add_argument_group("budget and method")
     add_flags(method, "budget and method")
@@ -94,7 +97,6 @@ def add(commands: Commands) -> None:
 
 
 def _train(options: argparse.Namespace) -> int:
-    from pde_sim_node.equations import allow
     from pdeloop.pairs import Recording
     from pdeloop.training_run import Transport, run_again, run_new
 
@@ -121,7 +123,7 @@ def _train(options: argparse.Namespace) -> int:
     for name in ("rollouts", "iterations"):
         if given.get(name) == 0:
             raise ParameterError(f"--{name} is 0; expected a whole number of at least 1")
-    own = {} if options.equation is None else {"equation": allow(options.equation)}
+    own = allow_equation(options)
     if options.model is not None:
         given["model"] = str(options.model.resolve())
     if options.resume is not None:

@@ -1,0 +1,53 @@
+"""`pdeloop check`."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+
+from pdeloop.commands.common import Commands, add_equation, add_json, allow_equation, command
+from pdeloop.output import print_json
+
+
+def add(commands: Commands) -> None:
+    """The command `check`."""
+    check = command(
+        commands,
+        "check",
+        _check,
+        help="whether a problem's file describes a plant that can be trained",
+        description="Check a problem before training on it: halve the integration step, see whether "
+        "the actuators reach the modes that do not decay at the target, explore once, say which order "
+        "the data support and what the first law costs, and draw fields and supports. Exit code "
+        "1 if anything is not as it should be.",
+        example="pdeloop check burgers --picture burgers.png",
+    )
+    check.add_argument("problem", metavar="FILE", help="a problem's YAML file, or a shipped name")
+    add_equation(check)
+    check.add_argument(
+        "--picture",
+        type=Path,
+        metavar="FILE",
+        help="draw initial fields, target and the actuators' supports to this .png",
+    )
+    add_json(check, "print the findings as JSON")
+
+
+def _check(options: argparse.Namespace) -> int:
+    from pdeloop.problem_check import check, draw
+    from pdeloop.training_run import resolve
+
+    values = resolve(options.problem, allow_equation(options))
+    findings = []
+    for finding in check(values):
+        findings.append(finding)
+        if not options.json:
+            print(f"{'ok ' if finding.good else 'BAD'}  {finding.name}: {finding.text}", flush=True)
+    if options.picture is not None:
+        draw(values, options.picture)
+    if options.json:
+        print_json([asdict(finding) for finding in findings])
+    elif options.picture is not None:
+        print(f"picture in {options.picture}")
+    return 0 if all(finding.good for finding in findings) else 1

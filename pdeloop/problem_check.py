@@ -1,0 +1,254 @@
+"""`pdeloop check FILE`: whether a problem's numbers are ones that a training can work with.
+
+Four findings: the integration step, by halving it; the actuators, by the plant linearised at the
+target; the exploration, the order and the first law, by one exploratory episode.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from controller_node.identification import DesignSettings, design
+from controller_node.order import study_orders
+from controller_node.policy import ProjectedLaw
+from loop_interfaces.parameters import INSTRUMENTS
+from pde_sim_node.build import build_plant
+from pde_sim_node.equations import LinearEquation
+from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD, Plant
+from pdeloop.episode import EpisodeRecord, rollout
+from tuner_node.build import build_training
+
+__all__ = ["Finding", "Reach", "check", "draw", "reach"]
+
+Array = NDArray[np.float64]
+STEP_ERROR = 1e-2
+"""Largest change of a sample by a halved integration step, relative to the sample's own change."""
+GROWS = 1e-8
+"""A mode is unstable whose eigenvalue is further outside of the unit circle than this."""
+REACHED = 1e-6
+"""Smallest singular value of [lambda I - T, W^T B], relative to |B|, of a mode that actuators reach."""
+MAX_LINEARISED = 2048
+"""Numbers of a state beyond which the linearisation, a square matrix of them, is left out."""
+SMALL = 1e-6
+"""Size of the perturbations whose answers are differenced."""
+DRAWN = 5
+"""Initial fields that are drawn beside their mean."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What one check found: whether it is good, and one or more sentences."""
+
+    name: str
+    good: bool
+    text: str
+
+
+def check(values: Mapping[str, Any]) -> Iterator[Finding]:
+    """The findings about a problem's resolved parameters, one after the other."""
+    plant = _field_plant(values)
+    explored = _explore(plant, values)
+    yield _halving(plant, values, explored)
+    yield _actuators(plant)
+    if explored.costs.diverged_step.max() >= 0:
+        yield Finding(
+            "exploration",
+            False,
+            f"the plant diverges at step {explored.costs.diverged_step.max()} under inputs of variance "
+            f"{_variance(values):.3g}: lower exploration_variance, or take a smaller integration_time",
+        )
+        return
+    yield from _identification(values)
+
+
+def _field_plant(values: Mapping[str, Any]) -> Plant:
+    """The plant without noise, limits and sensors."""
+    return build_plant({**values, **{spec.name: spec.default for spec in INSTRUMENTS}})
+
+
+def _variance(values: Mapping[str, Any]) -> float:
+    return build_training({**values, "seeds": 1}).settings.exploration_variance
+
+
+def _explore(plant: Plant, values: Mapping[str, Any]) -> EpisodeRecord:
+    """From the mean field and from a drawn one, under white inputs."""
+    inputs = np.random.default_rng(0).normal(
+        scale=np.sqrt(_variance(values)), size=(plant.horizon, 2, plant.n_a)
+    )
+    return rollout(plant, lambda k, states: inputs[k], [MEAN_FIELD, 0], np.arange(2))
+
+
+def _halving(plant: Plant, values: Mapping[str, Any], explored: EpisodeRecord) -> Finding:
+    """The steps of the exploration, each computed again from its state with half the step."""
+    step = plant.integration_time
+    if isinstance(plant.equation, LinearEquation):
+        return Finding("integration step", True, "none: a linear equation is advanced exactly")
+    end = int(explored.costs.diverged_step[explored.costs.diverged_step >= 0].min(initial=2**31))
+    states = explored.fields[:-1][:end].reshape(-1, plant.n_z)
+    actions = explored.actions[:end].reshape(-1, plant.n_a)
+    finer = _field_plant({**values, "integration_time": step / 2})
+    whole, half = (which.evaluate(states, actions)[0] for which in (plant, finer))
+    change = linalg.norm(half - states, axis=1)
+    error = float(np.max(linalg.norm(whole - half, axis=1) / np.maximum(change, 1e-300), initial=0))
+    text = f"halving {step:g} s changes a sample by at most {100 * error:.2g} % of its own change"
+    if error > STEP_ERROR:
+        return Finding("integration step", False, f"{text}: take {step / 2:g} s or less")
+    return Finding("integration step", True, text)
+
+
+@dataclass(frozen=True)
+class Reach:
+    """The unstable modes of the linearised plant, and how well actuators reach them.
+
+    growth (n,): ln|lambda| / sample_time; waves (n,): the strongest wave number j of exp(2 pi i j x/L)
+    in the mode; margins (n,): smallest singular value of [lambda I - A, B] on the subspace of these
+    modes, relative to the norm of B (Popov-Belevitch-Hautus; 0: out of reach).
+    """
+
+    growth: Array
+    waves: NDArray[np.int64]
+    margins: Array
+
+
+def reach(plant: Plant) -> Reach:
+    """Linearise z+ = f(z, a) at the target without action, by central differences; see `Reach`.
+
+    Left invariant subspace of the unstable eigenvalues: W^T A = T W^T with W orthonormal, from an
+    ordered real Schur form of A^T; mode by mode the test is then one of small matrices.
+    """
+    n, n_a = plant.n_z, plant.n_a
+    moves = SMALL * np.eye(n + n_a)
+    states, actions = moves[:, :n], moves[:, n:]
+    plus, _ = plant.evaluate(plant.field_target + states, actions)
+    minus, _ = plant.evaluate(plant.field_target - states, -actions)
+    A, B = np.split((plus - minus).T / (2 * SMALL), [n], axis=1)
+    T, W, count = linalg.schur(A.T, sort=lambda re, im: np.hypot(re, im) > 1 + GROWS)
+    if not count:
+        return Reach(np.empty(0), np.empty(0, dtype=np.int64), np.empty(0))
+    W, T = W[:, :count], T[:count, :count].T
+    eigenvalues, vectors = linalg.eig(T, left=True, right=False)
+    pencils = [np.hstack([value * np.eye(count) - T, W.T @ B]) for value in eigenvalues]
+    margins = [linalg.svdvals(pencil)[-1] for pencil in pencils]
+    fields = (W @ vectors).T.reshape(count, len(plant.equation.components), len(plant.x))
+    spectra = np.abs(np.fft.fft(fields)).sum(axis=1)[:, : len(plant.x) // 2 + 1]
+    growth = np.log(np.abs(eigenvalues)) / plant.sample_time
+    order = np.argsort(-growth)
+    relative = np.array(margins) / max(float(linalg.norm(B, 2)), 1e-300)
+    return Reach(growth[order], spectra.argmax(axis=1)[order], relative[order])
+
+
+def _actuators(plant: Plant) -> Finding:
+    name = "modes"
+    if plant.n_z > MAX_LINEARISED:
+        return Finding(name, True, f"not checked: a state of more than {MAX_LINEARISED} numbers")
+    found = reach(plant)
+    if not len(found.growth):
+        return Finding(name, True, "none is unstable at the target")
+    text = f"{len(found.growth)} unstable at the target, growing at up to {found.growth[0]:.3g} 1/s"
+    lost = sorted(set(found.waves[found.margins < REACHED].tolist()))
+    if not lost:
+        return Finding(
+            name, True, f"{text}; the actuators reach all, the least by {found.margins.min():.2g}"
+        )
+    waves = ", ".join(map(str, lost))
+    return Finding(
+        name,
+        False,
+        f"{text}; the actuators do not reach all of wave number {waves}: move, add or narrow some",
+    )
+
+
+def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
+    """What the plant as it is measured says about variance, order and the law."""
+    plant = build_plant(values)
+    explored = _explore(plant, values)
+    trajectories = [(explored.states[:, 1], explored.actions[:, 1])]  # drawn, as in a training
+    yield Finding(
+        "exploration",
+        True,
+        f"inputs of variance {_variance(values):.3g} keep the plant within its bound "
+        f"(largest {np.abs(explored.fields).max():.3g} of {plant.divergence_bound:g})",
+    )
+    settings = DesignSettings.of(values)
+    try:
+        suggested = study_orders(trajectories).suggested
+    except ValueError as error:
+        yield Finding("order", False, str(error))
+        return
+    n_s = settings.reduced_order
+    yield Finding(
+        "order",
+        True,
+        f"reduced_order {n_s}; one episode suggests {suggested}, and dmdc a rank of "
+        f"{suggested + plant.n_a} or more",
+    )
+    costs = {"no control": _cost(plant, None)}
+    for order in dict.fromkeys((n_s, suggested)):
+        try:
+            law = design(trajectories, plant.target, replace(settings, reduced_order=order))
+        except ValueError as error:
+            yield Finding("first law", False, f"of order {order}: {error}")
+            return
+        own = ProjectedLaw([law.U], plant.target, settings.action_limit)
+        own.set(law.policy[np.newaxis], np.zeros(1, dtype=np.int64))
+        costs[f"order {order}"] = _cost(plant, own)
+    told = ", ".join(
+        f"{'diverges' if cost >= DIVERGED_COST else format(cost, '.4g')} with {name}"
+        for name, cost in costs.items()
+    )
+    good = costs[f"order {n_s}"] < costs["no control"]
+    hint = "" if good else ": a training would begin with no control; try another reduced_order"
+    yield Finding("first law", good, f"mean stage cost from the mean field {told}{hint}")
+
+
+def _cost(plant: Plant, law: ProjectedLaw | None) -> float:
+    none = np.zeros((1, plant.n_a))
+
+    def answer(k: int, states: Array) -> Array:
+        return none if law is None else law.actions(states)
+
+    return float(rollout(plant, answer, [MEAN_FIELD], np.arange(1), keep=False).costs.mean[0])
+
+
+def draw(values: Mapping[str, Any], path: Path) -> None:
+    """A picture of the initial fields, the target and the actuators' supports."""
+    from matplotlib.figure import Figure
+
+    plant = _field_plant(values)
+    fields = plant.reset([MEAN_FIELD, *range(DRAWN)]).copy()
+    names = plant.equation.components
+    figure = Figure(figsize=(7.0, 0.6 + 2.4 * len(names)), layout="constrained")
+    for i, (ax, name) in enumerate(
+        zip(figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0], names, strict=True)
+    ):
+        own = slice(i * len(plant.x), (i + 1) * len(plant.x))
+        ax.plot(plant.x, fields[1:, own].T, color="0.7", linewidth=0.8)
+        ax.plot(plant.x, fields[0, own], color="0.35", label="initial field: mean, and five drawn")
+        ax.plot(plant.x, plant.field_target[own], color="black", linestyle="--", label="target")
+        if i == plant.equation.actuated:
+            below = ax.get_xaxis_transform()
+            for j, support in enumerate(plant.supports.T):
+                height = 0.12 * support / max(float(np.abs(support).max()), 1e-300)
+                label = "supports of the actuators" if j == 0 else None
+                ax.fill_between(
+                    plant.x, height, transform=below, color="#d55e00", alpha=0.45, label=label
+                )
+        ax.set_ylabel(f"{name}(x)")
+        ax.set_xlim(0, plant.equation.length)
+    ax.set_xlabel("x (m)")
+    handles = dict(
+        zip(
+            *reversed(figure.axes[plant.equation.actuated].get_legend_handles_labels()), strict=True
+        )
+    )
+    figure.legend(
+        handles.values(), handles.keys(), loc="outside upper center", ncols=3, frameon=False
+    )
+    figure.savefig(path, dpi=150)

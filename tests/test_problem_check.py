@@ -1,0 +1,122 @@
+"""`pdeloop check` and `pdeloop new`: modes and steps against theory, a template that passes."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+
+from pde_sim_node.equations import LinearEquation
+from pde_sim_node.plant import Plant
+from pdeloop.cli import FAILED, main
+from pdeloop.problem_check import check, reach
+from tests.small import parameters
+
+
+@dataclass(frozen=True, kw_only=True)
+class Growing(LinearEquation):
+    """u_t = u + 0.2 u_xx on [0, 2 pi): the waves 0, 1 and 2 grow."""
+
+    name: ClassVar[str] = "growing"
+    order: ClassVar[float] = 2.0
+    length: float = 2 * np.pi
+
+    def linear_operator(self, k: Any) -> Any:
+        return 1.0 - 0.2 * k**2
+
+    def initial_field(self, x: Any, rng: Any) -> Any:
+        return np.cos(x)
+
+    def target(self, x: Any) -> Any:
+        return np.zeros_like(x)
+
+
+def plant(n_a: int, width: float) -> Plant:
+    return Plant(
+        Growing(), n_z=32, n_a=n_a, width=width, sample_time=0.1, integration_time=0.1, horizon=5,
+        state_weight=1.0, action_weight=1.0,
+    )  # fmt: skip
+
+
+def test_the_unstable_modes_are_those_of_the_operator_and_enough_actuators_reach_them() -> None:
+    found = reach(plant(5, 0.1))
+    assert found.waves.tolist() == [0, 1, 1, 2, 2]
+    np.testing.assert_allclose(found.growth, [1.0, 0.8, 0.8, 0.2, 0.2], atol=1e-7)
+    assert found.margins.min() > 0.1
+
+
+@pytest.mark.parametrize(("n_a", "lost"), [(1, [1, 2]), (2, [1, 2]), (4, [2])])
+def test_waves_on_which_equally_spaced_actuators_have_one_phase_are_not_reached(
+    n_a: int, lost: list[int]
+) -> None:
+    """A pair cos, sin of one growth rate needs two columns of B, and they see wave n_a / 2 as one."""
+    found = reach(plant(n_a, 0.1))
+    assert sorted(set(found.waves[found.margins < 1e-6])) == lost
+
+
+def named(**changes: Any) -> dict[str, tuple[bool, str]]:
+    return {found.name: (found.good, found.text) for found in check(parameters(**changes))}
+
+
+def test_the_small_problem_is_good_and_a_coarse_step_is_not() -> None:
+    fine, coarse = named(), named(integration_time=0.05)
+    assert all(good for good, _ in fine.values()), fine
+    assert set(fine) == {"integration step", "modes", "exploration", "order", "first law"}
+    assert coarse["integration step"][0] is False
+    assert "take 0.025 s or less" in coarse["integration step"][1]
+
+
+def test_an_exploration_that_diverges_is_told() -> None:
+    found = named(divergence_bound=0.5)
+    assert found["exploration"][0] is False and "diverges at step" in found["exploration"][1]
+    assert "order" not in found
+
+
+def test_what_new_writes_runs_and_passes_its_own_test(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PDELOOP_EQUATIONS", "")
+    assert main(["new", "my-pde"]) == 0
+    *_, told, _ = capsys.readouterr().out.splitlines()
+    words = told.removeprefix("next: pdeloop ").split()
+    assert main(["check", "my-pde/my-pde.yaml"]) == FAILED  # a file alone runs no code
+    assert "name it yourself: --equation" in capsys.readouterr().err
+    assert main([*words, "--json"]) == 0
+    findings = json.loads(capsys.readouterr().out)
+    assert len(findings) == 5 and all(one["good"] for one in findings)
+    assert (tmp_path / "my-pde.png").read_bytes().startswith(b"\x89PNG")
+    spec = importlib.util.spec_from_file_location("own", tmp_path / "my-pde" / "test_my_pde.py")
+    assert spec is not None and spec.loader is not None
+    own = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(own)
+    own.test_a_small_wave_grows_as_the_linear_part_says()
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("../x", "is no name"),
+        ("9x", "is no name"),
+        ("burgers", "shipped"),
+        ("a" * 61, "is no name"),
+    ],
+)
+def test_new_refuses_a_name(name: str, words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["new", name]) == FAILED
+    assert words in capsys.readouterr().err
+
+
+def test_new_overwrites_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own").mkdir()
+    assert main(["new", "own"]) == FAILED
+    assert "there already" in capsys.readouterr().err
+    assert list((tmp_path / "own").iterdir()) == []
