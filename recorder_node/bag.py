@@ -1,21 +1,21 @@
 """A rosbag2 bag that is written as it grows: one MCAP file and metadata.yaml. No ROS import.
 
-What `flush` has written survives SIGKILL: the MCAP file is whole chunks up to there. The message
-definitions are in the bag, so that it is read without ROS.
+What `flush` has written survives SIGKILL: the MCAP file consists of whole chunks up to there, which
+are compressed with zstd. The message definitions are in the bag, so that it is read without ROS.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, cast
 
 import yaml
+from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
-
-from recorder_node.mcap_file import McapFile
 
 FILE, METADATA = "bag.mcap", "metadata.yaml"
 VERSION = 9
@@ -90,42 +90,56 @@ class BagWriter:
             raise BagError(f"{path} already exists; choose another folder for the bag")
         self.path = path
         self._schemas: dict[str, int] = {}
-        self._channels: list[Channel] = []
+        self._channels: dict[str, Channel] = {}
         self._numbers: dict[str, int] = {}
+        self._counts: Counter[str] = Counter()
+        self._first, self._last = 2**63, 0
+        self._pending = 0
+        """Bytes of messages that are not in the file yet."""
         try:
             path.mkdir(parents=True)
-            self._file = McapFile(path / FILE)
-            for channel in channels:
-                self._add(channel)
+            self._file = _WholeWrites(path / FILE)
+            self._mcap = Writer(cast("IO[bytes]", self._file), chunk_size=LARGEST)
+            self._mcap.start("ros2", "pdeloop")
         except OSError as error:
             raise BagError(f"cannot write a bag to {path}: {_reason(error)}") from error
+        for channel in channels:
+            self.add(channel)
 
     def add(self, channel: Channel) -> None:
         """Declare a topic."""
-        try:
-            self._add(channel)
-        except OSError as error:
-            raise self._stopped(error) from error
+        known, kind = channel.definition or definition(channel.type), channel.type
+        if kind not in self._schemas:
+            content = known.text.encode()
+            self._schemas[kind] = self._mcap.register_schema(kind, known.encoding, content)
+        metadata = {QOS: _yaml([channel.qos()]), HASH: known.hash}
+        number = self._mcap.register_channel(channel.topic, "cdr", self._schemas[kind], metadata)
+        self._numbers[channel.topic], self._channels[channel.topic] = number, channel
 
     def write(self, topic: str, when: int, data: bytes) -> None:
         """Append a serialised message; when: time of its arrival, ns since the epoch."""
-        self._file.add_message(self._numbers[topic], when, data)
-        if self._file.pending > LARGEST:
-            self.flush()
+        try:
+            self._mcap.add_message(self._numbers[topic], when, data, when)
+        except OSError as error:
+            raise self._stopped(error) from error
+        self._counts[topic] += 1
+        self._pending += len(data)
+        self._first, self._last = min(self._first, when), max(self._last, when)
 
     def pause(self) -> None:
         """Between two batches of messages, each of which is kept as a whole or not at all: write what
         has become large.
         """
-        if self._file.pending > LARGE:
+        if self._pending > LARGE:
             self.flush()
 
     def flush(self) -> None:
         """Hand everything to the operating system, in a form that can be read back."""
         try:
-            self._file.close_chunk()
+            self._mcap.flush()
         except OSError as error:
             raise self._stopped(error) from error
+        self._pending = 0
 
     def close(self, notes: Mapping[str, str]) -> None:
         """Finish the bag: indices, and metadata.yaml with `notes` as its custom data."""
@@ -133,31 +147,22 @@ class BagWriter:
         information = self._information(notes)
         try:
             # As rosbag2 does it: a file without its folder says as much.
-            self._file.add_metadata("rosbag2", {"serialized_metadata": _yaml(information)})
-            self._file.finish()
+            self._mcap.add_metadata("rosbag2", {"serialized_metadata": _yaml(information)})
+            self._mcap.finish()
+            self._file.close()
             part = self.path / f"{METADATA}.part"
             part.write_text(_yaml({"rosbag2_bagfile_information": information}))
             part.replace(self.path / METADATA)
         except OSError as error:
             raise self._stopped(error) from error
 
-    def _add(self, channel: Channel) -> None:
-        known = channel.definition or definition(channel.type)
-        if channel.type not in self._schemas:
-            number = self._file.add_schema(channel.type, known.text, known.encoding)
-            self._schemas[channel.type] = number
-        metadata = {QOS: _yaml([channel.qos()]), HASH: known.hash}
-        schema = self._schemas[channel.type]
-        self._numbers[channel.topic] = self._file.add_channel(channel.topic, schema, metadata)
-        self._channels.append(channel)
-
     def _information(self, notes: Mapping[str, str]) -> dict[str, Any]:
         """The content of metadata.yaml, without its outermost key."""
-        found = self._file.statistics()
+        first, last = (self._first, self._last) if self._counts else (0, 0)
         extent = {
-            "duration": {"nanoseconds": found.message_end_time - found.message_start_time},
-            "starting_time": {"nanoseconds_since_epoch": found.message_start_time},
-            "message_count": found.message_count,
+            "duration": {"nanoseconds": last - first},
+            "starting_time": {"nanoseconds_since_epoch": first},
+            "message_count": self._counts.total(),
         }
         topics = [
             {
@@ -168,9 +173,9 @@ class BagWriter:
                     "offered_qos_profiles": [channel.qos()],
                     "type_description_hash": (channel.definition or definition(channel.type)).hash,
                 },
-                "message_count": found.channel_message_counts.get(self._numbers[channel.topic], 0),
+                "message_count": self._counts[channel.topic],
             }
-            for channel in self._channels
+            for channel in self._channels.values()
         ]
         return {
             "version": VERSION,
@@ -191,6 +196,23 @@ class BagWriter:
             f"cannot write to {self.path}: {_reason(error)}; recording stopped, what was written "
             f"before can be read (pdeloop bag recover {self.path} makes it an ordinary bag)"
         )
+
+
+class _WholeWrites:
+    """A new file in which each write is there as a whole or, if the disk refuses, not at all."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("xb", buffering=0)
+        self.tell, self.flush, self.close = self._file.tell, self._file.flush, self._file.close
+
+    def write(self, data: bytes) -> None:
+        begin, rest = self._file.tell(), memoryview(data)
+        try:
+            while rest:
+                rest = rest[self._file.write(rest) :]
+        except OSError:
+            self._file.truncate(begin)
+            raise
 
 
 def _yaml(content: Any) -> str:
