@@ -1,73 +1,132 @@
-"""The index of a bag: which episodes are in it, when, and whether all of each was recorded. Pure."""
+"""The episodes of a bag: what belongs to each, and whether all of it was recorded. Pure.
+
+The recorder follows the messages with it as they arrive, and who reads a bag as they are read.
+"""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from collections import deque
+from dataclasses import dataclass, field
 from typing import Any
 
-from loop_interfaces.frames import Frame
+import numpy as np
+from numpy.typing import NDArray
+
+from loop_interfaces.frames import Frame, FrameError
+from loop_interfaces.protocol import ModelFailure
 from loop_interfaces.topics import (
     ACTION,
     COST,
+    MODEL,
     MODEL_IDENTIFIED,
     POLICY,
     START,
     STATE,
+    TARGET,
     VOID,
     CostColumn,
     StartColumn,
-    Topic,
 )
+from recorder_node.sources import Source
 
+Array = NDArray[np.float64]
 SETTLING = 0.3
 """Seconds after an episode's cost in which its other messages may still come in."""
 MODEL_SETTLING = 10.0
 """The same after an exploratory episode, whose model is still to come."""
+REMEMBERED = 1000
+"""Episodes that were taken out and whose late messages are recognised as such."""
 
 Key = tuple[str, int, int]
 """(namespace, run, episode)"""
+_ONCE = {START: "start", POLICY: "policy", COST: "cost", MODEL_IDENTIFIED: "model"}
+"""The messages that there are once an episode, and the attributes that hold them."""
 
 
 @dataclass
-class Episode:
-    """What was recorded of one episode. first, last: arrival of its messages, ns since the epoch."""
+class RecordedEpisode:
+    """What was recorded of one episode.
 
-    namespace: str
-    run: int
-    episode: int
+    Attributes
+    ----------
+    key : (str, int, int)
+        Namespace, run, and number of the episode.
+    first, last : int
+        Arrival of its first and last message, ns since the epoch.
+    start, policy, cost, model : Frame or None
+        What the topics of these names said; model is that of `model/identified`.
+    states, actions : dict of int to Frame
+        By step.
+    failure : ModelFailure or None
+        Why there is no model.
+    bases : Frame or None
+        The models that its policies are about.
+    repeats : int
+        Samples that were recorded more than once.
+    contradictions : list of str
+        Messages that were recorded twice with different content, in words.
+    cost_at : int or None
+        Arrival of its cost.
+    over : bool
+        Nothing more is expected of it.
+    """
+
+    key: Key
     first: int
     last: int
-    environments: int = 0
-    exploratory: bool = False
-    horizon: int = -1
-    void: bool = False
-    started: bool = False
-    policy: bool = False
-    model: bool = False
-    states: set[int] = field(default_factory=set)
-    actions: set[int] = field(default_factory=set)
+    start: Frame | None = None
+    policy: Frame | None = None
+    cost: Frame | None = None
+    model: Frame | None = None
+    states: dict[int, Frame] = field(default_factory=dict)
+    actions: dict[int, Frame] = field(default_factory=dict)
+    failure: ModelFailure | None = None
+    bases: Frame | None = None
     repeats: int = 0
+    contradictions: list[str] = field(default_factory=list)
     cost_at: int | None = None
     over: bool = False
 
     @property
-    def key(self) -> Key:
-        return self.namespace, self.run, self.episode
+    def number(self) -> int:
+        return self.key[2]
+
+    @property
+    def environments(self) -> int:
+        return 0 if self.start is None else len(self.start.values)
+
+    @property
+    def exploratory(self) -> bool:
+        rows = None if self.start is None else self.start.values
+        return rows is not None and bool((rows[:, StartColumn.EXCITATION] >= 0).any())
+
+    @property
+    def void(self) -> bool:
+        """Whether the plant declared it void."""
+        rows = None if self.cost is None else self.cost.values
+        return rows is not None and bool((rows[:, CostColumn.ENDED] == VOID).any())
+
+    @property
+    def horizon(self) -> int:
+        """Number of its steps; -1 before its cost is known."""
+        return -1 if self.cost is None else self.cost.step
 
     @property
     def missing(self) -> list[str]:
         """What the bag lacks of this episode, in words; empty when it is complete."""
-        lacking = [] if self.started else ["its start"]
-        if self.started and not self.exploratory and not self.policy:
+        lacking = [] if self.start is not None else ["its start"]
+        if self.start is not None and not self.exploratory and self.policy is None:
             lacking.append("its policies")
-        if self.cost_at is None:
+        if self.cost is None:
             return [*lacking, "its cost"]
         if self.void:
             return [*lacking, "an end: it is void"]
-        states = self.horizon + 1 - len(self.states & set(range(self.horizon + 1)))
-        actions = self.horizon - len(self.actions & set(range(self.horizon)))
-        lacking += [f"{states} of {self.horizon + 1} states"] if states else []
-        lacking += [f"{actions} of {self.horizon} actions"] if actions else []
+        for samples, count, name in (
+            (self.states, self.horizon + 1, "states"),
+            (self.actions, self.horizon, "actions"),
+        ):
+            lost = sum(step not in samples for step in range(count))
+            lacking += [f"{lost} of {count} {name}"] if lost else []
         return lacking
 
     @property
@@ -75,11 +134,17 @@ class Episode:
         """Whether no more samples are awaited of it, now that its cost is there."""
         return self.void or (len(self.states) > self.horizon and len(self.actions) >= self.horizon)
 
+    def trajectory(self) -> tuple[Array, Array]:
+        """States (T + 1, M, n_z) and actions (T, M, n_a) of a complete episode."""
+        assert not self.missing
+        states = [self.states[k].values for k in range(self.horizon + 1)]
+        return np.stack(states), np.stack([self.actions[k].values for k in range(self.horizon)])
+
     def settled(self, now: int) -> bool:
         """Whether nothing more is expected of it at time `now` (ns)."""
         if self.cost_at is None:
             return False
-        waits = self.exploratory and not self.model and not self.void
+        waits = self.exploratory and self.model is None and self.failure is None and not self.void
         return now - self.cost_at > (MODEL_SETTLING if waits else SETTLING) * 1e9
 
     def given_up(self, now: int, newest: int) -> bool:
@@ -87,60 +152,78 @@ class Episode:
 
         Episodes of a pair follow each other.
         """
-        unended = self.cost_at is None and self.episode < newest
+        unended = self.cost is None and self.number < newest
         return unended and now - self.last > MODEL_SETTLING * 1e9
 
-    def add(self, steps: set[int], step: int) -> None:
-        """Note a sample among the `steps` that there are."""
-        if step in steps:
-            self.repeats += 1
-        steps.add(step)
+    def put(self, source: Source, when: int, frame: Frame) -> None:
+        """Keep a message that arrived at `when` (ns)."""
+        assert source.array is not None
+        topic, before = source.array, None
+        if topic in (STATE, ACTION):
+            samples = self.states if topic is STATE else self.actions
+            before, samples[frame.step] = samples.get(frame.step), frame
+            self.repeats += before is not None
+        else:
+            before = getattr(self, _ONCE[topic])
+            setattr(self, _ONCE[topic], frame)
+            if topic is COST:
+                self.cost_at = when
+        if before is not None and before.values.tobytes() != frame.values.tobytes():
+            self.contradictions.append(
+                f"{topic.name} of step {frame.step} was recorded twice with different values"
+            )
 
     def row(self) -> dict[str, Any]:
         """Its line in the index."""
-        content = asdict(self)
-        for name in ("started", "policy", "model", "cost_at", "over"):
-            del content[name]
-        content |= {"states": len(self.states), "actions": len(self.actions)}
-        return content | {"complete": not self.missing, "missing": self.missing}
+        missing = self.missing
+        return {
+            **dict(zip(("namespace", "run", "episode"), self.key, strict=True)),
+            "first": self.first,
+            "last": self.last,
+            "environments": self.environments,
+            "exploratory": self.exploratory,
+            "horizon": self.horizon,
+            "void": self.void,
+            "states": len(self.states),
+            "actions": len(self.actions),
+            "repeats": self.repeats,
+            "complete": not missing,
+            "missing": missing,
+        }
 
 
 class EpisodeIndex:
-    """Follows the messages of a recording and tells which episodes are over."""
+    """Sorts messages into episodes and tells which of these are over."""
 
     def __init__(self) -> None:
-        self._open: dict[Key, Episode] = {}
+        self._open: dict[Key, RecordedEpisode] = {}
+        self._over: deque[Key] = deque(maxlen=REMEMBERED)
+        self._models: dict[Key, Frame] = {}
+        """By namespace, run and number of the models."""
 
-    def note(self, key: Key, when: int, topic: Topic, frame: Frame) -> Episode:
-        """Note a message that arrived at `when` (ns) in its episode, and return that."""
-        episode = self._see(key, when)
-        if topic is STATE:
-            episode.add(episode.states, frame.step)
-        elif topic is ACTION:
-            episode.add(episode.actions, frame.step)
-        elif topic is START:
-            episode.started = True
-            episode.environments = len(frame.values)
-            episode.exploratory = bool((frame.values[:, StartColumn.EXCITATION] >= 0).any())
-        elif topic is COST:
-            episode.cost_at = when
-            episode.horizon = frame.step
-            episode.void = bool((frame.values[:, CostColumn.ENDED] == VOID).any())
-        elif topic is POLICY:
-            episode.policy = True
-        elif topic is MODEL_IDENTIFIED:
-            episode.model = True
+    def take(self, source: Source, when: int, raw: bytes) -> RecordedEpisode | None:
+        """Note a message that arrived at `when` (ns); the episode that it is about, if any."""
+        if source.array is None:
+            return self._take_failure(source, when, raw) if source.namespace else None
+        if source.array is TARGET:
+            return None
+        try:
+            frame = source.codec.decode(raw)
+        except FrameError:
+            return None
+        if source.array is MODEL:
+            self._models[source.namespace, frame.run, frame.step] = frame
+            return None
+        if source.array in (START, COST) and not len(frame.values):
+            return None  # the run is over: no episode
+        episode = self._find((source.namespace, frame.run, frame.episode), when)
+        if episode is not None:
+            episode.put(source, when, frame)
         return episode
 
-    def note_model(self, key: Key, when: int) -> Episode:
-        """Note that an episode's model came, or why there is none."""
-        episode = self._see(key, when)
-        episode.model = True
-        return episode
-
-    def take_over(self, now: int | None) -> list[Episode]:
+    def take_over(self, now: int | None) -> list[RecordedEpisode]:
         """Take out the episodes of which nothing more is expected at time `now` (ns); None: all."""
-        newest = max((e.episode for e in self._open.values()), default=-1)
+        newest = max((e.number for e in self._open.values()), default=-1)
         done = [
             episode
             for episode in self._open.values()
@@ -148,16 +231,29 @@ class EpisodeIndex:
         ]
         for episode in done:
             episode.over = True
+            if episode.start is not None:
+                models = (*episode.key[:2], episode.start.step)
+                episode.bases = self._models.get(models)
+            self._over.append(episode.key)
             del self._open[episode.key]
         return sorted(done, key=lambda episode: episode.first)
 
-    def _see(self, key: Key, when: int) -> Episode:
-        """The episode a message belongs to, a new one if it is the first of it."""
-        found = self._open.get(key)
-        if found is None:
-            found = self._open[key] = Episode(*key, first=when, last=when)
-        elif when < found.first:
-            found.first = when
-        elif when > found.last:
-            found.last = when
-        return found
+    def _take_failure(self, source: Source, when: int, raw: bytes) -> RecordedEpisode | None:
+        try:
+            failure = ModelFailure.from_json(raw[8:].rstrip(b"\0").decode())
+        except ValueError:
+            return None
+        episode = self._find((source.namespace, failure.run, failure.episode), when)
+        if episode is not None:
+            episode.failure = failure
+        return episode
+
+    def _find(self, key: Key, when: int) -> RecordedEpisode | None:
+        """The episode a message belongs to, a new one if it is its first; None if that is over."""
+        if key not in self._open:
+            if key in self._over:
+                return None
+            self._open[key] = RecordedEpisode(key, when, when)
+        episode = self._open[key]
+        episode.first, episode.last = min(episode.first, when), max(episode.last, when)
+        return episode

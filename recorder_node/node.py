@@ -36,7 +36,8 @@ from loop_interfaces.topics import ACTION, RECORDER_STATUS, START, STATE
 from recorder_node.bag import BagError, Channel
 from recorder_node.diagnostics import RecorderHealth
 from recorder_node.peers import Peers
-from recorder_node.recording import CLOCK, DIAGNOSTICS, ROSOUT, Recording, Source, sources
+from recorder_node.recording import Recording
+from recorder_node.sources import CLOCK, DIAGNOSTICS, ROSOUT, Source, sources
 
 RECORDING_FAILED = 3
 """Exit code when writing fails later on; 1 is a recording that cannot begin."""

@@ -10,72 +10,16 @@ from __future__ import annotations
 import json
 from collections import defaultdict, deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from loop_interfaces.frames import ArrayCodec, FrameError
-from loop_interfaces.protocol import ModelFailure
-from loop_interfaces.topics import (
-    ACTION,
-    ARRAYS,
-    COST,
-    MODEL,
-    MODEL_FAILED,
-    POLICY,
-    START,
-    STATE,
-    TARGET,
-    Topic,
-)
-from recorder_node.bag import BagError, BagWriter, Channel
-from recorder_node.episodes import SETTLING, Episode, EpisodeIndex
+from loop_interfaces.topics import COST, POLICY
+from recorder_node.bag import BagError, BagWriter
+from recorder_node.episodes import SETTLING, EpisodeIndex, RecordedEpisode
+from recorder_node.sources import Source
 
 INDEX = "episodes.jsonl"
 PARAMETERS = "parameters.json"
-ARRAY_TYPE = "std_msgs/msg/Float64MultiArray"
-TEXT_TYPE = "std_msgs/msg/String"
-
-
-@dataclass(frozen=True)
-class Source:
-    """A topic that is recorded: its channel in the bag, and what it is in the loop.
-
-    array: its entry in loop_interfaces.topics, None for the others; namespace: its pair's, '' for
-    what belongs to no pair.
-    """
-
-    channel: Channel
-    array: Topic | None = None
-    namespace: str = ""
-
-    @cached_property
-    def codec(self) -> ArrayCodec:
-        """Decodes its messages, if it has arrays."""
-        assert self.array is not None
-        return ArrayCodec(self.array.labels)
-
-    @cached_property
-    def ordered(self) -> bool:
-        """Whether it may have to wait for what belongs before it in the bag."""
-        return bool(self.namespace) and self.array not in (STATE, ACTION)
-
-
-CLOCK = Source(Channel("/clock", "rosgraph_msgs/msg/Clock"))
-"""Simulated time, one topic for all pairs."""
-DIAGNOSTICS = Source(Channel("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"))
-ROSOUT = Source(Channel("/rosout", "rcl_interfaces/msg/Log", latched=True, depth=1000))
-
-
-def sources(namespace: str) -> list[Source]:
-    """The topics of a pair in the absolute `namespace` ('/' or '/left')."""
-    base = namespace.rstrip("/")
-    found = [
-        Source(Channel(f"{base}/{topic.name}", ARRAY_TYPE, topic.latched), topic, base or "/")
-        for topic in ARRAYS
-    ]
-    return [*found, Source(Channel(f"{base}/{MODEL_FAILED}", TEXT_TYPE, True), None, base or "/")]
 
 
 class _Taken(NamedTuple):
@@ -84,7 +28,7 @@ class _Taken(NamedTuple):
     source: Source
     when: int
     raw: bytes
-    episode: Episode | None
+    episode: RecordedEpisode | None
 
     @property
     def early(self) -> bool:
@@ -92,7 +36,7 @@ class _Taken(NamedTuple):
         if self.episode is None or self.episode.over:
             return False
         if self.source.array is POLICY:
-            return not self.episode.started
+            return self.episode.start is None
         return self.source.array is COST and not self.episode.sampled
 
 
@@ -126,7 +70,9 @@ class Recording:
     def take(self, source: Source, when: int, raw: bytes) -> None:
         """Record one message that arrived at `when` (ns since the epoch)."""
         self.messages += 1
-        episode = self._note(source, when, raw)
+        episode = self._index.take(source, when, raw)
+        if episode is not None:
+            self.run = episode.key[1]
         waiting = self._waiting[source.namespace]
         if source.ordered:
             waiting.append(_Taken(source, when, raw, episode))
@@ -178,29 +124,6 @@ class Recording:
                 return
             waiting.popleft()
             self._bag.write(first.source.channel.topic, first.when, first.raw)
-
-    def _note(self, source: Source, when: int, raw: bytes) -> Episode | None:
-        """Note a message in the index; the episode that it is about, if any."""
-        topic = source.array
-        if topic is None:
-            return self._note_failure(source, when, raw) if source.ordered else None
-        if topic in (MODEL, TARGET):
-            return None
-        try:
-            frame = source.codec.decode(raw)
-        except FrameError:
-            return None  # the reader of the bag will not take it for one either
-        if topic in (START, COST) and not len(frame.values):
-            return None  # the run is over: no episode
-        self.run = frame.run
-        return self._index.note((source.namespace, frame.run, frame.episode), when, topic, frame)
-
-    def _note_failure(self, source: Source, when: int, raw: bytes) -> Episode | None:
-        try:
-            failure = ModelFailure.from_json(raw[8:].rstrip(b"\0").decode())
-        except ValueError:
-            return None
-        return self._index.note_model((source.namespace, failure.run, failure.episode), when)
 
     def _append_index(self, lines: str) -> None:
         try:

@@ -35,7 +35,8 @@ from pdeloop.bags.tools import recover
 from pdeloop.bags.verify import verify
 from pdeloop.identification import Wanted, identify_bag
 from recorder_node.bag import BagError, BagWriter, Channel, Definition, definition
-from recorder_node.recording import CLOCK, DIAGNOSTICS, ROSOUT, Recording, Source, sources
+from recorder_node.recording import Recording
+from recorder_node.sources import CLOCK, DIAGNOSTICS, ROSOUT, Source, sources
 from tests.small_disk import read_only_folder, small_disk
 
 RUN = 2**52 + 1
@@ -544,7 +545,8 @@ def test_a_bag_is_written_without_ros(tmp_path):
     program = (
         "import sys\n"
         "for name in ('rclpy', 'std_msgs', 'rosgraph_msgs'): sys.modules[name] = None\n"
-        "from recorder_node.recording import *\n"
+        "from recorder_node.recording import Recording\n"
+        "from recorder_node.sources import sources\n"
         "from pathlib import Path\n"
         f"Recording(Path({str(tmp_path / 'bag')!r}), sources('/')).close()\n"
     )

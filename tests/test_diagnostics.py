@@ -23,7 +23,8 @@ from loop_interfaces.ros.introspection import Introspection
 from loop_interfaces.topics import COST, STATE, TARGET, VOID
 from pde_sim_node.diagnostics import PlantHealth
 from recorder_node.diagnostics import RecorderHealth
-from recorder_node.recording import Recording, sources
+from recorder_node.recording import Recording
+from recorder_node.sources import sources
 from tests.small import parameters
 from tests.test_lockstep import RUN, answer, plant_protocol, run_episode, start
 from tests.test_session import ITERATIONS, Loop, values

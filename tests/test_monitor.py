@@ -17,7 +17,8 @@ from pdeloop.live import Live
 from pdeloop.monitor.finder import Finder, run_id
 from pdeloop.monitor.read_budget import ReadBudget
 from pdeloop.monitor.replay import replay
-from recorder_node.recording import Recording, sources
+from recorder_node.recording import Recording
+from recorder_node.sources import sources
 from tests.small import parameters
 from tuner_node.results import RunFolder
 from viewer_node.episode_samples import COLUMNS, MAX_COMPONENTS, ROWS, EpisodeSamples, rows_of

@@ -23,13 +23,12 @@ def describe(path: Path) -> dict[str, Any]:
         last = message.when if last is None else max(last, message.when)
     episodes = []
     for episode in bag.episodes():
-        environments = 0 if episode.start is None else len(episode.start.values)
         episodes.append(
             {
                 "namespace": episode.key[0],
                 "run": episode.key[1],
                 "episode": episode.number,
-                "environments": environments,
+                "environments": episode.environments,
                 "exploratory": episode.exploratory,
                 "seconds": (episode.last - episode.first) / 1e9,
                 "mean_cost": None if episode.cost is None else episode.cost.values[:, 0].tolist(),

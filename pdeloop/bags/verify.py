@@ -23,11 +23,12 @@ from loop_interfaces import model_rows
 from loop_interfaces.frames import Frame
 from loop_interfaces.parameters import PLANT, as_recorded, table, with_budget
 from loop_interfaces.spec import check, read_yaml
-from loop_interfaces.topics import COMPLETED, VOID, CostColumn, StartColumn, noise_seeds
+from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn, noise_seeds
 from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.measurement import InstrumentedPlant
 from pde_sim_node.plant import DIVERGED_COST, Plant
-from pdeloop.bags.reader import Bag, RecordedEpisode
+from pdeloop.bags.reader import Bag
+from recorder_node.episodes import RecordedEpisode
 from tuner_node.batch import Batch, BatchResult
 from tuner_node.build import build_training
 from tuner_node.optimizers import NEED_TRAJECTORIES, Trajectory
@@ -153,12 +154,11 @@ class _Run:
         for text in episode.contradictions:
             report.differs(f"{where}: {text}")
         missing = episode.missing
-        void = episode.cost is not None and bool(
-            (episode.cost.values[:, CostColumn.ENDED] == VOID).any()
-        )
+        if episode.void:
+            return
         if missing:
             report.incomplete.append(f"{where} lacks {', '.join(missing)}")
-        if self._values is None or episode.start is None or episode.cost is None or void:
+        if self._values is None or episode.start is None or episode.cost is None:
             return
         if episode.cost.plant != self._fingerprint and not self._other:
             self._other = True
@@ -235,10 +235,7 @@ class _Run:
     def _keep(self, episode: RecordedEpisode, where: str) -> None:
         """Note what each rollout of the episode gave, for the replay of the training."""
         assert episode.start is not None and episode.cost is not None
-        if not episode.exploratory and episode.policy is None:
-            self._report.incomplete.append(f"{where} lacks its policies")
-            return
-        if episode.exploratory and episode.model is None:
+        if (episode.model if episode.exploratory else episode.policy) is None:
             return
         policies = None if episode.policy is None else episode.policy.values
         assert self._values is not None

@@ -28,7 +28,7 @@ from pdeloop.bags.reader import Bag
 from pdeloop.domain import own_domain
 from pdeloop.live import announced
 from recorder_node.bag import Channel
-from recorder_node.recording import DIAGNOSTICS, ROSOUT
+from recorder_node.sources import DIAGNOSTICS, ROSOUT
 from tuner_node.results import TRANSIENT
 
 NAME = "bag_player"

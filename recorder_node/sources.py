@@ -1,0 +1,78 @@
+"""The topics of the loop that are recorded, and what each of them is. Pure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from loop_interfaces.frames import ArrayCodec
+from loop_interfaces.topics import ACTION, ARRAYS, MODEL_FAILED, STATE, Topic
+from recorder_node.bag import Channel
+
+ARRAY_TYPE = "std_msgs/msg/Float64MultiArray"
+TEXT_TYPE = "std_msgs/msg/String"
+_NAMES = sorted([*(topic.name for topic in ARRAYS), MODEL_FAILED], key=len, reverse=True)
+
+
+@dataclass(frozen=True)
+class Source:
+    """A topic that is recorded.
+
+    Attributes
+    ----------
+    channel : Channel
+        What it is in the bag.
+    array : Topic or None
+        Its entry in loop_interfaces.topics; None for a topic without arrays.
+    namespace : str
+        That of its pair; '' for what belongs to no pair.
+    """
+
+    channel: Channel
+    array: Topic | None = None
+    namespace: str = ""
+
+    @cached_property
+    def codec(self) -> ArrayCodec:
+        """Decodes its messages, if it has arrays."""
+        assert self.array is not None
+        return ArrayCodec(self.array.labels)
+
+    @cached_property
+    def ordered(self) -> bool:
+        """Whether it may have to wait for what belongs before it in the bag."""
+        return bool(self.namespace) and self.array not in (STATE, ACTION)
+
+
+CLOCK = Source(Channel("/clock", "rosgraph_msgs/msg/Clock"))
+"""Simulated time, one topic for all pairs."""
+DIAGNOSTICS = Source(Channel("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"))
+ROSOUT = Source(Channel("/rosout", "rcl_interfaces/msg/Log", latched=True, depth=1000))
+
+
+def sources(namespace: str) -> list[Source]:
+    """The topics of a pair in the absolute `namespace` ('/' or '/left')."""
+    base = namespace.rstrip("/")
+    found = [
+        Source(Channel(f"{base}/{topic.name}", ARRAY_TYPE, topic.latched), topic, base or "/")
+        for topic in ARRAYS
+    ]
+    return [*found, Source(Channel(f"{base}/{MODEL_FAILED}", TEXT_TYPE, True), None, base or "/")]
+
+
+def source_of(name: str) -> Source | None:
+    """The topic of a pair with this full `name`; None for any other topic.
+
+    Examples
+    --------
+    >>> found = source_of("/left/episode/cost")
+    >>> found.namespace, found.array.name
+    ('/left', 'episode/cost')
+    >>> source_of("/clock") is None
+    True
+    """
+    for topic in _NAMES:
+        if name.endswith(f"/{topic}"):
+            pair = sources(name.removesuffix(f"/{topic}") or "/")
+            return next(source for source in pair if source.channel.topic == name)
+    return None
