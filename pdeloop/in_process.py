@@ -17,7 +17,7 @@ from controller_node.policy import ProjectedLaw, excitation
 from loop_interfaces import model_rows
 from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn, noise_seeds
 from pde_sim_node.build import build_plant, fingerprint
-from pde_sim_node.plant import Plant
+from pde_sim_node.plant import EpisodeCosts, Plant
 from pdeloop.episode import EpisodeRecord, Law, rollout
 from tuner_node.batch import Batch, BatchResult
 from tuner_node.training import Training
@@ -72,10 +72,9 @@ class LocalPair:
 
     def roll_out(self, batch: Batch) -> EpisodeRecord:
         """The episode of a batch; states and actions of one that is exploratory or asks for them."""
-        law = self._exploration(batch) if batch.exploratory else self._policies(batch)
         seeds = batch.rows[:, StartColumn.SEED].astype(np.int64)
         keep = batch.exploratory or batch.trajectories
-        episode = rollout(self.plant, law, seeds, noise_seeds(batch.rows), keep=keep)
+        episode = rollout(self.plant, self.law(batch), seeds, noise_seeds(batch.rows), keep=keep)
         lost = episode.costs.diverged_step
         if batch.exploratory and (lost >= 0).any():
             raise ValueError(
@@ -86,10 +85,7 @@ class LocalPair:
 
     def _episode(self, batch: Batch) -> BatchResult:
         episode = self.roll_out(batch)
-        costs = episode.costs
-        ended = np.where(costs.diverged_step >= 0, costs.diverged_step, COMPLETED)
-        table = np.column_stack([costs.mean, costs.total, ended.astype(np.float64)])
-        seen = None
+        table, seen = cost_table(episode.costs), None
         if batch.trajectories:
             seen = cut(episode.states, episode.actions, table[:, CostColumn.ENDED])
         if not batch.exploratory:
@@ -103,19 +99,23 @@ class LocalPair:
         ]
         return BatchResult(table, np.stack(models), trajectories=seen)
 
-    def _policies(self, batch: Batch) -> Law:
-        """Every environment's policy on the model that it belongs to."""
-        law, policies = self._law, batch.policies
-        assert law is not None and policies is not None
-        law.set(policies, batch.rows[:, StartColumn.MODEL].astype(np.int64))
-        return lambda k, states: law.actions(states)
-
-    def _exploration(self, batch: Batch) -> Law:
-        """Every environment's excitation, whatever the states."""
+    def law(self, batch: Batch) -> Law:
+        """Every environment's policy on the model that it belongs to, or its excitation."""
+        if batch.policies is not None:
+            law = self._law
+            assert law is not None
+            law.set(batch.policies, batch.rows[:, StartColumn.MODEL].astype(np.int64))
+            return lambda k, states: law.actions(states)
         n_a, limit = self._settings.n_a, self._settings.action_limit
         columns = batch.rows[:, [StartColumn.EXCITATION, StartColumn.VARIANCE]]
         drawn = [(int(seed), float(variance)) for seed, variance in columns]
         return lambda k, states: np.stack([excitation(s, k, n_a, v, limit) for s, v in drawn])
+
+
+def cost_table(costs: EpisodeCosts) -> Array:
+    """The costs of M environments as `episode/cost` has them: mean, total, ended, (M, 3)."""
+    ended = np.where(costs.diverged_step >= 0, costs.diverged_step, COMPLETED)
+    return np.column_stack([costs.mean, costs.total, ended.astype(np.float64)])
 
 
 def train(training: Training, pair: LocalPair, report: Report, *, max_batch: int = 1024) -> None:

@@ -1,9 +1,9 @@
-"""`pdeloop bag verify`: everything in a bag that can be computed again, is, and compared bit by bit.
+"""`pdeloop bag verify`: computes a recorded run again and compares it bit by bit.
 
-Of every complete episode: the initial fields from the seeds, the actions from states, policies and
-models (or from the excitation's seed), each z_{k+1} from z_k and a_k, the cost from states and
-actions, the reduced model from an exploratory episode. Of the run: every policy and its models from
-the costs before it, by running the tuner's own training on the recorded costs.
+Every complete episode is run again from its seeds, policies and models (or the excitation's seed):
+initial fields, actions, states, costs, and the reduced model after exploration. Of the run, every
+policy and its models follow from the costs before it, by running the tuner's own training on the
+recorded costs.
 """
 
 from __future__ import annotations
@@ -18,16 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller_node.identification import DesignSettings, design
-from controller_node.policy import ProjectedLaw, excitation
 from loop_interfaces import model_rows
-from loop_interfaces.frames import Frame
 from loop_interfaces.parameters import PLANT, as_recorded, table, with_budget
 from loop_interfaces.spec import check, read_yaml
 from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn, noise_seeds
-from pde_sim_node.build import build_plant, fingerprint
-from pde_sim_node.measurement import InstrumentedPlant
-from pde_sim_node.plant import DIVERGED_COST, Plant
+from pde_sim_node.build import fingerprint
 from pdeloop.bags.reader import Bag
+from pdeloop.episode import rollout
+from pdeloop.in_process import LocalPair, cost_table
 from recorder_node.episodes import RecordedEpisode
 from tuner_node.batch import Batch, BatchResult
 from tuner_node.build import build_training
@@ -125,261 +123,218 @@ def _complete(values: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
     return values if told else None
 
 
+@dataclass(frozen=True)
+class _Rollout:
+    """What one environment of an episode gave."""
+
+    episode: RecordedEpisode
+    environment: int
+    trajectory: Trajectory | None
+
+    @property
+    def cost(self) -> Array:
+        assert self.episode.cost is not None
+        cost: Array = self.episode.cost.values[self.environment]
+        return cost
+
+    @property
+    def model(self) -> Array | None:
+        model = self.episode.model
+        return None if model is None else model.values[self.environment]
+
+
 class _Run:
     """The episodes of one run, and what they must be."""
 
     def __init__(self, number: int, values: Mapping[str, Any] | None, report: Report) -> None:
-        self._number, self._report = number, report
-        self._results: dict[bytes, tuple[Array, Array | None, int]] = {}
-        self._bases: dict[bytes, Frame | None] = {}
-        self._rows: list[tuple[bytes, RecordedEpisode, int]] = []
-        self._trajectories: dict[bytes, Trajectory] = {}
+        self._name, self._report = f"run {number}", report
+        self._rollouts: dict[bytes, _Rollout] = {}
         self._values: dict[str, Any] | None = None
         if values is None:
-            report.notes.append(
-                f"run {number}: its parameters are not in the bag, so nothing is recomputed "
+            self._note(
+                "its parameters are not in the bag, so nothing is recomputed "
                 "(give them with --parameters FILE)"
             )
             return
         self._given = set(values)
         self._values = with_budget({**check(table(), {}), **as_recorded(values)})
-        self._plant = build_plant(self._values)
+        self._pair = LocalPair(self._values)
         self._fingerprint = fingerprint(self._values)
-        self._other = False
-        self._settings = DesignSettings.of(self._values)
+        self._same_plant = True
 
     def episode(self, episode: RecordedEpisode) -> None:
         """Check one episode."""
         report, where = self._report, f"episode {episode.number}"
         for text in episode.contradictions:
             report.differs(f"{where}: {text}")
-        missing = episode.missing
         if episode.void:
             return
-        if missing:
-            report.incomplete.append(f"{where} lacks {', '.join(missing)}")
+        if episode.missing:
+            report.incomplete.append(f"{where} lacks {', '.join(episode.missing)}")
         if self._values is None or episode.start is None or episode.cost is None:
             return
-        if episode.cost.plant != self._fingerprint and not self._other:
-            self._other = True
-            report.notes.append(
-                f"run {self._number}: recorded with another fingerprint of the plant "
-                f"({episode.cost.plant}; here it is {self._fingerprint}): its parameters or the source "
-                "of its equation are others. What it computes is compared all the same"
+        if self._same_plant and episode.cost.plant != self._fingerprint:
+            self._same_plant = False
+            self._note(
+                f"recorded with another fingerprint of the plant ({episode.cost.plant}; here it is "
+                f"{self._fingerprint}): its parameters or the source of its equation are others. "
+                "What it computes is compared all the same"
             )
         self._keep(episode, where)
-        if not missing:
-            self._trajectory(episode, where)
+        if not episode.missing:
+            self._run_again(episode, where)
 
     def finish(self) -> None:
-        """Replay the training on the recorded costs."""
-        if self._values is None or not self._rows:
+        """Run the training again on the recorded costs."""
+        if self._values is None or not self._rollouts:
             return
         if unknown := [name for name in _TUNERS if name not in self._given]:
-            self._report.notes.append(
-                f"run {self._number}: the tuner's {', '.join(unknown)} not known, so its policies "
-                "cannot be followed"
+            self._note(
+                f"the tuner's {', '.join(unknown)} not known, so its policies cannot be followed"
             )
             return
-        if not any(episode.exploratory for _, episode, _ in self._rows):
-            self._report.notes.append(
-                f"run {self._number}: its exploratory episode is not here, so its policies cannot be "
-                "followed (give all bags of the run)"
+        if not any(rollout.episode.exploratory for rollout in self._rollouts.values()):
+            self._note(
+                "its exploratory episode is not here, so its policies cannot be followed (give all "
+                "bags of the run)"
             )
             return
         training = build_training({**self._values, "plant": self._fingerprint})
-        used: set[bytes] = set()
-        report = self._report
+        unused = dict(self._rollouts)
         while (batch := training.next_batch()) is not None:
             keys = _keys(batch.rows, batch.policies, training.generation)
-            if absent := [i for i, key in enumerate(keys) if key not in self._results]:
-                self._explain(batch, absent[0], used, training)
+            if absent := [i for i, key in enumerate(keys) if key not in self._rollouts]:
+                self._explain(batch, absent[0], list(unused.values()), training)
                 return
-            used.update(keys)
-            results = [self._results[key] for key in keys]
-            models = [m for _, m, _ in results if m is not None]
+            rollouts = [self._rollouts[key] for key in keys]
+            for key in keys:
+                unused.pop(key, None)
+            models = [r.model for r in rollouts if batch.exploratory and r.model is not None]
             if batch.exploratory and len(models) < len(keys):
-                report.notes.append("a model is missing, so the training is not followed further")
+                self._note("a model is missing, so the training is not followed further")
                 return
             if batch.policies is not None:
-                report.compared["policies"] += len(keys)
-                self._compare_models(training, keys)
-            seen = None
-            if batch.trajectories:
-                if any(key not in self._trajectories for key in keys):
-                    paid = sum(training.progress["rollouts"])
-                    report.notes.append(
-                        f"samples of an episode after rollout {paid} are missing, "
-                        "and the optimiser used them, so the training is not followed further"
-                    )
-                    return
-                seen = [self._trajectories[key] for key in keys]
-            costs = np.stack([cost for cost, _, _ in results])
-            stacked = np.stack(models) if models else None
+                self._report.compared["policies"] += len(keys)
+                self._compare_models(training, rollouts)
+            seen = [r.trajectory for r in rollouts if r.trajectory is not None]
+            if batch.trajectories and len(seen) < len(keys):
+                self._note(
+                    f"samples of an episode after rollout {sum(training.progress['rollouts'])} are "
+                    "missing, and the optimiser used them, so the training is not followed further"
+                )
+                return
             training.finish(
-                BatchResult(costs, stacked, self._fingerprint, seen, self._plant.target)
+                BatchResult(
+                    np.stack([r.cost for r in rollouts]),
+                    np.stack(models) if models else None,
+                    self._fingerprint,
+                    seen if batch.trajectories else None,
+                    self._pair.plant.target,
+                )
             )
-        unused = [episode for key, episode, _ in self._rows if key not in used]
         if unused:
-            self._report.differs(
-                f"episode {unused[0].number} is none of those that the training asks for"
-            )
+            number = next(iter(unused.values())).episode.number
+            self._report.differs(f"episode {number} is none of those that the training asks for")
 
-    def _compare_models(self, training: Training, keys: Sequence[bytes]) -> None:
-        """The models that rollouts were about, against those of the replayed training."""
+    def _note(self, text: str) -> None:
+        self._report.notes.append(f"{self._name}: {text}")
+
+    def _compare_models(self, training: Training, rollouts: Sequence[_Rollout]) -> None:
+        """The models that rollouts were about, against those of the repeated training."""
         assert training.models is not None
-        for bases in {id(frame): frame for frame in map(self._bases.get, keys) if frame}.values():
-            where = f"models number {bases.step} of run {self._number}"
-            self._report.compare("models", where, bases.values, training.models)
+        bases = {id(frame): frame for r in rollouts if (frame := r.episode.bases) is not None}
+        for frame in bases.values():
+            where = f"models number {frame.step} of {self._name}"
+            self._report.compare("models", where, frame.values, training.models)
 
     def _keep(self, episode: RecordedEpisode, where: str) -> None:
-        """Note what each rollout of the episode gave, for the replay of the training."""
-        assert episode.start is not None and episode.cost is not None
+        """Note what each rollout of the episode gave, for the repetition of the training."""
+        assert self._values is not None and episode.start is not None and episode.cost is not None
         if (episode.model if episode.exploratory else episode.policy) is None:
             return
         policies = None if episode.policy is None else episode.policy.values
-        assert self._values is not None
-        seen: list[Trajectory] = []
+        seen: Sequence[Trajectory | None] = [None] * episode.environments
         if self._values["optimizer"] in NEED_TRAJECTORIES and not episode.missing:
             seen = cut(*episode.trajectory(), episode.cost.values[:, CostColumn.ENDED])
         for i, key in enumerate(_keys(episode.start.values, policies, episode.start.step)):
-            model = episode.model.values[i] if episode.model is not None else None
-            cost = episode.cost.values[i]
-            self._rows.append((key, episode, i))
-            self._bases[key] = episode.bases
-            if seen:
-                self._trajectories[key] = seen[i]
-            if key not in self._results:
-                self._results[key] = (cost, model, episode.number)
-                continue
-            before, _, number = self._results[key]
-            self._report.compare(
-                "repeated rollouts", f"cost of {where}, repeating episode {number}", cost, before
-            )
+            found = _Rollout(episode, i, seen[i])
+            known = self._rollouts.setdefault(key, found)
+            if known is not found:
+                text = f"cost of {where}, repeating episode {known.episode.number}"
+                self._report.compare("repeated rollouts", text, found.cost, known.cost)
 
-    def _trajectory(self, episode: RecordedEpisode, where: str) -> None:
+    def _run_again(self, episode: RecordedEpisode, where: str) -> None:
+        """The whole episode from its seeds, under its policies or its excitation."""
         assert episode.start is not None and episode.cost is not None
-        report, plant = self._report, self._plant
+        report, plant, rows = self._report, self._pair.plant, episode.start.values
         states, actions = episode.trajectory()
-        rows = episode.start.values
         if states.shape[1:] != (len(rows), plant.state_size) or actions.shape[2] != plant.n_a:
             report.differs(f"{where}: states and actions do not have the plant's shape")
             return
-        initial = plant.reset(rows[:, StartColumn.SEED].astype(np.int64), noise_seeds(rows)).copy()
-        report.compare("initial fields", f"z_0 of {where}", states[0], initial)
-        self._actions(episode, where, states, actions)
+        policies = None if episode.policy is None else episode.policy.values
+        if episode.bases is not None:
+            self._pair.use_models(episode.bases.values)
+        if episode.exploratory or episode.bases is not None:
+            law = self._pair.law(Batch(rows, None if episode.exploratory else policies))
+        else:  # the models that the policies are about are in another bag
+            law = lambda k, z: actions[k]  # noqa: E731
+        seeds = rows[:, StartColumn.SEED].astype(np.int64)
+        again = rollout(plant, law, seeds, noise_seeds(rows))
+        report.compare("initial fields", f"z_0 of {where}", states[0], again.states[0])
+        for what, name, first, recorded, computed in (
+            ("actions", "a", 0, actions, again.actions),
+            ("steps", "z", 1, states[1:], again.states[1:]),
+        ):
+            for k in range(len(recorded)):
+                text = f"{name}_{k + first} of {where}"
+                if not report.compare(what, text, recorded[k], computed[k]):
+                    break
+        costs = cost_table(again.costs)
+        report.compare("costs", f"cost of {where}", episode.cost.values, costs)
+        if episode.model is not None and (costs[:, CostColumn.ENDED] == COMPLETED).all():
+            assert self._values is not None
+            settings = DesignSettings.of(self._values)
+            for env, model in enumerate(episode.model.values):
+                own = design([(states[:, env], actions[:, env])], plant.target, settings)
+                text = f"model of {where}, environment {env}"
+                report.compare("rows of models", text, model, model_rows.pack(own))
 
-        ended = episode.cost.values[:, CostColumn.ENDED]
-        if isinstance(plant, InstrumentedPlant):
-            self._run_again(plant, where, states, actions, episode.cost.values)
-        else:
-            self._steps_again(plant, where, states, actions, episode.cost.values)
-        if episode.exploratory and episode.model is not None and (ended == COMPLETED).all():
-            self._models(episode, where, states, actions)
-
-    def _run_again(
-        self, plant: InstrumentedPlant, where: str, states: Array, actions: Array, costs: Array
+    def _explain(
+        self, batch: Batch, index: int, unused: Sequence[_Rollout], training: Training
     ) -> None:
-        """The whole episode from its seeds: what is recorded is not the field, but measurements."""
-        for k, held in enumerate(actions):
-            where_k = f"z_{k + 1} of {where}"
-            if not self._report.compare("steps", where_k, states[k + 1], plant.step(held)):
-                return
-        again = plant.episode_costs()
-        ended = np.where(again.diverged_step >= 0, again.diverged_step, COMPLETED)
-        table_again = np.column_stack([again.mean, again.total, ended.astype(np.float64)])
-        self._report.compare("costs", f"cost of {where}", costs, table_again)
-
-    def _steps_again(
-        self, plant: Plant, where: str, states: Array, actions: Array, recorded: Array
-    ) -> None:
-        """Every step from the recorded state before it."""
-        report = self._report
-        steps, count = actions.shape[:2]
-        ended = recorded[:, CostColumn.ENDED]
-        alive = np.arange(steps)[:, None] < np.where(ended == COMPLETED, steps, ended + 1)
-        flat = (steps * count, -1)
-        again, stage = plant.evaluate(states[:-1].reshape(flat), actions.reshape(flat))
-        again = np.where(alive[..., None], again.reshape(states[1:].shape), states[:-1])
-        for k in range(steps):
-            where_k = f"z_{k + 1} of {where}"
-            if not report.compare("steps", where_k, states[k + 1], again[k]):
-                break
-        total = np.zeros(count)
-        for costs, live in zip(stage.reshape(steps, count), alive, strict=True):
-            total[live] += costs[live]
-        mean = total / steps
-        diverged = ended != COMPLETED
-        total[diverged], mean[diverged] = DIVERGED_COST * plant.horizon, DIVERGED_COST
-        table_again = np.column_stack([mean, total, ended])
-        report.compare("costs", f"cost of {where}", recorded, table_again)
-
-    def _actions(self, episode: RecordedEpisode, where: str, states: Array, actions: Array) -> None:
-        assert episode.start is not None
-        report, rows, n_a = self._report, episode.start.values, self._plant.n_a
-        law = None
-        if not episode.exploratory:
-            if episode.policy is None or episode.bases is None:
-                return
-            models = [model_rows.unpack(own, n_a) for own in episode.bases.values]
-            limit = self._settings.action_limit
-            law = ProjectedLaw([model.U for model in models], self._plant.target, limit)
-            law.set(episode.policy.values, rows[:, StartColumn.MODEL].astype(np.int64))
-        columns = rows[:, [StartColumn.EXCITATION, StartColumn.VARIANCE]]
-        for k, recorded in enumerate(actions):
-            if law is not None:
-                again = law.actions(states[k])
-            else:
-                limit = self._settings.action_limit
-                again = np.stack([excitation(int(s), k, n_a, float(v), limit) for s, v in columns])
-            if not report.compare("actions", f"a_{k} of {where}", recorded, again):
-                return
-
-    def _models(self, episode: RecordedEpisode, where: str, states: Array, actions: Array) -> None:
-        assert episode.model is not None
-        for env, recorded in enumerate(episode.model.values):
-            own = design([(states[:, env], actions[:, env])], self._plant.target, self._settings)
-            text = f"model of {where}, environment {env}"
-            self._report.compare("rows of models", text, recorded, model_rows.pack(own))
-
-    def _explain(self, batch: Batch, index: int, used: set[bytes], training: Training) -> None:
         """Say why the training wants a rollout that is not in the bag."""
         report, rollouts = self._report, sum(training.progress["rollouts"])
-        left = [(e, i) for key, e, i in self._rows if key not in used]
-        if not left:
-            report.notes.append(
+        if not unused:
+            self._note(
                 f"the bag ends after rollout {rollouts}; up to there the training was followed"
             )
             return
-        row, policies = batch.rows[index], batch.policies
-        alike = [
-            (episode, i)
-            for episode, i in left
-            if episode.start is not None
-            and episode.policy is not None
-            and np.array_equal(episode.start.values[i], row)
-        ]
-        for episode, i in alike:
-            assert episode.start is not None and episode.policy is not None
-            if policies is not None and episode.start.step == training.generation:
+        row = batch.rows[index]
+        for r in unused:
+            start, policy = r.episode.start, r.episode.policy
+            assert start is not None
+            same = start.step == training.generation and np.array_equal(
+                start.values[r.environment], row
+            )
+            if same and policy is not None and batch.policies is not None:
                 report.compare(
                     "policies",
-                    f"policy of episode {episode.number}, environment {i}, "
+                    f"policy of episode {r.episode.number}, environment {r.environment}, "
                     f"after rollout {rollouts}",
-                    episode.policy.values[i],
-                    policies[index],
+                    policy.values[r.environment],
+                    batch.policies[index],
                 )
                 return
-        if self._report.incomplete:
-            report.notes.append(
-                f"an episode after rollout {rollouts} is not in the bag, "
-                "so the training is not followed further"
+        if report.incomplete:
+            self._note(
+                f"an episode after rollout {rollouts} is not in the bag, so the training is not "
+                "followed further"
             )
             return
         report.differs(
             f"after rollout {rollouts} the training asks for a rollout from seed "
             f"{int(row[StartColumn.SEED])} with models number {training.generation}, which is not in "
-            f"the bag; episode {left[0][0].number} has another one"
+            f"the bag; episode {unused[0].episode.number} has another one"
         )
 
 
