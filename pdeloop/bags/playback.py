@@ -10,10 +10,10 @@ from recorder_node.bag import BagError
 
 
 class Playback:
-    """The messages of a bag by the wall clock: what was recorded s seconds after the first message
-    is due s / rate seconds after the beginning.
+    """The messages of a bag by the clock: what was recorded s seconds after the first message is due
+    s / rate seconds after the first call of `take`.
 
-    again: begin anew at the end, for ever. `now` is any monotonic time in s.
+    again: begin anew at the end, for ever.
     """
 
     def __init__(self, bag: Bag, *, rate: float, again: bool) -> None:
@@ -22,36 +22,27 @@ class Playback:
         self.over = False
         self._messages: Iterator[Message] = iter(())
         self._next: Message | None = None
-        self._first = 0
-        self._begun = 0.0
+        self._first, self._begun = 0, 0.0
 
-    def begin(self, now: float) -> None:
-        """The first message is due now. BagError if there is none."""
+    def take(self, now: float) -> Iterator[Message]:
+        """The messages that are due at time `now` (monotonic s), in the order of the bag.
+
+        BagError if the bag holds none.
+        """
+        if self._next is None and not self.over:
+            self._begin(now)
+        while self._next is not None and self._due(self._next) <= now:
+            yield self._next
+            self.published += 1
+            self._next = next(self._messages, None)
+        self.over = self._next is None and not self._again
+
+    def _due(self, message: Message) -> float:
+        return self._begun + (message.when - self._first) / 1e9 / self._rate
+
+    def _begin(self, now: float) -> None:
         self._messages = self._bag.messages()
         self._next = next(self._messages, None)
         if self._next is None:
             raise BagError(f"{self._bag.path} holds no messages")
         self._first, self._begun = self._next.when, now
-
-    def delay(self, seconds: float) -> None:
-        """Nobody could publish for `seconds`: everything is due so much later."""
-        self._begun += seconds
-
-    @property
-    def due(self) -> float | None:
-        """When the next message is due; None if there is none left."""
-        if self._next is None:
-            return None
-        return self._begun + (self._next.when - self._first) / 1e9 / self._rate
-
-    def take(self, now: float) -> Iterator[Message]:
-        """The messages that are due, in the order of their arrival at the recorder."""
-        while (due := self.due) is not None and due <= now:
-            assert self._next is not None
-            yield self._next
-            self.published += 1
-            self._next = next(self._messages, None)
-            if self._next is None and self._again:
-                self.begin(now)
-                return
-        self.over = self._next is None

@@ -281,7 +281,7 @@ def test_a_recorder_that_is_held_up_for_a_second_misses_nothing(loop, tmp_path):
     hand.recorder.send_signal(signal.SIGSTOP)
     before = iterations_done(hand.out)
     time.sleep(1.0)
-    assert iterations_done(hand.out) > before + 20  # the loop did not wait
+    until(lambda: iterations_done(hand.out) > before + 5, LIMIT, "a loop that does not wait")
     hand.recorder.send_signal(signal.SIGCONT)
     loop.wait(hand.tuner, LIMIT)
     hand.recorder.send_signal(signal.SIGINT)

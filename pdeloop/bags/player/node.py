@@ -34,8 +34,8 @@ from tuner_node.results import TRANSIENT
 NAME = "bag_player"
 LOOK_FOR = 2.5
 """Seconds in which a live loop in this domain is found."""
-START_LOOK, LOOK = 0.1, 1.0
-"""Seconds between two looks for one before playing, and while playing."""
+LOOK = 0.2
+"""Seconds between two looks for one."""
 UNKNOWN = 1.0
 """Seconds in which the name of a publisher's node should come."""
 TICK = 0.005
@@ -54,65 +54,26 @@ class PlayerNode:
     wait: begin when somebody subscribes.
     """
 
-    def __init__(self, bag: Bag, playback: Playback, *, wait: bool) -> None:
-        self._bag, self._playback = bag, playback
+    def __init__(
+        self, node: Node, loop: Observer, bag: Bag, playback: Playback, *, wait: bool
+    ) -> None:
+        self._node, self._loop, self._playback, self._waiting = node, loop, playback, wait
         self._channels = bag.channels()
-        self._waiting = wait
-        self._left: float | None = None
-
-    def run(self) -> str:
-        """Play to the end, or until a signal comes; the reason."""
-        while True:
-            arguments = ["--ros-args", "--disable-external-lib-logs"]
-            with ros_node(NAME, arguments, Observer) as (node, loop):
-                self._join(node, loop)
-                reason: str = loop.run()
-                if not loop.suspended:
-                    return reason
-                self._left = time.monotonic()
-
-    def _join(self, node: Node, loop: Observer) -> None:
-        self._node, self._loop = node, loop
         self._publishers: dict[str, Publisher] = {}
-        self._until = time.monotonic() + LOOK_FOR
-        self._look_at = 0.0
+        self._create_at = time.monotonic() + LOOK_FOR
         self._seen_at: float | None = None
-        self._linger: float | None = None
-        for name, value in self._recorded_parameters().items():
+        """Since when there is another publisher of one of the topics."""
+        self._end_at: float | None = None
+        for name, value in _recorded_parameters(bag).items():
             node.declare_parameter(name, value, ParameterDescriptor(read_only=True))
+        loop.every(LOOK, self._look)
         loop.every(TICK, self._play)
-        loop.every(START_LOOK, self._look)
-
-    def _play(self) -> None:
-        now, playback = time.monotonic(), self._playback
-        if not self._publishers:
-            return
-        if self._waiting:
-            self._waiting = not any(p.get_subscription_count() for p in self._publishers.values())
-            return
-        if playback.due is None and not playback.over:
-            playback.begin(now)
-        for message in playback.take(now):
-            publisher = self._publishers.get(message.topic)
-            if publisher is not None:
-                publisher.publish(message.data)
-        if playback.over:
-            self._linger = self._linger or now + LINGER
-            if now >= self._linger:
-                self._loop.stop("end")
 
     def _look(self) -> None:
         now = time.monotonic()
-        if not self._publishers:
-            self._refuse_company(now)
-            if now >= self._until and self._seen_at is None:
-                self._create()
-                if self._left is not None:
-                    self._playback.delay(now - self._left)
-                    self._left = None
-        elif now >= self._look_at:
-            self._look_at = now + LOOK
-            self._refuse_company(now)
+        self._refuse_company(now)
+        if not self._publishers and now >= self._create_at and self._seen_at is None:
+            self._create()
 
     def _create(self) -> None:
         for channel in self._channels:
@@ -122,11 +83,25 @@ class PlayerNode:
                     f"{channel.topic} is not played: its type {channel.type} is not installed"
                 )
                 continue
-            self._publishers[channel.topic] = self._node.create_publisher(
-                kind, channel.topic, _qos(channel)
-            )
+            publisher = self._node.create_publisher(kind, channel.topic, _qos(channel))
+            self._publishers[channel.topic] = publisher
         if not self._publishers:
-            raise PlayerError(f"{self._bag.path} holds nothing that can be published here")
+            raise PlayerError("the bag holds nothing that can be published here")
+
+    def _play(self) -> None:
+        now, playback = time.monotonic(), self._playback
+        if not self._publishers:
+            return
+        if self._waiting:
+            self._waiting = not any(p.get_subscription_count() for p in self._publishers.values())
+            return
+        for message in playback.take(now):
+            if message.topic in self._publishers:
+                self._publishers[message.topic].publish(message.data)
+        if playback.over:
+            self._end_at = self._end_at or now + LINGER
+            if now >= self._end_at:
+                self._loop.stop("end")
 
     def _refuse_company(self, now: float) -> None:
         """A live loop must not be told what happened long ago."""
@@ -135,12 +110,11 @@ class PlayerNode:
                 continue  # every node publishes there
             if self._node.count_publishers(topic) <= (topic in self._publishers):
                 continue
-            names = [
+            others = [
                 f"{info.node_namespace.rstrip('/')}/{info.node_name}"
                 for info in self._node.get_publishers_info_by_topic(topic)
-                if info.node_name != NAMELESS
+                if info.node_name not in (NAMELESS, NAME)
             ]
-            others = [name for name in names if name != f"/{NAME}"]
             self._seen_at = self._seen_at or now
             if not others and now - self._seen_at < UNKNOWN:
                 return  # the name comes a little later than the publisher
@@ -152,11 +126,15 @@ class PlayerNode:
             )
         self._seen_at = None
 
-    def _recorded_parameters(self) -> dict[str, Any]:
-        """What defines the last run in the bag, as far as it knows: not its folders and the like."""
-        runs = list(self._bag.parameters().values())
-        known = {} if not runs else {k: v for k, v in runs[-1].items() if k not in TRANSIENT}
-        return {k: v for k, v in known.items() if isinstance(v, str | bool | int | float)}
+
+def _recorded_parameters(bag: Bag) -> dict[str, Any]:
+    """What defines the last run in the bag, as far as it knows: not its folders and the like."""
+    *_, last = ({}, *bag.parameters().values())
+    return {
+        name: value
+        for name, value in last.items()
+        if name not in TRANSIENT and isinstance(value, str | bool | int | float)
+    }
 
 
 def _qos(channel: Channel) -> QoSProfile:
@@ -183,7 +161,6 @@ def play(
     """Play the bag at `path` in a domain of its own or ROS_DOMAIN_ID; the exit code."""
     bag = Bag(path)
     playback = Playback(bag, rate=rate, again=again)
-    player = PlayerNode(bag, playback, wait=wait)
     if not network:
         keep_on_this_machine()
     with own_domain() as domain, announced(domain, bag.path, network=network):
@@ -192,7 +169,10 @@ def play(
         if wait:
             tell("  waiting for somebody who subscribes")
         try:
-            reason = player.run()
+            arguments = ["--ros-args", "--disable-external-lib-logs"]
+            with ros_node(NAME, arguments, Observer) as (node, loop):
+                PlayerNode(node, loop, bag, playback, wait=wait)
+                reason: str = loop.run()
         except ConfigurationError as error:
             raise PlayerError(str(error)) from error
     tell(
