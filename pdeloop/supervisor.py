@@ -39,12 +39,20 @@ class NodeError(RuntimeError):
 class Child:
     """One node: how it is started and how its life went.
 
-    optional: the others go on without it when it ends by itself, or dies too often. before_start:
-    called before each start, to change the arguments. cores: that it may use; empty: any.
+    Attributes
+    ----------
+    command : function
+        Gives the words of its command; called before each start.
+    optional : bool
+        The others go on without it when it ends by itself, or dies too often.
+    cores : sequence of int
+        The cores that it may use; empty: any.
+    ended : bool
+        It is optional, and has ended for good.
     """
 
     name: str
-    arguments: Sequence[str]
+    command: Callable[[], Sequence[str]]
     log: Path
     process: subprocess.Popen[bytes] | None = None
     deaths: int = 0
@@ -52,7 +60,6 @@ class Child:
     started: float = 0.0
     due: float | None = 0.0
     optional: bool = False
-    before_start: Callable[[], None] | None = None
     cores: Sequence[int] = ()
     ended: bool = False
 
@@ -147,11 +154,9 @@ class Supervisor:
                 child.process, child.due = None, None
 
     def _start(self, child: Child, now: float) -> None:
-        if child.before_start is not None:
-            child.before_start()
         with open_own(child.log, os.O_APPEND) as log:
             child.process = subprocess.Popen(
-                child.arguments,
+                child.command(),
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,

@@ -33,7 +33,7 @@ from pdeloop.supervisor import Child, NodeError, Supervisor, node_command
 from tuner_node import narration
 from tuner_node.build import build_training
 from tuner_node.results import RunFolder, RunFolderError, timestamp
-from tuner_node.run_store import Recorder
+from tuner_node.run_store import RunWriter
 
 BUILT_IN = {"nodes": [], "law": "affine"}
 """The controller of a training in this process, as result.json has it."""
@@ -147,27 +147,11 @@ def reopen(folder: Path) -> dict[str, Any]:
     return values
 
 
-def run_new(
-    problem: str,
-    options: Mapping[str, Any],
-    out: Path | None,
-    transport: Transport,
-    as_json: bool = False,
-) -> int:
-    """Train from the start in a new folder; returns the exit code.
+def run(folder: Path, values: dict[str, Any], transport: Transport, as_json: bool = False) -> int:
+    """Carry out the training in `folder`, from where it is; returns the exit code.
 
     as_json: the result alone on stdout, as JSON; progress goes to stderr.
     """
-    folder, values = begin(problem, options, out)
-    return _run(folder, values, transport, as_json)
-
-
-def run_again(folder: Path, transport: Transport, as_json: bool = False) -> int:
-    """Continue the training in `folder`; returns the exit code."""
-    return _run(folder, reopen(folder), transport, as_json)
-
-
-def _run(folder: Path, values: dict[str, Any], transport: Transport, as_json: bool) -> int:
     stream = sys.stderr if as_json else sys.stdout
     display = Display(values["seed"], values["seeds"], stream)
     started = time.monotonic()
@@ -213,30 +197,24 @@ def _train_here(
     folder: Path, values: dict[str, Any], display: Display, check: Callable[[], None]
 ) -> None:
     with RunFolder(folder).held():
-        _train_holding(folder, values, display, check)
+        training = build_training(values)
+        writer = RunWriter(folder, values, training, warn=display.line)
 
+        def report(row: Mapping[str, Any]) -> None:
+            writer.note(row)
+            writer.keep(now=time.monotonic())
+            display.row(row)
+            check()
 
-def _train_holding(
-    folder: Path, values: dict[str, Any], display: Display, check: Callable[[], None]
-) -> None:
-    training = build_training(values)
-    recorder = Recorder(folder, values, training, warn=display.line)
-
-    def report(row: Mapping[str, Any]) -> None:
-        recorder.note(row)
-        recorder.keep(now=time.monotonic())
-        display.row(row)
-        check()
-
-    # Nothing is saved on the way out of an interruption: it may come in the middle of an update.
-    train(training, LocalPair(values), report, max_batch=values["max_batch"])
-    try:
-        recorder.finish({"transport": "in-process", "controller": BUILT_IN})
-    except OSError as error:
-        raise RunFolderError(
-            f"cannot write the results to {folder}: {error.strerror}; make room and "
-            f"continue with: pdeloop train --resume {folder} --in-process"
-        ) from error
+        # Nothing is saved on the way out of an interruption: it may come in the middle of an update.
+        train(training, LocalPair(values), report, max_batch=values["max_batch"])
+        try:
+            writer.finish({"transport": "in-process", "controller": BUILT_IN})
+        except OSError as error:
+            raise RunFolderError(
+                f"cannot write the results to {folder}: {error.strerror}; make room and "
+                f"continue with: pdeloop train --resume {folder} --in-process"
+            ) from error
 
 
 def _train_over_topics(
@@ -249,10 +227,21 @@ def _train_over_topics(
         )
     logs = folder / "logs"
     logs.mkdir(exist_ok=True)
+    bags: list[Path] = []
+
+    def command(node: LoopNode) -> list[str]:
+        words = node.ros_arguments(folder / "parameters.yaml")
+        if node.package == "recorder_node":  # started again, it leaves the unfinished bag alone
+            bags.append(unused(folder / "bag"))
+            words += ["-p", f"bag:={quoted(bags[-1].resolve())}"]
+        elif node.package == "tuner_node" and recorder is not None and recorder.ended:
+            words = [word.replace("recorder:=start", "recorder:=none") for word in words]
+        return node_command(node.package, *words)
+
     children = {
         node.name: Child(
             node.name,
-            node_command(node.package, *node.ros_arguments(folder / "parameters.yaml")),
+            partial(command, node),
             logs / f"{node.name}.log",
             optional=node.package in ("recorder_node", "viewer_node"),
             cores=node.cores,
@@ -260,9 +249,6 @@ def _train_over_topics(
         for node in transport.nodes(folder)
     }
     recorder = children.get("recorder_node")
-    bags: list[Path] = []
-    if recorder is not None:
-        recorder.before_start = partial(_into_new_bag, recorder, folder, bags)
     progress = ProgressFile(folder / "progress.jsonl")
     begun = False
     with own_domain() as domain, announced(domain, folder, network=transport.network):
@@ -283,10 +269,8 @@ def _train_over_topics(
                 for row in progress.rows():
                     display.row(row)
                     begun |= row.get("event") != "phase"
-                if recorder is not None and recorder.ended and not done:
-                    if not begun:
-                        raise NodeError(f"nothing can be recorded: {recorder.last_words()}")
-                    _go_on_unrecorded(children["tuner_node"])
+                if recorder is not None and recorder.ended and not (done or begun):
+                    raise NodeError(f"nothing can be recorded: {recorder.last_words()}")
                 time.sleep(0 if done else POLL)
         except Interruption as signal_name:
             display.close()
@@ -299,22 +283,6 @@ def _train_over_topics(
     if recorder is not None:
         names_of_bags = ", ".join(str(bag) for bag in bags)
         display.line(f"  recorded in {names_of_bags}" + ", not to the end" * recorder.ended)
-
-
-def _go_on_unrecorded(tuner: Child) -> None:
-    """A tuner that is started again must not wait for a recorder that has ended."""
-    tuner.arguments = [
-        word.replace("recorder:=start", "recorder:=none") for word in tuner.arguments
-    ]
-
-
-def _into_new_bag(recorder: Child, folder: Path, bags: list[Path]) -> None:
-    """A recorder that is started again writes another bag, and leaves the unfinished one alone."""
-    bags.append(unused(folder / "bag"))
-    kept = [word for word in recorder.arguments if not word.startswith("bag:=")]
-    if kept[-1] == "-p":
-        kept.pop()
-    recorder.arguments = [*kept, "-p", f"bag:={quoted(bags[-1].resolve())}"]
 
 
 def unused(path: Path) -> Path:

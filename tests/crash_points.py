@@ -100,7 +100,7 @@ def training(out: Path, fail_at: int = 0, kind: str = "kill") -> Callable[[], in
 
     def task() -> int:
         run_store.CHECKPOINT_PERIOD, run_store.CHECKPOINT_SHARE = 0.0, 1e9
-        run_store.Recorder.keep = seldom(run_store.Recorder.keep)  # type: ignore[method-assign]
+        run_store.RunWriter.keep = seldom(run_store.RunWriter.keep)  # type: ignore[method-assign]
         begun = (out / "parameters.yaml").exists()
         how = ["--resume", str(out)] if begun else [str(SMALL), "--out", str(out)]
         disk = Disk(out, fail_at, kind)

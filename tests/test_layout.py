@@ -148,7 +148,7 @@ def test_bench_lists_its_programs(capsys) -> None:
 
 
 def test_a_refusal_is_the_sentence_of_the_node_whatever_its_end_says(tmp_path) -> None:
-    child = Child("tuner_node", [], tmp_path / "tuner_node.log")
+    child = Child("tuner_node", list, tmp_path / "tuner_node.log")
     assert child.refusal() == ""
     child.log.write_text("Exception ignored in: <function f>\nInvalidHandle: it is gone\n")
     assert child.refusal() == "InvalidHandle: it is gone"

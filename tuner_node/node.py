@@ -51,7 +51,7 @@ from tuner_node.diagnostics import TunerHealth
 from tuner_node.dispatch import Dispatcher, DispatchError, PairPublication
 from tuner_node.narration import Narration
 from tuner_node.results import RunFolder, RunIdentity, summarise
-from tuner_node.run_store import Recorder
+from tuner_node.run_store import RunWriter
 from tuner_node.session import Session
 
 RIVAL_GRACE = 6.0
@@ -84,7 +84,7 @@ class TunerNode:
         values = declare_parameters(node)
         self._log = node.get_logger()
         training = build_training(values)
-        self._recorder: Recorder | None = None
+        self._recorder: RunWriter | None = None
         identity = RunIdentity(1 + secrets.randbelow(MAX_ID - 1), 0)
         if values["out"]:
             folder = RunFolder(Path(values["out"]))
@@ -93,7 +93,7 @@ class TunerNode:
             else:
                 folder.create(values)
             held.enter_context(folder.held())
-            self._recorder = Recorder(folder.path, values, training, warn=self._log.warning)
+            self._recorder = RunWriter(folder.path, values, training, warn=self._log.warning)
             identity = self._recorder.identity
         pairs: list[str] = values["pairs"]
         dispatcher = Dispatcher.create(

@@ -20,7 +20,7 @@ CHECKPOINT_SHARE = 0.2
 """Share of the time that writing them may take: with many trajectories one has 100 MB and more."""
 
 
-class Recorder:
+class RunWriter:
     """Writes what `training` does into the folder `path`, going on from what is there.
 
     A file that cannot be written (full disk) is reported through `warn` and tried again; the

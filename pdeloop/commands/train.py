@@ -98,7 +98,7 @@ def add(commands: Commands) -> None:
 
 def _train(options: argparse.Namespace) -> int:
     from pdeloop.pairs import Recording
-    from pdeloop.training_run import Transport, run_again, run_new
+    from pdeloop.training_run import Transport, begin, reopen, run
 
     recording = None
     if options.record or options.record_or_stop or options.record_views:
@@ -132,10 +132,11 @@ def _train(options: argparse.Namespace) -> int:
                 "--resume continues a run with its own parameters; "
                 "give it alone (or with --in-process)"
             )
-        return run_again(options.resume, transport, options.json)
+        return run(options.resume, reopen(options.resume), transport, options.json)
     if options.problem is None:
         raise ParameterError(
             f"no problem given; expected one of {', '.join(shipped_problems())}, a YAML file, "
             "or --resume DIR"
         )
-    return run_new(options.problem, {**given, **own}, options.out, transport, options.json)
+    folder, values = begin(options.problem, {**given, **own}, options.out)
+    return run(folder, values, transport, options.json)
