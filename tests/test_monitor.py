@@ -28,9 +28,7 @@ from viewer_node.loop_view import SILENT, SLOW, LoopView
 from viewer_node.operation import FAILURE, Call
 from viewer_node.rollout_costs import RolloutCosts
 from viewer_node.sliding_rate import SlidingRate
-from viewer_node.web.messages import Cursor
-from viewer_node.web.page import Page
-from viewer_node.web.requests import Requests, ShowEpisode
+from viewer_node.web.page import Page, ShowEpisode
 
 PLANT = 7
 
@@ -57,9 +55,9 @@ def cost(
     return frame(rows, step=step, episode=episode, run=run)
 
 
-def unpacked(message: bytes) -> tuple[dict[str, Any], np.ndarray]:
+def unpacked(message: str | bytes) -> tuple[dict[str, Any], np.ndarray]:
     """What the page makes of a message."""
-    if message.startswith(b"{"):
+    if isinstance(message, str):
         return json.loads(message), np.empty(0)
     (length,) = struct.unpack_from("<I", message)
     return json.loads(message[4 : 4 + length]), np.frombuffer(message, "<f4", offset=4 + length)
@@ -141,7 +139,7 @@ def test_of_very_many_delayed_measurements_the_first_are_kept():
 
 
 def test_one_component_of_the_state_is_shown_at_a_time():
-    page, cursor = Page(), Cursor()
+    page, sent = Page(), {}
     view = page.view
     view.components = ["u", "u_t"]
     view.target(frame([0.0, 0.0, 7.0, 8.0]), 0.0)
@@ -152,9 +150,9 @@ def test_one_component_of_the_state_is_shown_at_a_time():
         (0, [0, 0, 1, 1, 2, 2, 2, 2], [0, 0], [0, 2]),
         (1, [90, 99] * 4, [7, 8], [7, 99]),
     ):
-        page.choose(component=component)
+        assert page.choose({"component": component})
         page.refresh(20.0 + component)
-        parts = {h["part"]: (h, n) for h, n in map(unpacked, page.updates(cursor, 0.0))}
+        parts = dict(map(part, page.updates(sent, 0.0)))
         assert parts["status"][0]["component"] == component
         np.testing.assert_array_equal(parts["target"][1], aim)
         header, numbers = parts["episode"]
@@ -348,8 +346,7 @@ def test_diagnostics_belong_to_the_node_they_name_and_are_forgotten_when_they_st
     nodes.diagnosis("lab/pde_sim_node: lock-step", 1, "paused", values, 10.0)
     nodes.diagnosis("lab/other: lock-step", 2, "no", [], 10.0)
     assert nodes.message(11.0)[0]["message"] == "paused" and nodes.message(11.0)[0]["level"] == 1
-    assert nodes.value("plant", "paused", since=9.0) == "yes"
-    assert nodes.value("plant", "paused", since=10.5) is None
+    assert nodes.value("plant", "paused") == "yes" and nodes.value("plant", "phase") is None
     assert "message" not in nodes.message(30.0)[0]
 
 
@@ -408,25 +405,25 @@ def test_only_the_asked_run_is_shown():
     assert view.current is not None
 
 
-def test_who_holds_the_loop_is_told_by_the_plant_by_diagnostics_or_by_the_answer():
+def test_who_is_paused_is_what_the_plant_and_the_diagnostics_say():
     view = LoopView()
     roles = {"plant": [Endpoint("/p", b"p")], "tuner": [Endpoint("/t", b"t")]}
     view.nodes.update(roles)
     view.state(state(0), 0.0)
     assert view.state_of_loop(0.1) == "running" and view.state_of_loop(9.0) == "silent"
     view.paused(frame([1.0]), 1.0)
-    assert view.operation.paused() == ["plant"] and view.state_of_loop(1.0) == "paused"
+    assert view.operation.paused(1.0) == ["plant"] and view.state_of_loop(1.0) == "paused"
     view.paused(frame([0.0]), 1.0)
     view.nodes.diagnosis("t: training", 1, "", [("paused", "yes")], 2.0)
-    assert view.operation.paused() == ["tuner"]
-    view.operation.answered(
-        Call("/t", "resume"), 2.5, None
-    )  # what it said before that no longer counts
-    assert view.operation.paused() == []
-    view.operation.answered(Call("/p", "pause"), 3.0, None)
-    assert view.operation.paused() == ["plant"]
-    view.state(state(1), 9.0)  # somebody else has resumed it
-    assert view.operation.paused() == []
+    assert view.operation.paused(1.0) == ["tuner"]
+    view.nodes.update({"plant": [Endpoint("/p", b"p")]})
+    assert view.operation.paused(2.0) == []  # who is gone is not paused
+    view.nodes.update(roles)
+    computing = [("paused", "yes"), ("activity", "fitting models"), ("activity for", "1.0")]
+    view.nodes.diagnosis("t: training", 0, "", computing, 2.5)  # resumed, and busy since then
+    assert view.operation.paused(2.5) == []
+    view.nodes.diagnosis("t: training", 0, "", [("paused", "no")], 3.0)
+    assert view.operation.paused(2.0) == []
     view.start(frame(np.empty((0, 4))), 9.0)
     assert view.state_of_loop(9.0) == "ended"
 
@@ -437,16 +434,16 @@ def test_what_was_asked_for_is_told_until_it_is_answered_and_a_failure_for_a_whi
     pause, stop = Call("/t", "pause"), Call("/t", "stop")
     view.operation.asked(pause, 1.0)
     asked = {"role": "tuner", "verb": "pause", "seconds": 7, "failure": ""}
-    assert view.operation.requests(8.0) == [asked] and view.operation.paused() == []
+    assert view.operation.requests(8.0) == [asked]
     view.operation.answered(pause, 8.0, None)
-    assert view.operation.requests(8.0) == [] and view.operation.paused() == ["tuner"]
+    assert view.operation.requests(8.0) == []
     view.operation.answered(pause, 9.0, "no")
     assert [r["failure"] for r in view.operation.requests(9.0 + FAILURE)] == ["no"]
     assert view.operation.requests(9.1 + FAILURE) == []
     view.operation.asked(stop, 30.0)
     assert not view.operation.stopping
     view.operation.answered(stop, 31.0, None)
-    assert view.operation.stopping and view.operation.paused() == []
+    assert view.operation.stopping
     view.operation.asked(pause, 32.0)
     view.nodes.update({"tuner": [Endpoint("/t", b"u")]})  # another one, that continues the run
     assert not view.operation.stopping
@@ -484,73 +481,63 @@ def test_a_loop_that_is_gone_without_a_word_has_ended_too():
 # The messages to a page.
 
 
-def test_a_page_that_puts_the_messages_together_has_the_whole_episode():
-    page, cursor = Page(environment=1), Cursor()
+def test_a_page_is_sent_the_whole_episode_whenever_something_of_it_is_new():
+    page, sent = Page(environment=1), {}
     view = page.view
-    columns: dict[int, np.ndarray] = {}
-    actions: dict[int, np.ndarray] = {}
     for k in range(50):
         view.state(state(k), 0.0)
-        for message in page.updates(cursor, 0.0) if k % 7 == 3 else []:
-            take_columns(message, columns, actions)
         if k != 20:  # an action that never comes
             view.action(frame([[k, 0], [100 + k, 0]], step=k), 0.0)
-    for message in page.updates(cursor, 0.0):
-        take_columns(message, columns, actions)
-    assert sorted(columns) == list(range(50))
-    for k in range(50):
-        np.testing.assert_allclose(columns[k], 100 + k + np.arange(4) / 10, rtol=1e-6)
-        assert np.isnan(actions[k]).all() if k == 20 else actions[k][0] == 100 + k
-    assert page.updates(cursor, 0.0) == []
+        if k % 7 == 3 or k == 49:
+            parts = dict(map(part, page.updates(sent, 0.0)))
+            header, numbers = parts["episode"]
+            assert (header["columns"], header["rows"], header["actions"]) == (k + 1, 4, 2)
+            field, actions, newest = np.split(numbers, np.cumsum([4 * (k + 1), 2 * (k + 1)]))
+            expected = 100 + np.arange(k + 1)[:, None] + np.arange(4) / 10
+            np.testing.assert_allclose(field.reshape(-1, 4), expected, rtol=1e-6)
+            np.testing.assert_allclose(newest, expected[-1], rtol=1e-6)
+            acted = 100.0 + np.arange(k + 1)
+            acted[20:21] = np.nan
+            np.testing.assert_array_equal(actions[::2], acted)
+            assert page.updates(sent, 0.0) == []
 
 
-def take_columns(
-    message: bytes, columns: dict[int, np.ndarray], actions: dict[int, np.ndarray]
-) -> None:
+def part(message: str | bytes) -> tuple[str, tuple[dict[str, Any], np.ndarray]]:
+    """A message by the name of the part of the page that it is about."""
     header, numbers = unpacked(message)
-    if header["part"] != "episode":
-        return
-    if header["new"]:
-        columns.clear()
-        actions.clear()
-    rows, count, n_a = header["rows"], header["columns"], header["actions"]
-    assert len(numbers) == (rows + n_a) * count + rows
-    for i in range(count):
-        columns[header["first"] + i] = numbers[i * rows : (i + 1) * rows]
-        at = rows * count + i * n_a
-        actions[header["first"] + i] = numbers[at : at + n_a]
+    return header["part"], (header, numbers)
 
 
-def test_another_environment_and_another_loop_are_told_from_the_beginning():
-    page, cursor = Page(), Cursor()
+def test_another_environment_and_another_loop_are_sent():
+    page, sent = Page(), {}
     view = page.view
     view.target(frame([1.0, 2.0, 3.0, 4.0]), 0.0)
     for k in range(5):
         view.state(state(k), 0.0)
-    parts = {h["part"]: (h, n) for h, n in map(unpacked, page.updates(cursor, 0.0))}
+    parts = dict(map(part, page.updates(sent, 0.0)))
     np.testing.assert_array_equal(parts["target"][1], [1, 2, 3, 4])
     assert parts["episode"][0]["environment"] == 0
-    page.choose(environment=1)
-    ((header, numbers),) = map(unpacked, page.updates(cursor, 0.0))
-    assert header["new"] and header["environment"] == 1 and numbers[0] == 100
+    assert page.choose({"environment": 1})
+    ((header, numbers),) = map(unpacked, page.updates(sent, 0.0))
+    assert header["environment"] == 1 and numbers[0] == 100
     view = LoopView()
     page.show(view, {"domain": 3, "namespace": "/"})
     page.refresh(0.0)
     view.state(state(0), 0.0)
-    headers = [unpacked(message)[0] for message in page.updates(cursor, 0.0)]
+    headers = [unpacked(message)[0] for message in page.updates(sent, 0.0)]
     assert [h["part"] for h in headers] == ["status", "curve", "target", "episode"]
-    assert headers[-1]["new"] and headers[0]["place"]["domain"] == 3
+    assert headers[-1]["columns"] == 1 and headers[0]["place"]["domain"] == 3
 
 
 def test_the_colours_span_the_field_and_the_target_and_do_not_flicker():
-    page, cursor = Page(), Cursor()
+    page, sent = Page(), {}
     view = page.view
     view.target(frame([-10.0, 0.0, 0.0, 0.0]), 0.0)
 
     def colours(k: int) -> Any:
         view.state(state(k), 0.0)
         page.refresh(10.0 * k)
-        return unpacked(page.updates(cursor, 0.0)[-1])[0]["range"]
+        return unpacked(page.updates(sent, 0.0)[-1])[0]["range"]
 
     first = colours(0)
     assert first == [-10.0, pytest.approx(0.3, abs=0.01)]
@@ -583,7 +570,7 @@ def test_a_run_that_was_interrupted_is_shown_until_it_goes_on(tmp_path, own_sign
 
     def look() -> list[Live]:
         if next(looks) == 2:
-            status = json.loads(page.updates(Cursor(), 0.0)[0])
+            status = json.loads(page.updates({}, 0.0)[0])
             assert status["state"] == "recorded" and not status["recorded"]["finished"]
             assert "not recorded" in status["recorded"]["note"]
             assert status["parameters"]["problem"] == "small"
@@ -591,11 +578,11 @@ def test_a_run_that_was_interrupted_is_shown_until_it_goes_on(tmp_path, own_sign
             found.append(Live(17, folder.path, 1.0))
         return list(found)
 
-    assert replay(folder.path, Finder(folder.path, None, look), page, Requests())
+    assert replay(folder.path, Finder(folder.path, None, look), page)
     assert found
 
 
-def test_an_episode_that_is_shown_already_is_not_begun_again(tmp_path, own_signals):
+def test_an_episode_that_is_shown_already_is_not_sent_again(tmp_path, own_signals):
     folder = RunFolder(tmp_path / "run")
     folder.create(parameters())
     run = run_id(folder.path)
@@ -604,24 +591,24 @@ def test_an_episode_that_is_shown_already_is_not_begun_again(tmp_path, own_signa
     recording = Recording(folder.path / "bag", list(by_topic.values()))
     for episode in (1, 2):
         ids = {"episode": episode, "run": run}
-        sent = [(START, start([[3.0, 4.0, 0.1, 0.0]], **ids))]
-        sent += [(STATE, state(step, batch=1, **ids)) for step in range(4)]
-        sent += [(COST, cost([1.0], **ids))]
-        for topic, content in sent:
+        published = [(START, start([[3.0, 4.0, 0.1, 0.0]], **ids))]
+        published += [(STATE, state(step, batch=1, **ids)) for step in range(4)]
+        published += [(COST, cost([1.0], **ids))]
+        for topic, content in published:
             raw = ArrayCodec(topic.labels).encode(content)
             recording.take(by_topic[topic], episode * 10**9, raw)
     recording.close()
-    page, cursor, requests, begun = Page(), Cursor(), Requests(), []
+    page, sent, begun = Page(), {}, []
     for index in (1, 0, 0, 1):
-        requests.put(ShowEpisode(index))
+        page.requests.put(ShowEpisode(index))
 
     def look() -> list[Live]:
-        told = [unpacked(m)[0] for m in page.updates(cursor, 0.0)]
-        begun.append([m["episode"] for m in told if m["part"] == "episode" and m["new"]])
-        return [Live(17, folder.path, 1.0)] if requests.empty() else []
+        parts = dict(map(part, page.updates(sent, 0.0)))
+        begun.append(parts["episode"][0]["episode"] if "episode" in parts else None)
+        return [Live(17, folder.path, 1.0)] if page.requests.empty() else []
 
-    assert replay(folder.path, Finder(folder.path, None, look), page, requests)
-    assert begun == [[2], [], [1], [], [2]]
+    assert replay(folder.path, Finder(folder.path, None, look), page)
+    assert begun == [2, None, 1, None, 2]
 
 
 def test_a_stop_signal_ends_the_replay(tmp_path, own_signals):
@@ -632,4 +619,4 @@ def test_a_stop_signal_ends_the_replay(tmp_path, own_signals):
         signal.raise_signal(signal.SIGTERM)
         return []
 
-    assert not replay(folder.path, Finder(folder.path, None, look), Page(), Requests())
+    assert not replay(folder.path, Finder(folder.path, None, look), Page())

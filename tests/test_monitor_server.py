@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -11,20 +12,21 @@ import aiohttp
 import numpy as np
 import pytest
 
+from tests.browser import browser
+from viewer_node.loop_nodes import Endpoint
 from viewer_node.operation import Call
-from viewer_node.web.page import Page, Recorded
-from viewer_node.web.requests import Requests, ShowEpisode, Watch
+from viewer_node.web.page import Page, Recorded, ShowEpisode, Watch
 from viewer_node.web.server import FILES, STATIC, TOKEN, Server
 
 
 @contextlib.contextmanager
-def served() -> Iterator[tuple[Server, Requests, Page]]:
-    page, requests = Page(), Requests()
+def served() -> Iterator[tuple[Server, Page]]:
+    page = Page()
     page.controls = [{"role": "plant", "node": "/p", "verbs": ["pause"]}]
-    server = Server(page, requests, 0)
+    server = Server(page, 0)
     server.start()
     try:
-        yield server, requests, page
+        yield server, page
     finally:
         server.stop()
 
@@ -51,7 +53,7 @@ async def connected(server: Server, origin: str) -> dict[str, Any]:
 
 
 def test_every_file_of_the_page_is_served_and_nothing_else():
-    with served() as (server, _, _):
+    with served() as (server, _):
         assert {"index.html", "main.js", "uPlot.iife.min.js"} <= set(FILES)
         for name, path in {"": STATIC / "index.html", **FILES}.items():
             status, text = asyncio.run(ask(server, "GET", f"/{name}"))
@@ -69,7 +71,7 @@ def test_every_file_of_the_page_is_served_and_nothing_else():
 
 
 def test_a_foreign_host_name_or_page_is_refused():
-    with served() as (server, requests, _):
+    with served() as (server, page):
         own = f"http://127.0.0.1:{server.port}"
         token = asyncio.run(connected(server, own))["token"]
         body = {"node": "/p", "verb": "pause"}
@@ -91,21 +93,21 @@ def test_a_foreign_host_name_or_page_is_refused():
         assert asyncio.run(ask(server, "POST", "/api/call", json=body, **without))[0] == 403
         for wrong in ({"Host": "evil.example"}, {"Origin": "http://evil.example"}):
             assert asyncio.run(ask(server, "GET", "/", **wrong))[0] == 403
-        assert requests.empty()
+        assert page.requests.empty()
         for origin in ("http://evil.example", "null", ""):
             with pytest.raises(aiohttp.WSServerHandshakeError):
                 asyncio.run(connected(server, origin))
 
 
 def test_a_page_of_ours_reaches_the_nodes_and_nothing_but_what_they_offer():
-    with served() as (server, requests, page):
+    with served() as (server, page):
         own = f"http://localhost:{server.port}"
         allowed = {"Origin": own, TOKEN: asyncio.run(connected(server, own))["token"]}
 
         body = {"node": "/p", "verb": "pause"}
         # Confirmed at once, whatever the node is doing.
         assert asyncio.run(ask(server, "POST", "/api/call", json=body, **allowed))[0] == 200
-        assert requests.get(timeout=10) == Call("/p", "pause")
+        assert page.requests.get(timeout=10) == Call("/p", "pause")
         for body in (
             {"node": "/p", "verb": "stop"},
             {"node": "/q", "verb": "pause"},
@@ -130,8 +132,8 @@ def test_a_page_of_ours_reaches_the_nodes_and_nothing_but_what_they_offer():
             ({"episode": -1}, 400),
         ):
             assert asyncio.run(ask(server, "POST", watch, json=body, **allowed))[0] == status, body
-        assert requests.get(timeout=10) == Watch("/lab")
-        assert requests.get(timeout=10) == ShowEpisode(1) and requests.empty()
+        assert page.requests.get(timeout=10) == Watch("/lab")
+        assert page.requests.get(timeout=10) == ShowEpisode(1) and page.requests.empty()
 
 
 def test_the_headers_allow_nothing_from_elsewhere_and_no_inline_script():
@@ -142,14 +144,14 @@ def test_the_headers_allow_nothing_from_elsewhere_and_no_inline_script():
         ):
             return answer.headers
 
-    with served() as (server, _, _):
+    with served() as (server, _):
         found = asyncio.run(headers(server))
     policy = found["Content-Security-Policy"]
     assert "default-src 'none'" in policy and "script-src 'self'" in policy
     assert "unsafe" not in policy and "http" not in policy
     assert found["X-Content-Type-Options"] == "nosniff"
     for name, path in FILES.items():
-        text = path.read_text().replace("http://www.w3.org/2000/svg", "")
+        text = path.read_text().replace("http://www.w3.org/", "")  # names of XML vocabularies
         text = text.removeprefix("/*! https://github.com/leeoniya/uPlot")  # the mark of its licence
         assert "https://" not in text and "http://" not in text and "eval(" not in text, name
 
@@ -157,12 +159,55 @@ def test_the_headers_allow_nothing_from_elsewhere_and_no_inline_script():
 def test_the_colour_map_is_that_of_the_report():
     from matplotlib import colormaps
 
-    from pdeloop.report.figures import FIELD_MAP
+    from pdeloop.report.style import FIELD_MAP
 
-    text = "".join((STATIC / "cividis.js").read_text().split('"')[1::2])
+    hexadecimal = (STATIC / "cividis.js").read_text().split("const COLOURS")[0]
+    text = "".join(hexadecimal.split('"')[1::2])
     ours = np.frombuffer(bytes.fromhex(text), np.uint8).reshape(-1, 3)
     theirs = (colormaps[FIELD_MAP](np.arange(256))[:, :3] * 255).round()
     np.testing.assert_array_equal(ours, theirs)
+
+
+def test_the_page_tells_what_a_node_computes_and_what_became_of_a_request(tmp_path):
+    """In a real browser, with a tuner that is only told of."""
+    with served() as (server, page), browser(tmp_path) as tab:
+        page.place = {"domain": 1, "folder": None, "namespace": "/"}
+        page.controls = [{"role": "tuner", "node": "/t", "verbs": ["pause", "resume", "stop"]}]
+        view, now = page.view, time.monotonic()
+        view.nodes.update({"tuner": [Endpoint("/t", b"t")]})
+        busy = [("activity", "fitting models"), ("activity for", "7.0")]
+
+        def shows(state: str, notice: str) -> None:
+            with page.lock:
+                page.refresh(now)
+            tab.until(f"document.querySelector('#state').textContent === {state!r}", 30.0)
+            tab.until(f"document.querySelector('#notice').textContent === {notice!r}", 30.0)
+
+        view.nodes.diagnosis("t: training", 0, "", busy, now)
+        tab.go(server.url)
+        shows("fitting models, 7 s", "")
+        tab.click("#tuner-pause")
+        asked = page.requests.get(timeout=30.0)
+        assert asked == Call("/t", "pause")
+        view.operation.asked(asked, now)
+        shows("fitting models, 7 s", "Pause training: asked for; takes effect after fitting models")
+        button = "document.querySelector('#tuner-%s')"
+        assert tab.ask(f"{button % 'pause'}.disabled")
+        assert tab.ask(f"{button % 'pause'}.textContent.trim()") == "Pausing…"
+        view.operation.answered(asked, now, None)
+        view.nodes.diagnosis("t: training", 1, "", [("paused", "yes")], now)
+        shows("training paused", "")
+        tab.click("#tuner-stop")
+        assert tab.ask(f"{button % 'stop'}.textContent.trim()") == "Really stop?"
+        assert page.requests.empty()
+        tab.click("#tuner-stop")
+        stop = page.requests.get(timeout=30.0)
+        view.operation.answered(stop, now, "no plant")
+        shows("training paused", "Stop training: no plant")
+        view.operation.answered(stop, now, None)
+        shows("training paused", "The training ends after the rollouts under way.")
+        assert tab.ask(f"{button % 'stop'}.disabled")
+        assert tab.console == []
 
 
 async def closed(connections: list[tuple[asyncio.StreamReader, asyncio.StreamWriter]]) -> None:
@@ -177,7 +222,7 @@ def test_connections_that_ask_nothing_are_closed_and_a_page_stays(monkeypatch):
     monkeypatch.setattr("viewer_node.web.server.LINGER", 1.0)
     monkeypatch.setattr("viewer_node.web.server.MOST_CONNECTIONS", 50)
 
-    async def scenario(server: Server) -> None:
+    async def scenario(server: Server, content: Page) -> None:
         url = f"http://127.0.0.1:{server.port}/ws"
         own = f"http://127.0.0.1:{server.port}"
         async with (
@@ -191,8 +236,8 @@ def test_connections_that_ask_nothing_are_closed_and_a_page_stays(monkeypatch):
             await closed(half[49:])  # beyond the limit: at once
             await closed(half[:49])
             assert (await ask(server, "GET", "/"))[0] == 200
-            assert not page.closed and server.watched()
+            assert not page.closed and content.open
             await page.ping()
 
-    with served() as (server, _, _):
-        asyncio.run(scenario(server))
+    with served() as (server, page):
+        asyncio.run(scenario(server, page))

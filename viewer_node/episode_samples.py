@@ -23,10 +23,10 @@ MAX_ACTIONS = 32
 """Actions that are kept: more lines than that nobody can tell apart."""
 MAX_COMPONENTS = 8
 """Components of the state that are kept: of delayed measurements there may be very many."""
-LATE = 64
-"""Columns by which actions may come later than states."""
 MAX_BYTES = 32 * 2**20
 """Bytes of one episode; of a batch that needs more only the chosen environment is kept."""
+
+_VERSIONS = itertools.count(1)
 
 Key = tuple[int, int, int]
 """Run, episode, plant."""
@@ -55,10 +55,9 @@ def _empty(*shape: int) -> Array:
 class EpisodeSamples:
     """What was seen of one episode.
 
-    first: the step of column 0; stride: steps of one column; last, acted: the newest step of which the
-    state and the action were seen; z (batch, n_z): the newest state; samples: how many there were of
-    both; environments: those of the batch of which the fields are kept; number: tells it from every
-    other one.
+    first: the step of column 0; stride: steps of one column; last: the newest step of which the state
+    was seen; z (batch, n_z): that state; environments: those of the batch of which the fields are
+    kept; version: another one after each change, and of each episode.
     """
 
     key: Key
@@ -71,12 +70,10 @@ class EpisodeSamples:
     components: int = 1
     actions: Array = field(default_factory=lambda: _empty(0, COLUMNS, 0))
     last: int = 0
-    acted: int = -1
     z: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
     sample_time: float = 0.0
     ended: bool = False
-    samples: int = 0
-    number: int = field(default_factory=itertools.count().__next__)
+    version: int = 0
 
     @staticmethod
     def begin(
@@ -116,12 +113,6 @@ class EpisodeSamples:
         """Columns that are in use."""
         return (self.last - self.first) // self.stride + 1
 
-    @property
-    def settled(self) -> int:
-        """Columns that will hardly change any more: actions come after their states."""
-        acted = (max(self.acted, self.first) - self.first) // self.stride
-        return max(min(acted, self.columns - 1), self.columns - LATE, 0)
-
     def state(self, frame: Frame) -> None:
         """Take z_k."""
         if frame.values.shape[0] != self.batch or frame.step < self.first:
@@ -133,7 +124,7 @@ class EpisodeSamples:
         self.fields[:, column] = frame.values[self.environments][:, rows]
         if frame.step >= self.last:
             self.last, self.z = frame.step, frame.values
-        self.samples += 1
+        self.version = next(_VERSIONS)
 
     def action(self, frame: Frame) -> None:
         """Take a_k."""
@@ -144,8 +135,7 @@ class EpisodeSamples:
             self.actions = _empty(len(self.environments), COLUMNS, min(n_a, MAX_ACTIONS))
         column = self._column(frame.step)
         self.actions[:, column] = frame.values[self.environments][:, : self.actions.shape[2]]
-        self.acted = max(self.acted, frame.step)
-        self.samples += 1
+        self.version = next(_VERSIONS)
 
     def row(self, environment: int) -> int:
         """Where the fields of `environment` are; of a smaller batch those of the last one."""

@@ -22,6 +22,7 @@ MAX_POINTS = 4_000
 MAX_SEEDS = 1024
 RATE_WINDOW = 60.0
 """Seconds over which the speed is taken that the remaining time is estimated with."""
+_VERSIONS = itertools.count(1)
 
 
 @dataclass(frozen=True, order=True)
@@ -40,7 +41,7 @@ class LearningCurve:
 
     axis: what x is; phase: what the training does; budget: the rollouts of a seed, 0 if unknown;
     references: mean stage costs to compare with, by controller; evaluations: those of each seed's
-    closing evaluation; version grows with each change.
+    closing evaluation; version: another one after each change, and of each curve.
     """
 
     axis: str = "episode"
@@ -49,9 +50,7 @@ class LearningCurve:
     references: dict[str, float] = field(default_factory=dict)
     evaluations: dict[int, dict[str, float]] = field(default_factory=dict)
     diverged: int = 0
-    version: int = 0
-    number: int = field(default_factory=itertools.count().__next__)
-    """Tells one curve from another."""
+    version: int = field(default_factory=lambda: next(_VERSIONS))
     _points: dict[int, list[CurvePoint]] = field(default_factory=dict)
     _rollouts: dict[int, int] = field(default_factory=dict)
     _budgets: int = 0
@@ -80,7 +79,7 @@ class LearningCurve:
                     self.references |= {n: float(np.mean([e[n] for e in done])) for n in names}
         except (KeyError, TypeError, ValueError, OverflowError):
             return
-        self.version += 1
+        self.version = next(_VERSIONS)
 
     def _phase(self, row: Mapping[str, Any]) -> None:
         self.phase = str(row["phase"])[:40]
@@ -108,7 +107,7 @@ class LearningCurve:
         One with a rollout without control is a comparison: it gives the references. Any other one
         with a policy is a point.
         """
-        self.version += 1
+        self.version = next(_VERSIONS)
         self.phase = "identify" if rollouts.explores else "policy"
         if rollouts.explores:
             return

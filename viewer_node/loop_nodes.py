@@ -114,9 +114,7 @@ class LoopNodes:
                     return {"role": role, "what": what, "seconds": round(seconds)}
         return None
 
-    def value(self, role: str, key: str, since: float) -> str | None:
-        """What the node in `role` said of itself under `key` in /diagnostics, if not before `since`."""
-        known = self._reports.get(self.by_role[role].name.strip("/"))
-        if known is None or known.when < since:
-            return None
-        return dict(known.values).get(key)
+    def value(self, role: str, key: str) -> str | None:
+        """What the node in `role` says under `key` in its newest /diagnostics."""
+        report = self._reports.get(self.by_role[role].name.strip("/"))
+        return None if report is None else dict(report.values).get(key)

@@ -246,7 +246,7 @@ class LoopView:
             return "ended"
         if nobody and quiet is None:
             return "empty"
-        if self.operation.paused():
+        if self.operation.paused(now):
             return "paused"
         if quiet is None:
             return "waiting"
@@ -313,7 +313,6 @@ class LoopView:
         before = self._counted[1] if self._counted and self._counted[0] == key else 0
         if step > before:
             self.rounds.add(step - before, now)
-            self.operation.plant_stepped(now)
         self._counted = key, max(step, before)
 
 

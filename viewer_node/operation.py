@@ -14,8 +14,6 @@ VERBS = ("pause", "resume", "step", "stop")
 """std_srvs/Trigger services that nodes of a loop may offer under their private names."""
 FAILURE = 15.0
 """Seconds for which the failure of a request is reported."""
-OVERRULED = 5.0
-"""Seconds after which a paused plant that goes on was resumed by somebody else."""
 
 
 @dataclass(frozen=True)
@@ -28,11 +26,10 @@ class Call:
 
 @dataclass
 class _Request:
-    """Since when something was asked for; why and when it failed."""
+    """A request, or its failure, and since when (s)."""
 
     since: float
     failure: str = ""
-    failed: float | None = None
 
 
 class Operation:
@@ -41,40 +38,27 @@ class Operation:
     def __init__(self, nodes: LoopNodes) -> None:
         self._nodes = nodes
         self._requests: dict[Call, _Request] = {}
-        self._answered: dict[str, float] = {}
-        self._paused: dict[str, float] = {}
         self._stopping: tuple[str, int] | None = None
         self.plant_paused = False
         """What the plant says on `episode/paused`."""
 
     def asked(self, call: Call, now: float) -> None:
-        """Somebody asks a node for something."""
+        """Note that an operator asks a node for something."""
         self._requests[call] = _Request(now)
 
     def answered(self, call: Call, now: float, failure: str | None) -> None:
-        """A node did what it was asked to, or not: then why."""
+        """Note that a node did what it was asked for, or why it did not."""
         if failure is not None:
-            self._requests[call] = _Request(now, failure, now)
+            self._requests[call] = _Request(now, failure)
             return
         self._requests.pop(call, None)
-        self._answered[call.node] = now
-        if call.verb == "pause":
-            self._paused[call.node] = now
-        elif call.verb in ("resume", "stop"):
-            self._paused.pop(call.node, None)
         if call.verb == "stop":
             self._stopping = call.node, self._nodes.by_role["tuner"].starts
-
-    def plant_stepped(self, now: float) -> None:
-        """The plant goes on."""
-        plant = self._nodes.by_role["plant"].name
-        if now - self._paused.get(plant, now) > OVERRULED:
-            del self._paused[plant]
 
     def requests(self, now: float) -> list[dict[str, Any]]:
         """What was asked for and is not answered yet, and what has just failed."""
         for call, request in list(self._requests.items()):
-            if request.failed is not None and now - request.failed > FAILURE:
+            if request.failure and now - request.since > FAILURE:
                 del self._requests[call]
         roles = {node.name: role for role, node in self._nodes.by_role.items() if node.present}
         return [
@@ -94,13 +78,18 @@ class Operation:
         tuner = self._nodes.by_role["tuner"]
         return tuner.present and self._stopping == (tuner.name, tuner.starts)
 
-    def paused(self) -> list[str]:
-        """The roles of the nodes that are paused."""
-        found = []
-        for role in ("plant", "tuner"):
-            node = self._nodes.by_role[role]
-            reported = self._nodes.value(role, "paused", since=self._answered.get(node.name, 0.0))
-            published = self.plant_paused and role == "plant"
-            if node.present and (published or node.name in self._paused or reported == "yes"):
-                found.append(role)
-        return found
+    def paused(self, now: float) -> list[str]:
+        """The roles of the nodes that say that they are paused.
+
+        One that computes is not: what it says meanwhile may be from before it was resumed.
+        """
+        activity = self._nodes.activity(now) or {"role": ""}
+        said = {
+            "plant": self.plant_paused or self._nodes.value("plant", "paused") == "yes",
+            "tuner": self._nodes.value("tuner", "paused") == "yes",
+        }
+        return [
+            role
+            for role, yes in said.items()
+            if yes and self._nodes.by_role[role].present and role != activity["role"]
+        ]

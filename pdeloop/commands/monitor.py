@@ -14,8 +14,6 @@ from pdeloop.commands.common import Commands, command
 if TYPE_CHECKING:  # what the other commands do without
     from pdeloop.monitor.finder import Finder
     from viewer_node.web.page import Page
-    from viewer_node.web.requests import Requests
-    from viewer_node.web.server import Server
 
 PORT = 8420
 
@@ -59,7 +57,6 @@ def _monitor(options: argparse.Namespace) -> int:
     from pdeloop.monitor.replay import replay
     from viewer_node.priority import lower_priority
     from viewer_node.web.page import Page
-    from viewer_node.web.requests import Requests
     from viewer_node.web.server import Server
 
     folder = options.folder
@@ -69,11 +66,11 @@ def _monitor(options: argparse.Namespace) -> int:
         raise ParameterError(f"--environment is {options.environment}; expected 0 or more")
     if folder is not None and run_id(folder) is None:
         raise ParameterError(f"no run in {folder}; give the folder of one, or none")
-    page, requests = Page(options.environment), Requests()
+    page = Page(options.environment)
     finder = Finder(folder, given_domain())
     lower_priority()
     try:
-        server = Server(page, requests, options.port)
+        server = Server(page, options.port)
     except OSError as error:
         raise ParameterError(
             f"port {options.port} on 127.0.0.1 cannot be had ({os.strerror(error.errno or 0)}); "
@@ -84,28 +81,21 @@ def _monitor(options: argparse.Namespace) -> int:
     if options.open:
         webbrowser.open(server.url)
     try:
-        if folder is None or finder.find() is not None or replay(folder, finder, page, requests):
-            _watch(options, finder, page, requests, server)
+        if folder is None or finder.find() is not None or replay(folder, finder, page):
+            _watch(options, finder, page)
     finally:
         server.stop()
     return 0
 
 
-def _watch(
-    options: argparse.Namespace, finder: Finder, page: Page, requests: Requests, server: Server
-) -> None:
+def _watch(options: argparse.Namespace, finder: Finder, page: Page) -> None:
     """Watch loops that run; needs ROS."""
     from pdeloop.monitor.node import ConfigurationError, watch
 
     namespace = options.namespace
+    if namespace is not None:
+        namespace = "/" + namespace.strip("/")
     try:
-        watch(
-            page,
-            finder,
-            requests,
-            namespace=None if namespace is None else "/" + namespace.strip("/"),
-            watched=server.watched,
-            network=options.network,
-        )
+        watch(page, finder, namespace=namespace, network=options.network)
     except ConfigurationError as error:
         raise RuntimeError(str(error)) from error

@@ -15,7 +15,6 @@ import queue
 import signal
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -40,8 +39,7 @@ from viewer_node.loop_nodes import ROLES, Endpoint
 from viewer_node.loop_reader import PERIOD, LoopReader
 from viewer_node.loop_view import LoopView
 from viewer_node.operation import VERBS, Call
-from viewer_node.web.page import Page
-from viewer_node.web.requests import Requests, Watch
+from viewer_node.web.page import Page, Watch
 
 ATTEND = 0.1
 """Seconds between two looks at what the page asks for, and at what was asked of the nodes."""
@@ -54,8 +52,7 @@ LOOK = 1.0
 class MonitorNode:
     """Watches one loop in one ROS domain.
 
-    namespace: of the pair to watch; None: the first one that is found. watched: whether somebody
-    looks at the page.
+    namespace: of the pair to watch; None: the first one that is found.
     """
 
     def __init__(
@@ -67,12 +64,9 @@ class MonitorNode:
         *,
         finder: Finder,
         namespace: str | None,
-        requests: Requests,
-        watched: Callable[[], bool],
     ) -> None:
         self._node, self._loop, self._page, self._live = node, loop, page, live
-        self._finder, self._requests, self._watched = finder, requests, watched
-        self._given = namespace is not None
+        self._finder, self._given = finder, namespace is not None
         self._reader: LoopReader | None = None
         self._calls: list[ServiceCall] = []
         self._asked: dict[bytes, RemoteParameters] = {}
@@ -118,12 +112,12 @@ class MonitorNode:
             self._budget.took(*self._reader.read())
             complete = self._view.complete
         now = self._loop.now()
-        self._reader.listen(self._budget.decide(now, watched=self._watched(), complete=complete))
+        self._reader.listen(self._budget.decide(now, watched=self._page.open, complete=complete))
 
     def _attend(self) -> None:
         with contextlib.suppress(queue.Empty):
             while True:
-                self._serve(self._requests.get_nowait())
+                self._serve(self._page.requests.get_nowait())
         with self._page.lock:
             self._calls = [call for call in self._calls if not call.poll(self._view.operation)]
             for parameters in self._asked.values():
@@ -241,15 +235,7 @@ def _progress(folder: Path | None) -> ProgressFile | None:
     return ProgressFile(folder / "progress.jsonl", past=True)
 
 
-def watch(
-    page: Page,
-    finder: Finder,
-    requests: Requests,
-    *,
-    namespace: str | None,
-    watched: Callable[[], bool],
-    network: bool,
-) -> None:
+def watch(page: Page, finder: Finder, *, namespace: str | None, network: bool) -> None:
     """Watch what `finder` finds, one loop after the other, until SIGINT or SIGTERM."""
     stop = threading.Event()
 
@@ -269,16 +255,7 @@ def watch(
         os.environ["ROS_DOMAIN_ID"] = str(live.domain)
         options = ["--ros-args", "--disable-external-lib-logs"]
         with ros_node("monitor", options, Observer) as (node, loop):
-            body = MonitorNode(
-                node,
-                loop,
-                page,
-                live,
-                finder=finder,
-                namespace=namespace,
-                requests=requests,
-                watched=watched,
-            )
+            body = MonitorNode(node, loop, page, live, finder=finder, namespace=namespace)
             if body.run().startswith("SIG"):
                 return
 

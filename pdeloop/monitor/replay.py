@@ -19,8 +19,7 @@ from pdeloop.monitor.finder import Finder, run_id
 from pdeloop.monitor.names import component_names, short
 from tuner_node.results import RunFolder
 from viewer_node.loop_view import LoopView
-from viewer_node.web.page import Page, Recorded
-from viewer_node.web.requests import Requests, ShowEpisode
+from viewer_node.web.page import Page, Recorded, ShowEpisode
 
 REFRESH = 0.5
 """Seconds between two looks whether the run goes on again."""
@@ -127,7 +126,7 @@ class _RecordedEpisodes:
         return ", ".join(words)
 
 
-def replay(folder: Path, finder: Finder, page: Page, requests: Requests) -> bool:
+def replay(folder: Path, finder: Finder, page: Page) -> bool:
     """Show the run in `folder` until it goes on, or until SIGINT or SIGTERM: then False."""
     stop = threading.Event()
 
@@ -141,7 +140,7 @@ def replay(folder: Path, finder: Finder, page: Page, requests: Requests) -> bool
         if finder.find() is not None:
             return True
         try:
-            request = requests.get(timeout=REFRESH)
+            request = page.requests.get(timeout=REFRESH)
         except queue.Empty:
             continue
         # Shown again, it would move every page that looks at a time in it to its newest state.

@@ -1,25 +1,35 @@
-"""What a page is sent: the status, the learning curve, and the new samples of the shown episode.
+"""What a web page is sent: the status, the learning curve, the target and the shown episode. Pure.
 
-One thread feeds the view, another takes out what a page does not have yet; both hold `Page.lock`
-meanwhile. `now` is any monotonic time in s.
+A message is JSON text. One with numbers is binary, little-endian: the length of the header (uint32),
+the header as JSON padded to 4 bytes, then float32 numbers.
+
+One thread feeds the view, another one sends what is new; both hold `Page.lock` meanwhile. `now` is
+any monotonic time in s.
 """
 
 from __future__ import annotations
 
 import json
+import queue
+import struct
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from viewer_node.episode_samples import MAX_COMPONENTS
-from viewer_node.loop_view import SILENT, LoopView
-from viewer_node.web.messages import Cursor, samples_message, target_message
+import numpy as np
+from numpy.typing import NDArray
 
-FRESH = 0.5
-"""Seconds between two looks at the range of the colours."""
+from viewer_node.episode_samples import MAX_COMPONENTS, EpisodeSamples, rows_of
+from viewer_node.loop_view import SILENT, LoopView
+from viewer_node.operation import Call
+
+MAX_INDEX = 2**24
+"""Environments and components that can be asked for."""
+COLOUR_PERIOD = 0.5
+"""Seconds between two computations of the range of the colours."""
 PARAMETERS = (
     *("problem", "length", "n_z", "n_a", "horizon", "sample_time"),
     *("optimizer", "seeds"),
@@ -27,10 +37,32 @@ PARAMETERS = (
 """Parameters that the page shows or needs."""
 
 
+@dataclass(frozen=True)
+class Watch:
+    """A request to show the loop in this namespace of the domain."""
+
+    namespace: str
+
+
+@dataclass(frozen=True)
+class ShowEpisode:
+    """A request to show the recorded episode of this index."""
+
+    index: int
+
+
 @dataclass
 class Recorded:
-    """A run that does not run: whether it came to its end, how many episodes of it were recorded, the
-    one that is shown; note: why there are none.
+    """A run on which no process works.
+
+    Parameters
+    ----------
+    finished
+        Whether it came to its end.
+    episodes, chosen, label
+        How many of its episodes were recorded, the index of the one that is shown, and what it is.
+    note
+        Why no episodes can be shown.
     """
 
     finished: bool
@@ -41,11 +73,22 @@ class Recorded:
 
 
 class Page:
-    """What all pages of a monitor are sent.
+    """The content of all web pages of a monitor, and what they ask for.
 
-    view: of the loop that is shown; place: its domain, folder, namespace and namespaces, for people;
-    parameters, controls: of its nodes, and the services that they offer; recorded: if it is a run that
-    does not run.
+    Attributes
+    ----------
+    view
+        The loop that is shown.
+    place
+        Its ROS domain, folder and namespace, and the namespaces that there are.
+    parameters, controls
+        Of its nodes: parameters, and the services that they offer.
+    recorded
+        Set for a run on which no process works.
+    requests
+        What the pages ask for, for the thread that feeds the view.
+    open
+        Whether a browser shows the page.
     """
 
     def __init__(self, environment: int = 0) -> None:
@@ -57,9 +100,9 @@ class Page:
         self.controls: list[dict[str, Any]] = []
         self.recorded: Recorded | None = None
         self.component = 0
-        self._generation = 0
-        self._status = b"{}"
-        self._status_version = -1
+        self.requests: queue.SimpleQueue[Call | Watch | ShowEpisode] = queue.SimpleQueue()
+        self.open = False
+        self._status: str | None = None
         self._colours = (0.0, 1.0)
         self._coloured = float("-inf")
 
@@ -70,8 +113,7 @@ class Page:
         with self.lock:
             view.environment = self.view.environment
             self.view, self.recorded = view, recorded
-            self._generation += 1
-            self.place = {**place, "begun": self._generation}
+            self.place = {**place, "begun": self.place.get("begun", 0) + 1}
             self.parameters, self.controls = {}, []
 
     def take_parameters(self, values: Mapping[str, Any]) -> None:
@@ -79,31 +121,35 @@ class Page:
         self.parameters |= {name: values[name] for name in PARAMETERS if name in values}
         self.view.horizon = int(self.parameters.get("horizon", 0))
 
-    def choose(self, *, environment: int | None = None, component: int | None = None) -> None:
-        """Show another environment, or another component of the state."""
+    def request_call(self, node: object, verb: object) -> bool:
+        """Ask for a call of the service `verb` of `node`; False if the loop has none."""
         with self.lock:
-            if environment is not None:
-                self.view.environment = environment
-            self.component = self.component if component is None else component
+            offered = any(c["node"] == node and verb in c["verbs"] for c in self.controls)
+        if offered:
+            self.requests.put(Call(str(node), str(verb)))
+        return offered
+
+    def choose(self, wanted: Mapping[str, Any]) -> bool:
+        """Show another environment, component, namespace or recorded episode, if there is one."""
+        with self.lock:
+            match wanted:
+                case {"environment": index} if _is_index(index, MAX_INDEX):
+                    self.view.environment = index
+                case {"component": index} if _is_index(index, MAX_INDEX):
+                    self.component = index
+                case {"namespace": str(name)} if name in (self.place.get("namespaces") or ()):
+                    self.requests.put(Watch(name))
+                case {"episode": index} if self.recorded and _is_index(
+                    index, self.recorded.episodes
+                ):
+                    self.requests.put(ShowEpisode(index))
+                case _:
+                    return False
             self._coloured = float("-inf")
-
-    def offers(self, node: str, verb: object) -> bool:
-        """Whether `node` is one of this loop's and has the service `verb`."""
-        with self.lock:
-            return any(c["node"] == node and verb in c["verbs"] for c in self.controls)
-
-    def has_episode(self, index: int) -> bool:
-        """Whether there is a recorded episode of this index."""
-        with self.lock:
-            return self.recorded is not None and 0 <= index < self.recorded.episodes
-
-    def known_namespaces(self) -> list[str]:
-        """The loops in this domain, by namespace."""
-        with self.lock:
-            return list(self.place.get("namespaces") or [])
+            return True
 
     def refresh(self, now: float) -> None:
-        """Put the status together again; call it now and then."""
+        """Compile the status again; call it every half second or so."""
         with self.lock:
             view, names = self.view, self.view.components[:MAX_COMPONENTS]
             quiet, remaining = view.quiet(now), view.curve.remaining(time.time())
@@ -112,7 +158,7 @@ class Page:
                 "part": "status",
                 "place": self.place,
                 "state": self._state(now),
-                "paused": view.operation.paused(),
+                "paused": view.operation.paused(now),
                 "stopping": view.operation.stopping,
                 "requests": view.operation.requests(now),
                 "activity": view.nodes.activity(now),
@@ -129,45 +175,88 @@ class Page:
                 "controls": self.controls,
                 "recorded": None if self.recorded is None else vars(self.recorded),
             }
-            text = json.dumps(status).encode()
-            if text != self._status:
-                self._status = text
-                self._status_version += 1
-            if now - self._coloured > FRESH:
+            self._status = json.dumps(status)
+            if now - self._coloured > COLOUR_PERIOD:
                 self._coloured = now
                 self._colours = view.colours(self.component, self._colours, now)
 
-    def updates(self, cursor: Cursor, now: float) -> list[bytes]:
-        """The messages with what is new since `cursor`, which moves on."""
+    def updates(self, sent: dict[str, object], now: float) -> list[str | bytes]:
+        """The messages that are new to a page.
+
+        Parameters
+        ----------
+        sent
+            The version of each part that the page has; it is brought up to date.
+        now
+            Monotonic time in s.
+        """
         with self.lock:
-            view, found = self.view, []
-            if cursor.status != self._status_version:
-                cursor.status = self._status_version
-                found.append(self._status)
-            curve = (view.curve.number, view.curve.version)
-            if cursor.curve != curve:
-                cursor.curve = curve
-                found.append(json.dumps({"part": "curve", **view.curve.message()}).encode())
-            shown = view.shown(now)
-            if shown is None:
-                return found
-            target = view.targets.get(shown.key[2])
-            aim = (shown.number, id(target), self.component)
-            if cursor.target != aim:
-                cursor.target = aim
-                found.append(target_message(target, shown, self.component))
-            message = samples_message(
-                shown,
-                cursor,
-                controller=partial(view.controller, shown),
-                environment=view.environment,
-                component=self.component,
-                colours=self._colours,
-                sample_time=shown.sample_time or self.parameters.get("sample_time", 0.0),
-            )
-            return [*found, message] if message else found
+            new = []
+            for part, version, message in self._messages(now):
+                if sent.get(part) != version:
+                    sent[part] = version
+                    new.append(message())
+            return new
+
+    def _messages(self, now: float) -> Iterator[tuple[str, object, Callable[[], str | bytes]]]:
+        """Name, version and content of every part."""
+        view, curve, shown = self.view, self.view.curve, self.view.shown(now)
+        yield "status", self._status, lambda: str(self._status)
+        yield "curve", curve.version, lambda: json.dumps({"part": "curve", **curve.message()})
+        if shown is None:
+            return
+        target = view.targets.get(shown.key[2])
+        chosen = (self.place.get("begun"), shown.components, self.component)
+        yield "target", (*chosen, id(target)), partial(self._target, target, shown)
+        samples = (*chosen, view.environment, shown.version, shown.ended, self._colours)
+        yield "episode", samples, partial(self._episode, shown)
+
+    def _target(self, target: NDArray[np.float64] | None, shown: EpisodeSamples) -> bytes:
+        """z_r at the kept grid points of the shown component; no numbers if it is not known."""
+        z_r = np.empty(0) if target is None else self._points(target, shown)
+        return _pack({"part": "target"}, z_r)
+
+    def _episode(self, shown: EpisodeSamples) -> bytes:
+        """The shown episode: its field (columns, rows), actions (columns, n_a), newest state (rows)."""
+        view = self.view
+        row = shown.row(view.environment)
+        fields = shown.fields[row, : shown.columns, shown.part(self.component)]
+        actions = shown.actions[row, : shown.columns] if shown.actions.size else fields[:, :0]
+        header = {
+            "part": "episode",
+            "run": shown.key[0],
+            "episode": shown.key[1],
+            "controller": view.controller(shown),
+            "environment": shown.environments[row],
+            "columns": len(fields),
+            "rows": fields.shape[1],
+            "actions": actions.shape[1],
+            "stride": shown.stride,
+            "begin": shown.first,
+            "last": shown.last,
+            "ended": shown.ended,
+            "sample_time": shown.sample_time or self.parameters.get("sample_time", 0.0),
+            "range": self._colours,
+        }
+        newest = self._points(shown.z[shown.environments[row]], shown)
+        return _pack(header, np.concatenate([fields.ravel(), actions.ravel(), newest]))
+
+    def _points(self, z: NDArray[np.float64], shown: EpisodeSamples) -> NDArray[np.float64]:
+        """A state at the kept grid points of the shown component."""
+        return z[rows_of(len(z), shown.components)[shown.part(self.component)]]
 
     def _state(self, now: float) -> str:
         if self.recorded is not None:
             return "recorded"
         return "searching" if self.place["domain"] is None else self.view.state_of_loop(now)
+
+
+def _is_index(value: object, count: int) -> bool:
+    return type(value) is int and 0 <= value < count
+
+
+def _pack(header: Mapping[str, Any], values: NDArray[np.floating]) -> bytes:
+    """A message with numbers."""
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    return struct.pack("<I", len(text)) + text + values.astype("<f4").tobytes()

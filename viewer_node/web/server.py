@@ -28,10 +28,8 @@ from typing import Any
 from aiohttp import WSMsgType, web
 
 from loop_interfaces.controllers import CONTROLLERS
-from viewer_node.operation import VERBS, Call
-from viewer_node.web.messages import Cursor
+from viewer_node.operation import VERBS
 from viewer_node.web.page import Page
-from viewer_node.web.requests import Requests, ShowEpisode, Watch
 
 FRAMES = 20.0
 """Pictures a second at the most."""
@@ -46,17 +44,10 @@ MAX_BODY = 10_000
 HOST = "127.0.0.1"
 TOKEN = "X-Pdeloop-Token"
 STATIC = Path(__file__).parent / "static"
-TYPES = {
-    ".html": "text/html",
-    ".css": "text/css",
-    ".js": "text/javascript",
-    ".svg": "image/svg+xml",
-}
 FILES = {
     path.name: path
-    for folder in (STATIC, STATIC / "vendor")
-    for path in sorted(folder.iterdir())
-    if path.suffix in TYPES
+    for path in sorted([*STATIC.iterdir(), *(STATIC / "vendor").iterdir()])
+    if path.suffix in (".html", ".css", ".js", ".mjs", ".svg")
 }
 """The files of the page by name; nothing else is served."""
 _HEADERS = {
@@ -72,28 +63,19 @@ _HEADERS = {
 _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
-class _Refusal(asyncio.Protocol):
-    """Closes a connection as soon as it is made."""
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)
-        transport.abort()
-
-
 class Server:
     """Serves the page from a thread of its own, between `start` and `stop`.
 
     port: 0 takes a free one. Raises OSError where the port is taken.
     """
 
-    def __init__(self, page: Page, requests: Requests, port: int) -> None:
-        self._page, self._requests = page, requests
+    def __init__(self, page: Page, port: int) -> None:
+        self._page = page
         self._token = secrets.token_urlsafe(32)
         self._socket = socket.create_server((HOST, port))
         self.port: int = self._socket.getsockname()[1]
-        self._open: set[web.WebSocketResponse] = set()
-        self._pages: set[object] = set()
-        """Connections that are WebSockets of pages."""
+        self._sockets: dict[object, web.WebSocketResponse] = {}
+        """The WebSockets of pages, by their connections."""
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._serve, name="page", daemon=True)
         self._ended = asyncio.Event()
@@ -101,10 +83,6 @@ class Server:
     @property
     def url(self) -> str:
         return f"http://{HOST}:{self.port}/"
-
-    def watched(self) -> bool:
-        """Whether a page is open."""
-        return bool(self._open)
 
     def start(self) -> None:
         self._thread.start()
@@ -132,7 +110,7 @@ class Server:
             listening = await self._loop.create_server(connect, sock=self._socket)
             await self._ended.wait()
             listening.close()
-            for page in list(self._open):
+            for page in list(self._sockets.values()):
                 with contextlib.suppress(Exception):
                     await asyncio.wait_for(page.close(code=1001), 1.0)
         finally:
@@ -140,15 +118,14 @@ class Server:
 
     def _connect(self, server: web.Server) -> asyncio.Protocol:
         """The protocol of a connection that comes in."""
-        if len(server.connections) >= MOST_CONNECTIONS:
-            return _Refusal()
+        full = len(server.connections) >= MOST_CONNECTIONS
         connection = server()
-        self._loop.call_later(LINGER, self._end, connection, connection.close)
-        self._loop.call_later(2 * LINGER, self._end, connection, connection.force_close)
+        for delay, end in ((LINGER, connection.close), (2 * LINGER, connection.force_close)):
+            self._loop.call_later(0.0 if full else delay, self._end, connection, end)
         return connection
 
     def _end(self, connection: web.RequestHandler, end: Callable[[], None]) -> None:
-        if connection not in self._pages:
+        if connection not in self._sockets:
             end()
 
     @web.middleware
@@ -171,75 +148,60 @@ class Server:
         return response
 
     async def _on_page(self, request: web.Request) -> web.WebSocketResponse:
-        if len(self._open) >= MOST_PAGES:
-            raise web.HTTPServiceUnavailable(text=f"{MOST_PAGES} pages look already; close one")
-        page = web.WebSocketResponse(heartbeat=10.0, max_msg_size=MAX_BODY, compress=False)
-        await page.prepare(request)
-        self._open.add(page)
-        self._pages.add(request.protocol)
-        telling = asyncio.create_task(self._tell(page))
+        if len(self._sockets) >= MOST_PAGES:
+            raise web.HTTPServiceUnavailable(text=f"{MOST_PAGES} pages are open; close one")
+        websocket = web.WebSocketResponse(heartbeat=10.0, max_msg_size=MAX_BODY, compress=False)
+        await websocket.prepare(request)
+        self._sockets[request.protocol] = websocket
+        self._page.open = True
+        sending = asyncio.create_task(self._send(websocket))
         try:
-            async for message in page:  # a page says nothing; this notices that it has gone
+            async for message in websocket:  # a page says nothing; this notices that it has gone
                 if message.type is not WSMsgType.PING:
                     break
         finally:
-            self._open.discard(page)
-            self._pages.discard(request.protocol)
-            telling.cancel()
+            del self._sockets[request.protocol]
+            self._page.open = bool(self._sockets)
+            sending.cancel()
             with contextlib.suppress(asyncio.CancelledError, ConnectionError):
-                await telling
-            await page.close()
-        return page
+                await sending
+            await websocket.close()
+        return websocket
 
-    async def _tell(self, page: web.WebSocketResponse) -> None:
-        """Tell a page what is new; a slow one gets fewer pictures, as each `send` waits for it."""
-        cursor = Cursor()
+    async def _send(self, websocket: web.WebSocketResponse) -> None:
+        """Send a page what is new; a slow one gets fewer pictures, as each `send` waits for it."""
+        sent: dict[str, object] = {}
         hello = {"part": "hello", "token": self._token, "controllers": CONTROLLERS}
-        await page.send_json(hello)
-        while not page.closed:
-            for update in self._page.updates(cursor, time.monotonic()):
-                if update.startswith(b"{"):
-                    await page.send_str(update.decode())
+        await websocket.send_json(hello)
+        while not websocket.closed:
+            for message in self._page.updates(sent, time.monotonic()):
+                if isinstance(message, str):
+                    await websocket.send_str(message)
                 else:
-                    await page.send_bytes(update)
+                    await websocket.send_bytes(message)
             await asyncio.sleep(1.0 / FRAMES)
 
     async def _on_call(self, request: web.Request) -> web.Response:
         asked = await _body(request)
-        node, verb = asked.get("node"), asked.get("verb")
-        if not isinstance(node, str) or not self._page.offers(node, verb):
+        if not self._page.request_call(asked.get("node"), asked.get("verb")):
             raise web.HTTPBadRequest(
                 text=f"no node of this loop offers that; expected one of {', '.join(VERBS)}"
             )
-        self._requests.put(Call(node, str(verb)))
         return web.json_response({"success": True})
 
     async def _on_watch(self, request: web.Request) -> web.Response:
-        asked = await _body(request)
-        namespace, episode = asked.get("namespace"), asked.get("episode")
-        chosen = {n: asked[n] for n in ("environment", "component") if n in asked}
-        if chosen:
-            if any(type(i) is not int or not 0 <= i < 2**24 for i in chosen.values()):
-                raise web.HTTPBadRequest(text="expected the index of an environment or component")
-            self._page.choose(**chosen)
-        elif isinstance(namespace, str) and namespace in self._page.known_namespaces():
-            self._requests.put(Watch(namespace))
-        elif type(episode) is int and self._page.has_episode(episode):
-            self._requests.put(ShowEpisode(episode))
-        else:
+        if not self._page.choose(await _body(request)):
             raise web.HTTPBadRequest(
                 text="expected an environment, a component, a recorded episode or a known namespace"
             )
         return web.json_response({"success": True})
 
 
-async def _on_file(request: web.Request) -> web.Response:
-    name = request.match_info["name"] or "index.html"
-    if name not in FILES:
-        raise web.HTTPNotFound
-    path = FILES[name]
-    kind = TYPES[path.suffix]
-    return web.Response(body=path.read_bytes(), content_type=kind, charset="utf-8")
+async def _on_file(request: web.Request) -> web.FileResponse:
+    try:
+        return web.FileResponse(FILES[request.match_info["name"] or "index.html"])
+    except KeyError:
+        raise web.HTTPNotFound from None
 
 
 async def _body(request: web.Request) -> dict[str, Any]:

@@ -23,13 +23,14 @@ export function extent(...lists) {
   return low <= high ? [low, high] : [0, 1];
 }
 
-export function actionsChart(episode, facts) {
+export function actionsChart(model) {
   const chart = new Chart("actions", { right: BAR });
   // Of cividis the part that stands out from the background.
   const along = (share) => css(DARK.matches ? 0.35 + 0.65 * share : 0.8 * share);
   const style = (j, count) => (count <= LINES.length ? LINES[j] : along((j + 0.5) / count));
 
   chart.update = () => {
+    const { facts, episode } = model;
     const { header } = episode;
     const count = header?.actions ?? 0;
     const columns = count ? episode.actions.length / count : 0;
@@ -58,10 +59,11 @@ export function actionsChart(episode, facts) {
   return chart;
 }
 
-export function profileChart(episode, facts) {
+export function profileChart(model) {
   const chart = new Chart("profile");
 
   chart.update = () => {
+    const { facts, episode } = model;
     const { header, target } = episode;
     const now = episode.profile();
     const initial = header?.begin === 0 ? episode.fields.subarray(0, header.rows) : [];
@@ -71,8 +73,7 @@ export function profileChart(episode, facts) {
     if (target.length === now.length && now.length) {
       lines.push(["target", target, { stroke: colour("text"), dash: DASHED, width: 1.3 }]);
     }
-    const known = header && colour(header.controller || "accent"); // an exploration has no colour
-    if (header) lines.push([facts.name, now, { stroke: known || colour("accent"), width: 2 }]);
+    if (header) lines.push([facts.name, now, { stroke: colour(header.controller || "accent"), width: 2 }]);
     const [low, high] = extent(...lines.map(([, values]) => values), header?.range ?? []);
     let caption = "";
     if (header) {
@@ -98,7 +99,7 @@ export function profileChart(episode, facts) {
   return chart;
 }
 
-export function curveChart(curve, controllers) {
+export function curveChart(model) {
   const chart = new Chart("curve");
 
   // What it is compared with is in the picture unless it would squeeze the curve flat.
@@ -116,14 +117,14 @@ export function curveChart(curve, controllers) {
     if (adapted !== undefined && lqt) {
       const share = 100 * (1 - adapted / lqt);
       const side = share >= 0 ? "below" : "above";
-      words.push(`evaluated: ${text(adapted)}, ${Math.abs(share).toFixed(1)} % ${side} ${controllers.lqt}`);
+      words.push(`evaluated: ${text(adapted)}, ${Math.abs(share).toFixed(1)} % ${side} ${model.controllers.lqt}`);
     }
     if (diverged) words.push(`${diverged} rollout${diverged === 1 ? "" : "s"} diverged`);
     return words.join("; ");
   }
 
   chart.update = () => {
-    const told = curve.told;
+    const { curve: told, controllers } = model;
     const { x, mean, low, high, costs, axis, budget } = told;
     const last = x.length ? x[x.length - 1] : 0;
     let grown = 10; // in jumps, so that the curve stays where it is for a while
@@ -138,7 +139,7 @@ export function curveChart(curve, controllers) {
     const ends = [0, ...x, end];
     const seeds = costs.length <= MOST_SEEDS ? costs : [];
     const value = (_, v, __, i) =>
-      i === null || v === null ? "" : `${text(v)} (${text(curve.told.low[i - 1])} to ${text(curve.told.high[i - 1])})`;
+      i === null || v === null ? "" : `${text(v)} (${text(model.curve.low[i - 1])} to ${text(model.curve.high[i - 1])})`;
     const hidden = { class: "unnamed", stroke: "transparent", width: 0 };
     const flat = references.map((name) => {
       const cost = told.references[name];

@@ -18,10 +18,13 @@ const HEX =
   "dec958dfca57e0cb56e1cc55e2cd54e4ce53e5cf52e6d051e7d150e8d24fe9d34eead34cebd44bedd54aeed649efd748" +
   "f0d846f1d945f2da44f3db42f5dc41f6dd3ff7de3ef8df3cf9e03afbe138fce236fde334fee434fee535fee636fee838";
 
-// Colours as [red, green, blue, red, ...], 0 to 255.
-export const CIVIDIS = Uint8Array.from(HEX.match(/../g), (pair) => parseInt(pair, 16));
+const COLOURS = HEX.match(/.{6}/g);
+
+// The colours as pixels of a canvas.
+export const CIVIDIS = new Uint32Array(
+  Uint8Array.from(COLOURS.flatMap((c) => `${c}ff`.match(/../g)), (pair) => parseInt(pair, 16)).buffer,
+);
 
 export function css(share) {
-  const i = 3 * Math.max(0, Math.min(255, Math.floor(256 * share)));
-  return `rgb(${CIVIDIS[i]}, ${CIVIDIS[i + 1]}, ${CIVIDIS[i + 2]})`;
+  return `#${COLOURS[Math.max(0, Math.min(255, Math.floor(256 * share)))]}`;
 }

@@ -8,15 +8,12 @@ const BAR = 12; // width of the colour bar
 
 // The samples of the shown episode: columns are steps, rows grid points.
 export class Episode {
-  constructor() {
-    this.header = null;
-    this.fields = new Float32Array(0);
-    this.actions = new Float32Array(0);
-    this.latest = new Float32Array(0);
-    this.target = new Float32Array(0);
-    this.changed = 0; // the first column that is new since the last picture
-    this.column = null; // the one whose profile is shown; null: the newest state
-  }
+  header = null;
+  fields = new Float32Array(0);
+  actions = new Float32Array(0);
+  latest = new Float32Array(0);
+  target = new Float32Array(0);
+  column = null; // the one whose profile is shown; null: the newest state
 
   // The field of the shown column.
   profile() {
@@ -26,23 +23,17 @@ export class Episode {
   }
 
   take(header, numbers) {
-    const { rows, actions, first, columns } = header;
-    if (header.new || !this.header) {
-      this.fields = new Float32Array(0);
-      this.actions = new Float32Array(0);
-      this.changed = 0;
-    }
-    const split = rows * columns;
-    const end = split + actions * columns;
-    this.fields = put(this.fields, numbers.subarray(0, split), first * rows);
-    this.actions = put(this.actions, numbers.subarray(split, end), first * actions);
-    this.latest = numbers.slice(end);
-    this.changed = Math.min(this.changed, first);
+    if (header.run !== this.header?.run || header.episode !== this.header.episode) this.column = null;
+    const split = header.rows * header.columns;
+    const end = split + header.actions * header.columns;
+    this.fields = numbers.subarray(0, split);
+    this.actions = numbers.subarray(split, end);
+    this.latest = numbers.subarray(end);
     this.header = header;
   }
 
   get columns() {
-    return this.header ? this.header.first + this.header.columns : 0;
+    return this.header?.columns ?? 0;
   }
 
   // Time since the start of the episode of a step; steps where the time is not known.
@@ -70,62 +61,35 @@ export class Episode {
   }
 }
 
-function put(all, part, at) {
-  const size = Math.max(all.length, at + part.length);
-  let grown = all;
-  if (size > all.length) {
-    grown = new Float32Array(size);
-    grown.set(all);
-  }
-  grown.set(part, at);
-  return grown;
-}
-
-export function fieldChart(episode, facts, controllers) {
+export function fieldChart(model) {
   const picture = document.createElement("canvas");
-  const paint = picture.getContext("2d");
 
-  // One pixel a sample; only new columns are painted, unless the colours have changed.
-  let painted = "";
-  function render() {
-    const { rows, range, run, episode: number, environment, stride } = episode.header;
+  // One pixel a sample.
+  function render({ fields, header: { rows, columns, range } }) {
+    picture.width = columns;
+    picture.height = rows;
+    const paint = picture.getContext("2d");
+    const image = paint.createImageData(columns, rows);
+    const pixels = new Uint32Array(image.data.buffer);
     const [low, high] = range;
-    const what = JSON.stringify([rows, range, run, number, environment, stride]);
-    const columns = episode.columns;
-    let from = episode.changed;
-    if (what !== painted || picture.width < columns || picture.height !== rows) {
-      picture.width = Math.max(512, columns);
-      picture.height = rows;
-      from = 0;
-      painted = what;
-    }
-    if (from === 0) paint.clearRect(0, 0, picture.width, rows);
-    episode.changed = columns;
-    if (columns <= from) return;
-    const image = paint.createImageData(columns - from, rows);
-    const pixels = image.data;
-    const scale = 256 / (high - low);
-    for (let i = from; i < columns; i++) {
+    const scale = CIVIDIS.length / (high - low);
+    for (let i = 0; i < columns; i++) {
       for (let r = 0; r < rows; r++) {
-        const u = episode.fields[i * rows + r];
-        if (Number.isNaN(u)) continue;
-        const k = 3 * Math.max(0, Math.min(255, Math.floor((u - low) * scale)));
-        const p = 4 * ((rows - 1 - r) * (columns - from) + (i - from));
-        pixels[p] = CIVIDIS[k];
-        pixels[p + 1] = CIVIDIS[k + 1];
-        pixels[p + 2] = CIVIDIS[k + 2];
-        pixels[p + 3] = 255;
+        const u = fields[i * rows + r];
+        const k = Math.max(0, Math.min(CIVIDIS.length - 1, Math.floor((u - low) * scale)));
+        if (!Number.isNaN(u)) pixels[(rows - 1 - r) * columns + i] = CIVIDIS[k];
       }
     }
-    paint.putImageData(image, from, 0);
+    paint.putImageData(image, 0, 0);
   }
 
   // Into uPlot's canvas, in its pixels, below the axes.
   function drawPicture(plot) {
+    const { episode } = model;
     if (!episode.header) return;
-    render();
+    render(episode);
     const { ctx: c, bbox: box } = plot;
-    const columns = episode.columns;
+    const { columns, rows } = episode.header;
     const start = plot.valToPos(episode.time(episode.step(0)), "x", true);
     const end = plot.valToPos(episode.time(episode.step(columns)), "x", true);
     c.save();
@@ -135,7 +99,7 @@ export function fieldChart(episode, facts, controllers) {
     c.fillStyle = colour("blank");
     c.fillRect(box.left, box.top, box.width, box.height);
     c.imageSmoothingEnabled = false;
-    c.drawImage(picture, 0, 0, columns, episode.header.rows, start, box.top, end - start, box.height);
+    c.drawImage(picture, 0, 0, columns, rows, start, box.top, end - start, box.height);
     if (episode.column !== null) {
       const at = Math.round(plot.valToPos(episode.time(episode.step(episode.column)), "x", true));
       c.fillStyle = "#ffffff";
@@ -145,7 +109,7 @@ export function fieldChart(episode, facts, controllers) {
   }
 
   function drawBar(plot) {
-    if (!episode.header) return;
+    if (!model.episode.header) return;
     const { ctx: c, bbox: box } = plot;
     const px = uPlot.pxRatio;
     const left = box.left + box.width + 12 * px;
@@ -154,7 +118,7 @@ export function fieldChart(episode, facts, controllers) {
       c.fillStyle = css(1 - y / box.height);
       c.fillRect(left, box.top + y, BAR * px, 1.5);
     }
-    const [low, high] = episode.header.range;
+    const [low, high] = model.episode.header.range;
     c.fillStyle = colour("muted");
     c.textAlign = "left";
     c.font = `${12 * px}px system-ui, "DejaVu Sans", sans-serif`;
@@ -169,6 +133,7 @@ export function fieldChart(episode, facts, controllers) {
   // What the pointer is on.
   function point(plot) {
     const { left, top } = plot.cursor;
+    const { facts, episode } = model;
     const { header } = episode;
     chart.pointed = false;
     if (header && left >= 0 && top >= 0) {
@@ -188,6 +153,7 @@ export function fieldChart(episode, facts, controllers) {
   const chart = new Chart("field", { right: 74, legend: false, grid: false, hooks });
 
   chart.update = () => {
+    const { facts, controllers, episode } = model;
     const { header } = episode;
     const range = header ? episode.span(facts.horizon) : [0, 1];
     let [caption, words] = ["no state has come yet", "Field in space and time: nothing yet"];

@@ -2,8 +2,12 @@
 
 export const DARK = matchMedia("(prefers-color-scheme: dark)");
 
+const probe = document.head.appendChild(document.createElement("i"));
+
+// A colour of the style sheet, as a canvas takes it; the accent where it has none of this name.
 export function colour(name) {
-  return getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+  probe.style.color = `var(--${name}, var(--accent))`;
+  return getComputedStyle(probe).color;
 }
 
 // With as many digits as a step of this size needs.

@@ -1,80 +1,114 @@
-// The live page: what comes over the link goes into the charts and the panel.
+// The live page: what comes over the link goes into the charts and the page around them.
 
 import { actionsChart, curveChart, profileChart } from "./charts.js";
 import { Episode, fieldChart } from "./field.js";
 import { Link } from "./link.js";
-import { Panel } from "./panel.js";
-import { Replay } from "./replay.js";
+import { showPage } from "./page.js";
 
+const CONFIRM = 5000; // ms in which a second click confirms
+const NOTICE = 10000; // ms for which a notice of the page's own stays
 const EMPTY = {
   ...{ axis: "rollouts", phase: "", budget: 0, band: "seeds", diverged: 0, paid: [0, 0] },
   ...{ seeds: [], references: {}, evaluations: {}, x: [], mean: [], low: [], high: [], costs: [] },
 };
+const NOTHING = {
+  ...{ state: "", recorded: null, stopping: false, activity: null, paused: [], requests: [] },
+  ...{ nodes: [], controls: [], components: [], component: 0, environments: 0, environment: 0 },
+  ...{ place: { domain: null }, parameters: {}, quiet: null, remaining: null, rounds: 0, episodes: 0 },
+};
 
-const episode = new Episode();
-const facts = { length: 0, horizon: 0, n_a: 0, name: "u" }; // of the loop, as far as its nodes told
-const curve = { told: EMPTY };
-const controllers = {}; // names, by key
-let status = null;
+// All that the page shows.
+const model = {
+  episode: new Episode(),
+  curve: EMPTY,
+  status: NOTHING,
+  controllers: {}, // names, by key
+  facts: { length: 0, horizon: 0, n_a: 0, name: "u" }, // of the loop, as far as its nodes told
+  connected: null,
+  notice: "",
+  called: null, // "role/verb" of the button that was pressed, until the next status
+  confirming: false, // whether a second click on Stop is awaited
+  pointed: null, // the recorded episode that the slider points at, until it is shown
+};
 
-const panel = new Panel(() => link);
-const training = curveChart(curve, controllers);
-const ofEpisode = [fieldChart(episode, facts, controllers), actionsChart(episode, facts), profileChart(episode, facts)];
+// Change the model, and show it.
+function set(changes) {
+  Object.assign(model, changes);
+  showPage(model, { press, watch, seek, point: (pointed) => set({ pointed }) });
+}
+
+set({});
+const training = curveChart(model);
+const ofEpisode = [fieldChart(model), actionsChart(model), profileChart(model)];
 
 function update(charts) {
   for (const chart of charts) chart.update();
 }
 
-const replay = new Replay(
-  episode,
-  () => update(ofEpisode),
-  (index) => panel.request({ episode: index }),
-);
-
 const take = {
-  hello(message) {
-    const { style } = document.documentElement;
-    for (const [key, [name, light, dark]] of Object.entries(message.controllers)) {
-      controllers[key] = name;
-      style.setProperty(`--${key}-light`, light);
-      style.setProperty(`--${key}-dark`, dark);
+  hello({ controllers }) {
+    for (const [key, [name, light, dark]] of Object.entries(controllers)) {
+      model.controllers[key] = name;
+      document.documentElement.style.setProperty(`--${key}`, `light-dark(${light}, ${dark})`);
     }
     for (const chart of [training, ...ofEpisode]) chart.restyle();
   },
-  status(message) {
-    const moved = status && status.place.begun !== message.place.begun;
-    status = message;
-    const { length = 0, horizon = 0, n_a = 0 } = message.parameters;
-    const name = message.components[message.component];
-    const changed = facts.length !== length || facts.horizon !== horizon || facts.name !== name;
-    Object.assign(facts, { length, horizon, n_a, name });
-    if (moved) {
-      Object.assign(episode, new Episode());
-      curve.told = EMPTY;
-    }
-    panel.status(message, curve);
-    replay.status(message.recorded);
-    if (changed || moved) update(ofEpisode);
+  status(status) {
+    const { length = 0, horizon = 0, n_a = 0 } = status.parameters;
+    const facts = { length, horizon, n_a, name: status.components[status.component] };
+    const moved = model.status.place.begun !== status.place.begun;
+    const pointed = model.pointed === status.recorded?.chosen ? null : model.pointed;
+    set({ status, facts, pointed, called: null, ...(moved && { episode: new Episode(), curve: EMPTY }) });
+    update(moved ? [...ofEpisode, training] : ofEpisode);
   },
-  curve(message) {
-    curve.told = message;
-    if (status) panel.figures(status, curve);
-    panel.seeds(message, controllers);
+  curve(curve) {
+    set({ curve });
     update([training]);
   },
-  target(message, numbers) {
-    episode.target = numbers.slice();
+  target(_, numbers) {
+    model.episode.target = numbers;
     update(ofEpisode.slice(2));
   },
-  episode(message, numbers) {
-    episode.take(message, numbers);
-    if (message.new) replay.begin();
+  episode(header, numbers) {
+    model.episode.take(header, numbers);
     update(ofEpisode);
+    if (model.status.recorded) set({});
   },
 };
 
 const link = new Link(
   (header, numbers) => take[header.part]?.(header, numbers),
-  (yes) => panel.connected(yes),
+  (connected) => set({ connected }),
 );
 update([...ofEpisode, training]);
+
+// Call a service of a node; one that stops the training is to be confirmed.
+function press(node, role, verb, words) {
+  const confirmed = verb !== "stop" || model.confirming;
+  set({ confirming: !confirmed });
+  if (confirmed) {
+    set({ called: `${role}/${verb}` });
+    request("/api/call", { node, verb }, `${words}: `);
+  } else {
+    setTimeout(() => set({ confirming: false }), CONFIRM);
+  }
+}
+
+// Ask for something else to be shown.
+function watch(what) {
+  request("/api/watch", what, "");
+}
+
+async function request(path, content, words) {
+  const answer = await link.post(path, content);
+  if (answer.success) return;
+  set({ notice: words + answer.message });
+  setTimeout(() => set({ notice: "" }), NOTICE);
+}
+
+// Show another column of the episode.
+function seek(column) {
+  model.episode.column = column < model.episode.columns - 1 ? column : null;
+  update(ofEpisode);
+  set({});
+}

@@ -1,0 +1,306 @@
+// The page around the charts: its markup as functions of the model, rendered by Preact.
+
+import htm from "./htm.mjs";
+import { h, render } from "./preact.mjs";
+import { duration, text } from "./format.js";
+
+const html = htm.bind(h);
+
+const STATES = {
+  searching: ["", "looking for a training", "No training runs on this machine. Start one: pdeloop train burgers"],
+  empty: ["warn", "no nodes", "Nobody publishes the loop's topics in this domain and namespace."],
+  waiting: ["warn", "waiting for the first message", ""],
+  running: ["good", "running", ""],
+  silent: ["warn", "nothing heard", ""],
+  paused: ["warn", "paused", ""],
+  ended: ["", "ended", ""],
+};
+const BUTTONS = { plant: ["pause", "resume", "step"], tuner: ["pause", "resume", "stop"] };
+const VERBS = {
+  pause: ["Pause", "Pausing…", "hold it where it is"],
+  resume: ["Resume", "Resuming…", "go on"],
+  step: ["Step", "Stepping…", "one step, then pause again"],
+  stop: ["Stop", "Stopping…", "end after this iteration"],
+};
+const ROLES = { plant: "plant", tuner: "training" };
+const LEVELS = ["good", "warn", "bad", "warn"];
+const MOST_CHOICES = 4096;
+
+// actions: press(node, role, verb, words), watch(what), seek(column), point(episode).
+export function showPage(model, actions) {
+  const { status, curve } = model;
+  document.title = `${status.parameters.problem ?? "pdeloop"} – ${doing(model)[1]} – pdeloop`;
+  const live = !status.recorded;
+  const onlyCurve = status.recorded?.episodes === 0;
+  render(
+    html`
+      <header>
+        <${Title} ...${model} />
+        ${live && html`<${Controls} ...${model} ...${actions} />`}
+      </header>
+      <${Notice} ...${model} />
+      <${Figures} status=${status} curve=${curve} />
+      <main class=${onlyCurve ? "curve-only" : ""}>
+        <${Panel} id="field" title="Field" before=${html`<${Choices} status=${status} ...${actions} />`}>
+          <${Replay} ...${model} ...${actions} />
+        <//>
+        <${Panel} id="actions" title=${html`Actions <i>a</i><sub>j</sub>(<i>t</i>)`} />
+        <${Panel} id="profile" title="Profile and target" />
+        <${Panel} id="curve" title="Training" />
+        <${Seeds} ...${model} />
+        ${live && html`<${Nodes} status=${status} />`}
+      </main>
+    `,
+    document.body,
+  );
+}
+
+// A panel with a chart, which fills `.plot` and says in `output` what it shows.
+function Panel({ id, title, before, children }) {
+  return html`
+    <section class="panel ${id}" aria-labelledby="${id}-title">
+      <div class="head">
+        <h2 id="${id}-title">${title}</h2>
+        <output id="${id}-text" class="muted"></output>
+        ${before}
+      </div>
+      <div class="plot" id=${id} role="img"></div>
+      ${children}
+    </section>
+  `;
+}
+
+// Class and words of the state: what the nodes compute says more than that they are silent.
+function doing({ status, connected }) {
+  const { state, paused, activity, quiet, stopping, recorded } = status;
+  if (connected === null || (connected && !state)) return ["", "connecting"];
+  if (!connected) return ["bad", "no connection to the monitor"];
+  if (recorded) return recorded.finished ? ["", "finished"] : ["warn", "not finished; nothing works on it"];
+  const [className, words] = STATES[state] ?? ["", state];
+  if (state === "paused") return [className, `${paused.map((role) => ROLES[role]).join(" and ")} paused`];
+  const busy = state === "running" || state === "silent" || state === "waiting";
+  if (busy && activity) return ["good", `${activity.what}, ${duration(activity.seconds)}`];
+  if (state === "silent") return [className, `${words} for ${duration(quiet ?? 0)}`];
+  if (state === "running" && stopping) return [className, "stopping"];
+  return [className, words];
+}
+
+function Title(model) {
+  const { place, parameters } = model.status;
+  const [className, words] = doing(model);
+  const domain = place.domain === null ? "" : `ROS domain ${place.domain}`;
+  const namespace = place.namespace === "/" ? "" : place.namespace;
+  return html`
+    <div class="title">
+      <h1 id="problem">${parameters.problem ?? "pdeloop"}</h1>
+      <span id="state" class="pill ${className}" role="status" aria-live="polite">${words}</span>
+      <span id="place" class="muted">${[place.folder, domain, namespace].filter(Boolean).join(" · ")}</span>
+    </div>
+  `;
+}
+
+function Controls(model) {
+  return html`
+    <div id="controls" class="controls" role="group" aria-label="Control of the loop">
+      ${Object.entries(BUTTONS).map(
+        ([role, verbs]) => html`
+          <div class="group">
+            <span>${ROLES[role]}</span>
+            ${verbs.map((verb) => html`<${Button} role=${role} verb=${verb} ...${model} />`)}
+          </div>
+        `,
+      )}
+    </div>
+  `;
+}
+
+function Button({ role, verb, status, connected, called, confirming, press }) {
+  const [name, going, meaning] = VERBS[verb];
+  const offer = status.controls.find((c) => c.role === role && c.verbs.includes(verb));
+  const asked = status.requests.some((r) => r.role === role && r.verb === verb && !r.failure);
+  const under = asked || (verb === "stop" && status.stopping);
+  const sure = verb === "stop" && confirming;
+  return html`
+    <button
+      id="${role}-${verb}"
+      class=${sure ? "sure" : ""}
+      disabled=${!offer || !connected || under || called === `${role}/${verb}`}
+      aria-label="${name} ${ROLES[role]}: ${meaning}"
+      title=${offer ? `${meaning} (${offer.node}/${verb})` : `no ${role} offers the service ~/${verb}`}
+      onClick=${() => press(offer.node, role, verb, `${name} ${ROLES[role]}`)}
+    >
+      ${sure ? "Really stop?" : under ? going : name}
+    </button>
+  `;
+}
+
+// What stands below the title is a function of the newest status, so that nothing old stays.
+function Notice({ status, notice }) {
+  const { requests, activity, state, stopping, recorded } = status;
+  const words = requests.map(({ role, verb, seconds, failure }) => {
+    const asked = `${VERBS[verb][0]} ${ROLES[role]}`;
+    if (failure) return `${asked}: ${failure}`;
+    const when = activity?.role === role ? `; takes effect after ${activity.what}` : "";
+    return `${asked}: asked for${seconds > 1 ? ` ${duration(seconds)} ago` : ""}${when}`;
+  });
+  if (stopping && state !== "ended") words.push("The training ends after the rollouts under way.");
+  const all = [notice, STATES[state]?.[2], recorded?.note, ...words].filter(Boolean).join(" · ");
+  return html`<p id="notice" class="notice" role="alert" hidden=${!all}>${all}</p>`;
+}
+
+function Figures({ status, curve }) {
+  const { mean, references, budget, axis, phase, seeds, paid } = curve;
+  const { recorded, remaining, rounds, episodes } = status;
+  const closing = references.adapted; // what the closing evaluation gave counts, once it is there
+  const cost = closing ?? mean.at(-1) ?? null;
+  const share = references.lqt && cost !== null ? 100 * (1 - cost / references.lqt) : null;
+  const side = share === null ? "" : share >= 0 ? " % below" : " % above";
+  const count = paid[0] === paid[1] ? paid[1] : `${paid[0]} to ${paid[1]}`;
+  const rows = [
+    ["phase", phase],
+    [axis, paid[1] && count, budget ? ` of ${budget}` : ""],
+    !recorded && ["time left", remaining !== null && duration(remaining)],
+    [closing === undefined ? "cost now" : "evaluated cost", text(cost)],
+    ["against LQT", share !== null && Math.abs(share).toFixed(1), side],
+    ["seeds", seeds.length],
+    !recorded && ["rounds", text(rounds < 10 ? rounds : Math.round(rounds)), " 1/s"],
+    recorded ? ["recorded episodes", String(recorded.episodes)] : ["episodes", text(episodes), " 1/s"],
+  ];
+  return html`
+    <dl id="figures" class="figures">
+      ${rows.filter(Boolean).map(
+        ([name, value, unit = ""]) => html`
+          <div><dt>${name}</dt><dd><span>${value || "–"}</span><small>${unit}</small></dd></div>
+        `,
+      )}
+    </dl>
+  `;
+}
+
+// Which component, pair and environment is shown.
+function Choices({ status, watch }) {
+  const { components, component, environments, environment, place } = status;
+  const most = Math.min(environments, MOST_CHOICES);
+  const numbers = Array.from({ length: most }, (_, i) => String(i));
+  const choice = (name, names, chosen, choose) => html`
+    <label hidden=${names.length < 2}>
+      ${name} <select id=${name} value=${chosen} onChange=${(event) => choose(event.target.value)}>
+        ${names.map((one) => html`<option value=${one}>${one}</option>`)}
+      </select>
+    </label>
+  `;
+  return [
+    choice("component", components, components[component], (value) => {
+      status.component = components.indexOf(value);
+      watch({ component: status.component });
+    }),
+    choice("pair", place.namespaces ?? [], place.namespace, (value) => {
+      place.namespace = value;
+      watch({ namespace: value });
+    }),
+    choice("environment", numbers, String(Math.min(environment, most - 1)), (value) => {
+      status.environment = Number(value);
+      watch({ environment: status.environment });
+    }),
+  ];
+}
+
+// Two sliders for a run that is over: which recorded episode, and when in it.
+function Replay({ status, episode, pointed, point, seek, watch }) {
+  const { recorded } = status;
+  if (!recorded?.episodes) return null;
+  const chosen = pointed ?? recorded.chosen;
+  const last = Math.max(0, episode.columns - 1);
+  const column = episode.column ?? last;
+  const time = episode.header ? text(episode.time(episode.step(column))) : "–";
+  const number = (event) => Number(event.target.value);
+  return html`
+    <div id="replay" class="replay">
+      <label for="time">time</label>
+      <input id="time" type="range" min="0" max=${last} value=${column} onInput=${(e) => seek(number(e))} />
+      <output id="time-text" class="muted">
+        ${episode.header?.sample_time ? `${time} s` : `step ${time}`}
+      </output>
+      <label for="recorded">episode</label>
+      <input
+        id="recorded"
+        type="range"
+        min="0"
+        max=${recorded.episodes - 1}
+        value=${chosen}
+        onInput=${(event) => point(number(event))}
+        onChange=${(event) => watch({ episode: number(event) })}
+      />
+      <output id="recorded-text" class="muted">
+        ${chosen + 1} of ${recorded.episodes}${chosen === recorded.chosen ? `: ${recorded.label}` : ""}
+      </output>
+    </div>
+  `;
+}
+
+// What the closing evaluation gave, once it has been.
+function Seeds({ curve, controllers }) {
+  const { evaluations, references } = curve;
+  const known = Object.entries(evaluations);
+  if (!known.length) return null;
+  const names = ["none", "lqt", "adapted"];
+  const below = ({ lqt, adapted }) => `${text(Number((100 * (1 - adapted / lqt)).toFixed(1)))} %`;
+  const rows = known.length > 1 ? [...known, ["mean", references]] : known;
+  return html`
+    <section id="seeds-panel" class="panel seeds" aria-labelledby="seeds-title">
+      <div class="head"><h2 id="seeds-title">Seeds: mean stage cost in the closing evaluation</h2></div>
+      <div class="scroll">
+        <table id="seeds">
+          <tr>
+            <th>seed</th>
+            ${names.map((name) => html`<th>${controllers[name]}</th>`)}
+            <th>below ${controllers.lqt}</th>
+          </tr>
+          ${rows.map(
+            ([seed, costs]) => html`
+              <tr>
+                <td>${seed}</td>
+                ${names.map((name) => html`<td>${text(costs[name])}</td>`)}
+                <td>${below(costs)}</td>
+              </tr>
+            `,
+          )}
+        </table>
+      </div>
+    </section>
+  `;
+}
+
+function Nodes({ status }) {
+  return html`
+    <section id="nodes-panel" class="panel nodes" aria-labelledby="nodes-title">
+      <div class="head"><h2 id="nodes-title">Nodes</h2></div>
+      <div id="nodes" class="cards">
+        ${status.nodes.map((node) => html`<${Card} ...${node} ended=${status.state === "ended"} />`)}
+      </div>
+    </section>
+  `;
+}
+
+// One node: who it is, whether it is there, what it says of itself.
+function Card({ role, name, present, level = 0, heard, restarts, rivals, message, values = [], ended }) {
+  const lost = name && !ended ? "bad" : "muted";
+  const facts = [present ? "there" : name ? "gone" : "not seen"];
+  if (heard !== null) facts.push(heard < 1.5 ? "heard now" : `last heard ${Math.round(heard)} s ago`);
+  if (restarts) facts.push(restarts === 1 ? "joined again once" : `joined again ${restarts} times`);
+  if (rivals) facts.push(`${rivals + 1} processes publish its topic`);
+  return html`
+    <article class="card" data-role=${role} data-present=${String(present)}>
+      <h3>
+        <span class="dot ${present ? (LEVELS[level] ?? "warn") : lost}"></span>
+        <span>${role}</span><span class="muted">${name}</span>
+      </h3>
+      <p>${facts.join(", ")}</p>
+      <p>${message}</p>
+      <details hidden=${!values.length}>
+        <summary>${values.length} values</summary>
+        <dl>${values.map(([key, value]) => [html`<dt>${key}</dt>`, html`<dd>${value}</dd>`])}</dl>
+      </details>
+    </article>
+  `;
+}
