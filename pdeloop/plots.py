@@ -13,7 +13,7 @@ from pdeloop.episode import EpisodeRecord
 from pdeloop.finished_run import FinishedRun
 from pdeloop.report import figures, learning
 from pdeloop.report.data import ProblemData, of_run
-from pdeloop.report.style import FIELD_MAP, STYLE, boxed
+from pdeloop.report.style import FIELD_MAP, STYLE, image
 
 __all__ = [
     "plot_behaviour",
@@ -45,10 +45,9 @@ def plot_episode(plant: Plant, episode: EpisodeRecord, environment: int = 0) -> 
         *maps, below = figure.subplots(len(components) + 1, 1, sharex=True)
         fields = np.split(episode.fields[:, environment], len(components), axis=1)
         for ax, name, field in zip(maps, components, fields, strict=True):
-            boxed(ax)
-            image = ax.imshow(field.T, origin="lower", aspect="auto", cmap=FIELD_MAP, extent=extent)
+            drawn = image(ax, field.T, extent, origin="lower", cmap=FIELD_MAP)
             ax.set_ylabel("x (m)")
-            figure.colorbar(image, ax=ax, label=f"{name}(x, t)", pad=0.01)
+            figure.colorbar(drawn, ax=ax, label=f"{name}(x, t)", pad=0.01)
         held = episode.actions[:, environment]
         below.step(times, np.vstack([held, held[-1:]]), where="post", linewidth=0.9)
         below.set_ylabel("actions $a_j$")

@@ -86,26 +86,21 @@ class Steps:
 class ProblemData:
     """A problem's part of a report.
 
-    runs: by adapted controller; costs: by controller, (S, fields); curves: while they learn;
-    shown: index of the seed whose behaviour, gains and steps are shown; x (n_x,), target (n_x times
-    components,), components: names of the fields that a state consists of; behaviours: empty where
-    they cannot be computed; orders: what the shown seed's exploratory episode says about the order,
-    None where that is not known; steps: by controller, where the optimiser judges its steps; reference:
-    the limits, where they are known; missing: a sentence for each thing that cannot be shown.
+    runs: by adapted controller; curves: their costs while they learn; shown: index of the seed whose
+    behaviour, gains and steps are shown; plant: the built-in one; behaviours: empty where they cannot
+    be computed; orders: what the shown seed's exploratory episode says about the order, None where
+    that is not known; reference: the limits, where they are known; missing: a sentence for each thing
+    that cannot be shown.
     """
 
     runs: Mapping[str, FinishedRun]
-    costs: Mapping[str, Array]
     curves: Sequence[Curve]
     shown: int
-    x: Array
-    target: Array
-    components: tuple[str, ...]
-    behaviours: Sequence[Behaviour]
-    orders: OrderStudy | None
-    steps: Mapping[str, Steps]
-    reference: Reference | None
-    missing: Sequence[str]
+    plant: Plant
+    missing: list[str] = field(default_factory=list)
+    behaviours: list[Behaviour] = field(default_factory=list)
+    orders: OrderStudy | None = None
+    reference: Reference | None = None
 
     @property
     def first(self) -> FinishedRun:
@@ -117,6 +112,12 @@ class ProblemData:
         return str(self.first.values["problem"])
 
     @property
+    def costs(self) -> dict[str, Array]:
+        """By controller, (S, fields)."""
+        own = {name: run.costs["adapted"] for name, run in self.runs.items()}
+        return {"none": self.first.costs["none"], "lqt": self.first.costs["lqt"], **own}
+
+    @property
     def policies(self) -> dict[str, Array]:
         """The gains of the shown seed, by controller."""
         warm = self.first.warm[self.shown]
@@ -126,6 +127,12 @@ class ProblemData:
     @property
     def models(self) -> list[ModelRows]:
         return self.first.models
+
+    @property
+    def steps(self) -> dict[str, Steps]:
+        """By controller, where the optimiser judges its steps."""
+        found = {name: _steps(run, self.shown) for name, run in self.runs.items()}
+        return {name: steps for name, steps in found.items() if steps is not None}
 
     def share(self, controller: str) -> float | None:
         """(J_LQT - J)/(J_LQT - J_opt) of the means over the seeds, None where it is not known."""
@@ -149,6 +156,16 @@ class ReportData:
     folder: Path
     problems: list[ProblemData]
     asked: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def missing(self) -> list[str]:
+        """What cannot be shown, with the problem where there are several."""
+        several = len(self.problems) > 1
+        return [
+            f"{problem.name}: {sentence}" if several else sentence
+            for problem in self.problems
+            for sentence in problem.missing
+        ]
 
 
 def gather(folder: Path, limits: Path | None = None) -> ReportData:
@@ -218,44 +235,29 @@ def _curve(controller: str, seeds: Sequence[tuple[Array, Array]]) -> list[Curve]
 def _problem(
     runs: Mapping[str, FinishedRun], curves: Sequence[Curve], shown: int, limits: Path | None
 ) -> ProblemData:
-    first = next(iter(runs.values()))
-    costs = {"none": first.costs["none"], "lqt": first.costs["lqt"]}
-    costs |= {name: run.costs["adapted"] for name, run in runs.items()}
-    steps = {name: _steps(run, shown) for name, run in runs.items()}
-    plant, missing = build_plant(first.values), []
+    values = next(iter(runs.values())).values
+    data = ProblemData(runs, curves, shown, build_plant(values))
     if not curves:
-        missing.append(
+        data.missing.append(
             "Training curves: LQT diverged, or every rollout of the adaptation did, or there was none."
         )
-    if note := another_plant(first.values, first.result):
-        missing.append(f"The run's own plant: {note}. The fields shown are of the built-in one.")
-    data = ProblemData(
-        runs=runs,
-        costs=costs,
-        curves=curves,
-        shown=shown,
-        x=plant.x,
-        target=plant.field_target,
-        components=plant.equation.components,
-        behaviours=[],
-        orders=None,
-        steps={name: found for name, found in steps.items() if found is not None},
-        reference=None,
-        missing=missing,
-    )
-    behaviours = _behaviours(data, plant)
-    if behaviours is None:
-        nodes = ", ".join(first.result.get("controller", {}).get("nodes", ()))
-        missing.append(
-            "Behaviour, gains, spectrum and share of the possible gain: the costs of this run are not "
-            "those of the built-in plant and law, so that it had another plant or another law"
-            + (f" (its controller: {nodes})" if nodes else "")
-            + ", which cannot be computed here. All costs are those that the run measured."
+    if note := another_plant(values, data.first.result):
+        data.missing.append(
+            f"The run's own plant: {note}. The fields shown are of the built-in one."
         )
-        return data
-    reference = find(first.values, behaviours[0].cost, limits)
-    orders = _orders(first, shown, plant)
-    return replace(data, behaviours=behaviours, orders=orders, reference=reference)
+    behaviours = _behaviours(data)
+    if behaviours:
+        reference = find(values, behaviours[0].cost, limits)
+        orders = _orders(data.first, shown, data.plant)
+        return replace(data, behaviours=behaviours, orders=orders, reference=reference)
+    nodes = ", ".join(data.first.result.get("controller", {}).get("nodes", ()))
+    data.missing.append(
+        "Behaviour, gains, spectrum and share of the possible gain: the costs of this run are not "
+        "those of the built-in plant and law, so that it had another plant or another law"
+        + (f" (its controller: {nodes})" if nodes else "")
+        + ", which cannot be computed here. All costs are those that the run measured."
+    )
+    return data
 
 
 def _orders(run: FinishedRun, shown: int, plant: Plant) -> OrderStudy | None:
@@ -278,16 +280,16 @@ def _orders(run: FinishedRun, shown: int, plant: Plant) -> OrderStudy | None:
         return None
 
 
-def _behaviours(data: ProblemData, plant: Plant) -> list[Behaviour] | None:
-    """The shown seed's controllers from the mean field; None if they are not those of the run.
+def _behaviours(data: ProblemData) -> list[Behaviour]:
+    """The shown seed's controllers from the mean field; none if they are not those of the run.
 
-    Beside it each starts from the first field of the closing evaluation, whose cost is known.
+    Each also starts from the first field of the closing evaluation, whose cost is known.
     """
-    policies, values = data.policies, data.first.values
+    policies, values, plant = data.policies, data.first.values, data.plant
     models = {name: run.models[data.shown] for name, run in data.runs.items()}
     bases = [models.get(name, data.models[data.shown]).U for name in policies]
     if any(len(basis) != plant.target.size for basis in bases):
-        return None
+        return []
     law = ProjectedLaw(bases, plant.target, values["action_limit"])
     count, seed = len(policies), values["evaluation_seed"]
     law.set(np.stack([*policies.values()] * 2), np.tile(np.arange(count), 2))
@@ -297,7 +299,7 @@ def _behaviours(data: ProblemData, plant: Plant) -> list[Behaviour] | None:
     costs = episode.costs
     known = [data.costs[name][data.shown, 0] for name in policies]
     if not np.allclose(costs.mean[count:], known, rtol=SAME_LAW):
-        return None
+        return []
     found = []
     for i, name in enumerate(policies):
         diverged = int(costs.diverged_step[i])

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from controller_node.order import OrderStudy
 from loop_interfaces.model_rows import ModelRows
 from pdeloop.report.data import Behaviour, ProblemData
-from pdeloop.report.style import COLOURS, FIELD_MAP, GAIN_MAP, NAMES, boxed, plain_log
+from pdeloop.report.style import COLOURS, FIELD_MAP, GAIN_MAP, NAMES, image, plain_log
 
 Array = NDArray[np.float64]
 Eigenvalues = NDArray[Any]
@@ -22,7 +22,7 @@ Eigenvalues = NDArray[Any]
 
 def behaviour(problem: ProblemData) -> Figure:
     """From the mean initial field: the fields in space and time, the actions, the final profiles."""
-    shown, components = problem.behaviours, problem.components
+    shown, components = problem.behaviours, problem.plant.equation.components
     count, fields = len(shown), len(components)
     figure = Figure(figsize=(2.05 * count + 0.9, 1.5 + 2.0 * fields + 1.3 * (1 + fields)))
     grid = figure.subplots(
@@ -44,7 +44,7 @@ def behaviour(problem: ProblemData) -> Figure:
             ax.xaxis.set_major_locator(MaxNLocator(3))
     grid[fields, 0].set_ylabel("actions $a_j$")
     for i, name in enumerate(components):
-        own = slice(i * len(problem.x), (i + 1) * len(problem.x))
+        own = slice(i * len(problem.plant.x), (i + 1) * len(problem.plant.x))
         _maps(figure, problem, own, grid[i], name, float(times[-1]))
         _profiles(problem, own, grid[fields + 1 + i], name)
     figure.legend(
@@ -62,30 +62,29 @@ def _maps(
     low, high = np.nanpercentile(np.stack(fields), (0.3, 99.7))
     length = float(problem.first.values["length"])
     for ax, values in zip(axes, fields, strict=True):
-        boxed(ax)
         ax.set_facecolor("0.9")
-        image = ax.imshow(
-            values.T,
-            origin="lower",
-            aspect="auto",
-            cmap=FIELD_MAP,
-            vmin=low,
-            vmax=high,
-            interpolation="nearest",
-            extent=(0.0, end, 0.0, length),
-        )
+        extent = (0.0, end, 0.0, length)
+        drawn = image(ax, values.T, extent, origin="lower", cmap=FIELD_MAP, vmin=low, vmax=high)
         ax.set_xlabel("t (s)")
     axes[0].set_ylabel("x (m)")
-    figure.colorbar(image, ax=list(axes), label=f"{name}(x, t)", aspect=14, pad=0.01, extend="both")
+    figure.colorbar(drawn, ax=list(axes), label=f"{name}(x, t)", aspect=14, pad=0.01, extend="both")
 
 
 def _profiles(problem: ProblemData, own: slice, axes: Sequence[Axes], name: str) -> None:
     """Its initial and final profiles, and the target."""
     for ax, b in zip(axes, problem.behaviours, strict=True):
         colour = COLOURS[b.controller]
-        ax.plot(problem.x, b.states[0, own], ":", color="0.45", linewidth=1, label="initial field")
-        ax.plot(problem.x, problem.target[own], color="black", linewidth=0.9, label="target")
-        ax.plot(problem.x, b.states[-1, own], color=colour, label="final field")
+        ax.plot(
+            problem.plant.x, b.states[0, own], ":", color="0.45", linewidth=1, label="initial field"
+        )
+        ax.plot(
+            problem.plant.x,
+            problem.plant.field_target[own],
+            color="black",
+            linewidth=0.9,
+            label="target",
+        )
+        ax.plot(problem.plant.x, b.states[-1, own], color=colour, label="final field")
         ax.set_xlim(0, float(problem.first.values["length"]))
         ax.set_xlabel("x (m)")
     axes[0].set_ylabel(f"{name}(x, T)")
@@ -109,25 +108,17 @@ def gains(problem: ProblemData) -> Figure:
         blocks = {name: own[:, part * n_s : (part + 1) * n_s] for name, own in policies.items()}
         largest = max(float(np.abs(block).max()) for block in blocks.values()) or 1.0
         for ax, (name, block) in zip(grid[:, part], blocks.items(), strict=True):
-            image = ax.imshow(
-                block,
-                cmap=GAIN_MAP,
-                vmin=-largest,
-                vmax=largest,
-                aspect="auto",
-                interpolation="nearest",
-                extent=(0.5, n_s + 0.5, n_a + 0.5, 0.5),
-            )
-            boxed(ax)
+            extent = (0.5, n_s + 0.5, n_a + 0.5, 0.5)
+            drawn = image(ax, block, extent, cmap=GAIN_MAP, vmin=-largest, vmax=largest)
             when = "before" if name == "lqt" else "after"
             ax.set_title(f"{symbol}, {NAMES[name]} ({when})")
-            ax.xaxis.set_major_locator(MaxNLocator(6, integer=True, min_n_ticks=1))
-            ax.yaxis.set_major_locator(MaxNLocator(6, integer=True, min_n_ticks=1))
+            for axis in (ax.xaxis, ax.yaxis):
+                axis.set_major_locator(MaxNLocator(6, integer=True, min_n_ticks=1))
             if part == 0:
                 ax.set_ylabel("actuator j")
         grid[-1, part].set_xlabel("mode of the reduced state")
         label = f"entry of {symbol}"
-        figure.colorbar(image, ax=grid[:, part].tolist(), label=label, aspect=40, pad=0.03)
+        figure.colorbar(drawn, ax=grid[:, part].tolist(), label=label, aspect=40, pad=0.03)
     return figure
 
 

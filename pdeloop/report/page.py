@@ -9,36 +9,29 @@ from __future__ import annotations
 import base64
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jinja2
 import matplotlib
 from matplotlib.figure import Figure
 
-from loop_interfaces.problem import load_parameters, shipped_problems
 from pdeloop.report import figures, learning
 from pdeloop.report.data import ProblemData, ReportData, gather
 from pdeloop.report.style import NAMES, STYLE
 from pdeloop.reproduce.table import CAVEAT, beside_the_paper, cost_text, reduction_texts, row_of
 from tuner_node.budget import PURPOSES
-from tuner_node.results import TRANSIENT, RunFolderError
+from tuner_node.results import RunFolderError
 
-PAGE = "index.html"
 PIXELS_PER_INCH = 115
 """On the page; the file has more, which an enlarged figure shows."""
-FLAGS = ("seed", "seeds", "rollouts", "iterations", "start", "optimizer", "directions")
-"""Parameters that `pdeloop train` has a flag for."""
 LIMITS = (
     " Best of class: the law with these reduced states that exact gradients find; open-loop limit: the "
     "optimal inputs of each field."
 )
 
 
-@dataclass(frozen=True)
-class Picture:
+class Picture(NamedTuple):
     """A figure on the page: file name, heading, caption, width there in pixels, PNG in base64."""
 
     name: str
@@ -72,28 +65,27 @@ def report(folder: Path, out: Path | None, limits: Path | None = None) -> tuple[
     """
     data = gather(folder, limits)
     target = out or folder / "report"
+    page = target / "index.html"
     try:
         target.mkdir(parents=True, exist_ok=True)
         with matplotlib.rc_context(STYLE):
             shared = [_save(target, *given) for given in _shared(data.problems)]
-            own = {
-                problem.name: [_save(target, *given) for given in _of_problem(problem)]
+            own = [
+                [_save(target, *given) for given in _of_problem(problem)]
                 for problem in data.problems
-            }
-        page = target / PAGE
+            ]
         page.write_text(_page(data, shared, own), encoding="utf-8")
     except OSError as error:
         raise RunFolderError(f"cannot write the report to {target}: {error.strerror}") from error
-    return page, _missing(data)
+    return page, data.missing
 
 
 def _save(target: Path, name: str, heading: str, caption: str, figure: Figure) -> Picture:
     figure.savefig(target / f"{name}.svg", metadata={"Date": None})
-    picture = BytesIO()
-    figure.savefig(picture, format="png")
-    (target / f"{name}.png").write_bytes(picture.getvalue())
+    figure.savefig(target / f"{name}.png")
     width = round(PIXELS_PER_INCH * figure.get_figwidth())
-    return Picture(name, heading, caption, width, base64.b64encode(picture.getvalue()).decode())
+    png = base64.b64encode((target / f"{name}.png").read_bytes()).decode()
+    return Picture(name, heading, caption, width, png)
 
 
 Drawn = Iterator[tuple[str, str, str, Figure]]
@@ -170,7 +162,7 @@ def _of_problem(problem: ProblemData) -> Drawn:
     )
 
 
-def _page(data: ReportData, shared: list[Picture], own: Mapping[str, list[Picture]]) -> str:
+def _page(data: ReportData, shared: list[Picture], own: list[list[Picture]]) -> str:
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -179,24 +171,16 @@ def _page(data: ReportData, shared: list[Picture], own: Mapping[str, list[Pictur
     )
     problems = data.problems
     rows = [row_of(problem.name, problem.runs) for problem in problems]
-    several = len(problems[0].first.seeds) > 1
     names = ", ".join(problem.name for problem in problems)
     return environment.get_template("page.html.j2").render(
         title="Reproduction of the paper's experiment" if data.asked else f"Training of {names}",
         facts=_facts(data),
-        missing=_missing(data),
+        missing=data.missing,
         shared=shared,
-        problems=[
-            {
-                "name": problem.name,
-                "figures": own[problem.name],
-                "parameters": list(problem.first.values.items()),
-            }
-            for problem in problems
-        ],
+        problems=list(zip(problems, own, strict=True)),
         costs=_costs(problems, rows),
         reductions=_reductions(problems, rows),
-        caveat=CAVEAT if several else "",
+        caveat=CAVEAT if len(problems[0].first.seeds) > 1 else "",
         paper=[sentence for row in rows if (sentence := beside_the_paper(row))],
         first_model=problems[0].first.values["identification_attempts"] == 1,
         shares=_shares(problems),
@@ -204,67 +188,37 @@ def _page(data: ReportData, shared: list[Picture], own: Mapping[str, list[Pictur
     )
 
 
-def _missing(data: ReportData) -> list[str]:
-    """What cannot be shown, with the problem where there are several."""
-    several = len(data.problems) > 1
-    return [
-        f"{problem.name}: {sentence}" if several else sentence
-        for problem in data.problems
-        for sentence in problem.missing
-    ]
-
-
-Facts = list[tuple[str, str]]
 Table = tuple[Sequence[str], list[tuple[str, ...]]]
 """Head and rows."""
 
 
-def _facts(data: ReportData) -> Facts:
+def _facts(data: ReportData) -> list[tuple[str, str]]:
     """What the report is about."""
-    first = data.problems[0].first
-    values = first.values
-    seeds, versions = first.seeds, first.result.get("versions", {})
+    first = data.problems[0]
+    seeds, values = first.first.seeds, first.first.values
+    if data.asked:
+        options = [f"--{k.replace('_', '-')} {v}" for k, v in data.asked["options"].items()]
+        command = " ".join(["pdeloop reproduce", *data.asked["files"], *options])
+    else:
+        command = f"pdeloop train {data.folder}/parameters.yaml"
+    facts = [("Command", command)]
+    for problem in data.problems:
+        size = "a state of {n_z} numbers, {n_a} actuators, {horizon} steps of {sample_time:g} s"
+        facts.append((f"Problem {problem.name}", size.format(**problem.first.values)))
+    for name, run in first.runs.items():
+        start = "zero gains" if run.values["start"] == "zero" else "the LQT gains"
+        text = f"{run.values['optimizer']}, started from {start}"
+        facts.append((f"Controller {NAMES[name]}", text))
+    fields = "{evaluation_fields} initial fields drawn from seed {evaluation_seed}"
+    versions = first.first.result.get("versions", {})
     return [
-        ("Command", _command(data)),
-        *((f"Problem {problem.name}", _problem(problem.first.values)) for problem in data.problems),
-        *(
-            (f"Controller {NAMES[name]}", f"{run.values['optimizer']}, started from {start}")
-            for name, run in data.problems[0].runs.items()
-            for start in ["zero gains" if run.values["start"] == "zero" else "the LQT gains"]
-        ),
+        *facts,
         ("Seeds", f"{seeds[0]} to {seeds[-1]}" if len(seeds) > 1 else str(seeds[0])),
-        (
-            "Evaluation",
-            f"{values['evaluation_fields']} initial fields drawn from seed "
-            f"{values['evaluation_seed']}",
-        ),
+        ("Evaluation", fields.format(**values)),
         ("Folder", str(data.folder.resolve())),
         ("Versions", ", ".join(f"{name} {number}" for name, number in versions.items())),
         ("Report made", time.strftime("%Y-%m-%d %H:%M")),
     ]
-
-
-def _problem(values: Mapping[str, Any]) -> str:
-    return (
-        f"a state of {values['n_z']} numbers, {values['n_a']} actuators, {values['horizon']} steps of "
-        f"{values['sample_time']:g} s"
-    )
-
-
-def _command(data: ReportData) -> str:
-    """A command that gives the same results again."""
-    if data.asked:
-        options = [f"--{k.replace('_', '-')} {v}" for k, v in data.asked["options"].items()]
-        return " ".join(["pdeloop reproduce", *data.asked["files"], *options])
-    values = data.problems[0].first.values
-    name = values["problem"]
-    if name in shipped_problems():
-        usual = load_parameters(name, {})
-        changed = [k for k in usual if k not in TRANSIENT and values.get(k, usual[k]) != usual[k]]
-        if set(changed) <= set(FLAGS):
-            flags = [f"--{k.replace('_', '-')} {values[k]}" for k in changed]
-            return " ".join(["pdeloop train", name, *flags])
-    return f"pdeloop train {data.folder}/parameters.yaml"
 
 
 def _costs(problems: Sequence[ProblemData], rows: Sequence[Mapping[str, Any]]) -> Table:

@@ -8,12 +8,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+from numpy.typing import NDArray
 
 from loop_interfaces.controllers import CONTROLLERS
 
+Array = NDArray[np.float64]
 COLOURS = {key: controller.colour for key, controller in CONTROLLERS.items()}
 NAMES = {key: controller.name for key, controller in CONTROLLERS.items()}
 LINES: dict[str, Any] = {"lqt": "--", "pure_po": "-.", "optimum": ":", "gauss_newton": (0, (5, 1))}
@@ -45,9 +48,10 @@ def panels(count: int, height: float, width: float, least: float) -> tuple[Figur
     return figure, list(figure.subplots(1, count, squeeze=False)[0])
 
 
-def boxed(ax: Axes) -> None:
-    """All four sides of the frame, as a picture has them."""
+def image(ax: Axes, values: Array, extent: tuple[float, float, float, float], **more: Any) -> Any:
+    """Draw a matrix as a picture over `extent`, inside a frame."""
     ax.spines[["top", "right"]].set_visible(True)
+    return ax.imshow(values, aspect="auto", interpolation="nearest", extent=extent, **more)
 
 
 def plain_log(ax: Axes, ratio: float) -> None:
