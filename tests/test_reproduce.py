@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-import time
 
 import numpy as np
 import pytest
@@ -116,8 +115,9 @@ def test_the_table_says_where_the_papers_figure_lies(ratio, mean, words):
 def test_an_interrupted_reproduction_continues_to_the_same_bits(loop, tmp_path):
     options = ("--seeds", "3", "--iterations", "80", "--processes", "1")
     run = loop.pdeloop("reproduce", str(SMALL), *options, "--out", str(tmp_path / "a"))
-    until(lambda: list((tmp_path / "a").glob("small/*/progress")), LIMIT, "saved progress")
-    time.sleep(0.5)
+    finished = tmp_path / "a" / "small" / "gauss_newton" / "result.json"
+    until(lambda: len(list((tmp_path / "a").glob("small/*/run.json"))) > 1, LIMIT, "second job")
+    assert finished.exists()
     run.send_signal(signal.SIGINT)
     text = loop.wait(run, 10.0, code=130)
     assert f"continue with: pdeloop reproduce --out {tmp_path / 'a'}" in text
