@@ -27,7 +27,6 @@ from viewer_node.loop_nodes import Endpoint, LoopNodes
 from viewer_node.loop_view import SILENT, SLOW, LoopView
 from viewer_node.operation import FAILURE, Call
 from viewer_node.rollout_costs import RolloutCosts
-from viewer_node.sliding_rate import SlidingRate
 from viewer_node.web.page import Page, ShowEpisode
 
 PLANT = 7
@@ -63,55 +62,57 @@ def unpacked(message: str | bytes) -> tuple[dict[str, Any], np.ndarray]:
     return json.loads(message[4 : 4 + length]), np.frombuffer(message, "<f4", offset=4 + length)
 
 
-# An episode in a fixed room.
+# An episode in a bounded memory.
 
 
 def test_an_episode_keeps_every_state_and_action_while_there_is_room():
-    episode = EpisodeSamples.begin(state(0))
+    episode = EpisodeSamples(state(0), environment=1)
     for k in range(10):
         episode.state(state(k))
         episode.action(frame([[k, -k], [10 + k, -k]], step=k))
     assert episode.columns == 10 and episode.stride == 1 and episode.whole
-    expected = np.arange(10)[:, None] + np.arange(4) / 10
-    np.testing.assert_allclose(episode.fields[0, :10], expected, rtol=1e-6)
-    np.testing.assert_allclose(episode.fields[1, :10], expected + 100, rtol=1e-6)
-    np.testing.assert_array_equal(episode.actions[1, :10, 0], 10 + np.arange(10))
-    assert np.isnan(episode.fields[:, 10:]).all()
+    expected = 100 + np.arange(10)[:, None] + np.arange(4) / 10
+    np.testing.assert_allclose(episode.fields[:10], expected, rtol=1e-6)
+    np.testing.assert_array_equal(episode.actions[:10, 0], 10 + np.arange(10))
+    assert np.isnan(episode.fields[10:]).all()
     assert episode.sample_time == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize("steps", [COLUMNS, COLUMNS + 1, 3 * COLUMNS + 7, 9 * COLUMNS])
 def test_a_long_episode_is_thinned_evenly_and_each_column_shows_a_step_of_its_own(steps):
-    episode = EpisodeSamples.begin(state(0))
+    episode = EpisodeSamples(state(0))
     for k in range(steps):
         episode.state(state(k))
     stride = episode.stride
     assert stride == 2 ** int(np.ceil(np.log2(steps / COLUMNS)))
-    shown = episode.fields[0, : episode.columns, 0]
+    shown = episode.fields[: episode.columns, 0]
     column = np.arange(episode.columns)
     assert (shown // stride == column).all()
     assert shown[-1] == steps - 1
-    assert np.isnan(episode.fields[0, episode.columns :]).all()
+    assert np.isnan(episode.fields[episode.columns :]).all()
 
 
 def test_missed_steps_stay_blank():
-    episode = EpisodeSamples.begin(state(0))
+    episode = EpisodeSamples(state(0))
     for k in (0, 1, 5):
         episode.state(state(k))
-    assert np.isnan(episode.fields[0, 2:5]).all() and not np.isnan(episode.fields[0, 5]).any()
+    assert np.isnan(episode.fields[2:5]).all() and not np.isnan(episode.fields[5]).any()
 
 
-def test_of_a_batch_that_is_too_large_only_the_chosen_environment_is_kept():
-    episode = EpisodeSamples.begin(state(0, batch=500, n_z=300), environment=321)
-    episode.state(state(0, batch=500, n_z=300))
-    assert episode.environments == [321] and episode.batch == 500
-    assert episode.fields.shape == (1, COLUMNS, ROWS)
-    assert episode.fields[0, 0, 0] == 32100 and episode.z[321, -1] == pytest.approx(32129.9)
-    assert episode.row(321) == 0 and episode.row(4) == 0
+def test_another_environment_is_shown_from_its_next_state_on():
+    view = LoopView()
+    view.state(state(0), 0.0)
+    view.environment = 7  # of a batch of two the last
+    for k in (1, 2):
+        view.state(state(k), 0.0)
+    shown = view.current
+    assert shown.first == 1 and not shown.whole and shown.environment == 1
+    np.testing.assert_allclose(shown.fields[:2, 0], [101, 102])
+    assert shown.z[-1] == pytest.approx(102.3)
 
 
 def test_a_state_of_another_batch_or_before_the_first_one_is_left_out():
-    episode = EpisodeSamples.begin(state(3))
+    episode = EpisodeSamples(state(3))
     episode.state(state(3))
     before = episode.fields.copy()
     episode.state(state(2))
@@ -131,10 +132,10 @@ def test_rows_are_evenly_spaced_from_the_first_point_of_each_component_to_the_la
 
 def test_of_very_many_delayed_measurements_the_first_are_kept():
     measured = Frame(5, 1, 0, 0.0, np.arange(3.0 * 1000)[None], PLANT)
-    episode = EpisodeSamples.begin(measured, components=1000)
+    episode = EpisodeSamples(measured, components=1000)
     episode.state(measured)
-    assert episode.fields.shape == (1, COLUMNS, 3 * MAX_COMPONENTS)
-    np.testing.assert_array_equal(episode.fields[0, 0, episode.part(1)], [3, 4, 5])
+    assert episode.fields.shape == (COLUMNS, 3 * MAX_COMPONENTS)
+    np.testing.assert_array_equal(episode.fields[0, episode.part(1)], [3, 4, 5])
     assert episode.part(999) == episode.part(MAX_COMPONENTS - 1)
 
 
@@ -351,11 +352,12 @@ def test_diagnostics_belong_to_the_node_they_name_and_are_forgotten_when_they_st
 
 
 def test_a_rate_is_that_of_the_last_seconds():
-    rate = SlidingRate()
-    for i in range(101):
-        rate.add(10, i * 0.1)
-    assert rate.per_second(10.0) == pytest.approx(100.0, rel=0.1)
-    assert rate.per_second(10.0 + 60.0) == pytest.approx(0.0, abs=1.0)
+    page, rates = Page(), []
+    for tick in range(200):
+        page.view.rounds += 50 * (tick < 100)
+        page.refresh(0.5 * tick)
+        rates.append(json.loads(page.updates({}, 0.0)[0])["rounds"])
+    assert rates[99] == pytest.approx(100.0, rel=0.01) and rates[-1] == 0.0
 
 
 # What is watched.
@@ -393,8 +395,8 @@ def test_rounds_are_counted_though_only_some_are_seen():
         view.start(start([[0, -1, 0, 0]], episode=episode), 0.1 * episode)
         view.cost(cost([1.0], episode=episode, step=50), 0.1 * episode)
         view.cost(cost([1.0], episode=episode, step=50), 0.1 * episode)  # repeated
-    assert view.rounds.per_second(3.0) == pytest.approx(500, rel=0.1)
-    assert view.episodes.per_second(3.0) == pytest.approx(10, rel=0.1)
+    assert view.rounds == 30 * 50
+    assert view.episodes == 30
 
 
 def test_only_the_asked_run_is_shown():
@@ -518,10 +520,11 @@ def test_another_environment_and_another_loop_are_sent():
     np.testing.assert_array_equal(parts["target"][1], [1, 2, 3, 4])
     assert parts["episode"][0]["environment"] == 0
     assert page.choose({"environment": 1})
+    view.state(state(5), 0.0)
     ((header, numbers),) = map(unpacked, page.updates(sent, 0.0))
-    assert header["environment"] == 1 and numbers[0] == 100
+    assert header["environment"] == 1 and numbers[0] == 105
     view = LoopView()
-    page.show(view, {"domain": 3, "namespace": "/"})
+    page.show(view, domain=3, namespace="/")
     page.refresh(0.0)
     view.state(state(0), 0.0)
     headers = [unpacked(message)[0] for message in page.updates(sent, 0.0)]
@@ -582,7 +585,7 @@ def test_a_run_that_was_interrupted_is_shown_until_it_goes_on(tmp_path, own_sign
     assert found
 
 
-def test_an_episode_that_is_shown_already_is_not_sent_again(tmp_path, own_signals):
+def test_the_recorded_episode_that_a_page_asks_for_is_shown(tmp_path, own_signals):
     folder = RunFolder(tmp_path / "run")
     folder.create(parameters())
     run = run_id(folder.path)
@@ -608,7 +611,7 @@ def test_an_episode_that_is_shown_already_is_not_sent_again(tmp_path, own_signal
         return [Live(17, folder.path, 1.0)] if page.requests.empty() else []
 
     assert replay(folder.path, Finder(folder.path, None, look), page)
-    assert begun == [2, None, 1, None, 2]
+    assert begun == [2, 2, 1, 1, 2]
 
 
 def test_a_stop_signal_ends_the_replay(tmp_path, own_signals):

@@ -133,6 +133,7 @@ def test_a_page_of_ours_reaches_the_nodes_and_nothing_but_what_they_offer():
         ):
             assert asyncio.run(ask(server, "POST", watch, json=body, **allowed))[0] == status, body
         assert page.requests.get(timeout=10) == Watch("/lab")
+        assert page.requests.get(timeout=10) == ShowEpisode(0)  # again, in the other environment
         assert page.requests.get(timeout=10) == ShowEpisode(1) and page.requests.empty()
 
 
@@ -171,7 +172,7 @@ def test_the_colour_map_is_that_of_the_report():
 def test_the_page_tells_what_a_node_computes_and_what_became_of_a_request(tmp_path):
     """In a real browser, with a tuner that is only told of."""
     with served() as (server, page), browser(tmp_path) as tab:
-        page.place = {"domain": 1, "folder": None, "namespace": "/"}
+        page.show(page.view, domain=1, namespace="/")
         page.controls = [{"role": "tuner", "node": "/t", "verbs": ["pause", "resume", "stop"]}]
         view, now = page.view, time.monotonic()
         view.nodes.update({"tuner": [Endpoint("/t", b"t")]})

@@ -85,9 +85,9 @@ def test_costs_are_told_apart_by_the_gains_that_caused_them(noise):
     begin(shown, [np.zeros_like(lqt), lqt, adapted, adapted, adapted], noise=noise)
     costs = [(10.0, 100.0, -1), (5.0, 50.0, -1), (4.0, 40.0, -1), (2.0, 20.0, -1), (1e9, 1e10, 3)]
     shown.cost(frame(costs), 0.0)
-    shown.state(frame(np.zeros((5, N_Z))), 0.0)
     for environment, controller in enumerate(("none", "lqt", "adapted")):
         shown.environment = environment
+        shown.state(frame(np.zeros((5, N_Z))), 0.0)
         assert shown.controller(shown.current) == controller
     shown.environment = 0
     numbers = shown.numbers()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from bisect import insort
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -25,23 +24,24 @@ RATE_WINDOW = 60.0
 _VERSIONS = itertools.count(1)
 
 
-@dataclass(frozen=True, order=True)
-class CurvePoint:
-    """Costs of one seed: x, mean cost, lowest and highest of the rollouts that it is made of."""
-
-    x: int
-    cost: float
-    low: float
-    high: float
-
-
 @dataclass
 class LearningCurve:
     """Mean stage cost by the rollouts that a seed has made, or by episode where only topics tell.
 
-    axis: what x is; phase: what the training does; budget: the rollouts of a seed, 0 if unknown;
-    references: mean stage costs to compare with, by controller; evaluations: those of each seed's
-    closing evaluation; version: another one after each change, and of each curve.
+    Attributes
+    ----------
+    axis, phase
+        What x is; what the training does.
+    budget
+        The rollouts of a seed, 0 if unknown.
+    references
+        Mean stage costs to compare with, by controller.
+    evaluations
+        Those of each seed's closing evaluation.
+    diverged
+        Rollouts of the adaptation that diverged.
+    version
+        Differs after each change, and from curve to curve.
     """
 
     axis: str = "episode"
@@ -51,7 +51,8 @@ class LearningCurve:
     evaluations: dict[int, dict[str, float]] = field(default_factory=dict)
     diverged: int = 0
     version: int = field(default_factory=lambda: next(_VERSIONS))
-    _points: dict[int, list[CurvePoint]] = field(default_factory=dict)
+    _points: dict[int, dict[int, tuple[float, float, float]]] = field(default_factory=dict)
+    """By seed and x: mean cost, lowest and highest of the rollouts that it is made of."""
     _rollouts: dict[int, int] = field(default_factory=dict)
     _budgets: int = 0
     _checked: dict[int, tuple[float, float]] = field(default_factory=dict)
@@ -99,7 +100,7 @@ class LearningCurve:
         if "cost" in row and math.isfinite(cost := float(row["cost"])):
             pair = [float(row[name]) for name in ("cost_plus", "cost_minus") if name in row]
             made_of = [value for value in pair if math.isfinite(value)] or [cost]
-            self._add(seed, CurvePoint(x, cost, min(made_of), max(made_of)))
+            self._add(seed, x, (cost, min(made_of), max(made_of)))
 
     def episode(self, rollouts: Rollouts) -> None:
         """Take an episode that is over, from the topics alone.
@@ -123,27 +124,25 @@ class LearningCurve:
             self._rollouts[model] = x
             own = rollouts.mean[rollouts.completed & (rollouts.models == model)]
             if own.size:
-                point = CurvePoint(x, float(own.mean()), float(own.min()), float(own.max()))
-                self._add(model, point)
+                self._add(model, x, (float(own.mean()), float(own.min()), float(own.max())))
 
     @property
     def seeds(self) -> list[int]:
         """The seeds that were seen, in order."""
         return sorted(self._rollouts)
 
-    def costs(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def costs(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Rollouts (X,) and the cost of each seed by then (S, X), NaN before its first.
 
         A seed keeps its cost until its next point. X is at most SENT.
         """
-        xs = np.unique([point.x for points in self._points.values() for point in points])
-        every = max(1, -(-len(xs) // SENT))
-        xs = xs[::-every][::-1].astype(np.float64)
+        xs = np.unique([x for points in self._points.values() for x in points]).astype(np.int64)
+        xs = xs[:: -max(1, -(-len(xs) // SENT))][::-1]
         rows = np.full((len(self._points), len(xs)), np.nan)
-        for row, seed in zip(rows, sorted(self._points), strict=True):
-            points = self._points[seed]
-            known = np.searchsorted([point.x for point in points], xs, side="right") - 1
-            row[known >= 0] = np.array([point.cost for point in points])[known[known >= 0]]
+        for row, (_, points) in zip(rows, sorted(self._points.items()), strict=True):
+            own = sorted(points)
+            known = np.searchsorted(own, xs, side="right") - 1
+            row[known >= 0] = np.array([points[x][0] for x in own])[known[known >= 0]]
         return xs, rows
 
     def remaining(self, now: float) -> float | None:
@@ -165,39 +164,35 @@ class LearningCurve:
         several = len(costs) > 1
         if several:
             # A seed without a point yet is left out of the mean; there is one with, or no x.
-            mean, low, high = (f(costs, axis=0) for f in (np.nanmean, np.nanmin, np.nanmax))
-        else:
-            points = {p.x: p for own in self._points.values() for p in own}
-            found = [points[int(x)] for x in xs]
             mean, low, high = (
-                np.array([getattr(p, name) for p in found]) for name in ("cost", "low", "high")
+                f(costs, axis=0).tolist() for f in (np.nanmean, np.nanmin, np.nanmax)
             )
+        else:
+            points = [own[x] for own in self._points.values() for x in xs.tolist()]
+            mean, low, high = ([point[i] for point in points] for i in range(3))
+        paid = self._rollouts.values()
         return {
             "axis": self.axis,
             "phase": self.phase,
             "budget": self.budget,
             "band": "seeds" if several else "rollouts",
             "seeds": self.seeds,
-            "paid": [
-                min(self._rollouts.values(), default=0),
-                max(self._rollouts.values(), default=0),
-            ],
+            "paid": [min(paid, default=0), max(paid, default=0)],
             "diverged": self.diverged,
             "references": self.references,
             "evaluations": self.evaluations,
             "x": xs.tolist(),
-            "mean": mean.tolist(),
-            "low": low.tolist(),
-            "high": high.tolist(),
+            "mean": mean,
+            "low": low,
+            "high": high,
             "costs": [[None if math.isnan(c) else c for c in row] for row in costs.tolist()]
             if several
             else [],
         }
 
-    def _add(self, seed: int, point: CurvePoint) -> None:
-        points = self._points.setdefault(seed, [])
-        if points and point.x <= points[-1].x:  # repeated by a tuner that began again
-            points[:] = [other for other in points if other.x != point.x]
-        insort(points, point)
+    def _add(self, seed: int, x: int, point: tuple[float, float, float]) -> None:
+        points = self._points.setdefault(seed, {})
+        points[x] = point  # in place of the same one of a tuner that began again
         if len(points) > MAX_POINTS:
-            del points[1::2]
+            for old in sorted(points)[1::2]:
+                del points[old]

@@ -19,7 +19,6 @@ from viewer_node.learning_curve import LearningCurve
 from viewer_node.loop_nodes import LoopNodes
 from viewer_node.operation import Operation
 from viewer_node.rollout_costs import RolloutCosts
-from viewer_node.sliding_rate import SlidingRate
 
 Array = NDArray[np.float64]
 SLOW = 1.0
@@ -84,12 +83,11 @@ class LoopView:
         self.nodes = LoopNodes()
         self.operation = Operation(self.nodes)
         self.curve = LearningCurve()
-        self.rounds, self.episodes = SlidingRate(), SlidingRate()
+        self.rounds = self.episodes = self.samples = 0
         self.current: EpisodeSamples | None = None
         self.finished: EpisodeSamples | None = None
         self.targets: OrderedDict[int, Array] = OrderedDict()
         self.run = 0
-        self.samples = 0
         self._costs = RolloutCosts()
         self._numbers: dict[str, float] = {}
         self._current_since = 0.0
@@ -107,16 +105,22 @@ class LoopView:
         self.samples += 1
         key, current = key_of(frame), self.current
         # The same episode again from its beginning: the plant was restarted.
-        if current is None or current.key != key or (frame.step == 0 and current.last):
+        again = current is not None and frame.step == 0 and current.last > 0
+        if (
+            current is None
+            or current.key != key
+            or current.environment != min(self.environment, current.batch - 1)
+            or again
+        ):
             self._current_since = now
-            self.current = current = EpisodeSamples.begin(
+            self.current = current = EpisodeSamples(
                 frame,
                 environment=self.environment,
                 components=len(self.components),
                 horizon=self.horizon,
             )
         current.state(frame)
-        self._count(key, frame.step, now)
+        self._count(key, frame.step)
 
     def action(self, frame: Frame, now: float) -> None:
         """Take a_k of all environments."""
@@ -126,7 +130,7 @@ class LoopView:
         if current.key != key_of(frame):
             return
         current.action(frame)
-        a = frame.values[min(self.environment, len(frame.values) - 1)]
+        a = frame.values[min(current.environment, len(frame.values) - 1)]
         self._numbers["action_norm"] = float(np.sqrt(a @ a))
         if frame.step == current.last and (error := self._error()) is not None:
             q, r = self.weights
@@ -168,10 +172,10 @@ class LoopView:
         if self._costs_of == ids:
             return  # repeated
         self._costs_of = ids
-        self._count(key, frame.step, now)
+        self._count(key, frame.step)
         if (frame.values[:, CostColumn.ENDED] == VOID).any():
             return
-        self.episodes.add(1, now)
+        self.episodes += 1
         self.nodes.heard(now, "controller")
         rollouts = self._costs.cost(frame)
         if rollouts is None:
@@ -222,19 +226,18 @@ class LoopView:
     def profile(self) -> tuple[Array, Array | None] | None:
         """The newest field (n_z,) of the chosen environment and its target; None before the first."""
         current = self.current
-        if current is None or not len(current.z):
+        if current is None:
             return None
-        z = current.z[min(self.environment, current.batch - 1)]
         target = self.targets.get(current.key[2])
-        return z, target if target is not None and len(target) == len(z) else None
+        fits = target is not None and len(target) == len(current.z)
+        return current.z, target if fits else None
 
     def space_time(self, now: float) -> NDArray[np.float32] | None:
         """The field of the shown episode, (steps, points), to the horizon; NaN where not seen."""
         shown = self.shown(now)
         if shown is None:
             return None
-        rows = min(shown.fields.shape[1], max(shown.columns, self.horizon // shown.stride + 1))
-        return shown.fields[shown.row(self.environment), :rows]
+        return shown.fields[: max(shown.columns, self.horizon // shown.stride + 1)]
 
     def state_of_loop(self, now: float) -> str:
         """What goes on, in one word."""
@@ -253,9 +256,8 @@ class LoopView:
         return "running" if quiet < SILENT else "silent"
 
     def controller(self, shown: EpisodeSamples) -> str:
-        """Who acts in the chosen environment: see RolloutCosts.controller."""
-        environment = shown.environments[shown.row(self.environment)]
-        return self._costs.controller(shown.key[0], shown.key[1], environment)
+        """Who acts in the shown environment: see RolloutCosts.controller."""
+        return self._costs.controller(shown.key[0], shown.key[1], shown.environment)
 
     def quiet(self, now: float) -> float | None:
         """Seconds since the last message of the loop; None before the first."""
@@ -269,7 +271,7 @@ class LoopView:
         if shown is None:
             return before
         part = shown.part(component)
-        seen = shown.fields[shown.row(self.environment), : shown.columns, part]
+        seen = shown.fields[: shown.columns, part]
         seen = seen[np.isfinite(seen)]
         if not seen.size:
             return before
@@ -308,11 +310,11 @@ class LoopView:
         self._heard, self.run = now, frame.run
         return True
 
-    def _count(self, key: Key, step: int, now: float) -> None:
+    def _count(self, key: Key, step: int) -> None:
         """Count rounds, of which not every one was seen: an episode's last step says how many."""
         before = self._counted[1] if self._counted and self._counted[0] == key else 0
         if step > before:
-            self.rounds.add(step - before, now)
+            self.rounds += step - before
         self._counted = key, max(step, before)
 
 

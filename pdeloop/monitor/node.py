@@ -12,11 +12,8 @@ from __future__ import annotations
 import contextlib
 import os
 import queue
-import signal
-import threading
 import time
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -27,12 +24,12 @@ from loop_interfaces.ros.introspection import NAMELESS
 from loop_interfaces.ros.node_main import ConfigurationError, ros_node
 from loop_interfaces.ros.observer import Observer
 from loop_interfaces.ros.parameters import RemoteParameters
-from loop_interfaces.topics import Topic
 from pdeloop.display import ProgressFile
 from pdeloop.live import Live
 from pdeloop.monitor.finder import Finder, run_id
 from pdeloop.monitor.names import component_names, short
 from pdeloop.monitor.read_budget import ReadBudget
+from pdeloop.monitor.replay import REFRESH, stop_event
 from pdeloop.monitor.service_call import ServiceCall
 from viewer_node.learning_curve import LearningCurve
 from viewer_node.loop_nodes import ROLES, Endpoint
@@ -43,8 +40,6 @@ from viewer_node.web.page import Page, Watch
 
 ATTEND = 0.1
 """Seconds between two looks at what the page asks for, and at what was asked of the nodes."""
-REFRESH = 0.5
-"""Seconds between two looks at rates and at the progress of the run."""
 LOOK = 1.0
 """Seconds between two looks at the graph and at which loop runs."""
 
@@ -92,15 +87,14 @@ class MonitorNode:
         self._namespace, self._budget = namespace, ReadBudget()
         folder = self._live.folder
         self._progress = _progress(folder)
-        place: dict[str, Any] = {
-            "domain": self._live.domain,
-            "folder": None if folder is None else short(folder),
-            "namespace": namespace,
-            "namespaces": [],
-        }
         from_topics = self._progress is None
         self._view = LoopView(only=self._finder.only_run, curve_from_topics=from_topics)
-        self._page.show(self._view, place)
+        self._page.show(
+            self._view,
+            domain=self._live.domain,
+            folder=None if folder is None else short(folder),
+            namespace=namespace,
+        )
         self._reader = None
         if namespace is not None:
             self._reader = LoopReader(self._node, namespace, self._view)
@@ -148,9 +142,10 @@ class MonitorNode:
         if not self._given and found and self._namespace not in found:
             self._begin(found[0])
         by_role: dict[str, list[Endpoint]] = {}
+        prefix = (self._namespace or "").rstrip("/")
         for role, topic in ROLES.items():
             by_role[role] = []
-            for endpoint in self._node.get_publishers_info_by_topic(self._name(topic)):
+            for endpoint in self._node.get_publishers_info_by_topic(f"{prefix}/{topic}"):
                 if endpoint.node_name == NAMELESS:
                     continue
                 name = f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
@@ -173,10 +168,6 @@ class MonitorNode:
                 for row in self._progress.rows():
                     self._view.curve.row(row)
         self._page.refresh(self._loop.now())
-
-    def _name(self, topic: Topic | str) -> str:
-        name = topic if isinstance(topic, str) else topic.name
-        return f"{(self._namespace or '').rstrip('/')}/{name}"
 
     def _namespaces(self) -> list[str]:
         """Namespaces in which somebody publishes what a node of a loop does."""
@@ -237,19 +228,12 @@ def _progress(folder: Path | None) -> ProgressFile | None:
 
 def watch(page: Page, finder: Finder, *, namespace: str | None, network: bool) -> None:
     """Watch what `finder` finds, one loop after the other, until SIGINT or SIGTERM."""
-    stop = threading.Event()
-
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        stop.set()
-
-    while not stop.is_set():
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, on_signal)
-        live = finder.find()
-        if live is None:
+    while True:
+        stop = stop_event()
+        while (live := finder.find()) is None:
             page.refresh(time.monotonic())
-            stop.wait(REFRESH)
-            continue
+            if stop.wait(REFRESH):
+                return
         if not (network or live.network):
             keep_on_this_machine()
         os.environ["ROS_DOMAIN_ID"] = str(live.domain)

@@ -11,7 +11,6 @@ import threading
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from pdeloop.display import ProgressFile
@@ -43,23 +42,12 @@ class Replay:
             episodes=len(self._bag.rows),
             note=self._bag.note,
         )
-        place: dict[str, Any] = {
-            "domain": None,
-            "folder": short(folder),
-            "namespace": None,
-            "namespaces": [],
-        }
         with page.lock:
-            page.show(self._view, place, self._recorded)
+            page.show(self._view, folder=short(folder), recorded=self._recorded)
             page.take_parameters(values)
         if self._bag.rows:
             self.show(len(self._bag.rows) - 1)
         page.refresh(time.monotonic())
-
-    @property
-    def index(self) -> int:
-        """The recorded episode that is shown."""
-        return self._recorded.chosen
 
     def show(self, index: int) -> None:
         """Show the recorded episode of this index, from its newest state."""
@@ -126,15 +114,17 @@ class _RecordedEpisodes:
         return ", ".join(words)
 
 
+def stop_event() -> threading.Event:
+    """An event that SIGINT and SIGTERM set from now on."""
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    return stop
+
+
 def replay(folder: Path, finder: Finder, page: Page) -> bool:
     """Show the run in `folder` until it goes on, or until SIGINT or SIGTERM: then False."""
-    stop = threading.Event()
-
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        stop.set()
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, on_signal)
+    stop = stop_event()
     shown = Replay(folder, page)
     while not stop.is_set():
         if finder.find() is not None:
@@ -143,7 +133,6 @@ def replay(folder: Path, finder: Finder, page: Page) -> bool:
             request = page.requests.get(timeout=REFRESH)
         except queue.Empty:
             continue
-        # Shown again, it would move every page that looks at a time in it to its newest state.
-        if isinstance(request, ShowEpisode) and request.index != shown.index:
+        if isinstance(request, ShowEpisode):
             shown.show(request.index)
     return False

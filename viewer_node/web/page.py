@@ -14,6 +14,7 @@ import queue
 import struct
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -28,6 +29,8 @@ from viewer_node.operation import Call
 
 MAX_INDEX = 2**24
 """Environments and components that can be asked for."""
+RATE_WINDOW = 3.0
+"""Seconds over which rates are taken."""
 COLOUR_PERIOD = 0.5
 """Seconds between two computations of the range of the colours."""
 PARAMETERS = (
@@ -80,7 +83,8 @@ class Page:
     view
         The loop that is shown.
     place
-        Its ROS domain, folder and namespace, and the namespaces that there are.
+        Its ROS domain, folder and namespace, the namespaces that there are, and a number that
+        differs from loop to loop.
     parameters, controls
         Of its nodes: parameters, and the services that they offer.
     recorded
@@ -95,7 +99,7 @@ class Page:
         self.lock = threading.RLock()
         self.view = LoopView()
         self.view.environment = environment
-        self.place: dict[str, Any] = {"domain": None, "folder": None, "namespace": None}
+        self.place: dict[str, Any] = {"domain": None, "namespaces": [], "begun": 0}
         self.parameters: dict[str, Any] = {}
         self.controls: list[dict[str, Any]] = []
         self.recorded: Recorded | None = None
@@ -105,16 +109,31 @@ class Page:
         self._status: str | None = None
         self._colours = (0.0, 1.0)
         self._coloured = float("-inf")
+        self._counts: deque[tuple[float, int, int]] = deque()
+        """Time, rounds and episodes of the last RATE_WINDOW."""
 
     def show(
-        self, view: LoopView, place: Mapping[str, Any], recorded: Recorded | None = None
+        self,
+        view: LoopView,
+        *,
+        domain: int | None = None,
+        folder: str | None = None,
+        namespace: str | None = None,
+        recorded: Recorded | None = None,
     ) -> None:
         """Show another loop, in the environment that was chosen."""
         with self.lock:
             view.environment = self.view.environment
             self.view, self.recorded = view, recorded
-            self.place = {**place, "begun": self.place.get("begun", 0) + 1}
             self.parameters, self.controls = {}, []
+            self._counts.clear()
+            self.place = {
+                "domain": domain,
+                "folder": folder,
+                "namespace": namespace,
+                "namespaces": [],
+                "begun": self.place["begun"] + 1,
+            }
 
     def take_parameters(self, values: Mapping[str, Any]) -> None:
         """Take parameters of a node."""
@@ -135,9 +154,11 @@ class Page:
             match wanted:
                 case {"environment": index} if _is_index(index, MAX_INDEX):
                     self.view.environment = index
+                    if self.recorded is not None:
+                        self.requests.put(ShowEpisode(self.recorded.chosen))
                 case {"component": index} if _is_index(index, MAX_INDEX):
                     self.component = index
-                case {"namespace": str(name)} if name in (self.place.get("namespaces") or ()):
+                case {"namespace": str(name)} if name in self.place["namespaces"]:
                     self.requests.put(Watch(name))
                 case {"episode": index} if self.recorded and _is_index(
                     index, self.recorded.episodes
@@ -154,6 +175,11 @@ class Page:
             view, names = self.view, self.view.components[:MAX_COMPONENTS]
             quiet, remaining = view.quiet(now), view.curve.remaining(time.time())
             shown = view.shown(now)
+            self._counts.append((now, view.rounds, view.episodes))
+            while now - self._counts[0][0] > RATE_WINDOW:
+                self._counts.popleft()
+            since, rounds, episodes = self._counts[0]
+            elapsed = max(now - since, RATE_WINDOW / 10)
             status = {
                 "part": "status",
                 "place": self.place,
@@ -169,8 +195,8 @@ class Page:
                 "environments": 0 if shown is None else shown.batch,
                 "component": min(self.component, len(names) - 1),
                 "components": names,
-                "rounds": round(view.rounds.per_second(now), 2),
-                "episodes": round(view.episodes.per_second(now), 2),
+                "rounds": round((view.rounds - rounds) / elapsed, 2),
+                "episodes": round((view.episodes - episodes) / elapsed, 2),
                 "nodes": view.nodes.message(now),
                 "controls": self.controls,
                 "recorded": None if self.recorded is None else vars(self.recorded),
@@ -206,9 +232,9 @@ class Page:
         if shown is None:
             return
         target = view.targets.get(shown.key[2])
-        chosen = (self.place.get("begun"), shown.components, self.component)
+        chosen = (self.place["begun"], shown.components, self.component)
         yield "target", (*chosen, id(target)), partial(self._target, target, shown)
-        samples = (*chosen, view.environment, shown.version, shown.ended, self._colours)
+        samples = (*chosen, shown.version, shown.ended, self._colours)
         yield "episode", samples, partial(self._episode, shown)
 
     def _target(self, target: NDArray[np.float64] | None, shown: EpisodeSamples) -> bytes:
@@ -218,16 +244,14 @@ class Page:
 
     def _episode(self, shown: EpisodeSamples) -> bytes:
         """The shown episode: its field (columns, rows), actions (columns, n_a), newest state (rows)."""
-        view = self.view
-        row = shown.row(view.environment)
-        fields = shown.fields[row, : shown.columns, shown.part(self.component)]
-        actions = shown.actions[row, : shown.columns] if shown.actions.size else fields[:, :0]
+        fields = shown.fields[: shown.columns, shown.part(self.component)]
+        actions = shown.actions[: shown.columns]
         header = {
             "part": "episode",
             "run": shown.key[0],
             "episode": shown.key[1],
-            "controller": view.controller(shown),
-            "environment": shown.environments[row],
+            "controller": self.view.controller(shown),
+            "environment": shown.environment,
             "columns": len(fields),
             "rows": fields.shape[1],
             "actions": actions.shape[1],
@@ -238,7 +262,7 @@ class Page:
             "sample_time": shown.sample_time or self.parameters.get("sample_time", 0.0),
             "range": self._colours,
         }
-        newest = self._points(shown.z[shown.environments[row]], shown)
+        newest = self._points(shown.z, shown)
         return _pack(header, np.concatenate([fields.ravel(), actions.ravel(), newest]))
 
     def _points(self, z: NDArray[np.float64], shown: EpisodeSamples) -> NDArray[np.float64]:
