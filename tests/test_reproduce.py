@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from pdeloop.finished_run import reduction
 from pdeloop.in_process import LocalPair
 from pdeloop.reproduce.job import LEARNED
 from pdeloop.reproduce.table import beside_the_paper, rows_of, runs_of
-from tests.loop_harness import Processes, until
+from tests.loop_harness import processes, until
 from tests.small import SMALL, parameters, same_bits, train_here
 from tuner_node.batch import Batch
 from tuner_node.seeds import Purpose, derive
@@ -21,20 +22,27 @@ from tuner_node.seeds import Purpose, derive
 LIMIT = 300.0
 
 
-def reproduced(loop: Processes, out, *more: str) -> str:
-    options = ("--seeds", "2", "--iterations", "12", "--out", str(out))
-    return loop.wait(loop.pdeloop("reproduce", str(SMALL), *options, *more), LIMIT)
+OPTIONS = (str(SMALL), "--seeds", "2", "--iterations", "12")
 
 
-def test_every_number_is_that_of_the_trainings(loop, tmp_path):
-    text = reproduced(loop, tmp_path / "out")
+@pytest.fixture(scope="module")
+def reproduction(tmp_path_factory) -> tuple[Path, str]:
+    """A small reproduction: its folder, and what it said."""
+    base = tmp_path_factory.mktemp("reproduction")
+    with processes(base) as running:
+        run = running.pdeloop("reproduce", *OPTIONS, "--out", str(base / "out"))
+        return base / "out", running.wait(run, LIMIT)
+
+
+def test_every_number_is_that_of_the_trainings(reproduction):
+    out, text = reproduction
     for words in ("below LQT", "LQT-PO", "pure PO", "Gauss-Newton", "bootstrap"):
         assert words in text, words
-    runs = runs_of(tmp_path / "out", "small")
+    runs = runs_of(out, "small")
     for name, how in LEARNED.items():
         budget = {"rollouts": 24} if how["optimizer"] == "gauss_newton" else {"iterations": 12}
         training = train_here(parameters(seeds=2, **how, **budget))
-        with np.load(tmp_path / "out" / "small" / name / "curve.npz") as curve:
+        with np.load(out / "small" / name / "curve.npz") as curve:
             assert same_bits(curve["policies"][-1], training.policies())
             assert same_bits(curve["costs"][-1], training.evaluation[:, 2].copy())
             start = training.evaluation[:, 0 if how["start"] == "zero" else 1]
@@ -43,7 +51,7 @@ def test_every_number_is_that_of_the_trainings(loop, tmp_path):
         assert same_bits(runs[name].costs["adapted"], training.evaluation[:, 2].copy())
         assert same_bits(runs[name].warm, runs["lqt_po"].warm)
         assert same_bits(runs[name].costs["lqt"], runs["lqt_po"].costs["lqt"])
-    (row,) = rows_of(tmp_path / "out", ["small"])
+    (row,) = rows_of(out, ["small"])
     lqt, adapted = (runs["lqt_po"].costs[name].mean(axis=1) for name in ("lqt", "adapted"))
     below = row["lqt_po"]["below_lqt_percent"]
     assert below["mean_of_ratios"] == pytest.approx(100 * (1 - adapted / lqt).mean(), abs=1e-9)
@@ -52,15 +60,15 @@ def test_every_number_is_that_of_the_trainings(loop, tmp_path):
     )
     low, high = below["ratio_interval"]
     assert low <= below["ratio_of_means"] <= high
-    saved = json.loads((tmp_path / "out" / "table.json").read_text())
+    saved = json.loads((out / "table.json").read_text())
     assert saved["rows"][0]["lqt"]["mean"] == row["lqt"]["mean"] == pytest.approx(lqt.mean())
 
 
-def test_the_curve_is_the_cost_of_each_policy(loop, tmp_path):
-    reproduced(loop, tmp_path / "out")
+def test_the_curve_is_the_cost_of_each_policy(reproduction):
+    out, _ = reproduction
     values = parameters()
     for name in ("lqt_po", "gauss_newton"):
-        folder = tmp_path / "out" / "small" / name
+        folder = out / "small" / name
         with np.load(folder / "curve.npz") as curve, np.load(folder / "policy.npz") as final:
             pair = LocalPair(values)
             pair.use_models(final["model"])
@@ -112,32 +120,28 @@ def test_the_table_says_where_the_papers_figure_lies(ratio, mean, words):
     assert words in beside_the_paper(row)
 
 
-def test_an_interrupted_reproduction_continues_to_the_same_bits(loop, tmp_path):
-    options = ("--seeds", "3", "--iterations", "80", "--processes", "1")
-    run = loop.pdeloop("reproduce", str(SMALL), *options, "--out", str(tmp_path / "a"))
-    finished = tmp_path / "a" / "small" / "gauss_newton" / "result.json"
-    until(lambda: len(list((tmp_path / "a").glob("small/*/run.json"))) > 1, LIMIT, "second job")
-    assert finished.exists()
+def test_an_interrupted_reproduction_continues_to_the_same_bits(loop, tmp_path, reproduction):
+    run = loop.pdeloop("reproduce", *OPTIONS, "--out", str(tmp_path / "a"))
+    until(lambda: list((tmp_path / "a").glob("small/*/run.json")), LIMIT, "first job")
     run.send_signal(signal.SIGINT)
     text = loop.wait(run, 10.0, code=130)
     assert f"continue with: pdeloop reproduce --out {tmp_path / 'a'}" in text
     until(lambda: loop.left_behind() == [], 2.0, "end of all processes")
     assert not (tmp_path / "a" / "table.json").exists()
     loop.wait(loop.pdeloop("reproduce", "--out", str(tmp_path / "a")), LIMIT)
-    whole = loop.pdeloop("reproduce", str(SMALL), *options[:4], "--out", str(tmp_path / "b"))
-    loop.wait(whole, LIMIT)
+    whole, _ = reproduction
     for name in LEARNED:
         with (
             np.load(tmp_path / "a" / "small" / name / "curve.npz") as a,
-            np.load(tmp_path / "b" / "small" / name / "curve.npz") as b,
+            np.load(whole / "small" / name / "curve.npz") as b,
         ):
             for array in ("costs", "policies", "rollouts"):
                 assert same_bits(a[array], b[array])
 
 
-def test_what_cannot_be_done_is_one_line(loop, tmp_path):
-    reproduced(loop, tmp_path / "out")
-    other = loop.pdeloop("reproduce", "--seeds", "3", "--out", str(tmp_path / "out"))
+def test_what_cannot_be_done_is_one_line(loop, tmp_path, reproduction):
+    out, _ = reproduction
+    other = loop.pdeloop("reproduce", "--seeds", "3", "--out", str(out))
     text = loop.wait(other, LIMIT, code=1)
     assert "asked for something else (seeds: 2 there, 3 now)" in text
     text = loop.wait(loop.pdeloop("reproduce", "nothing"), LIMIT, code=1)
