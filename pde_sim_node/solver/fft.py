@@ -14,6 +14,7 @@ SIAM 1992, section 1.7.
 """
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -144,83 +145,65 @@ def first_pass(w: int, x: int, y: int, d: int, b: int, c: int, v: int, e: int) -
             store(w, y + 8 * p + 8 * row + d, i[row])
 
 
-@inlined_njit
-def pass8(w: int, x: int, y: int, d: int, m: int, s: int, c: int, v: int, e: int) -> int:
-    for p in range(m):
-        for q in range(0, s, 8):
-            z = butterfly8(w, x + q + s * p, d, s * m)
-            o = y + q + 8 * s * p
-            store(w, o, z[0][0])
-            store(w, o + d, z[0][1])
-            twiddled(w, o + s, d, p, z[1][0], z[1][1], c, v, e)
-            twiddled(w, o + 2 * s, d, p, z[2][0], z[2][1], c, v + 1, e)
-            twiddled(w, o + 3 * s, d, p, z[3][0], z[3][1], c, v + 2, e)
-            twiddled(w, o + 4 * s, d, p, z[4][0], z[4][1], c, v + 3, e)
-            twiddled(w, o + 5 * s, d, p, z[5][0], z[5][1], c, v + 4, e)
-            twiddled(w, o + 6 * s, d, p, z[6][0], z[6][1], c, v + 5, e)
-            twiddled(w, o + 7 * s, d, p, z[7][0], z[7][1], c, v + 6, e)
-        v += 7
-    return v
+@jit
+def butterfly4(w: int, x: int, d: int, t: int) -> Any:
+    """DFT of the four numbers x, x + t, x + 2t, x + 3t."""
+    a0r, a0i = load(w, x), load(w, x + d)
+    a1r, a1i = load(w, x + t), load(w, x + t + d)
+    a2r, a2i = load(w, x + 2 * t), load(w, x + 2 * t + d)
+    a3r, a3i = load(w, x + 3 * t), load(w, x + 3 * t + d)
+    b0r, b0i, b2r, b2i = a0r + a2r, a0i + a2i, a0r - a2r, a0i - a2i
+    b1r, b1i, b3r, b3i = a1r + a3r, a1i + a3i, a1r - a3r, a1i - a3i
+    return (
+        (b0r + b1r, b0i + b1i),
+        (b2r + b3i, b2i - b3r),
+        (b0r - b1r, b0i - b1i),
+        (b2r - b3i, b2i + b3r),
+    )
 
 
-@inlined_njit
-def pass4(w: int, x: int, y: int, d: int, m: int, s: int, c: int, v: int, e: int) -> int:
-    t = s * m
-    for p in range(m):
-        for q in range(0, s, 8):
-            i = x + q + s * p
-            a0r, a0i = load(w, i), load(w, i + d)
-            a1r, a1i = load(w, i + t), load(w, i + t + d)
-            a2r, a2i = load(w, i + 2 * t), load(w, i + 2 * t + d)
-            a3r, a3i = load(w, i + 3 * t), load(w, i + 3 * t + d)
-            b0r, b0i, b2r, b2i = a0r + a2r, a0i + a2i, a0r - a2r, a0i - a2i
-            b1r, b1i, b3r, b3i = a1r + a3r, a1i + a3i, a1r - a3r, a1i - a3i
-            o = y + q + 4 * s * p
-            store(w, o, b0r + b1r)
-            store(w, o + d, b0i + b1i)
-            twiddled(w, o + s, d, p, b2r + b3i, b2i - b3r, c, v, e)
-            twiddled(w, o + 2 * s, d, p, b0r - b1r, b0i - b1i, c, v + 1, e)
-            twiddled(w, o + 3 * s, d, p, b2r - b3i, b2i + b3r, c, v + 2, e)
-        v += 3
-    return v
-
-
-@inlined_njit
-def pass3(w: int, x: int, y: int, d: int, m: int, s: int, c: int, v: int, e: int) -> int:
-    t = s * m
+@jit
+def butterfly3(w: int, x: int, d: int, t: int) -> Any:
+    """DFT of the three numbers x, x + t, x + 2t."""
     half, sine = splat(0.5), splat(SIN_60)
-    for p in range(m):
-        for q in range(0, s, 8):
-            i = x + q + s * p
-            a0r, a0i = load(w, i), load(w, i + d)
-            a1r, a1i = load(w, i + t), load(w, i + t + d)
-            a2r, a2i = load(w, i + 2 * t), load(w, i + 2 * t + d)
-            b1r, b1i = a1r + a2r, a1i + a2i
-            b2r, b2i = sine * (a1r - a2r), sine * (a1i - a2i)
-            b0r, b0i = minus_product(half, b1r, a0r), minus_product(half, b1i, a0i)
-            o = y + q + 3 * s * p
-            store(w, o, a0r + b1r)
-            store(w, o + d, a0i + b1i)
-            twiddled(w, o + s, d, p, b0r + b2i, b0i - b2r, c, v, e)
-            twiddled(w, o + 2 * s, d, p, b0r - b2i, b0i + b2r, c, v + 1, e)
-        v += 2
-    return v
+    a0r, a0i = load(w, x), load(w, x + d)
+    a1r, a1i = load(w, x + t), load(w, x + t + d)
+    a2r, a2i = load(w, x + 2 * t), load(w, x + 2 * t + d)
+    b1r, b1i = a1r + a2r, a1i + a2i
+    b2r, b2i = sine * (a1r - a2r), sine * (a1i - a2i)
+    b0r, b0i = minus_product(half, b1r, a0r), minus_product(half, b1i, a0i)
+    return (a0r + b1r, a0i + b1i), (b0r + b2i, b0i - b2r), (b0r - b2i, b0i + b2r)
 
 
-@inlined_njit
-def pass2(w: int, x: int, y: int, d: int, m: int, s: int, c: int, v: int, e: int) -> int:
-    t = s * m
-    for p in range(m):
-        for q in range(0, s, 8):
-            i = x + q + s * p
-            a0r, a0i = load(w, i), load(w, i + d)
-            a1r, a1i = load(w, i + t), load(w, i + t + d)
-            o = y + q + 2 * s * p
-            store(w, o, a0r + a1r)
-            store(w, o + d, a0i + a1i)
-            twiddled(w, o + s, d, p, a0r - a1r, a0i - a1i, c, v, e)
-        v += 1
-    return v
+@jit
+def butterfly2(w: int, x: int, d: int, t: int) -> Any:
+    """DFT of the two numbers x, x + t."""
+    a0r, a0i = load(w, x), load(w, x + d)
+    a1r, a1i = load(w, x + t), load(w, x + t + d)
+    return (a0r + a1r, a0i + a1i), (a0r - a1r, a0i - a1i)
+
+
+def later_pass(radix: int, butterfly: Callable[..., Any]) -> Callable[..., int]:
+    """A pass of that radix: one_pass(w, x, y, d, m, s, c, v, e), from x to y; the next v."""
+
+    @inlined_njit
+    def one_pass(w: int, x: int, y: int, d: int, m: int, s: int, c: int, v: int, e: int) -> int:
+        for p in range(m):
+            for q in range(0, s, 8):
+                z = butterfly(w, x + q + s * p, d, s * m)
+                o = y + q + radix * s * p
+                store(w, o, z[0][0])
+                store(w, o + d, z[0][1])
+                for j in range(1, radix):
+                    twiddled(w, o + j * s, d, p, z[j][0], z[j][1], c, v + j - 1, e)
+            v += radix - 1
+        return v
+
+    return one_pass
+
+
+pass8, pass4 = later_pass(8, butterfly8), later_pass(4, butterfly4)
+pass3, pass2 = later_pass(3, butterfly3), later_pass(2, butterfly2)
 
 
 @inlined_njit
