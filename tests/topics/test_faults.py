@@ -128,16 +128,16 @@ def test_a_node_that_keeps_dying_is_given_up_with_its_last_words(loop, tmp_path)
 def test_a_second_tuner_is_refused_and_the_first_one_unharmed(loop, tmp_path):
     start_pair(loop)
     out = tmp_path / "run"
-    first = start_tuner(loop, out, iterations=300)
-    until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
     with operator(loop) as desk:
+        first = start_tuner(loop, out, iterations=1000)
+        until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
         desk.call("/tuner_node/pause")  # so that it outlasts the other one's refusal
         second = start_tuner(loop, tmp_path / "second", seed=9)
         text = loop.wait(second, LIMIT, code=1)
         desk.call("/tuner_node/resume")
     assert "another tuner publishes /episode/start" in text.strip().splitlines()[-1]
     loop.wait(first, LIMIT)
-    assert_same_training(out, in_process(iterations=300))
+    assert_same_training(out, in_process(iterations=1000))
     assert iterations_done(tmp_path / "second") == 0
 
 
