@@ -81,7 +81,7 @@ class ControllerNode:
         for topic, handler in handlers.items():
             loop.receive(topic, partial(self._on_other, handler))
         loop.listen(PAUSED, self._on_paused)
-        loop.diagnose("responder", self._report)
+        loop.introspection.report("responder", self._report)
 
     def _on_state(self, frame: Frame) -> None:
         self._perform(self._responder.state(frame))

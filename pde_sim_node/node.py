@@ -117,10 +117,10 @@ class PlantNode:
         if type(self._lockstep.plant) is Plant:
             self._fast_path = PlantFastPath(self._lockstep, actions.codec, self._batcher)
             loop.answer_fast(actions, self._senders[STATE], self._fast_path)
-        loop.diagnose("lock-step", self._health.report)
-        loop.offer("~/pause", self._pause)
-        loop.offer("~/resume", self._resume)
-        loop.offer("~/step", self._step)
+        loop.introspection.report("lock-step", self._health.report)
+        loop.introspection.offer("~/pause", self._pause)
+        loop.introspection.offer("~/resume", self._resume)
+        loop.introspection.offer("~/step", self._step)
         on_change(node, PLANT, self._adjust)
         self._send([self._lockstep.announcement(), self._lockstep.paused_report()])
 

@@ -105,7 +105,9 @@ class RecorderNode:
             others=[f"{n}{START.name}" for n in self._namespaces],
         )
         self._status: Publisher | None = None
-        loop.diagnose("recording", lambda now: self._health.report(now, self._status is not None))
+        loop.introspection.report(
+            "recording", lambda now: self._health.report(now, self._status is not None)
+        )
         loop.every(DRAIN, self._record_next)
         loop.every(FLUSH, self._flush)
         loop.every(LOOK, self._look)

@@ -152,7 +152,7 @@ class TunerNode:
 
     def join(self, node: Node, loop: NodeLoop) -> None:
         declare_parameters(node, self._changed)
-        self._several_publishers |= self._loop.several_publishers
+        self._several_publishers |= self._loop.introspection.several_publishers
         self._wire(node, loop)
 
     def _wire(self, node: Node, loop: NodeLoop) -> None:
@@ -184,11 +184,12 @@ class TunerNode:
             )
             loop.listen(PAUSED, self._handler(dispatcher.paused, number), namespace)
             for topic in ARRAYS:
-                loop.supervise(topic, namespace)
-        loop.diagnose("training", self._health.report)
-        loop.offer("~/pause", self._pause)
-        loop.offer("~/resume", self._resume)
-        loop.offer("~/stop", self._stop)
+                name = scoped(namespace, topic.name)
+                loop.introspection.supervise(node.resolve_topic_name(name), topic)
+        loop.introspection.report("training", self._health.report)
+        loop.introspection.offer("~/pause", self._pause)
+        loop.introspection.offer("~/resume", self._resume)
+        loop.introspection.offer("~/stop", self._stop)
         on_change(node, TUNER, self._adjust)
 
     def _pause(self) -> str:
@@ -237,7 +238,7 @@ class TunerNode:
         """Perform what an event of the dispatcher or the session leads to."""
         session = self._session
         try:
-            with self._loop.working(session.training.computation):
+            with self._loop.introspection.working(session.training.computation):
                 now = self._loop.now()
                 publications = session.advance(event(now), now)
             self._send(publications)
@@ -246,7 +247,7 @@ class TunerNode:
         while self._news:  # once everybody has been told what to do next, and before it is kept
             self._report(self._news.popleft())
         if self._recorder:
-            with self._loop.working("writing the checkpoint"):
+            with self._loop.introspection.working("writing the checkpoint"):
                 self._recorder.keep(now=self._loop.now())
         if session.done or session.stopped:
             self._loop.stop("done")
@@ -350,7 +351,7 @@ class TunerNode:
                         "transport": "topics",
                         "controller": self._controller(),
                         "several_publishers": self._several_publishers
-                        | self._loop.several_publishers,
+                        | self._loop.introspection.several_publishers,
                     }
                 )
             except OSError as error:

@@ -73,7 +73,9 @@ class ViewerNode:
         }
         loop.every(PERIOD, self._read)
         loop.every(LOOK, self._reader.look)
-        loop.diagnose("views", lambda now: self._health.report(now, self._subscribers()))
+        loop.introspection.report(
+            "views", lambda now: self._health.report(now, self._subscribers())
+        )
         on_change(node, VIEWER, self._adjust)
 
     def run(self) -> int:

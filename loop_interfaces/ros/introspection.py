@@ -9,7 +9,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -36,26 +36,18 @@ NAMESAKE_GRACE = 6.0
 
 
 class Introspection:
-    """Tells how a node is, and who else is there who should not be.
+    """Tells how a node is, and who else is there who should not be."""
 
-    refused() counts the messages that were refused so far, and tells why the last one was; topics
-    has the full names of those that one node should publish for this one.
-    """
-
-    def __init__(
-        self,
-        node: Node,
-        refused: Callable[[], tuple[int, str]],
-        topics: Mapping[str, Topic],
-    ) -> None:
-        self._node, self._refused, self._topics = node, refused, topics
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._topics: dict[str, Topic] = {}
+        self._refused, self._reported, self._reason = 0, 0, ""
         self._publisher: Publisher | None = None
         self._health: Callable[[float], Health] = lambda now: Health(Level.OK, "")
         self._status = DiagnosticStatus(hardware_id=socket.gethostname())
         self._due = 0.0
         self._working_due = 0.0
-        self._began: float | None = None
-        self._refused_before = 0
+        self._began = time.monotonic()
         self._namesake = Lasting()
         self._last = Health(Level.OK, "")
         self._working: tuple[str, float] | None = None
@@ -64,6 +56,15 @@ class Introspection:
         """The nodes that published a topic which one node should publish."""
         self._known: dict[str, int] = {}
         """Publishers of a topic that were looked at."""
+
+    def supervise(self, name: str, topic: Topic) -> None:
+        """Look at the publishers of a topic, by its full name: one other node should publish it."""
+        self._topics[name] = topic
+
+    def refuse(self, topic: str, reason: object, count: int = 1) -> None:
+        """Count messages that were refused; they are reported with the next `round` that works."""
+        self._refused += count
+        self._reason = f"{topic}: {reason}"[:300]
 
     def report(self, task: str, health: Callable[[float], Health]) -> None:
         """Publish what `health(now)` says once a second, under the node's name and `task`."""
@@ -78,13 +79,24 @@ class Introspection:
             return
         # A steady beat, though the housekeeping comes a little late each time.
         self._due = max(self._due + PERIOD, now + PERIOD / 2)
-        if self._began is None:
-            self._began = now
         self._look_at_publishers()
-        namesakes = self._namesakes(now)
-        if self._publisher is not None:
-            self._last = self._health_now(namesakes, now - self._began, now)
-            self._publish(self._publisher, self._last)
+        namesakes, refused = self._namesakes(now), self._refused - self._reported
+        self._reported = self._refused
+        if refused:
+            self._node.get_logger().warning(
+                f"refused {refused} message(s), the last one because: {self._reason}"
+            )
+        if self._publisher is None:
+            return
+        health = self._health(now)
+        if refused:
+            health = health.worsened(Level.WARN, f"refused {refused} message(s): {self._reason}")
+        if namesakes:
+            health = health.worsened(Level.WARN, "another node has this name")
+        uptime = round(now - self._began, 1)
+        values = {**health.values, "refused messages": self._refused, "uptime": uptime}
+        self._last = Health(health.level, health.message, values)
+        self._publish(self._publisher, self._last)
 
     def offer(self, name: str, act: Callable[[], str]) -> None:
         """A std_srvs/Trigger service, after which the node reports at once.
@@ -128,19 +140,6 @@ class Introspection:
         seconds = now - since
         values = {**self._last.values, "activity": what, "activity for": round(seconds, 1)}
         self._publish(publisher, Health(self._last.level, f"{what} for {seconds:.0f} s", values))
-
-    def _health_now(self, namesakes: int, uptime: float, now: float) -> Health:
-        health = self._health(now)
-        total, reason = self._refused()
-        if total > self._refused_before:
-            health = health.worsened(
-                Level.WARN, f"refused {total - self._refused_before} message(s): {reason}"
-            )
-            self._refused_before = total
-        if namesakes:
-            health = health.worsened(Level.WARN, "another node has this name")
-        health.values = {**health.values, "refused messages": total, "uptime": round(uptime, 1)}
-        return health
 
     def _publish(self, publisher: Publisher, health: Health) -> None:
         with self._publishing:

@@ -11,23 +11,21 @@ group that the executor never runs, so both can share one node and ROS tools see
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from rclpy.executors import ShutdownException, SingleThreadedExecutor, TimeoutException
+from rclpy.executors import ShutdownException, TimeoutException
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 
 from loop_interfaces.affinity import pin_process
-from loop_interfaces.diagnostics import Health
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.ros.endpoints import Receiver, SampleBatcher, Sender, reader_qos, scoped
-from loop_interfaces.ros.introspection import Introspection
+from loop_interfaces.ros.observer import STUCK, SUSPENDED, EventLoop
 from loop_interfaces.ros.sample_subscription import SampleSubscription
 from loop_interfaces.ros.suspend_watchdog import SuspendWatchdog
 from loop_interfaces.samples import ACTION_KIND, STATE_KIND
@@ -44,13 +42,6 @@ BUSY = 20
 """Messages since the last round that make a stream."""
 SERVING = 0.02
 """Seconds in which a round begins callbacks of the executor: queued requests are answered together."""
-STUCK = 0.5
-"""Seconds in which the loop goes round at least once, unless it computes."""
-SUSPENDED = 2.0
-"""Seconds without being scheduled after which a process takes its peers to have dropped it.
-
-The DDS lease is 3 s: peers that stop hearing a participant forget it, while it does not know and
-does not introduce itself again. Joining as a new participant is the way back."""
 
 
 @dataclass
@@ -71,39 +62,17 @@ class _Fast(NamedTuple):
     path: FastPath
 
 
-class NodeLoop:
-    """Runs one node until it is told to stop.
-
-    refused counts the messages that were refused, by reason; new ones are reported through the
-    node's logger at most once a second.
-    """
+class NodeLoop(EventLoop):
+    """Runs one node that answers messages until it is told to stop."""
 
     def __init__(self, node: Node) -> None:
-        self.node = node
-        self.refused: Counter[str] = Counter()
+        super().__init__(node)
         self._receivers: list[Receiver] = []
-        self._topics: dict[str, Topic] = {}
-        """Topics that one node should publish, by full name."""
         self._batcher: SampleBatcher | None = None
         self._watched: dict[str, _Watched] = {}
-        self._stop_reason: str | None = None
         self._fast: _Fast | None = None
         self._guard = _rclpy.GuardCondition(node.context.handle)
         """Ends a wait: see `_look_after`, and RclChannel."""
-        self._turned = time.monotonic()
-        """When the loop last went round."""
-        self.suspended = False
-        """Whether `run` ended because the process had been suspended (SIGSTOP, a frozen machine)."""
-        self._executor = SingleThreadedExecutor(context=node.context)
-        self._executor.add_node(node)
-        self._last_reason = ""
-        self._reported = 0
-        self._report_at = 0.0
-        self._introspection = Introspection(
-            node,
-            refused=lambda: (sum(self.refused.values()), self._last_reason),
-            topics=self._topics,
-        )
 
     def sender(self, topic: Topic, namespace: str = "", *, sampled: bool = False) -> Sender:
         """A publisher of frames on `topic`; sampled: they go out on `samples`, too."""
@@ -115,17 +84,8 @@ class NodeLoop:
         """Call `callback` with every frame of `topic`; a ValueError it raises refuses the message."""
         receiver = Receiver(self.node, topic, callback, namespace)
         self._receivers.append(receiver)
-        self._topics[receiver.name] = topic
+        self.introspection.supervise(receiver.name, topic)
         return receiver
-
-    def supervise(self, topic: Topic, namespace: str = "") -> None:
-        """Look at the publishers of a topic, as is done for those that are received."""
-        self._topics[self.node.resolve_topic_name(scoped(namespace, topic.name))] = topic
-
-    @property
-    def several_publishers(self) -> dict[str, list[str]]:
-        """The nodes that published a topic which one node should publish."""
-        return self._introspection.several_publishers
 
     def answer_fast(self, receiver: Receiver, sender: Sender, path: FastPath) -> None:
         """Let `path` answer messages of `receiver` on `sender` while this thread waits.
@@ -166,30 +126,9 @@ class NodeLoop:
             try:
                 callback(decode(raw))
             except ValueError as error:
-                self._refuse(name, error)
+                self.introspection.refuse(name, error)
 
         self.node.create_subscription(Float64MultiArray, name, take, reader_qos(topic), raw=True)
-
-    def diagnose(self, task: str, health: Callable[[float], Health]) -> None:
-        """Publish what `health(now)` says on /diagnostics, once a second."""
-        self._introspection.report(task, health)
-
-    def offer(self, name: str, act: Callable[[], str]) -> None:
-        """A std_srvs/Trigger service. act() does it and says what it did; a ValueError says why not."""
-        self._introspection.offer(name, act)
-
-    def working(self, what: str) -> AbstractContextManager[None]:
-        """Say on /diagnostics that the node computes `what`, if the block takes long."""
-        return self._introspection.working(what)
-
-    @staticmethod
-    def now() -> float:
-        """Monotonic time in s, as handed to `tick` and `housekeeping`."""
-        return time.monotonic()
-
-    def stop(self, reason: str) -> None:
-        """Leave `run` after the present event."""
-        self._stop_reason = reason
 
     def pin(self, core: int) -> None:
         """Stay on one core; -1: on any. ValueError for a core not allowed."""
@@ -199,11 +138,6 @@ class NodeLoop:
     def resume(self) -> None:
         """Make `run` possible again after `stop`."""
         self._stop_reason = None
-
-    @property
-    def stopped(self) -> bool:
-        """Whether `stop` was called or ROS was shut down."""
-        return self._stop_reason is not None or not self.node.context.ok()
 
     def run(
         self,
@@ -271,8 +205,7 @@ class NodeLoop:
                 if any(changed):
                     handles, take_from = self._sources(fast)
                 housekeeping(now)
-                self._report(now)
-                self._introspection.round(now)
+                self.introspection.round(now)
                 next_round = now + (BUSY_HOUSEKEEPING if handled > BUSY else HOUSEKEEPING)
                 handled = 0
                 continue
@@ -317,7 +250,7 @@ class NodeLoop:
         """
         now = self.now()
         if now - self._turned > STUCK:
-            self._introspection.round_while_working(now)
+            self.introspection.round_while_working(now)
             self._guard.trigger_guard_condition()
 
     def _sources(self, fast: _Fast | None) -> tuple[list[Any], dict[int, Callable[[], int]]]:
@@ -345,15 +278,15 @@ class NodeLoop:
         try:
             receiver.callback(receiver.decode(raw))
         except ValueError as error:
-            self._refuse(receiver.name, error)
+            self.introspection.refuse(receiver.name, error)
         return 1
 
     def _take_waiting(self, fast: _Fast) -> int:
         """Handle the message that has waited longest; how many there were."""
         channel = fast.path.channel
         if dropped := channel.newly_dropped():
-            self._last_reason = f"{fast.receiver.name}: came while too many others waited"
-            self.refused[self._last_reason] += dropped
+            reason = "came while too many others waited"
+            self.introspection.refuse(fast.receiver.name, reason, dropped)
         raw = channel.next_message()
         return 0 if raw is None else self._handle(fast.receiver, raw)
 
@@ -368,23 +301,8 @@ class NodeLoop:
                     try:
                         callback(decode(raw))
                     except ValueError as error:
-                        self._refuse("state" if kind == STATE_KIND else "action", error)
+                        name = "state" if kind == STATE_KIND else "action"
+                        self.introspection.refuse(name, error)
         except ValueError as error:
-            self._refuse(SAMPLES, error)
+            self.introspection.refuse(SAMPLES, error)
         return count
-
-    def _refuse(self, topic: str, error: ValueError) -> None:
-        self._last_reason = f"{topic}: {error}"[:300]
-        self.refused[self._last_reason] += 1
-        if len(self.refused) > 1000:  # a flood with ever new reasons must not grow memory
-            self.refused = Counter({"others": sum(self.refused.values())})
-
-    def _report(self, now: float) -> None:
-        total = sum(self.refused.values())
-        if total > self._reported and now >= self._report_at:
-            self.node.get_logger().warning(
-                f"refused {total - self._reported} message(s), the last one because: "
-                f"{self._last_reason}"
-            )
-            self._reported = total
-            self._report_at = now + 1.0

@@ -1,8 +1,9 @@
-"""The event loop of a node that observes: ordinary rclpy timers and subscriptions.
+"""What event loops of nodes have in common, and that of a node that observes.
 
-The nodes that answer states have one of their own (loop_interfaces.ros.node_loop). This one serves
-whatever the node has on rclpy's executor, publishes its /diagnostics, and ends by a signal, on
-request, or when the process was suspended for so long that its peers have forgotten it.
+The nodes that answer states have one of their own (loop_interfaces.ros.node_loop). An observer's
+serves whatever the node has on rclpy's executor, ordinary timers and subscriptions. Both publish
+/diagnostics, and end by a signal, on request, or when the process was suspended for so long that
+its peers have forgotten it.
 """
 
 from __future__ import annotations
@@ -15,37 +16,33 @@ from rclpy.clock_type import ClockType
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
-from loop_interfaces.diagnostics import Health
 from loop_interfaces.ros.introspection import PERIOD, Introspection
-from loop_interfaces.ros.node_loop import STUCK, SUSPENDED
 from loop_interfaces.ros.suspend_watchdog import SuspendWatchdog
 
 WAIT = 0.1
 """Seconds of one wait at most: a wait does not end by a signal."""
+STUCK = 0.5
+"""Seconds in which a loop goes round at least once, unless it computes."""
+SUSPENDED = 2.0
+"""Seconds without being scheduled after which a process takes its peers to have dropped it.
+
+The DDS lease is 3 s: peers that stop hearing a participant forget it, while it does not know and
+does not introduce itself again. Joining as a new participant is the way back."""
 
 
-class Observer:
-    """Runs one observing node until it is told to stop."""
+class EventLoop:
+    """Holds a node's executor, and says when to stop."""
 
     def __init__(self, node: Node) -> None:
         self.node = node
+        self.introspection = Introspection(node)
         self.suspended = False
         """Whether `run` ended because the process had been suspended (SIGSTOP, a frozen machine)."""
         self._stop_reason: str | None = None
         self._turned = self.now()
+        """When the loop last went round."""
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
-        self._introspection = Introspection(node, refused=lambda: (0, ""), topics={})
-        self.every(PERIOD, lambda: self._introspection.round(self.now()))
-
-    def every(self, period: float, callback: Callable[[], None]) -> None:
-        """Call `callback` every `period` s of real time, whatever the simulated time."""
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.node.create_timer(period, callback, clock=steady)
-
-    def diagnose(self, task: str, health: Callable[[float], Health]) -> None:
-        """Publish what `health(now)` says on /diagnostics, once a second."""
-        self._introspection.report(task, health)
 
     @staticmethod
     def now() -> float:
@@ -53,14 +50,32 @@ class Observer:
         return time.monotonic()
 
     def stop(self, reason: str) -> None:
-        """Leave `run` after the present callback."""
+        """Leave `run` after the present event."""
         self._stop_reason = reason
+
+    @property
+    def stopped(self) -> bool:
+        """Whether `stop` was called or ROS was shut down."""
+        return self._stop_reason is not None or not self.node.context.ok()
+
+
+class Observer(EventLoop):
+    """Runs one observing node until it is told to stop."""
+
+    def __init__(self, node: Node) -> None:
+        super().__init__(node)
+        self.every(PERIOD, lambda: self.introspection.round(self.now()))
+
+    def every(self, period: float, callback: Callable[[], None]) -> None:
+        """Call `callback` every `period` s of real time, whatever the simulated time."""
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.node.create_timer(period, callback, clock=steady)
 
     def run(self) -> str:
         """Serve timers, subscriptions and services until `stop` or a signal; returns the reason."""
         self._turned = self.now()
         with SuspendWatchdog(self._wake_if_stuck) as watchdog:
-            while self._stop_reason is None and self.node.context.ok():
+            while not self.stopped:
                 self._executor.spin_once(timeout_sec=WAIT)
                 self._turned = self.now()
                 if watchdog.longest() > SUSPENDED:

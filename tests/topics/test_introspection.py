@@ -254,11 +254,11 @@ import time
 from loop_interfaces.diagnostics import Health, Level
 from loop_interfaces.ros.node_main import ros_node
 with ros_node("busy_node", ["--ros-args"]) as (node, loop):
-    loop.diagnose("work", lambda now: Health(Level.OK, "idle", {"run": 1}))
+    loop.introspection.report("work", lambda now: Health(Level.OK, "idle", {"run": 1}))
     began = time.monotonic()
     def housekeeping(now):
         if now > began + 2.5:
-            with loop.working("fitting models"):
+            with loop.introspection.working("fitting models"):
                 while True:
                     sum(range(10_000))
     loop.run(tick=lambda now: None, deadline=lambda: None, housekeeping=housekeeping)
@@ -286,13 +286,13 @@ from loop_interfaces.ros.node_main import ros_node
 fits = 0
 def housekeeping(now):
     global fits
-    with loop.working("fitting models"):
+    with loop.introspection.working("fitting models"):
         end = time.monotonic() + 1.6
         while time.monotonic() < end:
             sum(range(10_000))
     fits += 1
 with ros_node("busy_node", ["--ros-args"]) as (node, loop):
-    loop.diagnose("work", lambda now: Health(Level.OK, "idle", {"fits": fits}))
+    loop.introspection.report("work", lambda now: Health(Level.OK, "idle", {"fits": fits}))
     loop.run(tick=lambda now: None, deadline=lambda: None, housekeeping=housekeeping)
 """
 

@@ -174,7 +174,7 @@ rclpy.init()
 node_loop.SERVING = 60.0  # on a busy machine one call may take as long as a round has
 node, desk = rclpy.create_node("served"), rclpy.create_node("desk")
 loop, answered, rounds = node_loop.NodeLoop(node), [], []
-loop.offer("~/act", lambda: answered.append(1) or "done")
+loop.introspection.offer("~/act", lambda: answered.append(1) or "done")
 client = desk.create_client(Trigger, "/served/act")
 assert client.wait_for_service(60)
 for _ in range(20):
