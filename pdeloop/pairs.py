@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from loop_interfaces.affinity import core_text, least_busy_cores, usable_cores
+from loop_interfaces.isolation import PROFILE
 from loop_interfaces.spec import ParameterError, Spec
 from pde_sim_node.build import fingerprint
 from tuner_node.results import RunFolder
@@ -120,52 +121,81 @@ def pair_nodes(cores: Sequence[int | None], *, solver_polls: bool = False) -> li
     return nodes
 
 
-def training_nodes(
-    folder: Path,
-    *,
-    pairs: int = 1,
-    placement: str = "shared",
-    recording: Recording | None = None,
-    view: bool = False,
-) -> list[LoopNode]:
-    """The nodes of one training: `pairs` pairs, their tuner, perhaps a recorder and a viewer.
+@dataclass(frozen=True)
+class Transport:
+    """How a training is carried out; nothing of this changes its results.
 
-    Parameters
+    Attributes
     ----------
-    folder : Path
-        Holds a run that was begun (RunFolder.create), so that a tuner that is started again goes on
-        where it was.
-    pairs : int
-        How many.
-    placement : str
-        One of PLACEMENTS.
+    in_process : bool
+        Without ROS.
     recording : Recording, optional
-        How the run is recorded; None: not at all.
+        How it is recorded; None: not at all.
+    network : bool
+        Let the messages leave this machine.
+    pairs : int
+        Of plant and controller.
+    pin : bool
+        Keep each pair on a core of its own, and its solver's helpers polling.
     view : bool
-        With a viewer of the first pair.
+        With a viewer_node of the first pair.
+    spread : bool
+        Leave the cores to the scheduler (PLACEMENTS).
+    """
 
-    Returns
-    -------
-    list of LoopNode
+    in_process: bool = False
+    recording: Recording | None = None
+    network: bool = False
+    pairs: int = 1
+    pin: bool = False
+    view: bool = False
+    spread: bool = False
+
+    def __post_init__(self) -> None:
+        if self.in_process and (self.recording or self.network):
+            raise ParameterError("--record and --network are about topics; leave out --in-process")
+        if self.network and os.environ.get(PROFILE):
+            raise ParameterError(
+                f"--network and {PROFILE}={os.environ[PROFILE]} both say where messages go; leave "
+                "out --network to use that profile, or unset the variable"
+            )
+        if self.in_process and (self.pairs > 1 or self.pin or self.spread or self.view):
+            raise ParameterError(
+                "--pairs, --pin, --spread and --view are about nodes; leave out --in-process"
+            )
+        if self.pin and self.spread:
+            raise ParameterError(
+                "--pin keeps each pair on a core, --spread on none; leave out one of them"
+            )
+        check_pairs(self.pairs, self.placement)
+
+    @property
+    def placement(self) -> str:
+        """One of PLACEMENTS."""
+        return "pinned" if self.pin else "any" if self.spread else "shared"
+
+    def nodes(self, folder: Path) -> list[LoopNode]:
+        """The nodes of the training in `folder`, a run that was begun (RunFolder.create).
+
         The recorder, if any, comes first; it is told its bag when it is started. Recorder and viewer
         leave the cores of the pairs to them, if there are others.
-    """
-    serving = tuner_parameter(pairs)
-    cores = pair_cores(pairs, placement)
-    nodes = pair_nodes(cores, solver_polls=placement == "pinned")
-    others = tuple(core for core in usable_cores() if core not in cores)
-    if view or (recording is not None and recording.views):
-        first = namespaces(pairs)[0]
-        nodes.append(LoopNode("viewer_node", "viewer_node", namespace=first, cores=others))
-    wait = "none"
-    if recording is not None:
-        wait = "required" if recording.required else "start"
-        own = [*serving, *["record_views:=true"] * recording.views]
-        nodes.insert(0, LoopNode("recorder_node", "recorder_node", own, cores=others))
-    tuner = [f"out:={quoted(folder.resolve())}", "resume:=true", f"recorder:={wait}", *serving]
-    tuner.append(f"plant:={fingerprint(RunFolder(folder).values())}")
-    nodes.append(LoopNode("tuner_node", "tuner_node", tuner))
-    return nodes
+        """
+        recording, serving = self.recording, tuner_parameter(self.pairs)
+        cores = pair_cores(self.pairs, self.placement)
+        nodes = pair_nodes(cores, solver_polls=self.pin)
+        others = tuple(core for core in usable_cores() if core not in cores)
+        if self.view or (recording is not None and recording.views):
+            first = namespaces(self.pairs)[0]
+            nodes.append(LoopNode("viewer_node", "viewer_node", namespace=first, cores=others))
+        wait = "none"
+        if recording is not None:
+            wait = "required" if recording.required else "start"
+            own = [*serving, *["record_views:=true"] * recording.views]
+            nodes.insert(0, LoopNode("recorder_node", "recorder_node", own, cores=others))
+        # resume: one that is started again goes on where it was.
+        tuner = [f"out:={quoted(folder.resolve())}", "resume:=true", f"recorder:={wait}", *serving]
+        tuner.append(f"plant:={fingerprint(RunFolder(folder).values())}")
+        return [*nodes, LoopNode("tuner_node", "tuner_node", tuner)]
 
 
 def tuner_parameter(pairs: int) -> list[str]:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import importlib.util
 import itertools
-import os
 import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -19,16 +18,15 @@ from typing import Any
 
 import controller_node.fast_path
 import pde_sim_node.fast_path
-from loop_interfaces.isolation import NETWORK, PROFILE, loopback_environment
+from loop_interfaces.isolation import NETWORK, loopback_environment
 from loop_interfaces.problem import load_parameters
-from loop_interfaces.spec import ParameterError
 from pde_sim_node.build import build_equation, build_plant
 from pdeloop.display import Display, ProgressFile
 from pdeloop.domain import own_domain
 from pdeloop.in_process import LocalPair, train
 from pdeloop.live import announced
 from pdeloop.output import print_json
-from pdeloop.pairs import LoopNode, Recording, check_pairs, quoted, training_nodes
+from pdeloop.pairs import LoopNode, Transport, quoted
 from pdeloop.supervisor import Child, NodeError, Supervisor, node_command
 from tuner_node import narration
 from tuner_node.build import build_training
@@ -61,69 +59,6 @@ def resolve(problem: str, options: Mapping[str, Any]) -> dict[str, Any]:
     physical = asdict(build_equation(values))
     del physical["length"]
     return {**values, **{f"physical.{name}": value for name, value in physical.items()}}
-
-
-@dataclass(frozen=True)
-class Transport:
-    """How a training is carried out; nothing of this changes its results.
-
-    Attributes
-    ----------
-    in_process : bool
-        Without ROS.
-    recording : Recording, optional
-    network : bool
-        Let the messages leave this machine.
-    pairs : int
-        Of plant and controller.
-    pin : bool
-        Keep each pair on a core of its own, and its solver's helpers polling.
-    view : bool
-        With a viewer_node of the first pair.
-    spread : bool
-        Leave the cores to the scheduler (pdeloop.pairs.PLACEMENTS).
-    """
-
-    in_process: bool = False
-    recording: Recording | None = None
-    network: bool = False
-    pairs: int = 1
-    pin: bool = False
-    view: bool = False
-    spread: bool = False
-
-    def __post_init__(self) -> None:
-        if self.in_process and (self.recording or self.network):
-            raise ParameterError("--record and --network are about topics; leave out --in-process")
-        if self.network and os.environ.get(PROFILE):
-            raise ParameterError(
-                f"--network and {PROFILE}={os.environ[PROFILE]} both say where messages go; leave "
-                "out --network to use that profile, or unset the variable"
-            )
-        if self.in_process and (self.pairs > 1 or self.pin or self.spread or self.view):
-            raise ParameterError(
-                "--pairs, --pin, --spread and --view are about nodes; leave out --in-process"
-            )
-        if self.pin and self.spread:
-            raise ParameterError(
-                "--pin keeps each pair on a core, --spread on none; leave out one of them"
-            )
-        check_pairs(self.pairs, self.placement)
-
-    def nodes(self, folder: Path) -> list[LoopNode]:
-        """The nodes of the training in `folder`."""
-        return training_nodes(
-            folder,
-            pairs=self.pairs,
-            placement=self.placement,
-            recording=self.recording,
-            view=self.view,
-        )
-
-    @property
-    def placement(self) -> str:
-        """One of PLACEMENTS."""
-        return "pinned" if self.pin else "any" if self.spread else "shared"
 
 
 def begin(

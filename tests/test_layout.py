@@ -83,7 +83,7 @@ def test_the_busy_time_of_a_core_is_what_it_neither_idled_nor_waited(tmp_path: P
 def test_recorder_and_viewer_leave_the_core_of_the_pair_to_it(tmp_path: Path) -> None:
     folder, values = tmp_path / "run", resolve(str(SMALL), {})
     RunFolder(folder).create(values)
-    started = pairs.training_nodes(folder, recording=pairs.Recording(), view=True)
+    started = pairs.Transport(recording=pairs.Recording(), view=True).nodes(folder)
     nodes = {node.package: node for node in started}
     (pin,) = (word for word in nodes["controller_node"].parameters if word.startswith("pin"))
     others = os.sched_getaffinity(0) - {int(pin.removeprefix("pin:="))}

@@ -97,8 +97,8 @@ def add(commands: Commands) -> None:
 
 
 def _train(options: argparse.Namespace) -> int:
-    from pdeloop.pairs import Recording
-    from pdeloop.training_run import Transport, begin, reopen, run
+    from pdeloop.pairs import Recording, Transport
+    from pdeloop.training_run import begin, reopen, run
 
     recording = None
     if options.record or options.record_or_stop or options.record_views:

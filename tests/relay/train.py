@@ -8,7 +8,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from pdeloop import training_run
+from pdeloop import pairs
 from pdeloop.cli import main
 from pdeloop.pairs import LoopNode
 
@@ -32,7 +32,7 @@ class RelayNode(LoopNode):
         return [word for value in self.parameters for word in ("-p", value)]
 
 
-class TransportWithRelay(training_run.Transport):
+class TransportWithRelay(pairs.Transport):
     """One pair, with a relay."""
 
     def nodes(self, folder: Path) -> list[LoopNode]:
@@ -44,5 +44,5 @@ class TransportWithRelay(training_run.Transport):
 
 
 if __name__ == "__main__":
-    training_run.Transport = TransportWithRelay  # type: ignore[misc]
+    pairs.Transport = TransportWithRelay  # type: ignore[misc]
     sys.exit(main(["train", *sys.argv[1:]]))
