@@ -129,6 +129,9 @@ def parser() -> argparse.ArgumentParser:
         "--parts", nargs="+", metavar="PART", help="[ideal measurement process limit sensors both]"
     )
     robustness.add_argument("--seeds", type=int, default=3, metavar="N", help="[3]")
+    robustness.add_argument(
+        "--rollouts", type=int, default=20, metavar="N", help="of a seed, in all [20]"
+    )
     linearised = _add(
         programs,
         "linearised",
