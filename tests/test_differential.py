@@ -70,6 +70,6 @@ def test_burgers_is_recognised_and_simulated_where_fronts_cross_six_points_a_sam
         np.testing.assert_allclose(found / plant.sample_time, true, atol=0.1 * np.abs(true).max())
     q, r = context.state_weight, context.action_weight
     loop = Loop(context.U, context.target, q, r, context.horizon, 0.0, 1.0)
-    theta = Proposer(context, policy, 8).theta
+    theta = Proposer(context, policy).theta
     measured = [(theta(m.policy), m.trajectory.states[:-1]) for m in context.measured]
     assert mismatch(loop, model, measured, 1.0) < 0.01

@@ -271,7 +271,7 @@ def test_needs_sound_trajectories_and_stays_as_it_was_without() -> None:
 
 def test_a_step_moves_the_gains_and_the_constant_part_by_what_it_says() -> None:
     plant = Plant()
-    proposer = Proposer(plant.context(), plant.best, modes=N_S)
+    proposer = Proposer(plant.context(), plant.best)
     step = np.random.default_rng(8).standard_normal((N_A, N_S + 1))
     moved = proposer.moved(plant.best, step)
     s_r = plant.U.T @ plant.target
@@ -297,7 +297,6 @@ def test_a_target_outside_of_the_basis_leaves_the_constant_part_alone() -> None:
     [
         ({"fields": 0}, "fields must be positive"),
         ({"rollouts": 0}, "rollouts must be positive"),
-        ({"modes": 3}, "at least n_s = 4"),
         ({"policy": np.zeros((2, 6))}, "does not fit a basis"),
         ({"policy": np.zeros((3, 8))}, "exploratory trajectory must have"),
     ],
@@ -318,7 +317,7 @@ def test_a_reduced_model_larger_than_the_default_number_of_modes_is_adapted() ->
 
 def test_small_steps_are_judged_on_more_fields_and_survive_a_checkpoint() -> None:
     plant = Plant()
-    optimizer = make(plant, rollouts=40, most_fields=6)
+    optimizer = make(plant, rollouts=40)
     counts, asked_on = [], set()
     middle = None
     while not optimizer.done:
@@ -334,7 +333,7 @@ def test_small_steps_are_judged_on_more_fields_and_survive_a_checkpoint() -> Non
     assert 3 < counts[-1] <= 6
     assert len(asked_on) >= counts[-1]
     assert middle is not None
-    again = make(plant, rollouts=40, most_fields=6)
+    again = make(plant, rollouts=40)
     again.restore(middle)
     while not again.done:
         again.tell(measure(plant, again.ask()))

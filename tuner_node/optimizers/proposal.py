@@ -23,6 +23,9 @@ from tuner_node.optimizers.trajectories import Record
 
 __all__ = ["Proposal", "Proposer"]
 
+# Coordinates of the local models, at least, and how many of them their cubic part acts on, at most.
+_MODES = 32
+_CUBIC_MODES = 12
 # A step that predicts less than this share of the cost is not worth its rollouts: the next choice.
 _LEAST_FALL = 1e-3
 # Weight of a rollout in the fit: falls with its age, down to a floor, and with its cost.
@@ -100,13 +103,9 @@ class Proposer:
     context : Context
     policy : (n_a, 2 n_s) array
         Any policy of the training, for its shape.
-    modes : int
-        Coordinates of the fitted models.
-    cubic_modes : int
-        How many of them the cubic part acts on.
     """
 
-    def __init__(self, context: Context, policy: Array, modes: int, cubic_modes: int = 0) -> None:
+    def __init__(self, context: Context, policy: Array) -> None:
         U = np.array(context.U, dtype=np.float64)
         target = np.array(context.target, dtype=np.float64)
         n_a, columns = policy.shape
@@ -124,13 +123,8 @@ class Proposer:
                 f"the exploratory trajectory must have states of {target.size} and actions of "
                 f"{n_a} numbers, but the shapes are {states.shape} and {actions.shape}."
             )
-        if modes < U.shape[1]:
-            raise ValueError(f"modes must be at least n_s = {U.shape[1]}, but it is {modes}.")
-        if not 0 <= cubic_modes <= modes:
-            raise ValueError(f"cubic_modes must be 0 .. modes = {modes}, but it is {cubic_modes}.")
         self.n_z, self.n_s, self.n_a = U.shape[0], U.shape[1], n_a
-        self._U, self._target, self._modes = U, target, modes
-        self._cubic_modes = cubic_modes
+        self._U, self._target, self._modes = U, target, max(_MODES, U.shape[1])
         self._q, self._r = context.state_weight, context.action_weight
         self._horizon = context.horizon
         self._action_limit = context.action_limit
@@ -315,7 +309,7 @@ class Proposer:
             np.concatenate(change),
             np.concatenate(weights),
             RIDGES,
-            leading=min(self._cubic_modes, V.shape[1]),
+            leading=min(_CUBIC_MODES, V.shape[1]),
         )
 
     def _level(self, incumbents: Sequence[Record]) -> float:
