@@ -22,7 +22,7 @@ from pdeloop.display import Display
 from pdeloop.finished_run import FinishedRun, load
 from pdeloop.in_process import LocalPair
 from pdeloop.pairs import Transport
-from pdeloop.training_run import begin, carry_out
+from pdeloop.training_run import Interruption, begin, carry_out
 from tuner_node.build import build_training
 
 __all__ = ["Problem", "identify", "load_run", "problem", "train"]
@@ -49,7 +49,7 @@ class Problem:
     values: Mapping[str, Any]
 
     def plant(self, batch: int = 1) -> Plant:
-        """A plant of M = `batch` environments at the start of an episode, with the fields of seeds 0 ..
+        """A plant of M = `batch` environments, at the start of an episode with the fields 0 .. M - 1.
 
         `Plant.reset` begins another episode, of any M. `states` (M, n_z) are the fields, `step`
         takes actions (M, n_a), and `episode_costs` has what it cost so far.
@@ -189,7 +189,8 @@ def train(
     out
         Folder of the results, as the command line keeps them; none is kept if not given.
     over_topics
-        With the nodes in processes of their own, over ROS 2 topics, instead of in this process.
+        With the nodes in processes of their own, over ROS 2 topics, instead of in this process. Their
+        logs are in `out`, which must then be given.
     progress
         Where to show it, like sys.stdout; it is silent if not given.
     parameters
@@ -206,7 +207,7 @@ def train(
     ValueError
         The parameters do not fit together, or the folder cannot be used.
     RuntimeError
-        A node cannot be started or ends.
+        A node cannot be started or ends, or somebody stops the training over topics.
 
     Examples
     --------
@@ -217,6 +218,8 @@ def train(
     >>> run.policies.shape, run.costs["adapted"].shape
     ((1, 6, 8), (1, 2))
     """
+    if over_topics and out is None:
+        raise ValueError("a training over topics needs a folder for its results and logs: give out")
     with TemporaryDirectory() as temporary:
         source, given = (
             (problem.source, problem.given) if isinstance(problem, Problem) else (problem, {})
@@ -226,6 +229,10 @@ def train(
         display = Display(values["seed"], values["seeds"], progress or StringIO())
         try:
             carry_out(folder, values, Transport(not over_topics), display, lambda: None)
+        except Interruption as reason:
+            raise RuntimeError(
+                f"stopped by {reason}; continue with: pdeloop train --resume {folder}"
+            ) from None
         finally:
             display.close()
         return load(folder)

@@ -11,6 +11,7 @@ import pytest
 
 import pdeloop
 from pdeloop.cli import main
+from pdeloop.training_run import Interruption
 from tests.small import SMALL, same_bits
 from tuner_node.seeds import Purpose, derive
 
@@ -100,11 +101,23 @@ def test_what_does_not_fit_is_refused_in_one_sentence(small) -> None:
         (lambda: gradients.of_policy(basis, np.zeros((n_a, 5)), [0]), "policy must have shape"),
         (lambda: pdeloop.Gradients(pdeloop.problem(sensors=4).plant()), "without noise, limits"),
         (lambda: pdeloop.train(small, optimizer="adam"), "'optimizer' is 'adam'"),
+        (lambda: pdeloop.train(small, over_topics=True), "needs a folder .* give out"),
         (lambda: pdeloop.load_run("/nowhere"), "no run in /nowhere"),
     ):
         with pytest.raises(ValueError, match=words) as caught:
             refused()
         assert "\n" not in str(caught.value)
+
+
+def test_a_training_that_is_stopped_by_a_service_says_how_to_go_on(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def stopped(*_: object) -> None:
+        raise Interruption("request")
+
+    monkeypatch.setattr("pdeloop.api.carry_out", stopped)
+    with pytest.raises(RuntimeError, match=r"stopped by request; continue with: .*/run"):
+        pdeloop.train(str(SMALL), over_topics=True, out=tmp_path / "run")
 
 
 def test_figures_show_what_the_arrays_hold(run, small) -> None:
