@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from controller_node.lqt import track as track
+    from controller_node.order import study_orders as study_orders
     from controller_node.reduced_model import ReducedModel as ReducedModel
     from pde_sim_node.plant import Plant as Plant
     from pdeloop.api import Problem as Problem
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from pdeloop.api import load_run as load_run
     from pdeloop.api import problem as problem
     from pdeloop.api import train as train
+    from pdeloop.data_file import read_measurements as read_measurements
     from pdeloop.episode import projected_law as projected_law
     from pdeloop.episode import rollout as rollout
     from pdeloop.finished_run import FinishedRun as FinishedRun
@@ -54,7 +56,9 @@ _MODULES = {
     "plot_training": "pdeloop.plots",
     "problem": "pdeloop.api",
     "projected_law": "pdeloop.episode",
+    "read_measurements": "pdeloop.data_file",
     "rollout": "pdeloop.episode",
+    "study_orders": "controller_node.order",
     "track": "controller_node.lqt",
     "train": "pdeloop.api",
 }
