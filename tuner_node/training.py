@@ -86,16 +86,15 @@ class Training:
     """Whether the warm start of a seed was measured to be no better than no control."""
 
     def __post_init__(self) -> None:
-        self.pending = list(range(self.settings.seeds))
-        self.attempts = [0] * self.settings.seeds
-        self.explorations = [None] * self.settings.seeds
-        self.measured = [[] for _ in range(self.settings.seeds)]
-        self.worse = [False] * self.settings.seeds
-        settings = self.settings
-        self.budget = Budget(settings.seeds, settings.rollouts, settings.adaptation)
-        if self.settings.model is not None and not self.settings.trajectories:
-            self.models = np.repeat(self.settings.model[np.newaxis], self.settings.seeds, axis=0)
-            self._start_adapting()
+        settings, seeds = self.settings, self.settings.seeds
+        self.pending = list(range(seeds))
+        self.attempts = [0] * seeds
+        self.explorations = [None] * seeds
+        self.measured = [[] for _ in range(seeds)]
+        self.worse = [False] * seeds
+        self.budget = Budget(seeds, settings.rollouts, settings.adaptation)
+        if settings.model is not None and not settings.trajectories:
+            self._take_given_model(settings.model)
 
     def next_batch(self) -> Batch | None:
         """The rollouts wanted now; the same at every call until `finish`. None: all is done."""
@@ -198,18 +197,14 @@ class Training:
         }
         for m, rollouts in enumerate(self.measured):
             for i, rollout in enumerate(rollouts):
-                arrays |= {
-                    f"measured{m}.{i}.policy": rollout.policy,
-                    f"measured{m}.{i}.cost": np.array(rollout.cost),
-                    f"measured{m}.{i}.states": rollout.trajectory.states,
-                    f"measured{m}.{i}.actions": rollout.trajectory.actions,
-                }
+                name = f"measured{m}.{i}"
+                arrays |= {f"{name}.policy": rollout.policy, f"{name}.cost": np.array(rollout.cost)}
+                arrays |= trajectory_arrays(name, rollout.trajectory)
         if self.models is not None:
             arrays["models"] = self.models
         for m, exploration in enumerate(self.explorations):
             if exploration is not None:
-                arrays[f"exploration{m}.states"] = exploration.states
-                arrays[f"exploration{m}.actions"] = exploration.actions
+                arrays |= trajectory_arrays(f"exploration{m}", exploration)
         if self.target is not None:
             arrays["target"] = self.target
         if self.evaluation is not None and self.ended is not None:
@@ -234,7 +229,7 @@ class Training:
         vars(self).update(vars(restored))
 
     def _take(self, arrays: dict[str, NDArray[Any]]) -> None:
-        seeds = self.settings.seeds
+        seeds, n_a = self.settings.seeds, self.settings.n_a
         shape = (seeds, len(CONTROLLERS), self.settings.evaluation_fields)
         self.phase = str(taken(arrays, "phase", "U", ()))
         self.budget.restore(taken(arrays, "budget", "i", self.budget.state().shape))
@@ -250,24 +245,15 @@ class Training:
             self.target = taken(arrays, "target", "f", (None,))
         for m in range(seeds):
             if f"exploration{m}.states" in arrays:
-                self.explorations[m] = Trajectory(
-                    taken(arrays, f"exploration{m}.states", "f", (None, None)),
-                    taken(arrays, f"exploration{m}.actions", "f", (None, self.settings.n_a)),
-                )
-            i = 0
-            while f"measured{m}.{i}.policy" in arrays:
-                name, n_a = f"measured{m}.{i}.", self.settings.n_a
+                self.explorations[m] = taken_trajectory(arrays, f"exploration{m}", n_a)
+            while (name := f"measured{m}.{len(self.measured[m])}") + ".policy" in arrays:
                 self.measured[m].append(
                     Measured(
-                        taken(arrays, f"{name}policy", "f", (n_a, None)),
-                        float(taken(arrays, f"{name}cost", "f", ())),
-                        Trajectory(
-                            taken(arrays, f"{name}states", "f", (None, None)),
-                            taken(arrays, f"{name}actions", "f", (None, n_a)),
-                        ),
+                        taken(arrays, f"{name}.policy", "f", (n_a, None)),
+                        float(taken(arrays, f"{name}.cost", "f", ())),
+                        taken_trajectory(arrays, name, n_a),
                     )
                 )
-                i += 1
         self.worse = taken(arrays, "worse", "b", (seeds,)).tolist()
         if "evaluation" in arrays:
             self.evaluation = taken(arrays, "evaluation", "f", shape)
@@ -360,9 +346,12 @@ class Training:
                 f"plant's has {size - 3 * self.settings.n_a - 1}; identify one of this plant"
             )
         self.budget.count("identify", self.pending)
-        self.models = np.repeat(self.settings.model[np.newaxis], self.settings.seeds, axis=0)
-        self._start_adapting()
+        self._take_given_model(self.settings.model)
         return []
+
+    def _take_given_model(self, model: Array) -> None:
+        self.models = np.repeat(model[np.newaxis], self.settings.seeds, axis=0)
+        self._start_adapting()
 
     def _check_rollouts(self) -> list[tuple[int, Rollout]]:
         warm = self.warm_starts()
@@ -490,10 +479,8 @@ class Training:
     def _check_law(self, m: int, asked: Sequence[Rollout], seen: Sequence[Trajectory]) -> None:
         """ValueError if the actions are not those of the published law."""
         assert self.models is not None
-        model, limit = (
-            model_rows.unpack(self.models[m], self.settings.n_a),
-            self.settings.action_limit,
-        )
+        model = model_rows.unpack(self.models[m], self.settings.n_a)
+        limit = self.settings.action_limit
         for rollout, trajectory in zip(asked, seen, strict=True):
             if not follows(rollout.policy, model, trajectory, limit):
                 raise ValueError(
@@ -538,3 +525,16 @@ class Training:
                 self._seeds(), self.evaluation, self.ended != COMPLETED, strict=True
             )
         ]
+
+
+def trajectory_arrays(name: str, trajectory: Trajectory) -> dict[str, NDArray[Any]]:
+    """A trajectory in a checkpoint, under a name."""
+    return {f"{name}.states": trajectory.states, f"{name}.actions": trajectory.actions}
+
+
+def taken_trajectory(arrays: dict[str, NDArray[Any]], name: str, n_a: int) -> Trajectory:
+    """The trajectory of that name; ValueError if there is none with n_a actuators."""
+    return Trajectory(
+        taken(arrays, f"{name}.states", "f", (None, None)),
+        taken(arrays, f"{name}.actions", "f", (None, n_a)),
+    )
