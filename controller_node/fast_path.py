@@ -22,8 +22,6 @@ from loop_interfaces.frames import MAX_ID, ArrayCodec, Frame
 from loop_interfaces.jit.simd import load_unaligned
 from loop_interfaces.topics import ACTION
 
-__all__ = ["ControllerFastPath", "load_compiled"]
-
 PLAN = plan_type(
     ("law", LAW),
     ("batch", np.int64),

@@ -26,8 +26,6 @@ from loop_interfaces.jit.simd import (
     write,
 )
 
-__all__ = ["LAW", "act", "control", "padded"]
-
 LAW = np.dtype(
     [
         ("n_z", np.int64),

@@ -31,8 +31,6 @@ from threadpoolctl import threadpool_limits
 
 from controller_node.reduced_model import ReducedModel
 
-__all__ = ["DesignError", "Gains", "track"]
-
 Array = NDArray[np.float64]
 
 # A direction that the inputs move by less than this, relative to the model's size, counts as out of

@@ -19,8 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 from controller_node.law import LAW, control, padded
 from loop_interfaces.jit.simd import whole_lanes
 
-__all__ = ["ProjectedLaw", "excitation"]
-
 Array = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 

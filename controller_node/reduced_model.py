@@ -15,8 +15,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
 
-__all__ = ["ReducedModel", "Steps", "leading_modes", "numerical_rank", "steps_of"]
-
 Array = NDArray[np.float64]
 
 

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-__all__ = ["CONTROLLERS", "Controller"]
-
 
 class Controller(NamedTuple):
     """How a controller is shown: its name, and its colours on white and on a dark background."""

@@ -34,8 +34,6 @@ from pde_sim_node.solver.step_context import step_code
 if TYPE_CHECKING:
     from loop_interfaces.ros.endpoints import SampleBatcher
 
-__all__ = ["PlantFastPath", "load_compiled"]
-
 PLAN = plan_type(
     ("code", np.int64),  # of a step of the plant, see ParallelStep.lend
     ("context", np.int64),

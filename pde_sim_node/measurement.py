@@ -48,8 +48,6 @@ from numpy.typing import ArrayLike, NDArray
 from pde_sim_node.equations import Equation
 from pde_sim_node.plant import MEAN_FIELD, Plant
 
-__all__ = ["InstrumentedPlant", "Instruments", "Noise", "standard_normal"]
-
 
 class Noise(IntEnum):
     """What a draw is for; the numbers are part of the results' reproducibility."""

@@ -18,8 +18,6 @@ from pde_sim_node.solver.pointwise import all_finite
 from pde_sim_node.solver.workers import ParallelStep
 from pde_sim_node.supports import indicator_supports
 
-__all__ = ["DIVERGED_COST", "MEAN_FIELD", "EpisodeCosts", "Plant"]
-
 DIVERGED_COST = 1e9
 """Mean stage cost of an environment that diverged: very bad, and finite."""
 MEAN_FIELD = -1

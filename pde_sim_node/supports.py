@@ -3,8 +3,6 @@
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["indicator_supports"]
-
 
 def indicator_supports(n_z: int, n_a: int, width: float) -> NDArray[np.float64]:
     """Phi_j(x_i) of n_a equally spaced actuators, (n_z, n_a), entries 0 or 1.

@@ -13,8 +13,6 @@ from collections.abc import Sequence
 
 from tuner_node.seeds import Purpose, derive
 
-__all__ = ["PURPOSES", "evaluation_noise", "rollout_noise"]
-
 PURPOSES = {
     "identify": Purpose.EXPLORATORY_NOISE,
     "check": Purpose.CHECK_NOISE,

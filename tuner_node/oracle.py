@@ -25,8 +25,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["field_seed", "gradient", "orthonormal_directions", "unit_direction", "update"]
-
 Array = NDArray[np.float64]
 
 # Large constants: numpy pads a short seed sequence with zeros, so [seed, stream, 0] would equal the

@@ -55,8 +55,6 @@ from loop_interfaces.jit.native import (
 from loop_interfaces.jit.simd import read_word
 from loop_interfaces.ros.rcl import Allocator, SerializedMessage
 
-__all__ = ["CAPACITY", "RclChannel", "load_compiled"]
-
 CHANNEL = np.dtype(
     [
         # Addresses of functions of rcl and of the POSIX threads,

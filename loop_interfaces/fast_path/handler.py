@@ -31,8 +31,6 @@ from loop_interfaces.jit.cache import fingerprint
 from loop_interfaces.jit.native import MachineCode
 from loop_interfaces.topics import Topic
 
-__all__ = ["FastPath", "fast_handler", "plan_type"]
-
 
 def plan_type(*fields: Any) -> np.dtype[np.void]:
     """The type of the record that a handler works on.

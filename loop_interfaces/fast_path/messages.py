@@ -30,20 +30,6 @@ from loop_interfaces.jit.simd import (
 )
 from loop_interfaces.samples import SAMPLE_HEADER
 
-__all__ = [
-    "EXPECTED",
-    "FIRST",
-    "SAMPLE_BATCH",
-    "STEP",
-    "TIME",
-    "ExpectedMessage",
-    "OwnMessage",
-    "append",
-    "expected_header",
-    "full",
-    "write_answer",
-]
-
 RUN, EPISODE, STEP, TIME, PLANT, FIRST = range(HEADER + 1)
 """Places of the numbers of the header, and of the first value behind it."""
 EXPECTED = np.dtype(

@@ -7,8 +7,6 @@ from numba import types
 
 from loop_interfaces.jit.simd import intrinsic
 
-__all__ = ["compare_exchange", "fetch_add", "load_acquire", "store_release"]
-
 WORD = ir.IntType(64)
 
 

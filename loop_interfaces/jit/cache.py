@@ -14,8 +14,6 @@ from typing import Any, TypeVar
 
 import numba
 
-__all__ = ["CACHED", "cached_njit", "fingerprint", "inlined_njit", "jit"]
-
 F = TypeVar("F", bound=Callable[..., Any])
 
 

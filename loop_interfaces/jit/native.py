@@ -11,16 +11,6 @@ from numba import types
 from loop_interfaces.jit.cache import CACHED, jit
 from loop_interfaces.jit.simd import intrinsic, read_word
 
-__all__ = [
-    "CLOCK",
-    "MachineCode",
-    "MonotonicClock",
-    "address_of",
-    "call_c",
-    "compilations",
-    "monotonic_ns",
-]
-
 CLOCK = np.dtype(
     [
         ("gettime", np.int64),  # address of clock_gettime

@@ -21,29 +21,6 @@ from numba.core.datamodel import models
 from numba.extending import intrinsic as numba_intrinsic
 from numba.extending import overload, register_model
 
-__all__ = [
-    "WIDTH",
-    "backwards",
-    "fma",
-    "lane_sum",
-    "load",
-    "load_lanes_unaligned",
-    "load_unaligned",
-    "load_word_unaligned",
-    "minus_product",
-    "read",
-    "read_word",
-    "splat",
-    "store",
-    "store_lanes_unaligned",
-    "store_unaligned",
-    "store_word_unaligned",
-    "transpose",
-    "whole_lanes",
-    "write",
-    "write_word",
-]
-
 WIDTH = 8
 NUMBER = ir.DoubleType()
 VECTOR = ir.VectorType(NUMBER, WIDTH)

@@ -148,13 +148,3 @@ class RemoteParameters:
         """Drop the clients."""
         while self._clients:
             self._node.destroy_client(self._clients.pop())
-
-
-__all__ = [
-    "ParameterError",
-    "RemoteParameters",
-    "declare",
-    "descriptor",
-    "given_parameters",
-    "on_change",
-]

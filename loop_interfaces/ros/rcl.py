@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Allocator", "SerializedMessage", "publishes_where_it_is"]
-
 
 class Allocator(ctypes.Structure):
     """rcutils_allocator_t."""

@@ -20,8 +20,6 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Equation", "Field", "LinearEquation", "Spectrum", "draw", "parameter", "sech"]
-
 Field = NDArray[np.float64]
 Spectrum = NDArray[np.inexact[Any]]
 

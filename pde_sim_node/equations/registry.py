@@ -15,8 +15,6 @@ from pde_sim_node.equations.kuramoto_sivashinsky import KuramotoSivashinsky
 from pde_sim_node.equations.schrodinger import Schrodinger
 from pde_sim_node.equations.wave import Wave
 
-__all__ = ["EQUATIONS"]
-
 EQUATIONS: Mapping[str, type[Equation]] = MappingProxyType(
     {
         cls.name: cls

@@ -57,8 +57,6 @@ from pde_sim_node.solver.spectra import (
     synthesise,
 )
 
-__all__ = ["Adjoint", "LinearAdjoint", "adjoint_of"]
-
 Array = NDArray[np.float64]
 COMPLEX_STEP = 1e-30
 """g'(u) = Im g(u + i h)/h, without cancellation: h can be far below the rounding of u."""

@@ -16,8 +16,6 @@ from loop_interfaces.jit.cache import fingerprint, jit
 from loop_interfaces.jit.native import MachineCode
 from loop_interfaces.jit.simd import fma, load, read, read_word, splat, store, write, write_word
 
-__all__ = ["environments_of"]
-
 
 @jit
 def stage_cost(state: int, action: int, w: int, plan: Any, c: int) -> float:

@@ -24,8 +24,6 @@ import numpy as np
 
 from pde_sim_node.equations import Spectrum
 
-__all__ = ["Coefficients", "etdrk4_coefficients"]
-
 CONTOUR_POINTS = 32
 
 

@@ -24,8 +24,6 @@ from pde_sim_node.solver.memory import Constants, StepSettings, begin_plan, lay_
 from pde_sim_node.solver.spectra import analyse, get, plus_product, put, synthesise
 from pde_sim_node.solver.workers import ParallelStep
 
-__all__ = ["exact_propagator", "exact_step"]
-
 LINEAR_PLAN = step_plan_type(
     ("components", np.int64),
     # Offsets in c.

@@ -23,8 +23,6 @@ from numpy.typing import NDArray
 from loop_interfaces.jit.cache import inlined_njit, jit
 from loop_interfaces.jit.simd import WIDTH, fma, load, minus_product, read, splat, store, transpose
 
-__all__ = ["fft", "is_transform_length", "plane_size", "radices_of", "twiddles_of"]
-
 SQRT_HALF = math.sqrt(0.5)
 SIN_60 = math.sqrt(0.75)
 

@@ -44,8 +44,6 @@ from pde_sim_node.solver.spectra import (
 )
 from pde_sim_node.solver.workers import ParallelStep
 
-__all__ = ["PLAN", "environments", "etdrk4_step"]
-
 PLAN = step_plan_type(
     ("pointwise", np.int64),  # address of the compiled nonlinearity
     ("steps", np.int64),  # internal steps of a sampling time

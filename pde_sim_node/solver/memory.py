@@ -12,8 +12,6 @@ from pde_sim_node.equations import Equation, Field, Spectrum
 from pde_sim_node.solver.fft import is_transform_length, radices_of, twiddles_of
 from pde_sim_node.solver.spectra import TRANSFORM
 
-__all__ = ["Constants", "StepSettings", "aligned", "begin_plan", "lay_out", "step_plan_type"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StepSettings:

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from loop_interfaces.jit.cache import cached_njit, fingerprint
 from loop_interfaces.jit.native import MachineCode
 
-__all__ = ["all_finite", "pointwise_loop"]
-
 LOOPS: dict[Callable[[float], float], MachineCode] = {}
 
 

@@ -25,8 +25,6 @@ from scipy.fft import irfft, rfft
 from pde_sim_node.equations import Equation
 from pde_sim_node.solver.etdrk4 import etdrk4_coefficients
 
-__all__ = ["ReferenceStep"]
-
 Array = NDArray[np.float64]
 
 

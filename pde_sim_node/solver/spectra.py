@@ -20,21 +20,6 @@ from loop_interfaces.jit.cache import jit
 from loop_interfaces.jit.simd import backwards, fma, load, minus_product, read, splat, store, write
 from pde_sim_node.solver.fft import fft, times
 
-__all__ = [
-    "TRANSFORM",
-    "analyse",
-    "forward",
-    "get",
-    "inverse",
-    "minus",
-    "plus",
-    "plus_product",
-    "product",
-    "put",
-    "rfft_pack",
-    "rfft_unpack",
-]
-
 Complex = Any
 """A pair (real, imaginary) of lanes."""
 

@@ -12,8 +12,6 @@ from loop_interfaces.jit.native import MachineCode, call_c
 from pde_sim_node.solver import work_queue
 from pde_sim_node.solver.work_queue import begin_turn, claim, current_turn, finish, wait_until_done
 
-__all__ = ["SPINS", "STEP_CONTEXT", "step_code", "step_environments", "take_slices"]
-
 SPINS = 1_000_000
 
 STEP_CONTEXT = np.dtype(

@@ -8,16 +8,6 @@ late, when the next step has begun already, takes nothing of it.
 from loop_interfaces.jit.atomics import compare_exchange, fetch_add, load_acquire, store_release
 from loop_interfaces.jit.cache import jit
 
-__all__ = [
-    "QUEUE_WORDS",
-    "begin_turn",
-    "claim",
-    "close",
-    "current_turn",
-    "finish",
-    "wait_until_done",
-]
-
 QUEUE_WORDS = 16
 """Words of a queue: the two that are used, each on a cache line of its own."""
 MAX_TURN = 2**31

@@ -25,8 +25,6 @@ from pde_sim_node.solver.step_context import (
 )
 from pde_sim_node.solver.work_queue import QUEUE_WORDS, begin_turn, close, wait_until_done
 
-__all__ = ["COMPILED", "ParallelStep", "use_cores"]
-
 POINTS_PER_SLICE = 15_000
 """Grid points, in all stages, of a slice: 30 to 40 microseconds of one thread."""
 MIN_SLICES = 6
