@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller_node import dmdc, lqt, regression
+from controller_node.order import study_orders
 from controller_node.policy import ProjectedLaw
 from controller_node.reduced_model import ReducedModel
 from loop_interfaces.model_rows import ModelRows
@@ -19,9 +20,10 @@ from loop_interfaces.model_rows import ModelRows
 class DesignSettings:
     """How to identify and what to design for.
 
-    identification: "regression" of order n_s = reduced_order, or "dmdc" of order dmdc_order (0:
-    reduced_order) and rank p = dmdc_rank (0: n_s + n_a); the weights of the stage cost. The gains are
-    designed without the limit (action_limit, 0: none); only the actions keep it.
+    identification: "regression" of order n_s = reduced_order (0: as `order.study_orders` suggests), or
+    "dmdc" of order dmdc_order (0: reduced_order) and rank p = dmdc_rank (0: n_s + n_a); the weights of
+    the stage cost. The gains are designed without the limit (action_limit, 0: none); only the actions
+    keep it.
     """
 
     n_a: int
@@ -44,9 +46,10 @@ def identify(
     settings: DesignSettings,
 ) -> ReducedModel:
     """The reduced model from trajectories (states (N+1, n_z), actions (N, n_a)); see `design`."""
+    own = settings.dmdc_order if settings.identification == "dmdc" else 0
+    n_s = own or settings.reduced_order or study_orders(trajectories).suggested
     if settings.identification == "regression":
-        return regression.identify_from(trajectories, n_s=settings.reduced_order)
-    n_s = settings.dmdc_order or settings.reduced_order
+        return regression.identify_from(trajectories, n_s=n_s)
     p = settings.dmdc_rank or n_s + settings.n_a
     return dmdc.identify_from(trajectories, p=p, n_s=n_s)
 

@@ -57,7 +57,8 @@ class ControllerNode:
         self._health = ControllerHealth(responder)
         load_compiled()  # before there is a publisher: who sees one expects answers
         self._wire(node, loop)
-        node.get_logger().info(f"{values['problem']}: order {model_order(values)} tracking law")
+        order = model_order(values) or "suggested by the data"
+        node.get_logger().info(f"{values['problem']}: tracking law, order {order}")
 
     def join(self, node: Node, loop: NodeLoop) -> None:
         declare(node, taken_by("controller_node"), given_parameters(node))

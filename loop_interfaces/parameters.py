@@ -124,7 +124,15 @@ PROBLEM = _section(
         positive=True,
         maximum=1e6,
     ),
-    Spec("reduced_order", 4, "n_s, order of the reduced model", 1, 1024, nodes="CT"),
+    Spec(
+        "reduced_order",
+        4,
+        "n_s, order of the reduced model; 0: as the exploratory episode suggests, of one seed",
+        0,
+        1024,
+        nodes="CT",
+        group="budget and method",
+    ),
     Spec(
         "identification",
         "regression",
@@ -407,7 +415,7 @@ def as_recorded(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def model_order(values: Mapping[str, Any]) -> int:
-    """n_s of the reduced model that these parameters identify."""
+    """n_s of the reduced model that these parameters identify; 0: as the data suggest."""
     own = values["dmdc_order"] if values["identification"] == "dmdc" else 0
     order: int = own or values["reduced_order"]
     return order

@@ -177,7 +177,7 @@ def _settings(
 
     method = pick(wanted.method, known.get("identification"), "regression")
     dmdc_order = (method == "dmdc" and known.get("dmdc_order")) or None
-    order = pick(wanted.order, dmdc_order, known.get("reduced_order"), suggested)
+    order = pick(wanted.order, dmdc_order, known.get("reduced_order") or None, suggested)
     if order is None:
         raise BagError("there are too few steps to suggest an order; give it with --order")
     return DesignSettings(
@@ -192,7 +192,7 @@ def _settings(
 
 def _differs(wanted: Wanted, known: Mapping[str, Any]) -> bool:
     """Whether anything else is wanted than what the recorded run had."""
-    return _settings(wanted, known, 1, None) != _settings(Wanted(), known, 1, None)
+    return _settings(wanted, known, 1, 1) != _settings(Wanted(), known, 1, 1)
 
 
 def save(found: Identified, path: Path) -> None:

@@ -182,7 +182,7 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
     except ValueError as error:
         yield Finding("order", False, str(error))
         return
-    n_s = settings.reduced_order
+    n_s = settings.reduced_order or suggested
     yield Finding(
         "order",
         True,

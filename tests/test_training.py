@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from controller_node.order import study_orders
 from loop_interfaces.model_rows import unpack
 from loop_interfaces.topics import COMPLETED, StartColumn
 from pdeloop.in_process import LocalPair, train
@@ -252,3 +253,27 @@ def test_gauss_newton_refuses_actions_that_are_not_those_of_the_law(limit):
     with pytest.raises(ValueError, match=r"not those of the law .* use the optimizer 'two_point'"):
         training.finish(replace(result, trajectories=bent))
     assert training.budget.by_purpose() == before
+
+
+def test_the_order_may_be_that_which_the_data_suggest_and_another_one_the_second_time():
+    values = parameters(reduced_order=0, optimizer="gauss_newton", rollouts=20)
+    training, pair = build_training(values), LocalPair(values)
+    explored = pair.run(training.next_batch())
+    ((states, actions),) = [(t.states, t.actions) for t in explored.trajectories]
+    order = explored.models.shape[2]
+    assert order == study_orders([(states, actions)]).suggested
+    training.finish(explored)
+    pair.use_models(training.models)
+    check = pair.run(training.next_batch())
+    check.costs[1, 0] = check.costs[0, 0] + 1.0  # the law loses to no control
+    training.finish(check)
+    training.finish(LocalPair({**values, "reduced_order": order + 1}).run(training.next_batch()))
+    train(training, pair, lambda row: None)
+    assert training.policies().shape == (1, values["n_a"], 2 * (order + 1))
+
+
+def test_an_order_from_the_data_is_of_one_seed():
+    with pytest.raises(
+        ValueError, match="'reduced_order' is 0 and 'seeds' is 2; expected one seed"
+    ):
+        build_training(parameters(reduced_order=0, seeds=2))

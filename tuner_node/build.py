@@ -78,10 +78,16 @@ def build_training(values: Mapping[str, Any]) -> Training:
     from_zero = values["start"] == "zero"
     rate = values["learning_rate_from_zero" if from_zero else "learning_rate"]
 
+    order = model_order(values)
+    if not order and values["seeds"] > 1:
+        raise ParameterError(
+            f"parameter 'reduced_order' is 0 and 'seeds' is {values['seeds']}; expected one seed, as "
+            "the models of a batch have one order"
+        )
     options: dict[str, Any] = {}
     if values["optimizer"] == "directions":
-        most = 2 * values["n_a"] * model_order(values)
-        if values["directions"] > most:
+        most = 2 * values["n_a"] * order
+        if order and values["directions"] > most:
             raise ValueError(
                 f"parameter 'directions' is {values['directions']}; expected at most {most}, as "
                 "many as there are entries of the policy"

@@ -312,22 +312,26 @@ class Training:
         return noise.rollout_noise(noise.PURPOSES[self.phase], self._seeds(), owners, counts)
 
     def _identified(self, models: Array) -> list[dict[str, Any]]:
-        if self.models is None:
-            if len(models) != self.settings.seeds:
-                raise ValueError(f"expected {self.settings.seeds} models, got {len(models)}")
+        if len(models) == self.settings.seeds:  # perhaps of another order than before
             self.models = models.copy()
-        self.models[self.pending] = models
+        elif self.models is None:
+            raise ValueError(f"expected {self.settings.seeds} models, got {len(models)}")
+        else:
+            self.models[self.pending] = models
         self.budget.count("identify", self.pending)
         rows = []
         for m, own in zip(self.pending, models, strict=True):
-            A = model_rows.unpack(own, self.settings.n_a).A
+            model = model_rows.unpack(own, self.settings.n_a)
+            # What was kept ran without control, whose policy has the shape of the model's.
+            zero = np.zeros_like(model.policy)
+            self.measured[m] = [replace(kept, policy=zero) for kept in self.measured[m]]
             rows.append(
                 {
                     "event": "designed",
                     "seed": self._seeds()[m],
                     "attempt": self.attempts[m] + 1,
                     "reduced_order": own.shape[1],
-                    "spectral_radius": float(np.abs(np.linalg.eigvals(A)).max()),
+                    "spectral_radius": float(np.abs(np.linalg.eigvals(model.A)).max()),
                 }
             )
         self.phase = "check"
