@@ -7,6 +7,7 @@ A bag was not finished if its recorder was killed, or the disk was full.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -111,6 +112,14 @@ class Bag:
                 index.take(source, message.when, message.data)
                 yield from index.take_over(message.when)
         yield from index.take_over(None)
+
+
+def bags_of(path: Path) -> list[Bag]:
+    """All bags of the run in the folder `path` (bag, bag-2, ...), or the one bag there."""
+    numbered = [p for p in path.glob("bag*") if re.fullmatch(r"bag(-\d+)?", p.name)]
+    if not numbered or files(path):
+        return [Bag(path)]
+    return [Bag(p) for p in sorted(numbered, key=lambda p: (len(p.name), p.name))]
 
 
 def _text(path: Path) -> str:

@@ -23,7 +23,7 @@ from loop_interfaces.parameters import PLANT, as_recorded, table, with_budget
 from loop_interfaces.spec import check, read_yaml
 from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn, noise_seeds
 from pde_sim_node.build import fingerprint
-from pdeloop.bags.reader import Bag
+from pdeloop.bags.reader import bags_of
 from pdeloop.episode import rollout
 from pdeloop.in_process import LocalPair, cost_table
 from recorder_node.episodes import RecordedEpisode
@@ -93,11 +93,11 @@ class Report:
 
 
 def verify(*paths: Path, parameters: Path | None = None) -> Report:
-    """Recompute what is in the bags at `paths`; several bags of one run are one.
+    """Recompute what is in the bags at `paths`, or in all bags of runs; several of one run are one.
 
     parameters: a parameter file to use instead of what the bags say.
     """
-    bags = [Bag(path) for path in paths]
+    bags = [bag for path in paths for bag in bags_of(path)]
     report = Report(", ".join(str(bag.path) for bag in bags))
     given = None if parameters is None else read_yaml(parameters)
     runs: dict[int, _Run] = {}
@@ -195,8 +195,8 @@ class _Run:
             return
         if not any(rollout.episode.exploratory for rollout in self._rollouts.values()):
             self._note(
-                "its exploratory episode is not here, so its policies cannot be followed (give all "
-                "bags of the run)"
+                "its exploratory episode is not here, so its policies cannot be followed (give the "
+                "folder of the run, or all its bags)"
             )
             return
         training = build_training({**self._values, "plant": self._fingerprint})

@@ -53,7 +53,7 @@ def add(commands: Commands) -> None:
         type=Path,
         metavar="BAG",
         nargs="+",
-        help="folder of a bag or of a run; all bags of a run",
+        help="folder of a bag, or of a run with all its bags",
     )
     verify.add_argument(
         "--parameters", type=Path, metavar="FILE", help="instead of those in the bag"

@@ -382,6 +382,7 @@ def test_a_second_recording_of_a_run_gets_a_bag_of_its_own(loop, tmp_path):
     assert (both.count, both.notes) == (0, [])
     assert len(both.incomplete) <= 1  # the one that Ctrl-C cut short
     assert both.compared["policies"] == 2 + 2 * 150 + 30
+    assert verify(out).compared == both.compared
 
 
 def test_one_recorder_records_several_pairs(loop, tmp_path):
