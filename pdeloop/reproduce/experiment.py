@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import multiprocessing
-import queue
 import signal
 import time
 from collections.abc import Mapping, Sequence
@@ -121,47 +120,43 @@ def _jobs(folder: Path, problems: Sequence[str], options: Mapping[str, Any]) -> 
 def _run_all(jobs: Sequence[Job], processes: int, progress: Progress) -> None:
     """Run what is not done, in processes of their own.
 
-    An interruption ends the processes at once: they are continued from what they have saved.
+    An interruption ends the processes at once: what they were at begins again when it is continued.
     """
-    shares = {job.folder: float(job.done) for job in jobs}
     context = multiprocessing.get_context("spawn")
-    news: Any = context.Queue()
-    status = ""
-    with ProcessPoolExecutor(processes, context, _begin, (news,)) as pool:
-        waiting = {pool.submit(_work, job) for job in jobs if not job.done}
+    shares: Any = context.Array("d", [float(job.done) for job in jobs])
+    with ProcessPoolExecutor(processes, context, _begin, (shares,)) as pool:
+        waiting = {pool.submit(_work, i, job) for i, job in enumerate(jobs) if not job.done}
         try:
             while waiting:
                 done, waiting = wait(waiting, timeout=0.1, return_when=FIRST_COMPLETED)
-                while True:
-                    try:
-                        folder, shares[folder], status = news.get_nowait()
-                    except queue.Empty:
-                        break
                 for future in done:
-                    shares[future.result()] = 1.0
-                progress.tell(sum(shares.values()) / len(shares), status=status)
+                    future.result()
+                progress.tell(sum(shares) / len(shares))
         except BaseException:
             for process in multiprocessing.active_children():
                 process.terminate()
             raise
 
 
-_NEWS: list[Any] = []
-"""Where the process of a job says how far it is."""
+_SHARES: list[Any] = []
+"""In the process of a job: the share of each job that is done."""
 
 
-def _begin(news: Any) -> None:
+def _begin(shares: Any) -> None:
     """In a process that is about to run jobs. Ctrl-C is for its parent, which then ends it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     die_with_parent()
     use_cores(usable_cores()[:1])  # the others have jobs of their own
-    _NEWS.append(news)
+    _SHARES[:] = [shares]
 
 
-def _work(job: Job) -> Path:
+def _work(index: int, job: Job) -> None:
+    def tell(share: float) -> None:
+        _SHARES[0][index] = share
+
     try:
-        run(job, lambda share, status: _NEWS[0].put((job.folder, share, status)))
+        run(job, tell)
     except (ValueError, RuntimeError, OSError) as error:
         raise RunFolderError(f"{job.folder}: {error}") from error
-    return job.folder
+    tell(1.0)

@@ -19,11 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.controllers import CONTROLLERS
 from loop_interfaces.files import write_atomically
 from loop_interfaces.parameters import noisy
 from loop_interfaces.topics import CostColumn
-from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.in_process import LocalPair
 from pdeloop.training_run import resolve
 from tuner_node.batch import Batch
@@ -67,10 +65,10 @@ class Job:
         return (self.folder / "result.json").exists()
 
 
-def run(job: Job, tell: Callable[[float, str], None]) -> None:
+def run(job: Job, tell: Callable[[float], None]) -> None:
     """Carry the job out; one that was interrupted begins again, with the same numbers.
 
-    tell(share, status) is called now and then with the share that is done and the cost so far.
+    tell(share) is called now and then with the share that is done.
     """
     values, folder, began = job.values(), RunFolder(job.folder), time.monotonic()
     if (job.folder / "parameters.yaml").exists():
@@ -79,14 +77,12 @@ def run(job: Job, tell: Callable[[float, str], None]) -> None:
         folder.create(values)
     training, pair, curve = build_training(values), LocalPair(values), _Curve()
     pair.follow(training)
-    name = f"{values['problem']} {CONTROLLERS[job.controller].name}"
     while (batch := training.next_batch()) is not None:
         training.finish(pair.run(batch, values["max_batch"]))
         pair.follow(training)
         if training.optimizers and training.phase != "done":
             curve.add(training, pair, values)
-        budget = training.budget
-        tell(float(budget.paid.sum() / budget.total.sum()), f"{name} {curve.newest}".strip())
+        tell(float(training.budget.paid.sum() / training.budget.total.sum()))
     archive = BytesIO()
     np.savez(archive, **{key: np.stack(rows) for key, rows in vars(curve).items()})  # type: ignore[arg-type]
     write_atomically(job.folder / "curve.npz", archive.getvalue())
@@ -101,14 +97,6 @@ class _Curve:
     policies: list[Array] = field(default_factory=list)
     costs: list[Array] = field(default_factory=list)
     rollouts: list[Array] = field(default_factory=list)
-
-    @property
-    def newest(self) -> str:
-        """The mean cost of the newest policies, in words."""
-        if not self.costs:
-            return ""
-        newest = self.costs[-1]
-        return "diverged" if (newest >= DIVERGED_COST).any() else f"cost {newest.mean():.4g}"
 
     def add(self, training: Training, pair: LocalPair, values: Mapping[str, Any]) -> None:
         """Add the present policies; a seed's cost is measured anew where its policy changed."""

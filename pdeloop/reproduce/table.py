@@ -16,8 +16,8 @@ PAPER = {"burgers": 28.0, "allen-cahn": 15.8, "kdv": 36.4}
 """Percent by which LQT-PO lies below LQT after 40 iterations, arXiv:2403.01005."""
 CAVEAT = (
     f"In brackets: {100 * CONFIDENCE:.0f} % percentile bootstrap over the seeds. The reduced model, "
-    "and with it LQT's cost, varies much from seed to seed: of a few seeds such an interval is wide, "
-    "and itself too optimistic."
+    "and with it LQT's cost, varies much from seed to seed: with few seeds such an interval is wide, "
+    "and still too narrow."
 )
 
 
