@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 from loop_interfaces.files import FileError, is_private, open_new, open_ordinary, private_folder
 from pdeloop.domain import DOMAINS_FOLDER
@@ -74,19 +75,20 @@ def running() -> list[Live]:
     return sorted(found, key=lambda live: -live.started)
 
 
+def is_locked(file: BinaryIO) -> bool:
+    """Whether another process holds the lock of this open file."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    return False
+
+
 def _read(path: Path) -> list[Live]:
     with open_ordinary(path) as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            content = json.loads(file.read(_MAX_TEXT))
-            return [
-                Live(
-                    int(content["domain"]),
-                    Path(content["folder"]),
-                    float(content["started"]),
-                    bool(content["network"]),
-                )
-            ]
-    path.unlink(missing_ok=True)  # of a process that was killed
-    return []
+        if not is_locked(file):
+            path.unlink(missing_ok=True)  # of a process that was killed
+            return []
+        content = json.loads(file.read(_MAX_TEXT))
+    folder, started = Path(content["folder"]), float(content["started"])
+    return [Live(int(content["domain"]), folder, started, bool(content["network"]))]

@@ -181,8 +181,8 @@ def test_a_fast_loop_is_read_an_episode_at_a_time_within_the_budget():
         if listening:
             budget.took(int(rate * tick))
             read += int(rate * tick)
-    assert read / seconds < 1.2 * budget.budget
-    assert read / seconds > 0.5 * budget.budget
+    assert read / seconds < 1.2 * budget.rate
+    assert read / seconds > 0.5 * budget.rate
     assert pauses > 10
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
 from rclpy.node import Node
 from rclpy.subscription import Subscription
@@ -99,13 +100,13 @@ class LoopReader:
         return _Latched(subscription, ArrayCodec(topic.labels).decode, handle)
 
 
+@dataclass(frozen=True)
 class _Latched:
     """A latched topic of arrays."""
 
-    def __init__(
-        self, subscription: Subscription, decode: Callable[[bytes], Frame], handle: Handler
-    ) -> None:
-        self.subscription, self._decode, self._handle = subscription, decode, handle
+    subscription: Subscription
+    decode: Callable[[bytes], Frame]
+    handler: Handler
 
     def take(self) -> list[bytes]:
         """What has come in."""
@@ -119,4 +120,4 @@ class _Latched:
         now = time.monotonic()
         for raw in messages:
             with contextlib.suppress(ValueError):
-                self._handle(self._decode(raw), now)
+                self.handler(self.decode(raw), now)

@@ -104,13 +104,11 @@ class LoopView:
             return
         self.samples += 1
         key, current = key_of(frame), self.current
-        # The same episode again from its beginning: the plant was restarted.
-        again = current is not None and frame.step == 0 and current.last > 0
         if (
             current is None
             or current.key != key
             or current.environment != min(self.environment, current.batch - 1)
-            or again
+            or (frame.step == 0 and current.last > 0)  # from its beginning: the plant was restarted
         ):
             self._current_since = now
             self.current = current = EpisodeSamples(
@@ -124,10 +122,8 @@ class LoopView:
 
     def action(self, frame: Frame, now: float) -> None:
         """Take a_k of all environments."""
-        current = self.current
-        if not self._wanted(frame, now, "controller") or current is None:
-            return
-        if current.key != key_of(frame):
+        wanted, current = self._wanted(frame, now, "controller"), self.current
+        if not wanted or current is None or current.key != key_of(frame):
             return
         current.action(frame)
         a = frame.values[min(current.environment, len(frame.values) - 1)]
@@ -138,25 +134,20 @@ class LoopView:
 
     def start(self, frame: Frame, now: float) -> None:
         """Take the start of an episode; without rows it is the end of the run."""
-        if not self._wanted(frame, now, "tuner"):
-            return
-        self._ended = not len(frame.values)
-        if self._ended:
-            return
-        self._costs.start(frame)
-        self._take_gains()
+        if self._wanted(frame, now, "tuner"):
+            self._ended = not len(frame.values)
+            if not self._ended:
+                self._costs.start(frame)
 
     def policy(self, frame: Frame, now: float) -> None:
         """Take the gains of an episode."""
         if self._wanted(frame, now, "tuner"):
             self._costs.policy(frame)
-            self._take_gains()
 
     def model(self, frame: Frame, now: float) -> None:
         """Take a run's reduced models, which have the LQT gains in them."""
         if self._wanted(frame, now, "tuner"):
             self._costs.model(frame)
-            self._take_gains()
 
     def cost(self, frame: Frame, now: float) -> None:
         """Take the costs of an episode that is over."""
@@ -221,6 +212,11 @@ class LoopView:
             found["step"] = float(self.current.last)
         if (error := self._error()) is not None:
             found["tracking_error"] = _rms(error)
+        gains, lqt = self._costs.gains(self.environment)
+        if gains is not None:
+            found["gain_norm"] = float(np.linalg.norm(gains))
+        if gains is not None and lqt is not None and lqt.any():
+            found["gain_change"] = float(np.linalg.norm(gains - lqt) / np.linalg.norm(lqt))
         return found
 
     def profile(self) -> tuple[Array, Array | None] | None:
@@ -291,15 +287,6 @@ class LoopView:
         """z - z_r of the newest sample."""
         found = self.profile()
         return None if found is None or found[1] is None else found[0] - found[1]
-
-    def _take_gains(self) -> None:
-        known = self._costs.gains(self.environment)
-        if known is None:
-            return
-        gains, lqt = known
-        self._numbers["gain_norm"] = float(np.linalg.norm(gains))
-        if lqt is not None and (size := float(np.linalg.norm(lqt))) > 0.0:
-            self._numbers["gain_change"] = float(np.linalg.norm(gains - lqt)) / size
 
     def _wanted(self, frame: Frame, now: float, role: str) -> bool:
         if self.only is not None and frame.run != self.only:

@@ -21,11 +21,17 @@ MAX_MODELS = 4
 
 @dataclass(frozen=True)
 class Rollouts:
-    """The rollouts of an episode that is over, one row an environment.
+    """The rollouts of a finished episode, one for each of its M environments.
 
-    controllers: 'none', 'lqt' or 'adapted', the keys of loop_interfaces.controllers; empty if it was
-    an exploration or its policy is not known. mean: mean stage costs (M,); completed (M,); models:
-    index of the reduced model (M,).
+    Attributes
+    ----------
+    explores
+        Whether it was an exploration.
+    controllers : (M,)
+        'none', 'lqt' or 'adapted', the keys of loop_interfaces.controllers; empty for an exploration,
+        and if the policy is not known.
+    mean, completed, models : (M,)
+        Mean stage costs, whether they did not diverge, and the indices of the reduced models.
     """
 
     explores: bool
@@ -89,12 +95,12 @@ class RolloutCosts:
         controllers = self._controllers(start, policy.values)
         return str(controllers[environment]) if len(controllers) else ""
 
-    def gains(self, environment: int) -> tuple[Array, Array | None] | None:
-        """Gains of an environment in the newest episode with a policy, and its LQT gains if known."""
+    def gains(self, environment: int) -> tuple[Array | None, Array | None]:
+        """Gains of an environment in the newest episode, and its LQT gains; None where not known."""
         start = self._starts.newest
         policy = None if start is None else self._policies.of(start)
         if start is None or policy is None or len(start.values) != len(policy.values):
-            return None
+            return None, None
         row = min(environment, len(policy.values) - 1)
         lqt = self._lqt(start, policy.values)
         return policy.values[row], None if lqt is None else lqt[row]

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 from collections.abc import Callable
 from pathlib import Path
 
-from pdeloop.live import Live, running
+from pdeloop.live import Live, is_locked, running
 
 _MAX_TEXT = 1_000_000
 
@@ -57,10 +56,7 @@ class Finder:
 def worked_on(folder: Path) -> bool:
     """Whether a process works on the run in `folder` (tuner_node.results.RunFolder.held)."""
     with contextlib.suppress(OSError), (folder / "lock").open("rb") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
+        return is_locked(file)
     return False
 
 

@@ -45,9 +45,9 @@ class Replay:
         with page.lock:
             page.show(self._view, folder=short(folder), recorded=self._recorded)
             page.take_parameters(values)
+        page.refresh(time.monotonic())  # before the bag is read, which may take seconds
         if self._bag.rows:
             self.show(len(self._bag.rows) - 1)
-        page.refresh(time.monotonic())
 
     def show(self, index: int) -> None:
         """Show the recorded episode of this index, from its newest state."""
@@ -75,7 +75,7 @@ class Replay:
 class _RecordedEpisodes:
     """The episodes in the bag of a run; without rows and with a note if there are none.
 
-    rows: of the recorder's index, or what stands in their place for a bag without one.
+    rows: of the recorder's index.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -89,10 +89,7 @@ class _RecordedEpisodes:
             return
         try:
             self._bag = Bag(folder)
-            self.rows = [row for row in self._bag.index() if "episode" in row] or [
-                {"episode": episode.number, "namespace": episode.key[0]}
-                for episode in self._bag.episodes()
-            ]
+            self.rows = [row for row in self._bag.index() if "episode" in row]
             self.target = self._bag.target()
         except BagError:
             self.note = "The episodes of this run were not recorded (pdeloop train --record)."

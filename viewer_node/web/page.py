@@ -33,11 +33,8 @@ RATE_WINDOW = 3.0
 """Seconds over which rates are taken."""
 COLOUR_PERIOD = 0.5
 """Seconds between two computations of the range of the colours."""
-PARAMETERS = (
-    *("problem", "length", "n_z", "n_a", "horizon", "sample_time"),
-    *("optimizer", "seeds"),
-)
-"""Parameters that the page shows or needs."""
+PARAMETERS = ("problem", "length", "n_a", "horizon", "sample_time")
+"""Parameters that the page needs."""
 
 
 @dataclass(frozen=True)

@@ -7,21 +7,12 @@ import { showPage } from "./page.js";
 
 const CONFIRM = 5000; // ms in which a second click confirms
 const NOTICE = 10000; // ms for which a notice of the page's own stays
-const EMPTY = {
-  ...{ axis: "rollouts", phase: "", budget: 0, band: "seeds", diverged: 0, paid: [0, 0] },
-  ...{ seeds: [], references: {}, evaluations: {}, x: [], mean: [], low: [], high: [], costs: [] },
-};
-const NOTHING = {
-  ...{ state: "", recorded: null, stopping: false, activity: null, paused: [], requests: [] },
-  ...{ nodes: [], controls: [], components: [], component: 0, environments: 0, environment: 0 },
-  ...{ place: { domain: null }, parameters: {}, quiet: null, remaining: null, rounds: 0, episodes: 0 },
-};
 
 // All that the page shows.
 const model = {
   episode: new Episode(),
-  curve: EMPTY,
-  status: NOTHING,
+  curve: null, // as the monitor tells it, like the status
+  status: null,
   controllers: {}, // names, by key
   facts: { length: 0, horizon: 0, n_a: 0, name: "u" }, // of the loop, as far as its nodes told
   connected: null,
@@ -56,10 +47,10 @@ const take = {
   status(status) {
     const { length = 0, horizon = 0, n_a = 0 } = status.parameters;
     const facts = { length, horizon, n_a, name: status.components[status.component] };
-    const moved = model.status.place.begun !== status.place.begun;
+    if (model.status?.place.begun !== status.place.begun) model.episode = new Episode();
     const pointed = model.pointed === status.recorded?.chosen ? null : model.pointed;
-    set({ status, facts, pointed, called: null, ...(moved && { episode: new Episode(), curve: EMPTY }) });
-    update(moved ? [...ofEpisode, training] : ofEpisode);
+    set({ status, facts, pointed, called: null });
+    update(ofEpisode);
   },
   curve(curve) {
     set({ curve });
@@ -72,7 +63,7 @@ const take = {
   episode(header, numbers) {
     model.episode.take(header, numbers);
     update(ofEpisode);
-    if (model.status.recorded) set({});
+    if (model.status?.recorded) set({});
   },
 };
 
@@ -80,7 +71,7 @@ const link = new Link(
   (header, numbers) => take[header.part]?.(header, numbers),
   (connected) => set({ connected }),
 );
-update([...ofEpisode, training]);
+update(ofEpisode);
 
 // Call a service of a node; one that stops the training is to be confirmed.
 function press(node, role, verb, words) {

@@ -29,26 +29,25 @@ const MOST_CHOICES = 4096;
 // actions: press(node, role, verb, words), watch(what), seek(column), point(episode).
 export function showPage(model, actions) {
   const { status, curve } = model;
-  document.title = `${status.parameters.problem ?? "pdeloop"} – ${doing(model)[1]} – pdeloop`;
-  const live = !status.recorded;
-  const onlyCurve = status.recorded?.episodes === 0;
+  const known = status && curve;
+  document.title = `${status?.parameters.problem ?? "pdeloop"} – ${doing(model)[1]} – pdeloop`;
+  const onlyCurve = status?.recorded?.episodes === 0;
   render(
     html`
       <header>
         <${Title} ...${model} />
-        ${live && html`<${Controls} ...${model} ...${actions} />`}
+        ${known && !status.recorded && html`<${Controls} ...${model} ...${actions} />`}
       </header>
-      <${Notice} ...${model} />
-      <${Figures} status=${status} curve=${curve} />
+      ${known && html`<${Notice} ...${model} /><${Figures} ...${model} />`}
       <main class=${onlyCurve ? "curve-only" : ""}>
-        <${Panel} id="field" title="Field" before=${html`<${Choices} status=${status} ...${actions} />`}>
-          <${Replay} ...${model} ...${actions} />
+        <${Panel} id="field" title="Field" before=${known && html`<${Choices} ...${model} ...${actions} />`}>
+          ${known && html`<${Replay} ...${model} ...${actions} />`}
         <//>
         <${Panel} id="actions" title=${html`Actions <i>a</i><sub>j</sub>(<i>t</i>)`} />
         <${Panel} id="profile" title="Profile and target" />
         <${Panel} id="curve" title="Training" />
-        <${Seeds} ...${model} />
-        ${live && html`<${Nodes} status=${status} />`}
+        ${known && html`<${Seeds} ...${model} />`}
+        ${known && !status.recorded && html`<${Nodes} ...${model} />`}
       </main>
     `,
     document.body,
@@ -72,9 +71,9 @@ function Panel({ id, title, before, children }) {
 
 // Class and words of the state: what the nodes compute says more than that they are silent.
 function doing({ status, connected }) {
+  if (connected === false) return ["bad", "no connection to the monitor"];
+  if (!status) return ["", "connecting"];
   const { state, paused, activity, quiet, stopping, recorded } = status;
-  if (connected === null || (connected && !state)) return ["", "connecting"];
-  if (!connected) return ["bad", "no connection to the monitor"];
   if (recorded) return recorded.finished ? ["", "finished"] : ["warn", "not finished; nothing works on it"];
   const [className, words] = STATES[state] ?? ["", state];
   if (state === "paused") return [className, `${paused.map((role) => ROLES[role]).join(" and ")} paused`];
@@ -86,9 +85,9 @@ function doing({ status, connected }) {
 }
 
 function Title(model) {
-  const { place, parameters } = model.status;
+  const { place = {}, parameters = {} } = model.status ?? {};
   const [className, words] = doing(model);
-  const domain = place.domain === null ? "" : `ROS domain ${place.domain}`;
+  const domain = Number.isInteger(place.domain) ? `ROS domain ${place.domain}` : "";
   const namespace = place.namespace === "/" ? "" : place.namespace;
   return html`
     <div class="title">
