@@ -106,6 +106,7 @@ def test_recorder_and_viewer_leave_the_core_of_the_pair_to_it(tmp_path: Path) ->
         (["--directions", "99"], "'directions' is 99; expected at most 48"),
         (["--in-process", "--pairs", "2"], "leave out --in-process"),
         (["--in-process", "--pin"], "leave out --in-process"),
+        (["--in-process", "--view"], "leave out --in-process"),
         (["--in-process", "--spread"], "leave out --in-process"),
         (["--pin", "--spread"], "leave out one of them"),
         (["--pairs", "65"], "--pairs is 65"),

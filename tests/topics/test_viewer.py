@@ -161,9 +161,3 @@ def test_the_command_line_starts_a_viewer_and_goes_on_when_it_dies(loop: Process
     assert loop.output(run).count(news) == 1
     run.send_signal(signal.SIGINT)
     loop.wait(run, 20.0, code=130)
-
-
-def test_views_are_about_nodes(loop: Processes, tmp_path):
-    run = loop.pdeloop("train", str(SMALL), "--view", "--in-process", "--out", str(tmp_path / "a"))
-    text = loop.wait(run, 20.0, code=1)
-    assert "leave out --in-process" in text
