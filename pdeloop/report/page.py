@@ -122,9 +122,9 @@ def _of_problem(problem: ProblemData) -> Drawn:
         yield (
             f"{name}-steps",
             f"Steps of {NAMES[controller]}",
-            f"Seed {seed}: {len(steps.accepted)} steps were tried and {steps.accepted.sum()} "
-            "accepted; the damping, which a rejection raises; and the relative error of the best "
-            "fitted model in predicting how measured trajectories differ.",
+            f"Seed {seed}, steps accepted: {steps.accepted.sum()} of {len(steps.accepted)}. Below them "
+            "the damping, which a rejection raises, and the relative error of the best fitted model "
+            "in predicting how measured trajectories differ.",
             learning.steps(steps, controller),
         )
     if not problem.behaviours:
