@@ -16,7 +16,6 @@ from pde_sim_node.solver.kernel import etdrk4_step
 from pde_sim_node.solver.memory import StepSettings
 from pde_sim_node.solver.pointwise import all_finite
 from pde_sim_node.solver.workers import ParallelStep
-from pde_sim_node.supports import indicator_supports
 
 DIVERGED_COST = 1e9
 """Mean stage cost of an environment that diverged: very bad, and finite."""
@@ -62,7 +61,7 @@ class Plant:
     n_a
         Number of actuators.
     width
-        Width of one actuator's support as a fraction of the domain, width * n_a <= 1.
+        Width of one actuator as a fraction of the domain, see `Equation.supports`.
     sample_time
         Sampling time, a whole multiple of ``integration_time``.
     integration_time
@@ -84,7 +83,7 @@ class Plant:
     target : (state_size,)
         Target of what `reset` and `step` return: the same, unless instruments are between.
     supports : (n_x, n_a)
-        Phi_j(x_i), entries 0 or 1, on the component ``equation.actuated``.
+        Phi_j(x_i), on the component ``equation.actuated``.
     states : (M, n_z)
         The fields now.
     actions : (M, n_a)
@@ -131,8 +130,14 @@ class Plant:
         self.action_weight = positive("action_weight", action_weight)
         self.divergence_bound = positive("divergence_bound", divergence_bound)
         n_x = grid_points(equation, self.n_z)
-        self.supports = indicator_supports(n_x, n_a, positive("width", width))
         self.x = equation.length * np.arange(n_x) / n_x
+        shapes = np.array(equation.supports(self.x, self.n_a, positive("width", width)), np.float64)
+        if shapes.shape != (n_x, n_a) or not np.isfinite(shapes).all():
+            raise ValueError(
+                f"supports of the equation must return {n_x} x {n_a} finite numbers, got shape "
+                f"{shapes.shape}"
+            )
+        self.supports = shapes
         self.field_target = self._checked("target", equation.target(self.x))
         self.target = self.field_target
         settings = StepSettings(

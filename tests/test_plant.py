@@ -409,6 +409,26 @@ class Fisher(Equation):
 FISHER_GRID = {"n_z": 32, "n_a": 1, "width": 0.5, "sample_time": 0.5, "integration_time": 0.01}
 
 
+GAUSSIAN = """
+    def supports(self, x, n_a, width):
+        centres = self.length * np.array([0.2, 0.7])
+        away = (x[:, None] - centres + self.length / 2) % self.length - self.length / 2
+        return np.exp(-0.5 * (away / (width * self.length)) ** 2)
+"""
+
+
+def test_actuators_of_any_shape_at_any_place(tmp_path: Path) -> None:
+    """From rest a short step gives dt Phi a."""
+    path = tmp_path / "fisher.py"
+    path.write_text(FISHER + GAUSSIAN)
+    grid = FISHER_GRID | {"n_a": 2, "width": 0.1, "sample_time": 1e-6, "integration_time": 1e-6}
+    plant = make(load_equation(f"{path}:Fisher")(), **grid)
+    z, _ = plant.evaluate(np.zeros((1, 32)), np.array([[1.0, -2.0]]))
+    away = np.abs(np.arange(32)[:, np.newaxis] / 32 - [0.2, 0.7])
+    shapes = np.exp(-0.5 * (np.minimum(away, 1 - away) / 0.1) ** 2)
+    np.testing.assert_allclose(z[0], 1e-6 * (shapes @ [1.0, -2.0]), rtol=1e-4, atol=1e-12)
+
+
 def test_an_equation_of_the_users_own(tmp_path: Path) -> None:
     """u' = r u (1 - s u): u(t) = 1 / (s + (1/u0 - s) exp(-r t)); an edit of s must not go unnoticed."""
     path = tmp_path / "fisher.py"
@@ -451,6 +471,11 @@ def test_a_users_equation_is_compiled_once_for_all_processes(tmp_path: Path) -> 
         ("self.rate - 0.01 * k**2", "k / 0 * 1j", "linear_operator of the equation must return"),
         ("self.rate - 0.01 * k**2", "1e6 + k", "growth rate"),
         ("np.ones_like(x)", "np.ones(3)", "target of the equation must return"),
+        (
+            "def target(self, x)",
+            "def supports(self, *_): ...\n    def target(self, x)",
+            "supports of the",
+        ),
     ],
 )
 @pytest.mark.filterwarnings("ignore:(divide|invalid):RuntimeWarning")

@@ -20,6 +20,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pde_sim_node.supports import indicator_supports
+
 Field = NDArray[np.float64]
 Spectrum = NDArray[np.inexact[Any]]
 
@@ -124,6 +126,24 @@ class Equation(ABC):
         -------
         (n_x,), or (components, n_x) where there are several
         """
+
+    def supports(self, x: Field, n_a: int, width: float) -> Field:
+        """Phi_j(x_i), the shapes of the actuators: equally spaced and 1 on a ``width`` of the domain.
+
+        Override it for actuators of another shape or at other places.
+
+        Parameters
+        ----------
+        x : (n_x,)
+            Grid points i L / n_x.
+        n_a, width
+            As in the problem's file; width is a share of L.
+
+        Returns
+        -------
+        (n_x, n_a)
+        """
+        return indicator_supports(len(x), n_a, width)
 
     @abstractmethod
     def target(self, x: Field) -> Field:
