@@ -6,6 +6,7 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
+from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import Commands, add_equation, add_json, allow_equation, command
 from pdeloop.output import print_json
 
@@ -20,10 +21,20 @@ def add(commands: Commands) -> None:
         description="Check a problem before training on it: halve the integration step, see whether "
         "the actuators reach the modes that do not decay at the target, explore once, say which order "
         "the data support and what the first law costs, and draw fields and supports. Exit code "
-        "1 if anything is not as it should be.",
+        "1 if anything is not as it should be. With plant, controller or tuner instead of a FILE: "
+        "whether such a node of yours, alone in this ROS_DOMAIN_ID, keeps to docs/interfaces.md.",
         example="pdeloop check burgers --picture burgers.png",
     )
-    check.add_argument("problem", metavar="FILE", help="a problem's YAML file, or a shipped name")
+    check.add_argument(
+        "problem",
+        metavar="FILE",
+        help="a problem's YAML file, or a shipped name; or plant, controller, tuner",
+    )
+    check.add_argument("--n-a", type=int, default=1, metavar="N", help="actuators of the node [1]")
+    check.add_argument(
+        "--patience", type=float, default=10.0, metavar="S", help="seconds that it may take [10]"
+    )
+    check.add_argument("--network", action="store_true", help="also a node on another machine")
     add_equation(check)
     check.add_argument(
         "--picture",
@@ -38,9 +49,19 @@ def _check(options: argparse.Namespace) -> int:
     from pdeloop.problem_check import check, draw
     from pdeloop.training_run import resolve
 
-    values = resolve(options.problem, allow_equation(options))
+    if options.problem in ("plant", "controller", "tuner"):
+        from pdeloop.conformance.node import check_node
+
+        if options.picture is not None:
+            raise ParameterError("--picture is of a problem's file; leave it out")
+        found = check_node(
+            options.problem, n_a=options.n_a, patience=options.patience, network=options.network
+        )
+    else:
+        values = resolve(options.problem, allow_equation(options))
+        found = check(values)
     findings = []
-    for finding in check(values):
+    for finding in found:
         findings.append(finding)
         if not options.json:
             print(f"{'ok ' if finding.good else 'BAD'}  {finding.name}: {finding.text}", flush=True)

@@ -46,6 +46,8 @@ def test_a_linear_plant_written_from_the_interface_page_is_identified_and_tuned(
     A, B, target = (np.asarray(space[name]) for name in ("A", "B", "TARGET"))
 
     loop.start(str(tmp_path / "linear_plant.py"), name="linear_plant")
+    check = loop.start("-m", "pdeloop", "check", "plant", "--n-a", "2", name="check")
+    assert "BAD" not in loop.wait(check, LIMIT)
     loop.node("controller_node", *documented_command("controller_node"))
     out = tmp_path / "run"
     tuner = loop.node("tuner_node", *documented_command("tuner_node"), "-p", f"out:={out}")
