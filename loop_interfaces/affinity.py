@@ -108,3 +108,12 @@ def _busy_ticks(file: Path = Path("/proc/stat")) -> dict[int, int]:
                 spent = [int(number) for number in numbers[:8]]
                 ticks[int(name[3:])] = sum(spent) - spent[3] - spent[4]  # idle, waiting for a disk
     return ticks
+
+
+def lower_priority(niceness: int = 0) -> None:
+    """Schedule this process as batch work, so that a message that arrives here does not preempt its
+    sender; `niceness` is added to that of the process.
+    """
+    with contextlib.suppress(OSError, AttributeError):
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+        os.nice(niceness)

@@ -9,9 +9,7 @@ topics. What is written: recorder_node.recording.
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
 import sys
 import time
 from pathlib import Path
@@ -19,9 +17,10 @@ from typing import Any
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 
+from loop_interfaces.affinity import lower_priority
 from loop_interfaces.frames import FrameError
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.parameters import taken_by
@@ -46,19 +45,21 @@ DRAIN = 0.02
 FLUSH = 0.3
 """Seconds of recording that a SIGKILL may lose at the most."""
 LOOK = 0.1
-"""Seconds between two looks at the ROS graph."""
+"""Seconds between two rounds of reading the ROS graph."""
 HELD_UP, CATCH_UP = 0.15, 0.5
-"""Seconds between two batches after which this process was held up, and in which it then takes what
-has come in meanwhile, before it says of an episode that something is missing."""
+"""Stall threshold: seconds between two batches; and seconds after a stall before an episode is
+indexed, so that what arrived meanwhile is not reported as missing."""
 DEPTH = 1000
-"""Messages of a topic that wait here: seconds of the fastest loop, should this process be held up."""
+"""Messages of a topic that may wait: seconds of the fastest loop, if this process is held up."""
+LATCHED = DurabilityPolicy.TRANSIENT_LOCAL
+"""A node that starts later gets the messages of before, too."""
 REPORT = 1.0
 """Seconds between two messages on recorder/status."""
 SLICE, PAST = 200_000_000, 10_000_000_000
-"""Nanoseconds of arrivals that are recorded in one batch, so that a recorder that is behind writes what
-it has, too; and by how much it can be behind, beyond which the clock was set."""
+"""Nanoseconds of arrivals that are recorded in one batch, so that a recorder that is behind writes at
+regular times, too; and by how much it can be behind: beyond that, the clock was set."""
 QUIET, END = 0.1, 1.0
-"""At the end: seconds without a message after which nothing more is on its way, and in all."""
+"""At the end: seconds without a message after which the recording ends, and at the most."""
 
 
 class RecorderNode:
@@ -108,21 +109,16 @@ class RecorderNode:
         loop.introspection.report(
             "recording", lambda now: self._health.report(now, self._status is not None)
         )
-        loop.every(DRAIN, self._record_next)
+        loop.every(DRAIN, self._record)
         loop.every(FLUSH, self._flush)
         loop.every(LOOK, self._look)
 
     def _subscribe(self, source: Source) -> None:
         kind, channel = message_class(source.channel.type), source.channel
-        qos = QoSProfile(
-            reliability=ReliabilityPolicy.RELIABLE,
-            durability=DurabilityPolicy.TRANSIENT_LOCAL
-            if channel.latched
-            else DurabilityPolicy.VOLATILE,
-            history=HistoryPolicy.KEEP_LAST,
-            depth=DEPTH,
+        qos = LATCHED if channel.latched else DurabilityPolicy.VOLATILE
+        subscription = raw_subscription(
+            self._node, kind, channel.topic, QoSProfile(depth=DEPTH, durability=qos)
         )
-        subscription = raw_subscription(self._node, kind, channel.topic, qos)
         self._others.append((source, SerializedSubscription(subscription, kind, DEPTH)))
 
     def _subscribe_samples(self) -> None:
@@ -143,12 +139,11 @@ class RecorderNode:
             self._loop.run()
             if self._loop.suspended:
                 return 0
-            end = time.monotonic() + END
-            quiet_at = time.monotonic() + QUIET
-            while time.monotonic() < min(quiet_at, end):
-                time.sleep(DRAIN)
-                if self._record(PAST):
-                    quiet_at = time.monotonic() + QUIET
+            end, known = time.monotonic() + END, -1
+            while recording.messages > known and time.monotonic() < end:
+                known = recording.messages
+                time.sleep(QUIET)
+                self._record(PAST)
             recording.close()
         except BagError as error:
             print(f"recorder_node: {error}", file=sys.stderr)
@@ -159,14 +154,11 @@ class RecorderNode:
         )
         return 0
 
-    def _record_next(self) -> None:
-        self._record(SLICE)
+    def _record(self, longest: int = SLICE) -> None:
+        """Record what has arrived since the last time, in the order of arrival; at most `longest` ns.
 
-    def _record(self, longest: int) -> int:
-        """Record what has come in since the last time, in the order of arrival, of `longest` ns.
-
-        Of all topics up to the same moment: what is written next to each other then belongs
-        together, even if this process is held up between two of them and killed after it.
+        It takes all topics up to the same moment, so that what stands together in the bag belongs
+        together, even if this process is held up between two topics and then killed.
         """
         now = time.time_ns()
         behind = longest < now - self._until < PAST
@@ -189,7 +181,6 @@ class RecorderNode:
         for when, _, source, raw in taken:
             self._recording.take(source, when, raw)
         self._recording.pause()
-        return len(taken)
 
     def _flush(self) -> None:
         self._recording.flush()
@@ -197,7 +188,7 @@ class RecorderNode:
             self._recording.index(self._until)
 
     def _look(self) -> None:
-        """Look at the ROS graph, and say how the recording is."""
+        """Read the ROS graph, and publish how the recording is."""
         now = time.monotonic()
         for samples, _ in self._samples:
             samples.look()
@@ -208,11 +199,20 @@ class RecorderNode:
         if run and self._peers.changed(run):
             self._recording.note(run, self._peers.parameters())
         if self._status is None and self._peers.all_matched(now):
-            self._status = self._node.create_publisher(String, RECORDER_STATUS, STATUS_QOS)
+            self._status = self._node.create_publisher(
+                String, RECORDER_STATUS, QoSProfile(depth=1, durability=LATCHED)
+            )
             self._log.info("matched with all publishers of the loop")
         if self._status is not None and now >= self._report_at:
             self._report_at = now + REPORT
-            self._status.publish(String(data=self._status_text()))
+            recording = self._recording
+            status = {
+                "bag": str(recording.path.resolve()),
+                "messages": recording.messages,
+                "episodes": recording.episodes,
+                "incomplete": recording.incomplete,
+            }
+            self._status.publish(String(data=json.dumps(status)))
 
     def _look_for_views(self) -> None:
         """Record the topics of viewers that were not there before."""
@@ -233,26 +233,6 @@ class RecorderNode:
             self._sources.append(source)
             self._subscribe(source)
 
-    def _status_text(self) -> str:
-        recording = self._recording
-        return json.dumps(
-            {
-                "bag": str(recording.path.resolve()),
-                "messages": recording.messages,
-                "episodes": recording.episodes,
-                "incomplete": recording.incomplete,
-            }
-        )
-
-
-STATUS_QOS = QoSProfile(
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1,
-)
-"""Latched: a tuner that starts later learns of the recorder, too."""
-
 
 def _make(node: Node, loop: Observer) -> RecorderNode:
     try:
@@ -261,15 +241,9 @@ def _make(node: Node, loop: Observer) -> RecorderNode:
         raise ConfigurationError(str(error)) from error
 
 
-def _stand_back() -> None:
-    """Let the loop's processes go first: a message that arrives here must not preempt its sender."""
-    with contextlib.suppress(OSError, AttributeError):
-        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
-
-
 def main(args: list[str] | None = None) -> int:
     """Console script."""
-    _stand_back()
+    lower_priority()
     keep_on_this_machine()
     return node_main("recorder_node", args, _make, Observer)
 

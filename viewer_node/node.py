@@ -20,6 +20,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import ColorRGBA, Float64
 from visualization_msgs.msg import Marker
 
+from loop_interfaces.affinity import lower_priority
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.parameters import VIEWER, taken_by
 from loop_interfaces.ros.node_main import node_main
@@ -29,7 +30,6 @@ from viewer_node.diagnostics import ViewerHealth
 from viewer_node.loop_reader import PERIOD, LoopReader
 from viewer_node.loop_view import NUMBERS, LoopView
 from viewer_node.picture import diverging
-from viewer_node.priority import lower_priority
 
 LOOK = 0.5
 """Seconds between two looks at the graph."""
@@ -141,7 +141,7 @@ def _wanted(publisher: Publisher) -> bool:
 
 def main(args: list[str] | None = None) -> int:
     """Console script."""
-    lower_priority()
+    lower_priority(19)
     keep_on_this_machine()
     return node_main("viewer_node", args, ViewerNode, Observer)
 

@@ -52,10 +52,10 @@ def add(commands: Commands) -> None:
 
 
 def _monitor(options: argparse.Namespace) -> int:
+    from loop_interfaces.affinity import lower_priority
     from pdeloop.domain import given_domain
     from pdeloop.monitor.finder import Finder, run_id
     from pdeloop.monitor.replay import replay
-    from viewer_node.priority import lower_priority
     from viewer_node.web.page import Page
     from viewer_node.web.server import Server
 
@@ -68,7 +68,7 @@ def _monitor(options: argparse.Namespace) -> int:
         raise ParameterError(f"no run in {folder}; give the folder of one, or none")
     page = Page(options.environment)
     finder = Finder(folder, given_domain())
-    lower_priority()
+    lower_priority(19)
     try:
         server = Server(page, options.port)
     except OSError as error:
