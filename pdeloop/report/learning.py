@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.report.data import Curve, ProblemData, Steps
-from pdeloop.report.style import COLOURS, LINES, NAMES, legend_above, panels, plain_log
+from pdeloop.report.style import COLOURS, LINES, NAMES, panels, plain_log
 
 Array = NDArray[np.float64]
 EDGE = 1.5
@@ -37,7 +37,12 @@ def training_curves(problems: Sequence[ProblemData]) -> Figure:
         ax.set_xlabel("rollouts of the adaptation")
         ax.set_title(problem.name)
     axes[0].set_ylabel("cost relative to LQT")
-    legend_above(figure, axes)
+    legend = {
+        label: line
+        for ax in axes
+        for line, label in zip(*ax.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(legend.values(), legend, loc="outside upper center", ncols=len(legend))
     return figure
 
 

@@ -5,7 +5,6 @@ Fields are drawn with cividis and gains with PuOr, which any colour vision can r
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -61,15 +60,3 @@ def plain_log(ax: Axes, ratio: float) -> None:
     ax.yaxis.set_major_locator(LogLocator(10, subs=subs))
     ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     ax.yaxis.set_minor_locator(NullLocator())
-
-
-def legend_above(figure: Figure, axes: Sequence[Axes]) -> None:
-    """One legend for all axes, above them."""
-    entries = {
-        label: handle
-        for ax in axes
-        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
-    }
-    figure.legend(
-        list(entries.values()), list(entries), loc="outside upper center", ncols=len(entries)
-    )
