@@ -167,7 +167,7 @@ def test_one_component_of_the_state_is_shown_at_a_time():
 def test_a_slow_loop_is_read_all_the_time():
     budget = ReadBudget()
     for tick in range(10_000):
-        assert budget.decide(0.03 * tick, watched=True, complete=tick % 20 == 0)
+        assert budget.decide(0.03 * tick, page_open=True, complete=tick % 20 == 0)
         budget.took(12)
 
 
@@ -175,7 +175,7 @@ def test_a_fast_loop_is_read_an_episode_at_a_time_within_the_budget():
     budget, read, seconds, pauses, before = ReadBudget(), 0, 60.0, 0, True
     rate, tick = 10_000, 0.03
     for i in range(int(seconds / tick)):
-        listening = budget.decide(i * tick, watched=True, complete=i % 3 == 0)
+        listening = budget.decide(i * tick, page_open=True, complete=i % 3 == 0)
         pauses += before and not listening
         before = listening
         if listening:
@@ -188,16 +188,16 @@ def test_a_fast_loop_is_read_an_episode_at_a_time_within_the_budget():
 
 def test_nothing_is_read_while_nobody_looks():
     budget = ReadBudget()
-    assert not budget.decide(0.0, watched=False, complete=False)
-    assert budget.decide(0.1, watched=True, complete=False)
-    assert not budget.decide(0.2, watched=False, complete=False)
+    assert not budget.decide(0.0, page_open=False, complete=False)
+    assert budget.decide(0.1, page_open=True, complete=False)
+    assert not budget.decide(0.2, page_open=False, complete=False)
 
 
 def test_an_endless_episode_and_large_messages_do_not_escape_the_budget():
     budget = ReadBudget()
-    assert budget.decide(0.0, watched=True, complete=False)
+    assert budget.decide(0.0, page_open=True, complete=False)
     budget.took(100, size=100_000_000)
-    assert not budget.decide(0.01, watched=True, complete=False)
+    assert not budget.decide(0.01, page_open=True, complete=False)
 
 
 # The curve.

@@ -15,7 +15,7 @@ import pytest
 from tests.browser import browser
 from viewer_node.loop_nodes import Endpoint
 from viewer_node.operation import Call
-from viewer_node.web.page import Page, Recorded, ShowEpisode, Watch
+from viewer_node.web.page import Page, Recorded, ShowEpisode, ShowLoop
 from viewer_node.web.server import FILES, STATIC, TOKEN, Server
 
 
@@ -118,7 +118,7 @@ def test_a_page_of_ours_reaches_the_nodes_and_nothing_but_what_they_offer():
             assert asyncio.run(ask(server, "POST", "/api/call", json=body, **allowed))[0] == 400
         page.place["namespaces"] = ["/", "/lab"]
         page.recorded = Recorded(finished=True, episodes=2)
-        watch = "/api/watch"
+        show = "/api/show"
         for body, status in (
             ({"namespace": "/lab"}, 200),
             ({"namespace": "/other"}, 400),
@@ -131,8 +131,8 @@ def test_a_page_of_ours_reaches_the_nodes_and_nothing_but_what_they_offer():
             ({"episode": 2}, 400),
             ({"episode": -1}, 400),
         ):
-            assert asyncio.run(ask(server, "POST", watch, json=body, **allowed))[0] == status, body
-        assert page.requests.get(timeout=10) == Watch("/lab")
+            assert asyncio.run(ask(server, "POST", show, json=body, **allowed))[0] == status, body
+        assert page.requests.get(timeout=10) == ShowLoop("/lab")
         assert page.requests.get(timeout=10) == ShowEpisode(0)  # again, in the other environment
         assert page.requests.get(timeout=10) == ShowEpisode(1) and page.requests.empty()
 

@@ -12,18 +12,15 @@ class ViewerHealth:
     def __init__(self, view: LoopView) -> None:
         self._view = view
         self._rate = Rate()
-        self._seen, self._seen_at = 0, float("-inf")
 
     def report(self, now: float, subscribers: int) -> Health:
         """Level, sentence and values at time `now` (monotonic s)."""
-        view, current = self._view, self._view.current
-        if view.samples != self._seen:
-            self._seen, self._seen_at = view.samples, now
+        view, current, quiet = self._view, self._view.current, self._view.quiet(now)
         level, message = Level.OK, "nothing seen yet"
         if current is not None:
             message = f"step {current.last} of episode {current.key[1]}"
-            if now - self._seen_at > SILENT:
-                level, message = Level.STALE, f"no sample for {now - self._seen_at:.0f} s"
+            if quiet is not None and quiet > SILENT:
+                level, message = Level.STALE, f"nothing heard for {quiet:.0f} s"
         return Health(
             level,
             message,

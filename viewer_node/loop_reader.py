@@ -61,8 +61,8 @@ class LoopReader:
             self._samples.close()
             self._samples = None
 
-    def look(self) -> None:
-        """Now and then: look at the graph where the samples are to be had."""
+    def poll_graph(self) -> None:
+        """Subscribe to the samples where they are published; call it about once a second."""
         if self._samples is not None:
             self._samples.look()
 

@@ -31,8 +31,8 @@ from viewer_node.loop_reader import PERIOD, LoopReader
 from viewer_node.loop_view import NUMBERS, LoopView
 from viewer_node.picture import diverging
 
-LOOK = 0.5
-"""Seconds between two looks at the graph."""
+GRAPH_PERIOD = 0.5
+"""Period (s) of polling the ROS graph."""
 FRAME_ID = "field"
 """Frame of the markers and the image: x is the place, y the value of the field; no transform needed."""
 LINE_WIDTH = 0.006
@@ -72,7 +72,7 @@ class ViewerNode:
             name: node.create_publisher(Float64, f"view/{name}", 1) for name in NUMBERS
         }
         loop.every(PERIOD, self._read)
-        loop.every(LOOK, self._reader.look)
+        loop.every(GRAPH_PERIOD, self._reader.poll_graph)
         loop.introspection.report(
             "views", lambda now: self._health.report(now, self._subscribers())
         )

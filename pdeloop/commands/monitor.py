@@ -82,20 +82,20 @@ def _monitor(options: argparse.Namespace) -> int:
         webbrowser.open(server.url)
     try:
         if folder is None or finder.find() is not None or replay(folder, finder, page):
-            _watch(options, finder, page)
+            _show_loops(options, finder, page)
     finally:
         server.stop()
     return 0
 
 
-def _watch(options: argparse.Namespace, finder: Finder, page: Page) -> None:
-    """Watch loops that run; needs ROS."""
-    from pdeloop.monitor.node import ConfigurationError, watch
+def _show_loops(options: argparse.Namespace, finder: Finder, page: Page) -> None:
+    """Show loops that run; needs ROS."""
+    from pdeloop.monitor.node import ConfigurationError, show_loops
 
     namespace = options.namespace
     if namespace is not None:
         namespace = "/" + namespace.strip("/")
     try:
-        watch(page, finder, namespace=namespace, network=options.network)
+        show_loops(page, finder, namespace=namespace, network=options.network)
     except ConfigurationError as error:
         raise RuntimeError(str(error)) from error

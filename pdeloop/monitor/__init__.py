@@ -1,1 +1,1 @@
-"""The live page: a node that watches a loop, and a web server on this machine that shows it."""
+"""The live page: a node that reads a loop, and a web server on this machine that shows it."""

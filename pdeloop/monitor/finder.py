@@ -1,4 +1,4 @@
-"""Which loop the monitor watches: the given one, or the training that runs."""
+"""Which loop the monitor shows: the given one, or the training that runs."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ _MAX_TEXT = 1_000_000
 
 
 class Finder:
-    """Finds the loop to watch.
+    """Finds the loop to show.
 
-    folder: of a run (or a bag that is played), to watch this one only; domain: watch this ROS
+    folder: of a run (or a bag that is played), to show this one only; domain: show this ROS
     domain, whatever runs there. With neither, the newest loop on this machine that runs, and the
     next one when it has ended.
     """
@@ -24,23 +24,23 @@ class Finder:
         self,
         folder: Path | None,
         domain: int | None,
-        look: Callable[[], list[Live]] = running,
+        loops: Callable[[], list[Live]] = running,
     ) -> None:
         self._folder = None if folder is None else folder.resolve()
         self._domain = domain
-        self._look = look
+        self._loops = loops
         self._found: Live | None = None
 
     def find(self) -> Live | None:
-        """The loop to watch now; None as long as there is none. One that has ended stays, until
+        """The loop to show now; None as long as there is none. One that has ended stays, until
         there is another.
         """
-        running = self._look()
+        running = self._loops()
         if self._folder is not None:
             running = [live for live in running if live.folder == self._folder]
         if self._domain is not None:
             running = [live for live in running if live.domain == self._domain]
-            # Nodes that were started by hand tell nobody; but a tuner holds its run's folder.
+            # Nodes that were started by hand announce nothing, but a tuner holds its run's folder.
             if not running and (self._folder is None or worked_on(self._folder)):
                 running = [Live(self._domain, self._folder, 0.0)]
         if self._found not in running:

@@ -1,7 +1,7 @@
 """The monitor as a ROS 2 node: reads the loop's topics now and then, calls its services when asked.
 
 Subscribes  episode/start, policy, model, episode/cost, episode/paused, target, /diagnostics;
-            samples (of a plant without them state and action) while somebody looks, and no more of
+            samples (of a plant without them state and action) while a page is open, and no more of
             them than pdeloop.monitor.read_budget allows
 Calls       NODE/pause, resume, step, stop (std_srvs/Trigger) of the loop's nodes
 What it reads goes into the view core (viewer_node.loop_view), and to the page (viewer_node.web).
@@ -36,18 +36,18 @@ from viewer_node.loop_nodes import ROLES, Endpoint
 from viewer_node.loop_reader import PERIOD, LoopReader
 from viewer_node.loop_view import LoopView
 from viewer_node.operation import VERBS, Call
-from viewer_node.web.page import Page, Watch
+from viewer_node.web.page import Page, ShowLoop
 
-ATTEND = 0.1
-"""Seconds between two looks at what the page asks for, and at what was asked of the nodes."""
-LOOK = 1.0
-"""Seconds between two looks at the graph and at which loop runs."""
+REQUEST_PERIOD = 0.1
+"""Period (s) of serving the page's requests and of polling the answers of nodes."""
+GRAPH_PERIOD = 1.0
+"""Period (s) of polling the ROS graph, and which loop runs."""
 
 
 class MonitorNode:
-    """Watches one loop in one ROS domain.
+    """Shows one loop in one ROS domain.
 
-    namespace: of the pair to watch; None: the first one that is found.
+    namespace: of the pair to show; None: the first one that is found.
     """
 
     def __init__(
@@ -70,18 +70,18 @@ class MonitorNode:
         self._begin(namespace)
         for period, callback in (
             (PERIOD, self._read),
-            (ATTEND, self._attend),
-            (LOOK, self._look),
+            (REQUEST_PERIOD, self._serve_requests),
+            (GRAPH_PERIOD, self._poll_graph),
             (REFRESH, self._refresh),
         ):
             loop.every(period, callback)
 
     def run(self) -> str:
-        """Watch until a signal comes, or another loop is to be watched; the reason."""
+        """Run until a signal comes, or another loop is to be shown; the reason."""
         return self._loop.run()
 
     def _begin(self, namespace: str | None) -> None:
-        """Watch the loop in `namespace`."""
+        """Show the loop in `namespace`."""
         if self._reader is not None:
             self._reader.close()
         self._namespace, self._budget = namespace, ReadBudget()
@@ -106,9 +106,9 @@ class MonitorNode:
             self._budget.took(*self._reader.read())
             complete = self._view.complete
         now = self._loop.now()
-        self._reader.listen(self._budget.decide(now, watched=self._page.open, complete=complete))
+        self._reader.listen(self._budget.decide(now, page_open=self._page.open, complete=complete))
 
-    def _attend(self) -> None:
+    def _serve_requests(self) -> None:
         with contextlib.suppress(queue.Empty):
             while True:
                 self._serve(self._page.requests.get_nowait())
@@ -122,22 +122,22 @@ class MonitorNode:
 
     def _serve(self, request: object) -> None:
         """Do what the page asks for."""
-        if isinstance(request, Watch):
+        if isinstance(request, ShowLoop):
             self._given = True
             self._begin(request.namespace)
-            self._look()
+            self._poll_graph()
         elif isinstance(request, Call):
             self._calls.append(ServiceCall(self._node, request))
             with self._page.lock:
                 self._view.operation.asked(request, self._loop.now())
             self._page.refresh(self._loop.now())
 
-    def _look(self) -> None:
-        """Look who is there, and which loop is to be watched."""
+    def _poll_graph(self) -> None:
+        """Update which nodes there are, and which loop is to be shown."""
         if self._finder.find() != self._live:
             self._loop.stop("moved")
         if self._reader is not None:
-            self._reader.look()
+            self._reader.poll_graph()
         found = self._namespaces()
         if not self._given and found and self._namespace not in found:
             self._begin(found[0])
@@ -226,8 +226,8 @@ def _progress(folder: Path | None) -> ProgressFile | None:
     return ProgressFile(folder / "progress.jsonl", past=True)
 
 
-def watch(page: Page, finder: Finder, *, namespace: str | None, network: bool) -> None:
-    """Watch what `finder` finds, one loop after the other, until SIGINT or SIGTERM."""
+def show_loops(page: Page, finder: Finder, *, namespace: str | None, network: bool) -> None:
+    """Show what `finder` finds, one loop after the other, until SIGINT or SIGTERM."""
     while True:
         stop = stop_event()
         while (live := finder.find()) is None:
@@ -244,4 +244,4 @@ def watch(page: Page, finder: Finder, *, namespace: str | None, network: bool) -
                 return
 
 
-__all__ = ["ConfigurationError", "MonitorNode", "watch"]
+__all__ = ["ConfigurationError", "MonitorNode", "show_loops"]

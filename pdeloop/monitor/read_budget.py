@@ -37,14 +37,14 @@ class ReadBudget:
         """Add `count` messages of together `size` bytes."""
         self._level += count + size / MESSAGE
 
-    def decide(self, now: float, *, watched: bool, complete: bool) -> bool:
+    def decide(self, now: float, *, page_open: bool, complete: bool) -> bool:
         """Whether to read on at time `now` (monotonic s).
 
-        watched: a page is open; complete: a whole episode was read.
+        page_open: whether a page is open; complete: a whole episode was read.
         """
         elapsed = 0.0 if self._when is None else max(0.0, now - self._when)
         self._when = now
         self._level = max(0.0, self._level - self.rate * elapsed)
         limit = (self.burst if complete else self.most) if self.listening else 0.0
-        self.listening = watched and self._level <= limit
+        self.listening = page_open and self._level <= limit
         return self.listening

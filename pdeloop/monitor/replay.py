@@ -21,7 +21,7 @@ from viewer_node.loop_view import LoopView
 from viewer_node.web.page import Page, Recorded, ShowEpisode
 
 REFRESH = 0.5
-"""Seconds between two looks whether the run goes on again."""
+"""Period (s) of updating rates and progress, and of checking whether a run goes on again."""
 
 
 class Replay:

@@ -38,7 +38,7 @@ PARAMETERS = ("problem", "length", "n_a", "horizon", "sample_time")
 
 
 @dataclass(frozen=True)
-class Watch:
+class ShowLoop:
     """A request to show the loop in this namespace of the domain."""
 
     namespace: str
@@ -101,7 +101,7 @@ class Page:
         self.controls: list[dict[str, Any]] = []
         self.recorded: Recorded | None = None
         self.component = 0
-        self.requests: queue.SimpleQueue[Call | Watch | ShowEpisode] = queue.SimpleQueue()
+        self.requests: queue.SimpleQueue[Call | ShowLoop | ShowEpisode] = queue.SimpleQueue()
         self.open = False
         self._status: str | None = None
         self._colours = (0.0, 1.0)
@@ -156,7 +156,7 @@ class Page:
                 case {"component": index} if _is_index(index, MAX_INDEX):
                     self.component = index
                 case {"namespace": str(name)} if name in self.place["namespaces"]:
-                    self.requests.put(Watch(name))
+                    self.requests.put(ShowLoop(name))
                 case {"episode": index} if self.recorded and _is_index(
                     index, self.recorded.episodes
                 ):

@@ -3,7 +3,7 @@
 GET   /, /NAME     the page and its files, all of them from this package
 GET   /ws          a WebSocket with what is new (viewer_node.web.page), at most FRAMES times a second
 POST  /api/call    {"node", "verb"}: call a service of a node; the status tells what comes of it
-POST  /api/watch   {"namespace"}, {"episode"}, {"environment"} or {"component"}: what is shown
+POST  /api/show    {"namespace"}, {"episode"}, {"environment"} or {"component"}: what is shown
 
 Any page of the web that is open in a browser can send requests to 127.0.0.1. So a request must name
 this server as its host (a foreign name that was made to resolve to 127.0.0.1 does not), one from a
@@ -34,7 +34,7 @@ from viewer_node.web.page import Page
 FRAMES = 20.0
 """Pictures a second at the most."""
 MOST_PAGES = 16
-"""Pages that may look at the same time."""
+"""Pages that may be open at the same time."""
 MOST_CONNECTIONS = 128
 """Connections at the same time; further ones are closed as they come."""
 LINGER = 10.0
@@ -100,7 +100,7 @@ class Server:
         app = web.Application(middlewares=[self._guard], client_max_size=MAX_BODY)
         app.router.add_get("/ws", self._on_page)
         app.router.add_post("/api/call", self._on_call)
-        app.router.add_post("/api/watch", self._on_watch)
+        app.router.add_post("/api/show", self._on_show)
         app.router.add_get("/{name:[A-Za-z.]*}", _on_file)
         runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
         await runner.setup()
@@ -189,7 +189,7 @@ class Server:
             )
         return web.json_response({"success": True})
 
-    async def _on_watch(self, request: web.Request) -> web.Response:
+    async def _on_show(self, request: web.Request) -> web.Response:
         if not self._page.choose(await _body(request)):
             raise web.HTTPBadRequest(
                 text="expected an environment, a component, a recorded episode or a known namespace"

@@ -25,7 +25,7 @@ const model = {
 // Change the model, and show it.
 function set(changes) {
   Object.assign(model, changes);
-  showPage(model, { press, watch, seek, point: (pointed) => set({ pointed }) });
+  showPage(model, { press, choose, seek, point: (pointed) => set({ pointed }) });
 }
 
 set({});
@@ -85,9 +85,9 @@ function press(node, role, verb, words) {
   }
 }
 
-// Ask for something else to be shown.
-function watch(what) {
-  request("/api/watch", what, "");
+// Ask for another environment, component, namespace or recorded episode.
+function choose(what) {
+  request("/api/show", what, "");
 }
 
 async function request(path, content, words) {

@@ -26,7 +26,7 @@ const ROLES = { plant: "plant", tuner: "training" };
 const LEVELS = ["good", "warn", "bad", "warn"];
 const MOST_CHOICES = 4096;
 
-// actions: press(node, role, verb, words), watch(what), seek(column), point(episode).
+// actions: press(node, role, verb, words), choose(what), seek(column), point(episode).
 export function showPage(model, actions) {
   const { status, curve } = model;
   const known = status && curve;
@@ -177,13 +177,13 @@ function Figures({ status, curve }) {
 }
 
 // Which component, pair and environment is shown.
-function Choices({ status, watch }) {
+function Choices({ status, choose }) {
   const { components, component, environments, environment, place } = status;
   const most = Math.min(environments, MOST_CHOICES);
   const numbers = Array.from({ length: most }, (_, i) => String(i));
-  const choice = (name, names, chosen, choose) => html`
+  const choice = (name, names, chosen, take) => html`
     <label hidden=${names.length < 2}>
-      ${name} <select id=${name} value=${chosen} onChange=${(event) => choose(event.target.value)}>
+      ${name} <select id=${name} value=${chosen} onChange=${(event) => take(event.target.value)}>
         ${names.map((one) => html`<option value=${one}>${one}</option>`)}
       </select>
     </label>
@@ -191,21 +191,21 @@ function Choices({ status, watch }) {
   return [
     choice("component", components, components[component], (value) => {
       status.component = components.indexOf(value);
-      watch({ component: status.component });
+      choose({ component: status.component });
     }),
     choice("pair", place.namespaces ?? [], place.namespace, (value) => {
       place.namespace = value;
-      watch({ namespace: value });
+      choose({ namespace: value });
     }),
     choice("environment", numbers, String(Math.min(environment, most - 1)), (value) => {
       status.environment = Number(value);
-      watch({ environment: status.environment });
+      choose({ environment: status.environment });
     }),
   ];
 }
 
 // Two sliders for a run that is over: which recorded episode, and when in it.
-function Replay({ status, episode, pointed, point, seek, watch }) {
+function Replay({ status, episode, pointed, point, seek, choose }) {
   const { recorded } = status;
   if (!recorded?.episodes) return null;
   const chosen = pointed ?? recorded.chosen;
@@ -228,7 +228,7 @@ function Replay({ status, episode, pointed, point, seek, watch }) {
         max=${recorded.episodes - 1}
         value=${chosen}
         onInput=${(event) => point(number(event))}
-        onChange=${(event) => watch({ episode: number(event) })}
+        onChange=${(event) => choose({ episode: number(event) })}
       />
       <output id="recorded-text" class="muted">
         ${chosen + 1} of ${recorded.episodes}${chosen === recorded.chosen ? `: ${recorded.label}` : ""}
