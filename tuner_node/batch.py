@@ -73,6 +73,8 @@ class TrainingSettings:
     noise: bool = False
     """Whether rollouts get seeds of the plant's noise."""
     action_limit: float = 0.0
+    measurement_noise: float = 0.0
+    """Standard deviation of the noise on every number of the states; 0 also with point sensors."""
     model: Array | None = None
     """Rows of a reduced model to start from instead of identifying one."""
 

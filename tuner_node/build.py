@@ -136,6 +136,7 @@ def build_training(values: Mapping[str, Any]) -> Training:
         trajectories=trajectories,
         noise=noisy(values),
         action_limit=values["action_limit"],
+        measurement_noise=0.0 if values["sensors"] else values["measurement_noise"],
         model=read_model(Path(values["model"]), values["n_a"]) if values["model"] else None,
     )
     return Training(settings, make_optimizer, plant=values["plant"] or UNKNOWN_PLANT)

@@ -447,6 +447,7 @@ class Training:
             exploration=exploration,
             measured=self.measured[m],
             action_limit=self.settings.action_limit,
+            noise=self.settings.measurement_noise,
         )
 
     def _asked(self) -> list[list[Rollout]]:

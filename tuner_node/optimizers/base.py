@@ -113,6 +113,8 @@ class Context:
         Rollouts from before the optimisation: those that checked the first law, and no control.
     action_limit : float
         Magnitude at which actions saturate; 0 for none.
+    noise : float
+        Standard deviation of the noise on every number of the states; 0 for none, or unknown.
     """
 
     U: Array
@@ -123,6 +125,7 @@ class Context:
     exploration: Trajectory
     measured: Sequence[Measured] = ()
     action_limit: float = 0.0
+    noise: float = 0.0
 
 
 class Optimizer(Protocol):

@@ -128,6 +128,7 @@ class Proposer:
         self._q, self._r = context.state_weight, context.action_weight
         self._horizon = context.horizon
         self._action_limit = context.action_limit
+        self._noise = context.noise
         self._before = [
             Record(-1, np.zeros_like(policy), np.inf, states, actions),
             *(
@@ -272,7 +273,9 @@ class Proposer:
         )
         for fitted in kinds if measured else ():
             models = fitted()
-            errors = [mismatch(self._loop, model, measured, _REPRODUCED) for model in models]
+            errors = [
+                mismatch(self._loop, model, measured, _REPRODUCED, self._noise) for model in models
+            ]
             best = int(np.argmin(errors))
             if errors[best] <= _REPRODUCED:
                 return models[best], errors[best]
