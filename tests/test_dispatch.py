@@ -131,6 +131,17 @@ def test_two_different_costs_of_one_episode_end_the_run():
         served.cost(0, replace(cost, values=np.nextafter(cost.values, 9.0)), 0.0)
 
 
+def test_two_different_targets_of_the_run_s_plant_end_the_run():
+    served = dispatcher(plant=5)
+    target = Frame(0, 0, 0, 0.0, np.arange(3.0), 5)
+    other = replace(target, values=target.values + 1e-9)
+    assert served.target(0, target, 0.0) == served.target(0, target, 1.0) == []
+    assert served.target(0, replace(other, plant=6), 0.0) == []
+    assert served.target(0, replace(target, plant=6), 0.0) == []  # not this run's plant
+    with pytest.raises(DispatchError, match="two different targets came for the plant 5"):
+        served.target(0, other, 2.0)
+
+
 def test_a_cost_that_is_taken_back_after_it_was_used_ends_the_run():
     served = dispatcher()
     ((_, first),) = starts(served.assign(batch(2), 0.0))

@@ -219,9 +219,16 @@ class Dispatcher:
         return newest if newest >= 0 else None
 
     def target(self, pair: int, frame: Frame, now: float) -> list[PairPublication]:
-        """Learn the target z_r of a plant."""
-        if len(self._targets) < MAX_TARGETS or frame.plant in self._targets:
-            self._targets[frame.plant] = frame.values.copy()
+        """Learn the target z_r of a plant. DispatchError if that of the run's plant was another one."""
+        known = self._targets.get(frame.plant)
+        if known is None:
+            if len(self._targets) < MAX_TARGETS:
+                self._targets[frame.plant] = frame.values.copy()
+        elif self.plant in (UNKNOWN_PLANT, frame.plant) and not np.array_equal(known, frame.values):
+            raise DispatchError(
+                f"two different targets came for the plant {frame.plant} of this run; expected one "
+                "plant with this fingerprint: stop the other and start a new run"
+            )
         return []
 
     def state(self, pair: int, frame: Frame) -> bool:
