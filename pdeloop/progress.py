@@ -46,12 +46,12 @@ class Progress:
         self._console, self._title, self._unit, self._period = console, title, unit, period
         self._bar: Bar | None = None
         self._task: Any = None
-        self._began = self._said = time.monotonic()
+        self._started_at = self._printed_at = time.monotonic()
         self._first: float | None = None
         self._done, self._total, self._status = 0.0, 1.0, ""
         self._lock = threading.Lock()
-        self._over = threading.Event()
-        self._heart: threading.Thread | None = None
+        self._closed = threading.Event()
+        self._repeater: threading.Thread | None = None
 
     def tell(self, done: float, total: float = 1.0, status: str = "") -> None:
         """Now `done` of `total` are done; status: a few words on what was done last."""
@@ -63,25 +63,25 @@ class Progress:
             if self._console.is_terminal:
                 self._draw()
             elif int(10 * done / total) > int(10 * before / total) and done < total:
-                self._say()
-        if not self._console.is_terminal and self._heart is None:
-            self._heart = threading.Thread(target=self._beat, daemon=True)
-            self._heart.start()
+                self._print()
+        if not self._console.is_terminal and self._repeater is None:
+            self._repeater = threading.Thread(target=self._repeat, daemon=True)
+            self._repeater.start()
 
     def close(self) -> None:
         """Leave the terminal as it was."""
-        self._over.set()
-        if self._heart is not None:
-            self._heart.join()
+        self._closed.set()
+        if self._repeater is not None:
+            self._repeater.join()
         if self._bar is not None:
             self._bar.stop()
             self._bar = None
 
-    def _beat(self) -> None:
-        while not self._over.wait(self._period / 4):
+    def _repeat(self) -> None:
+        while not self._closed.wait(self._period / 4):
             with self._lock:
-                if time.monotonic() - self._said > self._period:
-                    self._say()
+                if time.monotonic() - self._printed_at > self._period:
+                    self._print()
 
     @property
     def _amount(self) -> str:
@@ -89,12 +89,14 @@ class Progress:
             return f"{100 * self._done / self._total:.0f} %"
         return f"{self._done:.0f} of {self._total:.0f} {self._unit}"
 
-    def _say(self) -> None:
+    def _print(self) -> None:
         now = time.monotonic()
-        self._said, gained = now, self._done - (self._first or 0.0)
+        self._printed_at, gained = now, self._done - (self._first or 0.0)
         left = ""
         if gained > 0:
-            left = f"{duration((now - self._began) * (self._total - self._done) / gained)} left"
+            left = (
+                f"{duration((now - self._started_at) * (self._total - self._done) / gained)} left"
+            )
         words = [f"{self._title}: {self._amount}", self._status, left]
         self._console.print(", ".join(word for word in words if word), markup=False)
 

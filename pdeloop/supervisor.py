@@ -1,4 +1,4 @@
-"""Starts the nodes of a run as processes, restarts what dies, and leaves nobody behind."""
+"""Starts the nodes of a run as processes, restarts those that die, and ends all of them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _KILLED = range(-64, 0)
 
 
 class NodeError(RuntimeError):
-    """A node that cannot be kept running; the text has its last words."""
+    """A node that cannot be kept running; the text has the last line of its log."""
 
 
 @dataclass
@@ -56,14 +56,13 @@ class Child:
     log: Path
     process: subprocess.Popen[bytes] | None = None
     deaths: int = 0
-    restarts: int = 0
     started: float = 0.0
     due: float | None = 0.0
     optional: bool = False
     cores: Sequence[int] = ()
     ended: bool = False
 
-    def last_words(self) -> str:
+    def last_line(self) -> str:
         """The last line of the node's log."""
         lines = self._logged()
         return lines[-1] if lines else ""
@@ -72,7 +71,7 @@ class Child:
         """Why the process refused to run, in its one sentence; what ends after it may say more."""
         node = self.name.partition("-")[0]  # behind a hyphen stands its namespace
         said = [line for line in self._logged() if line.startswith(f"{node}: ")]
-        return said[-1] if said else self.last_words()
+        return said[-1] if said else self.last_line()
 
     def _logged(self) -> list[str]:
         try:
@@ -125,7 +124,7 @@ class Supervisor:
             if child.name == self.main and code in (0, STOPPED, NO_CONTROLLER):
                 self.stopped = code == STOPPED
                 return True
-            self._bury(child, code, now)
+            self._ended(child, code, now)
         return False
 
     def stop(self) -> None:
@@ -167,7 +166,8 @@ class Supervisor:
         keep_on(child.process.pid, child.cores)
         child.started, child.due = now, None
 
-    def _bury(self, child: Child, code: int, now: float) -> None:
+    def _ended(self, child: Child, code: int, now: float) -> None:
+        """Start a node that ended again, now or later, or give it up."""
         how = (
             f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
         )
@@ -178,16 +178,15 @@ class Supervisor:
         often = child.deaths > len(BACK_OFF)
         if child.optional and (often or code not in (CRASHED, *_KILLED)):
             child.ended = True
-            self.tell(f"{child.name} {how}; {child.last_words()}")
+            self.tell(f"{child.name} {how}; {child.last_line()}")
             return
         if often:
             raise NodeError(
-                f"{child.name} {how} for the {child.deaths}th time; its last words: "
-                f"{child.last_words() or 'none'} (see {child.log})"
+                f"{child.name} {how} for the {child.deaths}th time; the last line of its log: "
+                f"{child.last_line() or 'none'} (see {child.log})"
             )
         wait = BACK_OFF[child.deaths - 1]
         child.due = now + wait
-        child.restarts += 1
         self.tell(f"{child.name} {how}; starting it again" + (f" in {wait:g} s" if wait else ""))
 
 
@@ -206,11 +205,9 @@ def keep_on(process: int, cores: Sequence[int]) -> None:
 
 
 def _signal(process: subprocess.Popen[bytes], number: signal.Signals) -> None:
-    try:
+    with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, number)
         os.killpg(process.pid, signal.SIGCONT)  # a stopped process must be able to die
-    except ProcessLookupError:
-        pass
 
 
 _LIBC = ctypes.CDLL(None, use_errno=True)

@@ -205,7 +205,7 @@ def _train_over_topics(
                     display.row(row)
                     begun |= row.get("event") != "phase"
                 if recorder is not None and recorder.ended and not (done or begun):
-                    raise NodeError(f"nothing can be recorded: {recorder.last_words()}")
+                    raise NodeError(f"nothing can be recorded: {recorder.last_line()}")
                 time.sleep(0 if done else POLL)
         except Interruption as signal_name:
             display.close()

@@ -1,5 +1,5 @@
-"""The other nodes of the loop, as the ROS graph shows them: whether all know of our readers, and what
-parameters they have.
+"""The other nodes of the loop, as the ROS graph shows them: whether all have discovered the
+recorder's subscriptions, and what parameters they have.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ PATIENCE = 3.0
 
 @dataclass
 class _Peer:
-    """A process that publishes a topic of the loop, and since when we know of it."""
+    """A process that publishes a topic of the loop, and since when it is known."""
 
     since: float
     name: str = ""
     parameters: RemoteParameters | None = None
 
     def matched(self, now: float) -> bool:
-        """Whether it knows of our readers; one without parameter services counts in the end."""
+        """Whether it has discovered our subscriptions, or has no parameter services to say so."""
         answered = self.parameters is not None and self.parameters.values is not None
         return answered or now - self.since > PATIENCE
 
 
 class Peers:
-    """The nodes of the loop: whether they know of our readers, and their parameters.
+    """The nodes of the loop: whether they have discovered our subscriptions, and their parameters.
 
     required: full names of topics that somebody must publish; others: whose publishers, if there
     are any, are asked, too.
@@ -41,7 +41,7 @@ class Peers:
         self._node, self._required, self._topics = node, required, [*others, *required]
         self._peers: dict[bytes, _Peer] = {}
         self._lacking = list(required)
-        self._told: object = None
+        self._known: object = None
 
     def look(self, now: float) -> None:
         """Look at the graph, ask who is new, take answers."""
@@ -66,7 +66,7 @@ class Peers:
                 peer.parameters.poll()
 
     def all_matched(self, now: float) -> bool:
-        """Whether every required topic has a publisher, and all of them know of us."""
+        """Whether every required topic has a publisher, and all of them have discovered us."""
         return not self._lacking and all(peer.matched(now) for peer in self._peers.values())
 
     def changed(self, run: int) -> bool:
@@ -74,11 +74,11 @@ class Peers:
         answered = [
             p for p, peer in self._peers.items() if peer.parameters and peer.parameters.values
         ]
-        changed, self._told = (run, answered) != self._told, (run, answered)
+        changed, self._known = (run, answered) != self._known, (run, answered)
         return changed
 
     def parameters(self) -> dict[str, object]:
-        """The loop's parameters, as far as its nodes told them; of a node started again the new."""
+        """The loop's parameters, as far as its nodes have answered."""
         known = {spec.name for spec in table()}
         answers = [peer.parameters.values for peer in self._peers.values() if peer.parameters]
         return {

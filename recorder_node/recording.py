@@ -1,8 +1,8 @@
 """A recording: the loop's messages in one bag, with an index of its episodes. No ROS.
 
 bag/bag.mcap, bag/metadata.yaml    the bag
-bag/episodes.jsonl                 one line an episode: where it is, and what is missing of it
-bag/parameters.json                the nodes' parameters by run, as far as the nodes told them
+bag/episodes.jsonl                 one line per episode: where it is, and what is missing of it
+bag/parameters.json                the nodes' parameters by run, as far as they have answered
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ class _Taken(NamedTuple):
 class Recording:
     """Writes the messages that `take` is given into the bag at `path`, a new folder.
 
-    A plant sends its samples after the cost they make up, and a tuner the policies of an episode as
-    soon as it has them. In the bag a cost stands behind its samples and policies behind the start:
-    they wait, and what the pair says next waits behind them. So whenever this process may be killed,
-    all episodes of a pair but the last are whole. Raises BagError when the bag cannot be written.
+    A plant publishes the samples of an episode after its cost, and a tuner the policies before the
+    start. In the bag a cost comes after its samples and policies after the start: they are held back
+    until then, and so are later messages of the pair. So whenever this process is killed, all
+    episodes of a pair but the last are whole. Raises BagError when the bag cannot be written.
     """
 
     def __init__(self, path: Path, what: Sequence[Source]) -> None:

@@ -109,7 +109,7 @@ def test_everything_dies_at_once_and_the_run_continues(loop, tmp_path):
     assert_same_training(out, in_process(iterations=150))
 
 
-def test_a_node_that_keeps_dying_is_given_up_with_its_last_words(loop, tmp_path):
+def test_a_node_that_keeps_dying_is_given_up(loop, tmp_path):
     out = tmp_path / "run"
     run = loop.pdeloop("train", str(SMALL), "--iterations", "100000", "--out", str(out))
     killed: set[int] = set()
