@@ -19,7 +19,7 @@ def add(commands: Commands) -> None:
         _check,
         help="whether a problem's file describes a plant that can be trained",
         description="Check a problem before training on it: halve the integration step, see whether "
-        "the actuators reach the modes that do not decay at the target, explore once, say which order "
+        "the actuators reach the modes that are unstable at the target, explore once, say which order "
         "the data support and what the first law costs, and draw fields and supports. Exit code "
         "1 if anything is not as it should be. With plant, controller or tuner instead of a FILE: "
         "whether such a node of yours, alone in this ROS_DOMAIN_ID, keeps to docs/interfaces.md.",

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable
 from typing import TypeAlias
 
-from loop_interfaces.parameters import TUNER, flags
+from loop_interfaces.parameters import PROBLEM, TUNER, flags
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 """Where a command adds its parser."""
@@ -60,12 +60,13 @@ def allow_equation(options: argparse.Namespace) -> dict[str, str]:
 def add_flags(parser: argparse._ActionsContainer, group: str) -> None:
     """The flags of a group of parameters (loop_interfaces.parameters)."""
     for spec in flags(group):
+        own = "the problem's, or " if spec in PROBLEM else ""
         parser.add_argument(
             spec.flag,
             type=_word if spec.choices else spec.type,
             choices=spec.choices or None,
             metavar=None if spec.choices else "N" if spec.type is int else "X",
-            help=f"{spec.description} [{spec.default}]".replace("%", "%%"),
+            help=f"{spec.description} [{own}{spec.default}]".replace("%", "%%"),
         )
 
 
