@@ -192,9 +192,12 @@ def _offers(text: str) -> list[dict[str, Any]]:
 
 def files(folder: Path) -> list[Path]:
     """The MCAP files of a bag in their order. BagError, saying what to do, for one of another kind."""
+    by_message = re.search(
+        r"compression_mode:\W*message", text_of(folder / METADATA), re.IGNORECASE
+    )
     for kind, found in (
         ("a sqlite3 bag", any(folder.glob("*.db3*"))),
-        ("compressed by rosbag2", any(folder.glob("*.zstd")) or _compressed_messages(folder)),
+        ("compressed by rosbag2", by_message or any(folder.glob("*.zstd"))),
     ):
         if found:
             raise BagError(
@@ -204,10 +207,12 @@ def files(folder: Path) -> list[Path]:
     return sorted(folder.glob("*.mcap"), key=lambda path: (len(path.name), path.name))
 
 
-def _compressed_messages(folder: Path) -> bool:
+def text_of(path: Path) -> str:
+    """The beginning of a text file beside a bag; empty if there is none."""
     try:
-        with (folder / METADATA).open("rb") as file:
-            text = file.read(MAX_TEXT).decode(errors="replace")
-    except OSError:
-        return False
-    return re.search(r"compression_mode:\W*message", text, re.IGNORECASE) is not None
+        with path.open("rb") as file:
+            return file.read(MAX_TEXT).decode(errors="replace")
+    except FileNotFoundError:
+        return ""
+    except OSError as error:
+        raise BagError(f"{path} cannot be read: {error.strerror}") from error

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.topics import TARGET
-from pdeloop.bags.mcap_messages import MAX_TEXT, McapMessages, Message, files
+from pdeloop.bags.mcap_messages import McapMessages, Message, files, text_of
 from recorder_node.bag import METADATA, BagError, Channel
 from recorder_node.episodes import EpisodeIndex, RecordedEpisode
 from recorder_node.recording import INDEX, PARAMETERS
@@ -83,7 +83,7 @@ class Bag:
     def index(self) -> list[dict[str, Any]]:
         """The recorder's index of episodes; empty if another recorder wrote the bag."""
         rows = []
-        for line in _text(self.path / INDEX).splitlines():
+        for line in text_of(self.path / INDEX).splitlines():
             try:
                 rows.append(dict(json.loads(line)))
             except (ValueError, TypeError, RecursionError):
@@ -93,7 +93,7 @@ class Bag:
     def parameters(self) -> dict[int, dict[str, Any]]:
         """The nodes' parameters by run, as far as the bag or the run's folder knows them."""
         try:
-            content = json.loads(_text(self.path / PARAMETERS) or "{}")
+            content = json.loads(text_of(self.path / PARAMETERS) or "{}")
             return {int(run): dict(values) for run, values in content.items()}
         except (ValueError, TypeError, AttributeError, RecursionError) as error:
             raise BagError(f"{self.path / PARAMETERS} cannot be read: {error}") from error
@@ -120,13 +120,3 @@ def bags_of(path: Path) -> list[Bag]:
     if not numbered or files(path):
         return [Bag(path)]
     return [Bag(p) for p in sorted(numbered, key=lambda p: (len(p.name), p.name))]
-
-
-def _text(path: Path) -> str:
-    try:
-        with path.open("rb") as file:
-            return file.read(MAX_TEXT).decode(errors="replace")
-    except FileNotFoundError:
-        return ""
-    except OSError as error:
-        raise BagError(f"{path} cannot be read: {error.strerror}") from error
