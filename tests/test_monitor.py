@@ -283,6 +283,7 @@ def test_the_time_that_is_left_follows_from_the_rollouts_of_the_last_minute():
     rate = 2 * (30 - 6) / 60.0
     assert curve.remaining(120.0) == pytest.approx((70 + 20) / rate, rel=0.05)
     assert curve.remaining(130.0) == pytest.approx(curve.remaining(120.0) - 10.0)
+    assert curve.remaining(1e4) is None  # nothing has come for longer than that
     curve.row({"event": "phase", "phase": "evaluate", **paid})
     assert curve.remaining(130.0) is None
 

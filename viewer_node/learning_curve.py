@@ -146,7 +146,10 @@ class LearningCurve:
         return xs, rows
 
     def remaining(self, now: float) -> float | None:
-        """Estimated seconds to the end of the adaptation at time `now` (epoch s); None if unknown."""
+        """Estimated seconds to the end of the adaptation at time `now` (epoch s).
+
+        None if it is not known: too little has come, or nothing for longer than the estimate.
+        """
         if self.phase != "adapt" or not self.budget or len(self._marks) < 2:
             return None
         last, done = self._marks[-1]
@@ -155,8 +158,9 @@ class LearningCurve:
             since, before = self._marks[0]
         if done <= before or last <= since:
             return None
-        left = max(0, self._budgets - done)
-        return max(0.0, left * (last - since) / (done - before) - max(0.0, now - last))
+        left = max(0, self._budgets - done) * (last - since) / (done - before)
+        waited = max(0.0, now - last)
+        return None if 0.0 < left <= waited else max(0.0, left - waited)
 
     def message(self) -> dict[str, Any]:
         """What a page is sent: x, mean, low and high by point, and the cost of every seed."""
