@@ -1,4 +1,4 @@
-"""A minute of trainings under random faults: every one ends with the undisturbed policy."""
+"""Trainings under random faults: every one ends with the undisturbed policy."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from tests.soak import as_dict, soak, text
 pytestmark = pytest.mark.topics
 
 
-def test_a_minute_of_random_faults_changes_no_bit(tmp_path: Path):
+def test_random_faults_change_no_bit(tmp_path: Path):
     lines: list[str] = []
     report = soak(
-        0.8,
+        0.3,
         problem=str(SMALL),
         iterations=60,
         seed=1,
@@ -25,7 +25,7 @@ def test_a_minute_of_random_faults_changes_no_bit(tmp_path: Path):
     told = "\n".join([*lines, text(as_dict(report))])
     assert report.mismatches == 0, told
     assert report.trainings >= 1, told
-    assert sum(report.faults.values()) >= 10, told
-    # The shortest of the trainings: 6 Gauss-Newton iterations of a rollout on each of 3 fields.
-    assert report.environment_steps >= report.trainings * 6 * 3 * 30, told
+    assert sum(report.faults.values()) >= 5, told
+    # The shortest of the trainings takes at least one step of Gauss-Newton: 6 rollouts of 30 steps.
+    assert report.environment_steps >= report.trainings * 6 * 30, told
     assert all(last < first + 30 for first, last in report.memory_mb.values()), told
