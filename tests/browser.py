@@ -33,7 +33,7 @@ COMMAND = [
     "--remote-debugging-port=0",
     "--remote-allow-origins=*",
 ]
-PATIENCE = 60.0
+PATIENCE = 180.0
 """Seconds for the browser's start and for each answer of it."""
 
 

@@ -121,7 +121,7 @@ class Processes:
         for pid in self.left_behind():
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
-        deadline = time.monotonic() + 3.0  # a killed process takes a moment to end
+        deadline = time.monotonic() + 60.0  # a killed process takes a moment to end
         while self.left_behind() and time.monotonic() < deadline:
             time.sleep(0.01)
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from tests.loop_harness import Processes, until
 
-LIMIT = 60.0
+LIMIT = 180.0
 SERVICES = [
     *(f"/pde_sim_node/{name}" for name in ("pause", "resume", "step")),
     *(f"/tuner_node/{name}" for name in ("pause", "resume", "stop")),

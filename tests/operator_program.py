@@ -25,7 +25,7 @@ from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
 from rclpy.parameter import Parameter, parameter_value_to_python
 from std_srvs.srv import Trigger
 
-LIMIT = 20.0
+LIMIT = 120.0
 
 
 class Operator:

@@ -199,7 +199,7 @@ class _Training:
             if not (path.exists() and (self._out / "checkpoint.previous").exists()):
                 return
             supervisor.kill()
-            supervisor.wait(30.0)
+            supervisor.wait(180.0)
             self._end_of(supervisor)
             (self._out / "checkpoint.new").unlink(missing_ok=True)
             path.write_bytes(path.read_bytes()[: int(rng.integers(1, 200))])
@@ -220,8 +220,8 @@ class _Training:
         """Wait until the supervisor and all its nodes are gone."""
         if kill:
             supervisor.kill()
-        supervisor.wait(60.0)
-        deadline = time.monotonic() + 10.0
+        supervisor.wait(180.0)
+        deadline = time.monotonic() + 180.0
         while self._nodes():
             if time.monotonic() > deadline:
                 raise RuntimeError(f"nodes outlive their supervisor: {self._nodes()}")

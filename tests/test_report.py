@@ -209,11 +209,11 @@ def test_a_figure_opens_large(folder, tab):
         tab.send("Input.dispatchKeyEvent", type=kind, key="Enter", code="Enter", text="\r",
                  windowsVirtualKeyCode=13)  # fmt: skip
     large = "document.querySelector('dialog[open] img')"
-    tab.until(f"{large} !== null", 10.0)
+    tab.until(f"{large} !== null", LIMIT)
     width, natural = tab.ask(f"[{large}.getBoundingClientRect().width, {large}.naturalWidth]")
     assert width == natural > 1000
     tab.click("dialog button")
-    tab.until(f"{large} === null", 10.0)
+    tab.until(f"{large} === null", LIMIT)
 
 
 def test_the_page_needs_no_network_and_a_browser_shows_it_without_complaint(folder, tab):

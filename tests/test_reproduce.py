@@ -124,9 +124,9 @@ def test_an_interrupted_reproduction_continues_to_the_same_bits(loop, tmp_path, 
     run = loop.pdeloop("reproduce", *OPTIONS, "--out", str(tmp_path / "a"))
     until(lambda: list((tmp_path / "a").glob("small/*/run.json")), LIMIT, "first job")
     run.send_signal(signal.SIGINT)
-    text = loop.wait(run, 10.0, code=130)
+    text = loop.wait(run, LIMIT, code=130)
     assert f"continue with: pdeloop reproduce --out {tmp_path / 'a'}" in text
-    until(lambda: loop.left_behind() == [], 2.0, "end of all processes")
+    until(lambda: loop.left_behind() == [], LIMIT, "end of all processes")
     assert not (tmp_path / "a" / "table.json").exists()
     loop.wait(loop.pdeloop("reproduce", "--out", str(tmp_path / "a")), LIMIT)
     whole, _ = reproduction

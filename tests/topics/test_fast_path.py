@@ -61,7 +61,7 @@ def test_a_protocol_that_changes_hands_all_the_time_loses_nothing(
     assert_same_training(tmp_path / "run", in_process(iterations=200))
     for node in nodes:
         node.send_signal(signal.SIGTERM)
-        said = loop.wait(node, 10.0)
+        said = loop.wait(node, LIMIT)
         ((count, repeated),) = re.findall(r"interrupted (\d+) times, (\d+) repeated", said)
         assert int(count) > 500
         assert int(repeated) == 0

@@ -62,7 +62,7 @@ def test_lost_repeated_delayed_and_reordered_messages_change_nothing(loop, tmp_p
     loop.wait(tuner, LIMIT)
     assert_same_training(tmp_path / "run", in_process(iterations=8))
     relay.send_signal(signal.SIGINT)
-    text = loop.wait(relay, 5.0)
+    text = loop.wait(relay, LIMIT)
     if "loss" in faults:
         assert " 0 lost" not in text
     if "duplicate" in faults:
@@ -102,7 +102,7 @@ def test_everything_dies_at_once_and_the_run_continues(loop, tmp_path):
     for count in (20, 70):
         until(lambda n=count: iterations_done(out) >= n, LIMIT, f"iteration {count}")
         os.kill(run.pid, signal.SIGKILL)  # its children die with it
-        until(lambda: loop.left_behind() == [], 3.0, "end of the killed supervisor's nodes")
+        until(lambda: loop.left_behind() == [], LIMIT, "end of the killed supervisor's nodes")
         run.wait()
         run = loop.pdeloop("train", "--resume", str(out))
     loop.wait(run, LIMIT)
@@ -120,7 +120,7 @@ def test_a_node_that_keeps_dying_is_given_up(loop, tmp_path):
             os.kill(pid, signal.SIGKILL)
             killed.add(pid)
         time.sleep(0.05)
-    text = loop.wait(run, 5.0, code=1)
+    text = loop.wait(run, LIMIT, code=1)
     assert "controller_node was killed by SIGKILL for the 6th time" in text
     assert len(killed) == 6
 
@@ -183,7 +183,7 @@ def test_a_new_run_is_not_disturbed_by_what_an_earlier_one_left_latched(loop, tm
     time.sleep(0.2)
     first.send_signal(signal.SIGINT)
     first.send_signal(signal.SIGCONT)
-    loop.wait(first, 5.0, code=130)
+    loop.wait(first, LIMIT, code=130)
     second = start_tuner(loop, tmp_path / "second", seed=1)
     loop.wait(second, LIMIT)
     assert_same_training(tmp_path / "second", in_process(seed=1))
@@ -383,7 +383,7 @@ def test_a_flood_of_garbage_on_every_topic_changes_nothing(loop, tmp_path):
     until(lambda: iterations_done(out) >= 50, LIMIT, "iteration 50")
     before = {name: resident(process) for name, process in running.items()}
     flood = loop.start("-c", FLOOD, name="flood")
-    sent = int(loop.wait(flood, 30.0).strip().splitlines()[-1])
+    sent = int(loop.wait(flood, LIMIT).strip().splitlines()[-1])
     assert sent > 5000
     after = {name: resident(process) for name, process in running.items()}
     until(lambda: running["tuner"].poll() is not None, LIMIT, "end of the training")

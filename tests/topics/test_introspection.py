@@ -245,7 +245,7 @@ def test_a_second_node_of_the_same_name_is_reported(loop: Processes):
         )
         assert desk.status("elsewhere/controller_node")[1] == 0
         second.send_signal(signal.SIGINT)
-        loop.wait(second, 10.0)
+        loop.wait(second, LIMIT)
         until(lambda: desk.status("controller_node")[1] == 0, LIMIT, "one node of that name")
 
 
@@ -305,4 +305,4 @@ def test_a_node_that_hardly_does_anything_but_compute_reports_what_has_changed(l
             values = desk.values("busy_node")
             return "activity" in values and int(values.get("fits", 0)) >= 2
 
-        until(fits_in_a_report_during_a_fit, 60.0, "report that counts the fits")
+        until(fits_in_a_report_during_a_fit, LIMIT, "report that counts the fits")

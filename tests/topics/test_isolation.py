@@ -14,6 +14,7 @@ from loop_interfaces.isolation import NETWORK, PROFILE, loopback_environment, ou
 from loop_interfaces.problem import config_folder
 from pdeloop.domain import DomainError, own_domain
 from tests.loop_harness import ROOT, Processes, until
+from tests.topics.test_loop import LIMIT
 
 pytestmark = pytest.mark.topics
 
@@ -31,7 +32,7 @@ def udp_addresses(pid: int) -> set[str]:
 
 def test_a_nodes_sockets_are_on_loopback_only(loop: Processes):
     node = loop.node("controller_node")
-    until(lambda: "tracking law" in loop.output(node), 20.0, "start of the node")
+    until(lambda: "tracking law" in loop.output(node), LIMIT, "start of the node")
     assert udp_addresses(node.pid) <= {"0100007F", "0100FFEF"}  # 127.0.0.1, 239.255.0.1
     assert "0100007F" in udp_addresses(node.pid)
 

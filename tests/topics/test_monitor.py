@@ -111,7 +111,7 @@ def test_the_page_shows_a_running_loop_and_survives_a_restart_of_the_plant(loop,
     assert page.console == []
     assert all(request.split("://")[1].startswith(url[7:]) for request in page.requested)
     monitor.send_signal(signal.SIGINT)
-    loop.wait(monitor, 10.0)
+    loop.wait(monitor, LIMIT)
 
 
 def test_pause_step_and_resume_on_the_page_move_the_plant_and_stop_ends_the_training(
@@ -183,7 +183,7 @@ def test_the_monitor_finds_a_training_that_starts_after_it_and_the_page_a_new_mo
         page.until("document.querySelector('#place').textContent.includes('second')", LIMIT)
         page.until(f"{STATE} === 'running' && {ROLLOUTS} >= 1", LIMIT)
         again.send_signal(signal.SIGTERM)
-        loop.wait(again, 10.0)
+        loop.wait(again, LIMIT)
 
 
 def test_a_pair_in_a_namespace_and_an_environment_are_chosen_on_the_page(loop, page, tmp_path):

@@ -111,7 +111,7 @@ def test_a_paused_tuner_begins_no_episode_and_keeps_the_plant(loop: Processes, t
         episodes = desk.values("pde_sim_node")["episodes"]
         desk.wait_for_reports("tuner_node", 5)  # longer than run_hold
         second = start_tuner(loop, tmp_path / "second", seed=1)
-        text = loop.wait(second, 30.0, code=1)
+        text = loop.wait(second, LIMIT, code=1)
         assert "another tuner publishes /episode/start" in text
         assert iterations_done(out) == done
         assert iterations_done(tmp_path / "second") == 0
@@ -140,7 +140,7 @@ def test_a_tuner_that_was_asked_to_stop_is_continued_to_the_same_policy(
         if paused:
             desk.call("/tuner_node/pause")
         desk.call("/tuner_node/stop")
-        text = loop.wait(tuner, 10.0, code=STOPPED)
+        text = loop.wait(tuner, LIMIT, code=STOPPED)
         assert "stopped on request" in text
         assert 20 <= iterations_done(out) < ITERATIONS
         until(
@@ -158,7 +158,7 @@ def test_the_command_line_ends_with_a_stopped_tuner_and_continues(loop: Processe
         run = loop.pdeloop("train", str(SMALL), *options)
         until(lambda: iterations_done(out) >= 20, LONG, "iteration 20")
         desk.call("/tuner_node/stop")
-        text = loop.wait(run, 15.0, code=130)
+        text = loop.wait(run, LIMIT, code=130)
     assert f"stopped by request; continue with: pdeloop train --resume {out}" in text
     assert iterations_done(out) < ITERATIONS
     assert not (out / "result.json").exists()

@@ -89,11 +89,11 @@ def test_plant_and_controller_share_a_core(loop, tmp_path, seeds, flags) -> None
     assert plant == free if flags else [len(cores) for cores in plant] == [1]
     assert places("tuner_node") == free
     run.send_signal(signal.SIGINT)
-    loop.wait(run, 20.0, code=130)
+    loop.wait(run, LIMIT, code=130)
 
 
 def test_a_node_refuses_a_core_that_is_not_there(loop: Processes) -> None:
-    text = loop.wait(loop.node("controller_node", "-p", "pin:=4000"), 20.0, code=1)
+    text = loop.wait(loop.node("controller_node", "-p", "pin:=4000"), LIMIT, code=1)
     assert "parameter 'pin' is 4000; expected -1 or one of the cores" in text
 
 

@@ -330,8 +330,8 @@ def test_a_training_that_must_be_recorded_stops_when_the_recorder_does(loop, tmp
     hand = Hand(loop, tmp_path / "bag", tmp_path / "run", "required", 100_000)
     until(lambda: iterations_done(hand.out) >= 20, LIMIT, "iteration 20")
     hand.recorder.send_signal(signal.SIGTERM)
-    loop.wait(hand.recorder, 5.0)
-    text = loop.wait(hand.tuner, 10.0, code=1)
+    loop.wait(hand.recorder, LIMIT)
+    text = loop.wait(hand.tuner, LIMIT, code=1)
     assert "tuner_node: the recorder is gone, and this training is required" in text
     assert verify(hand.bag).count == 0
 
@@ -356,12 +356,12 @@ def test_a_full_disk_ends_the_recording_and_the_training_as_the_user_chose(
 
 def test_a_bag_that_cannot_be_begun_is_refused_in_one_line(loop, tmp_path):
     (tmp_path / "there").mkdir()
-    text = loop.wait(loop.node("recorder_node", "-p", f"bag:={tmp_path / 'there'}"), 20.0, code=1)
+    text = loop.wait(loop.node("recorder_node", "-p", f"bag:={tmp_path / 'there'}"), LIMIT, code=1)
     assert text.strip().splitlines() == [
         f"recorder_node: {tmp_path / 'there'} already exists; choose another folder for the bag"
     ]
     with read_only_folder(tmp_path / "locked") as folder:
-        text = loop.wait(loop.node("recorder_node", "-p", f"bag:={folder / 'b'}"), 20.0, code=1)
+        text = loop.wait(loop.node("recorder_node", "-p", f"bag:={folder / 'b'}"), LIMIT, code=1)
     (line,) = text.strip().splitlines()
     assert line.startswith(f"recorder_node: cannot write a bag to {folder / 'b'}: ")
 
@@ -371,7 +371,7 @@ def test_a_second_recording_of_a_run_gets_a_bag_of_its_own(loop, tmp_path):
     run = loop.pdeloop("train", str(SMALL), "--iterations", "150", "--out", str(out), "--record")
     until(lambda: iterations_done(out) >= 30, LIMIT, "iteration 30")
     run.send_signal(signal.SIGINT)
-    loop.wait(run, 10.0, code=130)
+    loop.wait(run, LIMIT, code=130)
     loop.wait(loop.pdeloop("train", "--resume", str(out), "--record"), LIMIT)
     assert_same_training(out, in_process(iterations=150))
     for name in ("bag", "bag-2"):
@@ -399,7 +399,7 @@ def test_one_recorder_records_several_pairs(loop, tmp_path):
     )
     loop.wait(tuner, LIMIT)
     recorder.send_signal(signal.SIGINT)
-    loop.wait(recorder, 10.0)
+    loop.wait(recorder, LIMIT)
     assert_same_training(tmp_path / "run", in_process(seeds=2))
     report = verify(tmp_path / "bag")
     assert (report.count, report.incomplete, report.notes) == (0, [], []), report.text()

@@ -105,7 +105,7 @@ def test_the_views_are_those_of_the_loop_and_the_policy_is_the_same(loop: Proces
         assert told["step"] == 30.0
         until(lambda: desk.status("viewer_node")[1] == 3, LIMIT, "stale viewer")
     viewer.send_signal(signal.SIGINT)
-    loop.wait(viewer, 5.0)
+    loop.wait(viewer, LIMIT)
 
 
 def test_a_viewer_is_throttled_and_shows_another_environment_when_told_to(
@@ -160,4 +160,4 @@ def test_the_command_line_starts_a_viewer_and_goes_on_when_it_dies(loop: Process
         until(lambda: iterations_done(out) >= done + 20, LIMIT, "further iterations")
     assert loop.output(run).count(news) == 1
     run.send_signal(signal.SIGINT)
-    loop.wait(run, 20.0, code=130)
+    loop.wait(run, LIMIT, code=130)
