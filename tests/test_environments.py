@@ -19,7 +19,7 @@ GRID = {"n_z": 32, "horizon": 6}
 
 @pytest.mark.parametrize("problem", shipped_problems())
 def test_every_problem_passes_the_check_of_the_library_without_a_warning(problem: str) -> None:
-    env = gymnasium.make(environment_id(problem), action_limit=1.0, n_z=32)
+    env = gymnasium.make(environment_id(problem), action_limit=1.0, n_z=64)
     check_env(env.unwrapped)
 
 
