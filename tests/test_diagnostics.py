@@ -52,8 +52,9 @@ def test_a_publisher_whose_messages_do_not_arrive_is_named_with_its_topic():
     node.count_publishers.return_value = 2
     node.get_publishers_info_by_topic.return_value = there
     node.count_services.return_value = 1
-    found = Introspection(node, refused=lambda: (0, ""), topics={"/target": TARGET})
-    found.round(0.0)
+    found = Introspection(node)
+    found.supervise("/target", TARGET)
+    found.round(1.0)
     ((said,), _) = node.get_logger().error.call_args
     assert said.startswith("/lab/mine publishes /target so that it does not arrive (QoS: Volatile")
     assert node.get_logger().error.call_count == 1
