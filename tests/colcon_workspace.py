@@ -60,7 +60,7 @@ def build(folder: Path, *options: str) -> Workspace:
         capture_output=True,
         text=True,
         check=True,
-        timeout=60,
+        timeout=600,
     )
     environment = dict(item.split("=", 1) for item in shown.stdout.split("\0") if item)
     prefix = Path(environment["AMENT_PREFIX_PATH"].split(os.pathsep)[0])

@@ -25,7 +25,7 @@ from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
 from rclpy.parameter import Parameter, parameter_value_to_python
 from std_srvs.srv import Trigger
 
-LIMIT = 120.0
+LIMIT = 300.0
 
 
 class Operator:

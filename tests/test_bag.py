@@ -350,12 +350,12 @@ def test_what_rosbags_convert_makes_of_a_sqlite3_bag_is_read(tmp_path):
     """The command that the refusal names."""
     source, converted = tmp_path / "sqlite", tmp_path / "sqlite-mcap"
     convert = [sys.executable, "-m", "rosbags.convert", "--src", written(tmp_path), "--dst", source]
-    subprocess.run([*convert, "--dst-storage", "sqlite3"], check=True, timeout=60)
+    subprocess.run([*convert, "--dst-storage", "sqlite3"], check=True, timeout=600)
     with pytest.raises(BagError, match="sqlite3") as refused:
         Bag(source)
     words = str(refused.value).split("Convert it: ")[1].split()
     assert words[0] == "rosbags-convert"
-    subprocess.run([sys.executable, "-m", "rosbags.convert", *words[1:]], check=True, timeout=60)
+    subprocess.run([sys.executable, "-m", "rosbags.convert", *words[1:]], check=True, timeout=600)
     assert [e.missing for e in Bag(converted).episodes()] == [[], []]
 
 
@@ -464,7 +464,7 @@ def test_a_small_file_that_becomes_gigabytes_is_refused_in_one_sentence(
         [sys.executable, "-c", MEMORY, *command, str(bag)],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=600,
         cwd=ROOT,
     )
     *lines, last = ended.stderr.strip().splitlines()
@@ -551,7 +551,7 @@ def test_a_bag_is_written_without_ros(tmp_path):
         f"Recording(Path({str(tmp_path / 'bag')!r}), sources('/')).close()\n"
     )
     root = Path(__file__).resolve().parent.parent
-    subprocess.run([sys.executable, "-c", program], cwd=root, check=True, timeout=60)
+    subprocess.run([sys.executable, "-c", program], cwd=root, check=True, timeout=600)
     assert Bag(tmp_path / "bag").finished
 
 

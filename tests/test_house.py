@@ -89,6 +89,6 @@ def test_the_loop_runs_in_one_process_without_ros():
         "print(train_here(parameters(iterations=1)).policies().shape)\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=120
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=600
     )
     assert done.stdout.strip() == "(1, 4, 8)", done.stderr

@@ -188,7 +188,7 @@ def test_the_page_tells_what_a_node_computes_and_what_became_of_a_request(tmp_pa
         tab.go(server.url)
         shows("fitting models, 7 s", "")
         tab.click("#tuner-pause")
-        asked = page.requests.get(timeout=30.0)
+        asked = page.requests.get(timeout=600)
         assert asked == Call("/t", "pause")
         view.operation.asked(asked, now)
         shows("fitting models, 7 s", "Pause training: asked for; takes effect after fitting models")
@@ -202,7 +202,7 @@ def test_the_page_tells_what_a_node_computes_and_what_became_of_a_request(tmp_pa
         assert tab.ask(f"{button % 'stop'}.textContent.trim()") == "Really stop?"
         assert page.requests.empty()
         tab.click("#tuner-stop")
-        stop = page.requests.get(timeout=30.0)
+        stop = page.requests.get(timeout=600)
         view.operation.answered(stop, now, "no plant")
         shows("training paused", "Stop training: no plant")
         view.operation.answered(stop, now, None)

@@ -136,7 +136,7 @@ def launched(file: str, **texts: object) -> list[dict[str, Any]]:
         env={**os.environ, "PYTHONPATH": path, "LAUNCH_DRY_RUN": "1"},
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=600,
     )
     assert "Traceback" not in done.stderr, done.stderr
     said = done.stdout.splitlines()

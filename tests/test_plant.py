@@ -215,7 +215,7 @@ def test_another_process_gives_the_same_bits() -> None:
     root = Path(__file__).parent.parent
     done = subprocess.run(
         [sys.executable, "-c", "from tests.test_plant import digest; print(digest())"],
-        capture_output=True, text=True, timeout=120, check=True,
+        capture_output=True, text=True, timeout=600, check=True,
         cwd=root, env={**os.environ, "PYTHONPATH": str(root)},
     )  # fmt: skip
     assert done.stdout.split()[-1] == digest()
@@ -452,7 +452,7 @@ def test_a_users_equation_is_compiled_once_for_all_processes(tmp_path: Path) -> 
     def compiles() -> str:
         done = subprocess.run(
             [sys.executable, "-c", program, f"{path}:Fisher"],
-            capture_output=True, text=True, timeout=120, check=True,
+            capture_output=True, text=True, timeout=600, check=True,
             env={**os.environ, "PYTHONPATH": root, "NUMBA_CACHE_DIR": str(tmp_path / "cache")},
         )  # fmt: skip
         return done.stdout.strip()

@@ -26,7 +26,7 @@ from pdeloop.study.table import text
 from pdeloop.study.training import FILES, train_one
 from tests.small import SMALL, same_bits, train_here
 
-LIMIT = 120.0
+LIMIT = 300.0
 CONTENT: dict[str, Any] = {
     "problems": [str(SMALL)],
     "seeds": 3,

@@ -42,7 +42,7 @@ def longest(work: str, seconds: float, stop: float = 0.0, share: str = "") -> tu
             time.sleep(stop)
             stopped = time.monotonic() - began
             os.kill(process.pid, signal.SIGCONT)
-        said, _ = process.communicate(timeout=30.0)
+        said, _ = process.communicate(timeout=600)
     finally:
         process.kill()
     return float(said), stopped

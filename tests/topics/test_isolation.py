@@ -57,7 +57,7 @@ def test_a_profile_without_effect_is_noticed_and_refused(loop: Processes, tmp_pa
         cwd=sources,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=600,
     )
     assert done.returncode == 1, done.stdout + done.stderr
     assert "did not take effect" in done.stderr.strip().splitlines()[-1]
