@@ -70,7 +70,8 @@ def test_every_figure_is_there_as_png_and_svg(folder):
     for name in FIGURES:
         picture = imread(folder / "report" / f"{name}.png")
         assert picture.shape[1] > 600
-        assert np.unique(picture[..., :3].reshape(-1, 3), axis=0).shape[0] > 20
+        colours = (255 * picture[..., :3]).astype(np.uint32) @ np.array([2**16, 2**8, 1], np.uint32)
+        assert np.unique(colours).size > 20
         root = ElementTree.parse(folder / "report" / f"{name}.svg").getroot()
         assert root.tag.endswith("svg") and len(list(root.iter())) > 50
     assert len(list((folder / "report").glob("*.png"))) == len(FIGURES)
@@ -231,26 +232,18 @@ def test_the_page_needs_no_network_and_a_browser_shows_it_without_complaint(fold
     assert all(address.startswith(("file:", "data:")) for address in tab.requested)
 
 
-def test_what_a_folder_is_called_is_text_on_the_page(folder, tmp_path):
-    """Whatever stands in a run's folder, the page shows it and does not run it."""
-    from pdeloop.cli import main
-
-    odd = tmp_path / "<img src=x onerror=alert(1)>"
-    shutil.copytree(folder, odd, ignore=shutil.ignore_patterns("report"))
-    assert main(["report", str(odd)]) == 0
-    page = (odd / "report" / "index.html").read_text()
-    assert "<img src=x" not in page and "&lt;img src=x" in page
-
-
 def test_a_run_with_another_law_shows_what_it_measured_and_says_what_is_missing(
     folder, tmp_path, capsys
 ):
-    """The costs of a law that is not the projected one cannot be computed again."""
+    """The costs of a law that is not the projected one cannot be computed again.
+
+    Whatever the run's folder is called is text on the page.
+    """
     from pdeloop.cli import main
 
     if not is_run(folder):
         return
-    own = tmp_path / "own"
+    own = tmp_path / "<img src=x onerror=alert(1)>"
     shutil.copytree(folder, own, ignore=shutil.ignore_patterns("report"))
     with np.load(own / "policy.npz") as saved:
         arrays = dict(saved)
@@ -263,6 +256,7 @@ def test_a_run_with_another_law_shows_what_it_measured_and_says_what_is_missing(
     assert "not shown: Behaviour, gains, spectrum" in capsys.readouterr().out
     page = (own / "report" / "index.html").read_text()
     assert "Not shown." in page and "had another plant or another law" in page
+    assert "<img src=x" not in page and "&lt;img src=x" in page  # shown, not run
     drawn = {path.stem for path in (own / "report").glob("*.png")}
     assert drawn == {"training-curves", "costs", "small-steps"}
 
