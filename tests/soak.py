@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import math
 import os
 import signal
 import subprocess
@@ -39,8 +40,8 @@ PAUSE = (0.1, 2.5)
 """Seconds between two faults: now within a start-up, now after some checkpoints."""
 LIMIT = 600.0
 """Seconds that one training may take under faults."""
-SETTLE = 10.0
-"""Seconds of life before a process's memory counts as its memory at the start."""
+SETTLE = 3.0
+"""Seconds of processor time before a process's memory counts as its memory at the start."""
 
 
 @dataclass
@@ -67,8 +68,11 @@ def soak(
     tell: Callable[[str], None],
     tick: Callable[[float, str], None] = lambda share, status: None,
     folder: Path | None = None,
+    most: float = math.inf,
 ) -> SoakReport:
-    """Run trainings of `problem` under faults for `minutes`; the last one is brought to its end.
+    """Run trainings of `problem` under faults for `minutes`, or until there were `most` of them.
+
+    The last training is brought to its end undisturbed.
 
     tell: a line after each training; tick(share, status): often, with the share of the time.
     """
@@ -77,16 +81,19 @@ def soak(
     with contextlib.ExitStack() as stack:
         place = folder or Path(stack.enter_context(tempfile.TemporaryDirectory()))
         place.mkdir(parents=True, exist_ok=True)
-        while time.monotonic() - began < 60 * minutes:
+
+        def share() -> float:
+            return max((time.monotonic() - began) / (60 * minutes), report.faults.total() / most)
+
+        while share() < 1:
             number = report.trainings
             training = _Training(problem, iterations, seed + number, place / f"{number}", report)
 
             def now() -> None:
-                share = min(1.0, (time.monotonic() - began) / (60 * minutes))
-                faults = sum(report.faults.values())
-                tick(share, f"training {report.trainings + 1}, {faults} faults")
+                faults = report.faults.total()
+                tick(min(1.0, share()), f"training {report.trainings + 1}, {faults} faults")
 
-            training.run(rng, now)
+            training.run(rng, lambda: share() < 1, now)
             report.trainings += 1
             same = training.matches()
             report.mismatches += not same
@@ -113,9 +120,15 @@ class _Training:
         self._options = {**budget, "seed": seed, "optimizer": optimizer}
         self._problem, self._out, self._report = problem, out, report
         self._log = out.with_suffix(".log")
-        self._seen: dict[int, tuple[str, float, float]] = {}
+        self._first: dict[int, float] = {}
+        # Before the faults: it compiles what is not compiled, which a killed node would begin again.
+        values = resolve(problem, self._options)
+        self._quiet = build_training(values)
+        train(self._quiet, LocalPair(values), lambda row: None)
 
-    def run(self, rng: np.random.Generator, tick: Callable[[], None] = lambda: None) -> None:
+    def run(
+        self, rng: np.random.Generator, disturbing: Callable[[], bool], tick: Callable[[], None]
+    ) -> None:
         """Start it, disturb it, and start it again until it has its result."""
         report = self._report
         options = [
@@ -141,7 +154,7 @@ class _Training:
                 self._watch_memory()
                 tick()
                 time.sleep(0.05)
-            if process.poll() is None and not (self._out / "result.json").exists():
+            if disturbing() and process.poll() is None and not (self._out / "result.json").exists():
                 self._disturb(process, rng)
         self._end_of(process)
         report.restarts += self._log.read_text(errors="replace").count("; starting it again")
@@ -153,9 +166,7 @@ class _Training:
 
     def matches(self) -> bool:
         """Whether policy and costs are those of the quiet training, bit for bit."""
-        values = resolve(self._problem, self._options)
-        quiet = build_training(values)
-        train(quiet, LocalPair(values), lambda row: None)
+        quiet = self._quiet
         assert quiet.evaluation is not None
         result = json.loads((self._out / "result.json").read_text())
         costs = np.array([result["costs_by_field"][n] for n in ("none", "lqt", "adapted")])
@@ -228,15 +239,14 @@ class _Training:
             time.sleep(0.02)
 
     def _watch_memory(self) -> None:
-        now = time.monotonic()
         for pid, name in self._nodes():
             with contextlib.suppress(OSError, IndexError):
+                used = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13]
                 pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
                 size = pages * os.sysconf("SC_PAGE_SIZE") / 2**20
-                _, born, first = self._seen.setdefault(pid, (name, now, size))
-                if now - born < SETTLE:
-                    self._seen[pid] = (name, born, size)
+                if sum(map(int, used)) / os.sysconf("SC_CLK_TCK") < SETTLE:
                     continue
+                first = self._first.setdefault(pid, size)
                 known = self._report.memory_mb.setdefault(name, [first, size])
                 if size - first >= known[1] - known[0]:
                     self._report.memory_mb[name] = [round(first, 1), round(size, 1)]
