@@ -312,7 +312,16 @@ class Lockstep:
         if frame.plant != self._fingerprint:
             self.counters["actions for another plant"] += 1
             return []
+        awaited = frame.step == plant.step_index
+        if not awaited:
+            self.counters["actions of another step"] += 1
         expected = (plant.batch, plant.n_a)
+        if frame.values.shape != expected:  # it could never have been taken: nothing is in doubt
+            if not awaited:
+                return []
+            raise FrameError(
+                f"expected an action of shape {expected} (env, actuator), got {frame.values.shape}"
+            )
         if not self._is_signed(frame):
             if self._signs is False:
                 return [self._finish(now, void=True, contradiction=_TWO_CONTROLLERS)]
@@ -320,17 +329,11 @@ class Lockstep:
                 f"the action for step {frame.step} was not computed from the policy, model and target "
                 "of its episode; expected one controller and one tuner"
             )
-        if frame.step != plant.step_index:
-            self.counters["actions of another step"] += 1
-            # One of another shape could never have been taken: it puts nothing in doubt.
-            past = frame.step < plant.step_index and frame.values.shape == expected
+        if not awaited:
+            past = frame.step < plant.step_index
             if past and frame.digest() != self._taken[frame.step]:
                 return [self._finish(now, void=True, contradiction=_contradiction(frame))]
             return []
-        if frame.values.shape != expected:
-            raise FrameError(
-                f"expected an action of shape {expected} (env, actuator), got {frame.values.shape}"
-            )
         if self._held:
             self.counters["actions before their state"] += 1
             return []

@@ -112,6 +112,8 @@ def test_a_controller_that_was_told_something_else_never_moves_the_plant(others)
     foreign = loop.controller_told(**others)
 
     def disturb() -> None:
+        with pytest.raises(FrameError, match="expected an action of shape"):
+            loop.plant.action(replace(loop.state, values=np.zeros((2, 3))), 0.0)
         with pytest.raises(FrameError, match=REFUSED):
             loop.act(foreign)
 
