@@ -9,21 +9,18 @@ import sys
 import tempfile
 from pathlib import Path
 
-import pytest
-
 from tests.crash_points import KINDS
 
-LIMIT = 300.0
+LIMIT = 600.0
 MEMORY_DISK = Path("/dev/shm")
 """There fsync does not wait; what is on the disk at a crash is decided by the test."""
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_training_comes_to_the_same_policy_after_a_failure_at_any_call(kind):
+def test_a_training_comes_to_the_same_policy_after_a_failure_at_any_call():
     where = MEMORY_DISK if os.access(MEMORY_DISK, os.W_OK) else None
     with tempfile.TemporaryDirectory(dir=where) as folder:
         run = subprocess.run(
-            [sys.executable, "-m", "tests.crash_points", folder, kind],
+            [sys.executable, "-m", "tests.crash_points", folder],
             env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},  # no threads before a fork
             capture_output=True,
             text=True,
@@ -31,5 +28,5 @@ def test_a_training_comes_to_the_same_policy_after_a_failure_at_any_call(kind):
         )
     assert run.returncode == 0, run.stderr
     result = json.loads(run.stdout)
-    assert result["failures"] > 10
+    assert all(result["failures"][kind] > 10 for kind in KINDS)
     assert result["wrong"] == []
