@@ -43,17 +43,8 @@ def start_tuner(loop: Processes, out: Path, **options: object) -> subprocess.Pop
     return loop.node("tuner_node", *PARAMETERS, *tuner_arguments(out, **options))
 
 
-@pytest.mark.parametrize(
-    "faults",
-    [
-        {"loss": 0.05},
-        {"duplicate": 0.5},
-        {"delay": 0.02},
-        {"loss": 0.03, "duplicate": 0.2, "delay": 0.01},
-    ],
-    ids=lambda faults: "-".join(faults),
-)
-def test_lost_repeated_delayed_and_reordered_messages_change_nothing(loop, tmp_path, faults):
+def test_lost_repeated_delayed_and_reordered_messages_change_nothing(loop, tmp_path):
+    faults = {"loss": 0.03, "duplicate": 0.2, "delay": 0.01}
     loop.node("pde_sim_node", *PARAMETERS, "-r", "state:=state_sent", "-p", "action_timeout:=0.02")
     loop.node("controller_node", *PARAMETERS, "-r", "action:=action_sent")
     arguments = [word for name, value in faults.items() for word in ("-p", f"{name}:={value}")]
@@ -63,10 +54,8 @@ def test_lost_repeated_delayed_and_reordered_messages_change_nothing(loop, tmp_p
     assert_same_training(tmp_path / "run", in_process(iterations=8))
     relay.send_signal(signal.SIGINT)
     text = loop.wait(relay, LIMIT)
-    if "loss" in faults:
-        assert " 0 lost" not in text
-    if "duplicate" in faults:
-        assert " 0 duplicated" not in text
+    assert " 0 lost" not in text
+    assert " 0 duplicated" not in text
 
 
 @pytest.mark.parametrize("victim", ["plant", "controller", "tuner"])

@@ -48,7 +48,7 @@ def test_every_node_reports_once_a_second_what_an_operator_asks(loop: Processes,
             desk.wait_for_reports(node, 2)
         before = {node: desk.status(node)[0] for node in VALUES}
         began = time.monotonic()
-        desk.wait_for_reports("pde_sim_node", 8)
+        desk.wait_for_reports("pde_sim_node", 3)
         seconds = time.monotonic() - began
         for node, names in VALUES.items():
             count, level, message, values = desk.status(node)

@@ -37,7 +37,7 @@ def test_a_paused_and_stepped_plant_gives_the_same_policy_and_nobody_complains(
         desk.call("/pde_sim_node/pause")
         until(lambda: desk.values("pde_sim_node").get("paused") == "yes", LIMIT, "paused plant")
         done = iterations_done(out)
-        desk.wait_for_reports("pde_sim_node", 6)
+        desk.wait_for_reports("pde_sim_node", 4)
         assert iterations_done(out) == done
         _, level, message, values = desk.status("pde_sim_node")
         assert level == 1
