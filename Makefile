@@ -24,7 +24,7 @@ test: setup packages
 
 # Debian's packages that tests need: a real browser for the report's page, faketime to make a clock
 # jump, iproute2 for hosts made of network namespaces, zsh and fish for their
-# completion. Where they cannot be had, those tests fail and say so.
+# completion. Where they cannot be had, those tests are skipped and say so.
 packages:
 	@missing=(); \
 	command -v chromium >/dev/null || missing+=(chromium); \
@@ -35,7 +35,7 @@ packages:
 	if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
 		apt-get update -qq && apt-get install -y -qq --no-install-recommends "$${missing[@]}" >/dev/null; \
 	else \
-		echo "not installed: $${missing[*]} (Debian's names): some tests will fail without" >&2; \
+		echo "not installed: $${missing[*]} (Debian's names): some tests will be skipped" >&2; \
 	fi
 
 lint: setup

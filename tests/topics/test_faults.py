@@ -8,8 +8,7 @@ import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ from pde_sim_node.build import fingerprint
 from tests.loop_harness import Processes, until
 from tests.operator_harness import held_training, operator
 from tests.small import SMALL, parameters
+from tests.small_disk import small_disk
 from tests.topics.test_loop import (
     LIMIT,
     assert_same_training,
@@ -185,22 +185,9 @@ def fill(disk: Path) -> None:
             file.write(b"x" * 4096)
 
 
-@contextmanager
-def small_disk(folder: Path) -> Iterator[Path]:
-    """A real file system of 8 MiB."""
-    folder.mkdir()
-    subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(folder)], check=True, timeout=10
-    )
-    try:
-        yield folder
-    finally:
-        subprocess.run(["umount", "-l", str(folder)], check=True, timeout=10)
-
-
 def test_a_full_disk_is_reported_and_the_training_goes_on(loop, tmp_path):
     start_pair(loop)
-    with small_disk(tmp_path / "disk") as disk:
+    with small_disk(tmp_path / "disk", megabytes=8) as disk:
         out = disk / "run"
         tuner = start_tuner(loop, out, iterations=1200)
         until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
@@ -213,7 +200,7 @@ def test_a_full_disk_is_reported_and_the_training_goes_on(loop, tmp_path):
 
 
 def test_a_full_disk_at_the_end_is_an_error_and_the_run_continues_later(loop, tmp_path):
-    with small_disk(tmp_path / "disk") as disk:
+    with small_disk(tmp_path / "disk", megabytes=8) as disk:
         out = disk / "run"
         options = ("--iterations", "2000", "--out", str(out))
         run = loop.pdeloop("train", str(SMALL), "--in-process", *options)
