@@ -10,6 +10,7 @@ import pytest
 
 from tests.colcon_workspace import Workspace, build
 from tests.loop_harness import Processes, processes
+from tests.small import REPRODUCED
 
 # Hundreds of processes import the same modules; each would compile them again.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -60,3 +61,12 @@ def loop(tmp_path: Path) -> Iterator[Processes]:
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
     """The package as `colcon build` installs it."""
     return build(tmp_path_factory.mktemp("colcon"))
+
+
+@pytest.fixture(scope="session")
+def reproduction(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A small reproduction: its folder, and what it said."""
+    base = tmp_path_factory.mktemp("reproduction")
+    with processes(base) as running:
+        run = running.pdeloop("reproduce", *REPRODUCED, "--out", str(base / "out"))
+        return base / "out", running.wait(run, 600.0)

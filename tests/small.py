@@ -15,6 +15,8 @@ from tuner_node.training import Training
 _OWN = ("optimizer", "seed", "seeds", "rollouts", "iterations", "start")
 
 SMALL = Path(__file__).parent / "data" / "small.yaml"
+REPRODUCED = (str(SMALL), "--seeds", "2", "--iterations", "12")
+"""What a small reproduction is asked for."""
 
 
 def parameters(**options: Any) -> dict[str, Any]:

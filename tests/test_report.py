@@ -34,22 +34,22 @@ FIGURES = (
 def folder(request, tmp_path_factory) -> Path:
     """A small finished run with its limits, or a small reproduction without them."""
     base = tmp_path_factory.mktemp(request.param)
-    options = ("--seeds", "2", "--out", str(base / "out"))
-    command, report = ("reproduce", str(SMALL), "--iterations", "12"), ()
-    if request.param == "run":
-        command = ("train", str(SMALL), "--in-process", "--rollouts", "33")
-        command += ("--optimizer", "gauss_newton")
-        limits = ("optimum", str(SMALL), "--seeds", "2", "--fields", "2", "--no-checks")
-        report = ("--limits", str(base / "limits"))
+    out, report = base / "out", ()
     with processes(base) as running:
-        running.wait(running.pdeloop(*command, *options), LIMIT)
-        if report:
+        if request.param == "run":
+            options = ("--in-process", "--rollouts", "33", "--optimizer", "gauss_newton")
+            words = ("train", str(SMALL), "--seeds", "2", *options, "--out", str(out))
+            running.wait(running.pdeloop(*words), LIMIT)
+            limits = ("optimum", str(SMALL), "--seeds", "2", "--fields", "2", "--no-checks")
             words = ("--jobs", "1", "--tolerance", "0.01", "--save", str(base / "limits"))
             running.wait(
                 running.start("-m", "benchmarks", *limits, *words, name="benchmarks"), LIMIT
             )
-        running.wait(running.pdeloop("report", str(base / "out"), *report), LIMIT)
-    return base / "out"
+            report = ("--limits", str(base / "limits"))
+        else:
+            out, _ = request.getfixturevalue("reproduction")
+        running.wait(running.pdeloop("report", str(out), *report), LIMIT)
+    return out
 
 
 def is_run(folder: Path) -> bool:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,24 +13,12 @@ from pdeloop.finished_run import reduction
 from pdeloop.in_process import LocalPair
 from pdeloop.reproduce.job import LEARNED
 from pdeloop.reproduce.table import beside_the_paper, rows_of, runs_of
-from tests.loop_harness import processes, until
-from tests.small import SMALL, parameters, same_bits, train_here
+from tests.loop_harness import until
+from tests.small import REPRODUCED, parameters, same_bits, train_here
 from tuner_node.batch import Batch
 from tuner_node.seeds import Purpose, derive
 
 LIMIT = 300.0
-
-
-OPTIONS = (str(SMALL), "--seeds", "2", "--iterations", "12")
-
-
-@pytest.fixture(scope="module")
-def reproduction(tmp_path_factory) -> tuple[Path, str]:
-    """A small reproduction: its folder, and what it said."""
-    base = tmp_path_factory.mktemp("reproduction")
-    with processes(base) as running:
-        run = running.pdeloop("reproduce", *OPTIONS, "--out", str(base / "out"))
-        return base / "out", running.wait(run, LIMIT)
 
 
 def test_every_number_is_that_of_the_trainings(reproduction):
@@ -121,7 +108,7 @@ def test_the_table_says_where_the_papers_figure_lies(ratio, mean, words):
 
 
 def test_an_interrupted_reproduction_continues_to_the_same_bits(loop, tmp_path, reproduction):
-    run = loop.pdeloop("reproduce", *OPTIONS, "--out", str(tmp_path / "a"))
+    run = loop.pdeloop("reproduce", *REPRODUCED, "--out", str(tmp_path / "a"))
     until(lambda: list((tmp_path / "a").glob("small/*/run.json")), LIMIT, "first job")
     run.send_signal(signal.SIGINT)
     text = loop.wait(run, LIMIT, code=130)
