@@ -311,10 +311,13 @@ while True:
 
 
 def test_a_second_controller_that_answers_otherwise_never_mixes_in(loop, tmp_path):
-    """It listens to the loop and so has all the right ids; what it does not have is the signature."""
-    running = start_pair(loop)
+    """It listens to the loop and so has all the right ids; what it does not have is the signature.
+
+    A step takes 5 ms, so that its answers, of ordinary speed, come while their episode lasts.
+    """
+    running = start_pair(loop, real_time_factor=10.0)
     out = tmp_path / "run"
-    tuner = start_tuner(loop, out, iterations=2000)
+    tuner = start_tuner(loop, out, iterations=60)
     until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
     with held_training(loop, "/second_controller"):
         second = loop.start("-c", SECOND_CONTROLLER, name="second")
@@ -322,7 +325,7 @@ def test_a_second_controller_that_answers_otherwise_never_mixes_in(loop, tmp_pat
     until(lambda: refused in loop.output(running["plant"]), LIMIT, "refusal")
     loop.wait(tuner, LIMIT)
     second.kill()
-    assert_same_training(out, in_process(iterations=2000))
+    assert_same_training(out, in_process(iterations=60))
 
 
 SECOND_CONTROLLER = """
