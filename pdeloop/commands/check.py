@@ -17,7 +17,7 @@ def add(commands: Commands) -> None:
         commands,
         "check",
         _check,
-        help="whether a problem's file describes a plant that can be trained",
+        help="whether a problem can be trained on, or a node of yours keeps to the interface",
         description="Check a problem before training on it: halve the integration step, see whether "
         "the actuators reach the modes that are unstable at the target, explore once, say which order "
         "the data support and what the first law costs, and draw fields and supports. Exit code "
