@@ -216,6 +216,23 @@ def test_the_command_runs_continues_and_refuses_another_study(
     assert "no Dask scheduler answers" in capsys.readouterr().err
 
 
+def test_an_interrupted_command_ends_its_processes_in_the_middle(tmp_path: Path):
+    file, out = tmp_path / "study.yaml", tmp_path / "out"
+    endless = {"rollouts": 2_000_000, "optimizer": "two_point"}
+    file.write_text(json.dumps({"problems": [str(SMALL)], "seeds": 2, "settings": endless}))
+    words = [sys.executable, "-m", "pdeloop.cli", "study", str(file), "--out", str(out)]
+    process = subprocess.Popen([*words, "--processes", "2"], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        assert "0 of 2 trainings" in process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        told, _ = process.communicate(timeout=LIMIT)
+    finally:
+        process.kill()
+    assert process.returncode == 130 and f"continue with: pdeloop study --out {out}" in told
+    assert not list(out.rglob("result.json"))
+
+
 def dask(command: str, *options: str) -> subprocess.Popen[bytes]:
     """A Dask process on loopback, in a session of its own."""
     words = [sys.executable, "-m", "distributed.cli." + command, "--host", "127.0.0.1", *options]

@@ -9,22 +9,19 @@ from __future__ import annotations
 
 import json
 import multiprocessing
-import signal
 import time
 from collections.abc import Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, wait
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from loop_interfaces.affinity import usable_cores
-from pde_sim_node.solver.workers import use_cores
 from pdeloop.output import print_json
 from pdeloop.progress import Progress
 from pdeloop.reproduce.job import LEARNED, Job, run
 from pdeloop.reproduce.table import PAPER, rows_of, text
-from pdeloop.supervisor import die_with_parent
+from pdeloop.study import executors
 from pdeloop.training_run import Interruption, interruptible
 from tuner_node.results import RunFolderError, timestamp, versions
 
@@ -60,7 +57,7 @@ def reproduce(
     started = time.monotonic()
     try:
         with interruptible():
-            _run_all(jobs, processes or len(usable_cores()), progress)
+            _run_all(jobs, processes, progress)
     except Interruption as signal_name:
         progress.close()
         console.print(
@@ -117,37 +114,27 @@ def _jobs(folder: Path, problems: Sequence[str], options: Mapping[str, Any]) -> 
     ]
 
 
-def _run_all(jobs: Sequence[Job], processes: int, progress: Progress) -> None:
+def _run_all(jobs: Sequence[Job], processes: int | None, progress: Progress) -> None:
     """Run what is not done, in processes of their own.
 
     An interruption ends the processes at once: what they were at begins again when it is continued.
     """
-    context = multiprocessing.get_context("spawn")
-    shares: Any = context.Array("d", [float(job.done) for job in jobs])
-    with ProcessPoolExecutor(processes, context, _begin, (shares,)) as pool:
+    shares: Any = multiprocessing.get_context("spawn").Array("d", [float(job.done) for job in jobs])
+    with executors.processes(processes, _share, shares) as pool:
         waiting = {pool.submit(_work, i, job) for i, job in enumerate(jobs) if not job.done}
-        try:
-            while waiting:
-                done, waiting = wait(waiting, timeout=0.1, return_when=FIRST_COMPLETED)
-                for future in done:
-                    future.result()
-                progress.tell(sum(shares) / len(shares))
-        except BaseException:
-            for process in multiprocessing.active_children():
-                process.terminate()
-            raise
+        while waiting:
+            done, waiting = wait(waiting, timeout=0.1, return_when=FIRST_COMPLETED)
+            for future in done:
+                future.result()
+            progress.tell(sum(shares) / len(shares))
 
 
 _SHARES: list[Any] = []
 """In the process of a job: the share of each job that is done."""
 
 
-def _begin(shares: Any) -> None:
-    """In a process that is about to run jobs. Ctrl-C is for its parent, which then ends it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    die_with_parent()
-    use_cores(usable_cores()[:1])  # the others have jobs of their own
+def _share(shares: Any) -> None:
+    """In a process that is about to run jobs."""
     _SHARES[:] = [shares]
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
+from typing import Any
 
 from loop_interfaces.affinity import usable_cores
 from pde_sim_node.solver.workers import use_cores
@@ -20,25 +21,36 @@ RETRIES = 3
 
 
 @contextmanager
-def processes(count: int | None = None) -> Iterator[Executor]:
-    """So many processes of this machine, a core each; as many as cores by default."""
+def processes(
+    count: int | None = None, prepare: Callable[..., None] | None = None, *arguments: Any
+) -> Iterator[Executor]:
+    """So many processes of this machine, a core each; as many as cores by default.
+
+    An exception in the block ends them at once, in the middle of what they do. prepare(*arguments) is
+    called in each before its first task.
+    """
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(count or len(usable_cores()), context, _begin)
-    try:
-        with pool:
+    others = {process.pid for process in multiprocessing.active_children()}
+    with ProcessPoolExecutor(
+        count or len(usable_cores()), context, _begin, (prepare, arguments)
+    ) as pool:
+        try:
             yield pool
-    except BaseException:
-        for process in multiprocessing.active_children():
-            process.terminate()
-        raise
+        except BaseException:
+            for process in multiprocessing.active_children():
+                if process.pid not in others:
+                    process.terminate()
+            raise
 
 
-def _begin() -> None:
+def _begin(prepare: Callable[..., None] | None, arguments: tuple[Any, ...]) -> None:
     """In a process that is about to train. Ctrl-C is for its parent, which then ends it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     die_with_parent()
     use_cores(usable_cores()[:1])  # the others have trainings of their own
+    if prepare is not None:
+        prepare(*arguments)
 
 
 @contextmanager
