@@ -145,7 +145,7 @@ def _collect(
             for future in done:
                 status = waiting.pop(future)
                 try:
-                    _write(folder / status, future.result())
+                    files = future.result()
                 except EnvironmentMismatchError as error:
                     raise StudyError(
                         f"{error}: its results may differ in the last bits; install the same "
@@ -153,10 +153,12 @@ def _collect(
                     ) from error
                 except (BrokenExecutor, CancelledError):
                     raise
-                except OSError as error:
-                    raise StudyError(f"cannot write to {folder}: {error.strerror}") from error
                 except (ValueError, RuntimeError) as error:
                     failures.append(Failure(status, str(error)))
+                except Exception as error:  # of a worker: no memory, no disk, no pdeloop, given up
+                    failures.append(Failure(status, f"{type(error).__name__}: {error}"))
+                else:
+                    _write(folder / status, files)
                 finished.add(status)
         tell(len(finished), total, status)
     except BaseException:
@@ -166,9 +168,12 @@ def _collect(
 
 
 def _write(folder: Path, files: Mapping[str, bytes]) -> None:
-    make_folder(folder)
-    for name, content in files.items():  # result.json last: where it is, the training is finished
-        write_atomically(folder / name, content)
+    try:
+        make_folder(folder)
+        for name, content in files.items():  # result.json last: with it the training is finished
+            write_atomically(folder / name, content)
+    except OSError as error:
+        raise StudyError(f"cannot write to {folder}: {error.strerror}") from error
 
 
 def _check_finished(folder: Path, names: set[str], expected: Mapping[str, str]) -> None:
