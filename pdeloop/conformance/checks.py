@@ -6,6 +6,7 @@ answers, sends wrong ones, begins anew in the middle of an episode, and compares
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -56,7 +57,7 @@ class NoAnswerError(Exception):
     """What the rest of a check depends on does not come; the text says what was expected."""
 
 
-class Check:
+class Check(ABC):
     """What the three checks share.
 
     n_a: actuators; patience (s): how long an answer may take; run: id of the run that is played.
@@ -76,9 +77,9 @@ class Check:
         except NoAnswerError as error:
             yield Finding("no answer", False, str(error))
 
+    @abstractmethod
     def findings(self) -> Iterator[Finding]:
         """The same; NoAnswerError if the check cannot go on."""
-        raise NotImplementedError
 
     def answer(
         self,
