@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from controller_node import dmdc, lqt, regression
 from controller_node.order import study_orders
@@ -42,16 +42,20 @@ class DesignSettings:
 
 
 def identify(
-    trajectories: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]],
-    settings: DesignSettings,
+    trajectories: Sequence[tuple[ArrayLike, ArrayLike]], *, method: str, n_s: int, p: int = 0
 ) -> ReducedModel:
-    """The reduced model from trajectories (states (N+1, n_z), actions (N, n_a)); see `design`."""
-    own = settings.dmdc_order if settings.identification == "dmdc" else 0
-    n_s = own or settings.reduced_order or study_orders(trajectories).suggested
-    if settings.identification == "regression":
+    """The reduced model from trajectories (states (N+1, n_z), actions (N, n_a)).
+
+    method: "regression" or "dmdc"; n_s: its order, 0: the suggested one (`study_orders`); p: rank of
+    dmdc, 0: n_s + n_a. Raises ValueError when the data allow no such model, or there is no such method.
+    """
+    n_s = n_s or study_orders(trajectories).suggested
+    if method == "regression":
         return regression.identify_from(trajectories, n_s=n_s)
-    p = settings.dmdc_rank or n_s + settings.n_a
-    return dmdc.identify_from(trajectories, p=p, n_s=n_s)
+    if method == "dmdc":
+        n_a = np.shape(trajectories[0][1])[-1]
+        return dmdc.identify_from(trajectories, p=p or n_s + n_a, n_s=n_s)
+    raise ValueError(f"method is {method!r}; expected 'regression' or 'dmdc'")
 
 
 def design(
@@ -64,7 +68,13 @@ def design(
     trajectories: states (N+1, n_z) and actions (N, n_a) of each; target (n_z,). Raises ValueError
     with one sentence when the data allow no model of this order or the model no stabilising gains.
     """
-    model = identify(trajectories, settings)
+    own = settings.dmdc_order if settings.identification == "dmdc" else 0
+    model = identify(
+        trajectories,
+        method=settings.identification,
+        n_s=own or settings.reduced_order,
+        p=settings.dmdc_rank,
+    )
     gains = lqt.track(
         model, state_weight=settings.state_weight, action_weight=settings.action_weight
     )

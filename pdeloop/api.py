@@ -12,7 +12,7 @@ from typing import Any, TextIO
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from controller_node import dmdc, regression
+from controller_node import identification
 from controller_node.reduced_model import ReducedModel
 from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_equation, build_plant
@@ -137,7 +137,7 @@ def identify(
     trajectories : (states (N + 1, n_z), actions (N, n_a)) each
         As `Problem.explore` gives them; a_k is held from z_k to z_{k+1}.
     n_s
-        Order of the model.
+        Order of the model; 0: the one that `study_orders` suggests.
     method : {"regression", "dmdc"}
         Least squares in reduced coordinates with the inputs whole, or the truncated regression of
         Proctor, Brunton and Kutz (2016).
@@ -164,12 +164,7 @@ def identify(
     """
     if not trajectories:
         raise ValueError("identify needs one trajectory or more, each a pair (states, actions)")
-    if method == "regression":
-        return regression.identify_from(trajectories, n_s=n_s)
-    if method == "dmdc":
-        n_a = np.shape(trajectories[0][1])[-1]
-        return dmdc.identify_from(trajectories, p=p or n_s + n_a, n_s=n_s)
-    raise ValueError(f"method is {method!r}; expected 'regression' or 'dmdc'")
+    return identification.identify(trajectories, method=method, n_s=n_s, p=p)
 
 
 def train(
