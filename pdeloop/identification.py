@@ -83,9 +83,12 @@ class Identified:
         known = self.summary()
         used = ", ".join("/".join(map(str, source.values())) for source in self.sources[:6])
         more = f" and {len(self.sources) - 6} more" if len(self.sources) > 6 else ""
+        trajectories = (
+            "1 trajectory" if len(self.sources) == 1 else f"{len(self.sources)} trajectories"
+        )
         lines = [
             f"reduced model of order {known['reduced_order']} from {self.steps} steps of "
-            f"{len(self.sources)} trajectories ({'/'.join(self.sources[0])} {used}{more})",
+            f"{trajectories} ({'/'.join(self.sources[0])} {used}{more})",
             f"  {known['n_z']} points, {known['n_a']} actuators, "
             f"spectral radius {known['spectral_radius']:.4f}",
         ]
