@@ -35,150 +35,82 @@ def _section(nodes: str, *specs: Spec) -> tuple[Spec, ...]:
 
 INSTRUMENTS = _section(
     "PT",
-    Spec(
-        "measurement_noise",
-        0.0,
-        "standard deviation of the noise on every number of the published state; 0: none",
-        0.0,
-        1e6,
-        group="problem",
+    Spec("measurement_noise", 0.0, 0.0, 1e6, group="problem").means(
+        "standard deviation of the noise on every number of the published state; 0: none"
     ),
-    Spec(
-        "process_noise",
-        0.0,
-        "intensity sigma of a white noise in space and time that forces the field: "
-        "N(0, sigma^2 sample_time / dx) per step and grid point; 0: none",
-        0.0,
-        1e6,
-        group="problem",
+    Spec("process_noise", 0.0, 0.0, 1e6, group="problem").means(
+        "intensity sigma of a white noise in space and time that forces the field: N(0, sigma^2 "
+        "sample_time / dx) per step and grid point; 0: none"
     ),
-    Spec(
-        "action_limit",
-        0.0,
-        "largest magnitude of an action, which saturates there; 0: no limit",
-        0.0,
-        1e9,
-        nodes="PCT",
-        group="problem",
+    Spec("action_limit", 0.0, 0.0, 1e9, nodes="PCT", group="problem").means(
+        "largest magnitude of an action, which saturates there; 0: no limit"
     ),
-    Spec(
-        "sensors",
-        0,
-        "point sensors n_y, equally spaced, instead of the whole state; 0: the whole state",
-        0,
-        65536,
-        group="problem",
+    Spec("sensors", 0, 0, 65536, group="problem").means(
+        "point sensors n_y, equally spaced, instead of the whole state; 0: the whole state"
     ),
-    Spec(
-        "sensor_delays",
-        4,
-        "last measurements d of each sensor that the published state holds, if there are sensors",
-        1,
-        1024,
-        group="problem",
+    Spec("sensor_delays", 4, 1, 1024, group="problem").means(
+        "last measurements d of each sensor that the published state holds, if there are sensors"
     ),
 )
 """What stands between the field and its controller (docs/robustness.md)."""
 
 PROBLEM = _section(
     "PT",
-    Spec(
-        "problem",
-        "burgers",
-        "name of the problem, used in messages and result folders",
-        file_name=True,
-        nodes="PCTV",
+    Spec("problem", "burgers", file_name=True, nodes="PCTV").means(
+        "name of the problem, used in messages and result folders"
     ),
-    Spec(
-        "equation",
-        "burgers",
+    Spec("equation", "burgers").means(
         "PDE of the plant: a shipped or installed name; or code that the user has to allow, "
-        "'package.module:Class' or 'path/to/file.py:Class'",
+        "'package.module:Class' or 'path/to/file.py:Class'"
     ),
-    Spec("length", 1.0, "length L of the periodic domain", positive=True, unit="m", nodes="PTV"),
-    Spec(
-        "n_z",
-        128,
-        "size of the state: the grid points, times the components of the equation",
-        8,
-        65536,
-        multiple_of=2,
+    Spec("length", 1.0, positive=True, unit="m", nodes="PTV").means(
+        "length L of the periodic domain"
     ),
-    Spec("n_a", 6, "actuators, the size of the action", 1, 1024, nodes="PCT"),
-    Spec("actuator_width", 0.15, "width of one actuator as a share of L", positive=True, maximum=1),
-    Spec("sample_time", 0.05, "sampling time; the action is held over it", positive=True, unit="s"),
-    Spec(
-        "integration_time",
-        0.0025,
-        "internal step of the integrator; sample_time is a whole multiple of it",
-        positive=True,
-        unit="s",
+    Spec("n_z", 128, 8, 65536, multiple_of=2).means(
+        "size of the state: the grid points, times the components of the equation"
     ),
-    Spec("horizon", 300, "steps T of an episode", 1, 1_000_000, nodes="PTV"),
-    Spec("state_weight", 1.0, "q of Q = q I in the stage cost", positive=True, nodes="PCTV"),
-    Spec("action_weight", 1.0, "r of R = r I in the stage cost", positive=True, nodes="PCTV"),
-    Spec(
-        "divergence_bound",
-        1e3,
-        "an environment whose field exceeds this magnitude has diverged",
-        positive=True,
-        maximum=1e6,
+    Spec("n_a", 6, 1, 1024, nodes="PCT").means("actuators, the size of the action"),
+    Spec("actuator_width", 0.15, positive=True, maximum=1).means(
+        "width of one actuator as a share of L"
     ),
-    Spec(
-        "reduced_order",
-        4,
-        "n_s, order of the reduced model; 0: as the exploratory episode suggests, of one seed",
-        0,
-        1024,
-        nodes="CT",
-        group="budget and method",
+    Spec("sample_time", 0.05, positive=True, unit="s").means(
+        "sampling time; the action is held over it"
     ),
-    Spec(
-        "identification",
-        "regression",
+    Spec("integration_time", 0.0025, positive=True, unit="s").means(
+        "internal step of the integrator; sample_time is a whole multiple of it"
+    ),
+    Spec("horizon", 300, 1, 1_000_000, nodes="PTV").means("steps T of an episode"),
+    Spec("state_weight", 1.0, positive=True, nodes="PCTV").means("q of Q = q I in the stage cost"),
+    Spec("action_weight", 1.0, positive=True, nodes="PCTV").means("r of R = r I in the stage cost"),
+    Spec("divergence_bound", 1e3, positive=True, maximum=1e6).means(
+        "an environment whose field exceeds this magnitude has diverged"
+    ),
+    Spec("reduced_order", 4, 0, 1024, nodes="CT", group="budget and method").means(
+        "n_s, order of the reduced model; 0: as the exploratory episode suggests, of one seed"
+    ),
+    Spec("identification", "regression", choices=("regression", "dmdc"), nodes="CT").means(
         "how the reduced model is identified: least squares in reduced coordinates with the inputs "
-        "whole, or the paper's truncated DMDc, which the optimizers that learn from costs begin with",
-        choices=("regression", "dmdc"),
-        nodes="CT",
+        "whole, or the paper's truncated DMDc, which the optimizers that learn from costs begin "
+        "with"
     ),
-    Spec(
-        "dmdc_rank",
-        0,
-        "p of the identification dmdc, rank of [Z; Y]; 0: n_s + n_a",
-        0,
-        4096,
-        nodes="CT",
+    Spec("dmdc_rank", 0, 0, 4096, nodes="CT").means(
+        "p of the identification dmdc, rank of [Z; Y]; 0: n_s + n_a"
     ),
-    Spec("dmdc_order", 0, "n_s of the identification dmdc; 0: reduced_order", 0, 1024, nodes="CT"),
-    Spec(
-        "exploration_variance",
-        0.1,
-        "least variance of each exploratory action, drawn from N(0, variance); with measurement_noise "
-        "as much as B needs",
-        positive=True,
-        nodes="T",
+    Spec("dmdc_order", 0, 0, 1024, nodes="CT").means(
+        "n_s of the identification dmdc; 0: reduced_order"
     ),
-    Spec(
-        "learning_rate",
-        1e-4,
-        "eta of the policy gradient from the LQT warm start",
-        positive=True,
-        nodes="T",
+    Spec("exploration_variance", 0.1, positive=True, nodes="T").means(
+        "least variance of each exploratory action, drawn from N(0, variance); with "
+        "measurement_noise as much as B needs"
     ),
-    Spec(
-        "learning_rate_from_zero",
-        1e-5,
-        "eta of the policy gradient from zero",
-        positive=True,
-        nodes="T",
+    Spec("learning_rate", 1e-4, positive=True, nodes="T").means(
+        "eta of the policy gradient from the LQT warm start"
     ),
-    Spec(
-        "smoothing_radius",
-        0.1,
-        "r, size of the two-point perturbation",
-        positive=True,
-        maximum=1e6,
-        nodes="T",
+    Spec("learning_rate_from_zero", 1e-5, positive=True, nodes="T").means(
+        "eta of the policy gradient from zero"
+    ),
+    Spec("smoothing_radius", 0.1, positive=True, maximum=1e6, nodes="T").means(
+        "r, size of the two-point perturbation"
     ),
     *INSTRUMENTS,
 )
@@ -186,207 +118,112 @@ PROBLEM = _section(
 
 PLANT = _section(
     "P",
-    Spec(
-        "action_timeout",
-        0.05,
-        "silence after which the plant publishes its state again",
-        0.001,
-        60.0,
-        unit="s",
-        live=True,
+    Spec("action_timeout", 0.05, 0.001, 60.0, unit="s", live=True).means(
+        "silence after which the plant publishes its state again"
     ),
-    Spec(
-        "max_repeats",
-        600,
-        "repeats of one state without an answer after which the episode is void",
-        1,
-        1_000_000,
-        live=True,
+    Spec("max_repeats", 600, 1, 1_000_000, live=True).means(
+        "repeats of one state without an answer after which the episode is void"
     ),
-    Spec(
-        "run_hold",
-        10.0,
-        "silence of a run's tuner after which another run may take the plant",
-        0.1,
-        3600.0,
-        unit="s",
-        live=True,
+    Spec("run_hold", 10.0, 0.1, 3600.0, unit="s", live=True).means(
+        "silence of a run's tuner after which another run may take the plant"
     ),
-    Spec("publish_clock", True, "publish simulated time on /clock while somebody listens"),
-    Spec(
-        "real_time_factor",
-        0.0,
-        "simulated seconds per second of the wall clock; 0: as fast as possible",
-        0.0,
-        1e6,
-        live=True,
-        group="problem",
+    Spec("publish_clock", True).means("publish simulated time on /clock while somebody listens"),
+    Spec("real_time_factor", 0.0, 0.0, 1e6, live=True, group="problem").means(
+        "simulated seconds per second of the wall clock; 0: as fast as possible"
     ),
-    Spec(
-        "solver_cores",
-        "",
+    Spec("solver_cores", "").means(
         "cores of the threads that share a step of many environments, like 0-3,6; empty: those of "
-        "the node",
+        "the node"
     ),
-    Spec(
-        "solver_polls",
-        False,
-        "those threads look for work all the time within an episode, instead of sleeping",
+    Spec("solver_polls", False).means(
+        "those threads look for work all the time within an episode, instead of sleeping"
     ),
 )
 
 EXECUTION = _section(
     "PC",
-    Spec(
-        "pin",
-        -1,
-        "core on which every thread of the node stays, but those of solver_cores; -1: any core",
-        -1,
-        4095,
+    Spec("pin", -1, -1, 4095).means(
+        "core on which every thread of the node stays, but those of solver_cores; -1: any core"
     ),
 )
 """How plant and controller use the machine."""
 
 TUNER = _section(
     "T",
-    Spec(
-        "seed",
-        0,
-        "seed of everything random in the training",
-        0,
-        MAX_SEED,
-        group="budget and method",
+    Spec("seed", 0, 0, MAX_SEED, group="budget and method").means(
+        "seed of everything random in the training"
     ),
-    Spec(
-        "seeds",
-        1,
-        "trainings side by side in one batch, with seeds seed, seed + 1, ...",
-        1,
-        1024,
-        group="budget and method",
+    Spec("seeds", 1, 1, 1024, group="budget and method").means(
+        "trainings side by side in one batch, with seeds seed, seed + 1, ..."
     ),
-    Spec(
-        "rollouts",
-        0,
-        "budget of a seed: all rollouts before the closing evaluation, explorations and checks among "
-        f"them; 0: {ROLLOUTS}, unless 'iterations' is given",
-        0,
-        2_000_000,
-        group="budget and method",
+    Spec("rollouts", 0, 0, 2_000_000, group="budget and method").means(
+        "budget of a seed: all rollouts before the closing evaluation, explorations and checks "
+        f"among them; 0: {ROLLOUTS}, unless 'iterations' is given"
     ),
-    Spec(
-        "iterations",
-        0,
-        "instead of 'rollouts', for the optimizer two_point: iterations of two rollouts each, after "
-        "exploration and check, as the paper counts; 0: not given",
-        0,
-        1_000_000,
-        group="budget and method",
+    Spec("iterations", 0, 0, 1_000_000, group="budget and method").means(
+        "instead of 'rollouts', for the optimizer two_point: iterations of two rollouts each, "
+        "after exploration and check, as the paper counts; 0: not given"
     ),
-    Spec(
-        "start",
-        "lqt",
-        "where the policy starts: the LQT gains of the reduced model, or zero",
-        choices=("lqt", "zero"),
-        group="budget and method",
+    Spec("start", "lqt", choices=("lqt", "zero"), group="budget and method").means(
+        "where the policy starts: the LQT gains of the reduced model, or zero"
     ),
-    Spec(
-        "model",
-        "",
-        "file of 'pdeloop identify --out': the reduced model and warm start of every seed instead of "
-        "an identification; empty: identify",
+    Spec("model", "").means(
+        "file of 'pdeloop identify --out': the reduced model and warm start of every seed instead "
+        "of an identification; empty: identify"
     ),
-    Spec(
-        "identification_attempts",
-        3,
-        "exploratory episodes a seed may use until its LQT law beats no control on a sampled field, "
-        "which the adaptation begins with if none does; 1: take the first, unchecked, as the paper "
-        "does",
-        1,
-        1000,
+    Spec("identification_attempts", 3, 1, 1000).means(
+        "exploratory episodes a seed may use until its LQT law beats no control on a sampled "
+        "field, which the adaptation begins with if none does; 1: take the first, unchecked, as "
+        "the paper does"
     ),
-    Spec("evaluation_fields", 10, "sampled initial fields of the closing evaluation", 1, 1000),
-    Spec(
-        "evaluation_seed",
-        0,
-        "seed of those fields: the same for every training seed, so that runs compare",
-        0,
-        MAX_SEED,
+    Spec("evaluation_fields", 10, 1, 1000).means(
+        "sampled initial fields of the closing evaluation"
     ),
-    Spec("out", "", "folder of the results and the checkpoint; empty: keep nothing"),
-    Spec("resume", False, "continue the run whose checkpoint is in 'out'"),
-    Spec(
-        "plant",
-        0,
-        "fingerprint of the plant that is to be trained; 0: the first one that answers",
-        0,
-        2**53 - 1,
+    Spec("evaluation_seed", 0, 0, MAX_SEED).means(
+        "seed of those fields: the same for every training seed, so that runs compare"
     ),
-    Spec("max_batch", 1024, "environments of one episode at the most", 1, 65536, live=True),
-    Spec(
-        "episode_timeout",
-        600.0,
-        "silence of a plant and controller after which an episode is started again",
-        1.0,
-        86400.0,
-        unit="s",
-        live=True,
+    Spec("out", "").means("folder of the results and the checkpoint; empty: keep nothing"),
+    Spec("resume", False).means("continue the run whose checkpoint is in 'out'"),
+    Spec("plant", 0, 0, 2**53 - 1).means(
+        "fingerprint of the plant that is to be trained; 0: the first one that answers"
     ),
-    Spec(
-        "max_attempts",
-        5,
-        "attempts at one episode after which the run stops with an error",
-        1,
-        1000,
-        live=True,
+    Spec("max_batch", 1024, 1, 65536, live=True).means("environments of one episode at the most"),
+    Spec("episode_timeout", 600.0, 1.0, 86400.0, unit="s", live=True).means(
+        "silence of a plant and controller after which an episode is started again"
+    ),
+    Spec("max_attempts", 5, 1, 1000, live=True).means(
+        "attempts at one episode after which the run stops with an error"
     ),
     Spec(
         "optimizer",
         "gauss_newton",
-        "method of the adapt phase",
         choices=("two_point", "directions", "gauss_newton"),
         group="budget and method",
+    ).means("method of the adapt phase"),
+    Spec("directions", 4, 1, 1_000_000, group="budget and method").means(
+        "directions D of a step of the optimizer 'directions', which takes 2 D rollouts side by side"
     ),
-    Spec(
-        "directions",
-        4,
-        "directions D of a step of the optimizer 'directions', which takes 2 D rollouts side by side",
-        1,
-        1_000_000,
-        group="budget and method",
-    ),
-    Spec(
-        "recorder",
-        "none",
+    Spec("recorder", "none", choices=("none", "start", "required")).means(
         "none: run without one; start: begin when a recorder is ready, go on if it stops; "
-        "required: stop if it stops",
-        choices=("none", "start", "required"),
+        "required: stop if it stops"
     ),
-    Spec(
-        "pairs",
-        [""],
-        "namespaces of the plant and controller pairs that serve this tuner, relative to its own",
-        nodes="TR",
+    Spec("pairs", [""], nodes="TR").means(
+        "namespaces of the plant and controller pairs that serve this tuner, relative to its own"
     ),
 )
 
 RECORDER = _section(
     "R",
-    Spec("bag", "", "new folder of the bag; empty: bags/ and the time"),
-    Spec("record_clock", True, "record /clock, too"),
-    Spec("record_views", False, "record the topics of a viewer_node, too"),
+    Spec("bag", "").means("new folder of the bag; empty: bags/ and the time"),
+    Spec("record_clock", True).means("record /clock, too"),
+    Spec("record_views", False).means("record the topics of a viewer_node, too"),
 )
 
 VIEWER = _section(
     "V",
-    Spec("view_rate", 10.0, "views a second", 0.1, 100.0, unit="1/s", live=True),
-    Spec(
-        "view_environment",
-        0,
-        "environment that is shown; of a smaller episode the last one",
-        0,
-        65535,
-        live=True,
+    Spec("view_rate", 10.0, 0.1, 100.0, unit="1/s", live=True).means("views a second"),
+    Spec("view_environment", 0, 0, 65535, live=True).means(
+        "environment that is shown; of a smaller episode the last one"
     ),
 )
 

@@ -10,7 +10,7 @@ import difflib
 import math
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,6 @@ class Spec:
 
     name: str
     default: Value
-    description: str
     minimum: float | None = None
     maximum: float | None = None
     unit: str = ""
@@ -50,6 +49,15 @@ class Spec:
     file_name: bool = False
     nodes: str = ""
     group: str = ""
+    description: str = ""
+
+    def means(self, description: str) -> Spec:
+        """The same parameter with its description.
+
+        >>> Spec("horizon", 300, minimum=1).means("steps of an episode").description
+        'steps of an episode'
+        """
+        return replace(self, description=description)
 
     @property
     def flag(self) -> str:
@@ -94,7 +102,7 @@ class Spec:
     def parse(self, text: str) -> Value:
         """The value that a text stands for, as in a launch argument; a ParameterError if it is bad.
 
-        >>> Spec("horizon", 300, "steps of an episode", 1).parse("20")
+        >>> Spec("horizon", 300, minimum=1).parse("20")
         20
         """
         words = {"true": True, "false": False}

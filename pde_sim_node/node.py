@@ -50,11 +50,10 @@ def declare_parameters(node: Node, changed: Mapping[str, Any] | None = None) -> 
         Spec(
             f"physical.{item.name}",
             float(item.default),  # type: ignore[arg-type]
-            item.metadata["description"],
             item.metadata["minimum"],
             item.metadata["maximum"],
             unit=item.metadata.get("unit", ""),
-        )
+        ).means(item.metadata["description"])
         for item in fields(configured_equation(str(values["equation"])))
         if item.name != "length"
     ]

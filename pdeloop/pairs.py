@@ -19,7 +19,7 @@ from tuner_node.results import RunFolder
 
 MAX_PAIRS = 64
 """On one machine; on several, start the pairs by hand (docs/scaling.md)."""
-PAIRS = Spec("pairs", 1, "plants with a controller each", 1, MAX_PAIRS)
+PAIRS = Spec("pairs", 1, 1, MAX_PAIRS).means("plants with a controller each")
 """How many pairs a command or a launch file starts."""
 PLACEMENTS = ("shared", "pinned", "any")
 """Where plant and controller of a pair run, for good: on one core for both, which they take in turns,

@@ -52,7 +52,7 @@ def test_defaults_are_within_their_own_ranges():
 
 
 def test_a_whole_number_serves_where_a_number_is_expected():
-    value = Spec("x", 1.0, "").check(2)
+    value = Spec("x", 1.0).check(2)
     assert value == 2.0
     assert isinstance(value, float)
 

@@ -32,8 +32,10 @@ from loop_interfaces.topics import COST, MODEL, POLICY, START, CostColumn
 from pde_sim_node.build import build_plant
 
 PARAMETERS = (
-    Spec("solver_pin", -1, "core to measure the solver on; -1: all cores", -1, 4095),
-    Spec("give_up", 60.0, "silence after which a measurement is given up", 1.0, 3600.0, unit="s"),
+    Spec("solver_pin", -1, -1, 4095).means("core to measure the solver on; -1: all cores"),
+    Spec("give_up", 60.0, 1.0, 3600.0, unit="s").means(
+        "silence after which a measurement is given up"
+    ),
 )
 ASK_AGAIN = 0.5
 """Seconds without an answer after which an episode is asked for again."""

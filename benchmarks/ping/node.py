@@ -28,8 +28,8 @@ from loop_interfaces.spec import Spec
 from loop_interfaces.topics import ACTION, STATE, Topic
 
 PARAMETERS = (
-    Spec("end", "ping", "which end this is", choices=("ping", "pong")),
-    Spec("pin", -1, "core to stay on, polling before waiting; -1: none", -1, 4095),
+    Spec("end", "ping", choices=("ping", "pong")).means("which end this is"),
+    Spec("pin", -1, -1, 4095).means("core to stay on, polling before waiting; -1: none"),
 )
 OUT, BACK = (Topic(f"bench/{topic.name}", topic.labels, latched=False) for topic in (STATE, ACTION))
 POLL = 200e-6

@@ -26,10 +26,12 @@ from loop_interfaces.spec import Spec
 from loop_interfaces.topics import ACTION, STATE
 
 PARAMETERS = (
-    Spec("loss", 0.0, "probability that a message is lost", 0.0, 0.99),
-    Spec("duplicate", 0.0, "probability that a message is sent twice", 0.0, 1.0),
-    Spec("delay", 0.0, "largest delay of a message; smaller ones overtake", 0.0, 10.0, unit="s"),
-    Spec("seed", 0, "seed of the faults", 0, 2**31 - 1),
+    Spec("loss", 0.0, 0.0, 0.99).means("probability that a message is lost"),
+    Spec("duplicate", 0.0, 0.0, 1.0).means("probability that a message is sent twice"),
+    Spec("delay", 0.0, 0.0, 10.0, unit="s").means(
+        "largest delay of a message; smaller ones overtake"
+    ),
+    Spec("seed", 0, 0, 2**31 - 1).means("seed of the faults"),
 )
 TICK = 0.001
 """Seconds between two rounds of passing on what is due."""
