@@ -1,4 +1,4 @@
-"""A reduced linear model of the plant from one exploratory trajectory, by DMD with control (DMDc).
+"""A reduced linear model of the plant from exploratory trajectories, by DMD with control (DMDc).
 
     z_{k+1} = f(z_k, a_k)    is approximated on s = U^T z by    s_{k+1} = A s_k + B a_k
 
@@ -28,18 +28,16 @@ from threadpoolctl import threadpool_limits
 
 from controller_node.reduced_model import ReducedModel, leading_modes, numerical_rank, steps_of
 
-__all__ = ["identify", "identify_from"]
 
-
-def identify(states: ArrayLike, actions: ArrayLike, *, p: int, n_s: int) -> ReducedModel:
-    """Identify a reduced model from one trajectory.
+def identify(
+    trajectories: Sequence[tuple[ArrayLike, ArrayLike]], *, p: int, n_s: int
+) -> ReducedModel:
+    """Identify a reduced model from trajectories of one plant, whose steps are pooled.
 
     Parameters
     ----------
-    states : (N + 1, n_z) array
-        z_0 .. z_N.
-    actions : (N, n_a) array
-        a_0 .. a_{N-1}; a_k is held from z_k to z_{k+1}.
+    trajectories : sequence of (states (N + 1, n_z), actions (N, n_a))
+        z_0 .. z_N and a_0 .. a_{N-1}; a_k is held from z_k to z_{k+1}.
     p : int
         Directions of [Z; Y] that are kept, n_s <= p <= min(n_z + n_a, N). Too small loses the
         effect of the actuators; too large fits noise.
@@ -49,18 +47,8 @@ def identify(states: ArrayLike, actions: ArrayLike, *, p: int, n_s: int) -> Redu
     Raises
     ------
     ValueError
-        Shapes that do not fit, NaN or infinity, or more directions asked for than the trajectory
-        holds.
-    """
-    return identify_from([(states, actions)], p=p, n_s=n_s)
-
-
-def identify_from(
-    trajectories: Sequence[tuple[ArrayLike, ArrayLike]], *, p: int, n_s: int
-) -> ReducedModel:
-    """Identify a reduced model from several trajectories (states, actions) of one plant.
-
-    As `identify`, with the steps of all trajectories as columns beside each other.
+        Shapes that do not fit, NaN or infinity, or more directions asked for than the trajectories
+        hold.
     """
     data = steps_of(trajectories)
     steps, n_a = data.inputs.shape

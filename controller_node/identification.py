@@ -51,10 +51,10 @@ def identify(
     """
     n_s = n_s or study_orders(trajectories).suggested
     if method == "regression":
-        return regression.identify_from(trajectories, n_s=n_s)
+        return regression.identify(trajectories, n_s=n_s)
     if method == "dmdc":
         n_a = np.shape(trajectories[0][1])[-1]
-        return dmdc.identify_from(trajectories, p=p or n_s + n_a, n_s=n_s)
+        return dmdc.identify(trajectories, p=p or n_s + n_a, n_s=n_s)
     raise ValueError(f"method is {method!r}; expected 'regression' or 'dmdc'")
 
 

@@ -53,7 +53,7 @@ def padded(values: NDArray[np.float64]) -> NDArray[np.float64]:
 @jit
 def basis_of(law: Any, m: int) -> int:
     """Address of the basis of an environment."""
-    size = law.n_z * (-(-law.n_s // 8) * 8)
+    size = law.n_z * whole_lanes(law.n_s)
     address: int = law.bases + 8 * size * read_word(law.index, m)
     return address
 
@@ -61,7 +61,7 @@ def basis_of(law: Any, m: int) -> int:
 @jit
 def reduce(law: Any, states: int, first: int, batch: int) -> None:
     """s = U^T z of four environments, into the scratch; of the last one again beyond the batch."""
-    n_z, width, s = law.n_z, -(-law.n_s // 8) * 8, law.scratch
+    n_z, width, s = law.n_z, whole_lanes(law.n_s), law.scratch
     last = batch - 1
     m0, m1 = first, min(first + 1, last)
     m2, m3 = min(first + 2, last), min(first + 3, last)
@@ -87,7 +87,7 @@ def reduce(law: Any, states: int, first: int, batch: int) -> None:
 def answer(law: Any, m: int, s: int, action: int) -> None:
     """The action of an environment whose reduced state is at the address s."""
     n_s, n_a = law.n_s, law.n_a
-    width, wide = -(-n_s // 8) * 8, -(-n_a // 8) * 8
+    width, wide = whole_lanes(n_s), whole_lanes(n_a)
     sums = law.scratch + 8 * 4 * width
     for block in range(0, wide, 8):
         a = load(law.constant, m * wide + block)
@@ -106,7 +106,7 @@ def answer(law: Any, m: int, s: int, action: int) -> None:
 @jit
 def act(law: Any, states: int, actions: int, batch: int) -> None:
     """a = K_a s + K_b s_r of every environment, with s = U^T z."""
-    width = -(-law.n_s // 8) * 8
+    width = whole_lanes(law.n_s)
     for first in range(0, batch, 4):
         reduce(law, states, first, batch)
         for m in range(first, min(first + 4, batch)):

@@ -29,31 +29,10 @@ from threadpoolctl import threadpool_limits
 
 from controller_node.reduced_model import ReducedModel, Steps, leading_modes, steps_of
 
-__all__ = ["fit", "identify", "identify_from"]
-
 Array = NDArray[np.float64]
 
 
-def identify(states: ArrayLike, actions: ArrayLike, *, n_s: int) -> ReducedModel:
-    """Identify a reduced model from one trajectory; see `identify_from`.
-
-    Examples
-    --------
-    A plant z_{k+1} = 0.9 z_k + 2 a_k is found again:
-
-    >>> import numpy as np
-    >>> a = np.array([[1.0], [-1.0], [0.5], [2.0]])
-    >>> z = [np.array([1.0])]
-    >>> for a_k in a:
-    ...     z.append(0.9 * z[-1] + 2.0 * a_k)
-    >>> model = identify(z, a, n_s=1)
-    >>> model.A.round(12), model.B.round(12)
-    (array([[0.9]]), array([[2.]]))
-    """
-    return identify_from([(states, actions)], n_s=n_s)
-
-
-def identify_from(trajectories: Sequence[tuple[ArrayLike, ArrayLike]], *, n_s: int) -> ReducedModel:
+def identify(trajectories: Sequence[tuple[ArrayLike, ArrayLike]], *, n_s: int) -> ReducedModel:
     """Identify a reduced model from trajectories of one plant, whose steps are pooled.
 
     Parameters
@@ -74,6 +53,18 @@ def identify_from(trajectories: Sequence[tuple[ArrayLike, ArrayLike]], *, n_s: i
     ValueError
         Shapes that do not fit, NaN or infinity, fewer steps than unknowns, or more modes than the
         states have.
+
+    Examples
+    --------
+    A plant z_{k+1} = 0.9 z_k + 2 a_k is found again:
+
+    >>> a = np.array([[1.0], [-1.0], [0.5], [2.0]])
+    >>> z = [np.array([1.0])]
+    >>> for a_k in a:
+    ...     z.append(0.9 * z[-1] + 2.0 * a_k)
+    >>> model = identify([(z, a)], n_s=1)
+    >>> model.A.round(12), model.B.round(12)
+    (array([[0.9]]), array([[2.]]))
     """
     data = steps_of(trajectories)
     steps, n_a = data.inputs.shape
@@ -91,7 +82,7 @@ def identify_from(trajectories: Sequence[tuple[ArrayLike, ArrayLike]], *, n_s: i
 
 
 def fit(data: Steps, U: Array) -> ReducedModel:
-    """The regression on given modes U (n_z, n_s); see `identify_from`. Call with one LAPACK thread."""
+    """The regression on given modes U (n_z, n_s); see `identify`. Call with one LAPACK thread."""
     s, y = data.before @ U, data.inputs
     n_s = s.shape[1]
     # In units in which both have the norm 1, so that what counts as zero does not depend on theirs.

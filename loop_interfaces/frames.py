@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import math
 import struct
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -68,38 +67,6 @@ class Frame:
 def digest(values: NDArray[np.float64]) -> int:
     """A number that tells other values from these, in this process."""
     return hash(values.tobytes())
-
-
-class Recent:
-    """The newest frames of a topic by run and episode.
-
-    For who takes what has come in now and then: of several episodes all starts may come before all
-    costs.
-    """
-
-    def __init__(self, most: int = 100) -> None:
-        self._most = most
-        self._frames: OrderedDict[tuple[int, int], Frame] = OrderedDict()
-
-    def add(self, frame: Frame) -> None:
-        """Keep it, in place of one of the same episode, or of the oldest."""
-        key = frame.run, frame.episode
-        self._frames[key] = frame
-        self._frames.move_to_end(key)
-        if len(self._frames) > self._most:
-            self._frames.popitem(last=False)
-
-    def of(self, frame: Frame) -> Frame | None:
-        """The one of the episode that `frame` is about."""
-        return self.get(frame.run, frame.episode)
-
-    def get(self, run: int, episode: int) -> Frame | None:
-        """The one of this episode."""
-        return self._frames.get((run, episode))
-
-    @property
-    def newest(self) -> Frame | None:
-        return next(reversed(self._frames.values()), None)
 
 
 @dataclass(slots=True)

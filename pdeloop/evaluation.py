@@ -15,9 +15,8 @@ from pde_sim_node.build import fingerprint
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.in_process import LocalPair
 from tuner_node.batch import Batch
-from tuner_node.noise import evaluation_noise
 from tuner_node.results import RunFolder, RunFolderError
-from tuner_node.seeds import Purpose, derive
+from tuner_node.seeds import Purpose, derive, evaluation_noise
 from tuner_node.training import CONTROLLERS
 
 Array = NDArray[np.float64]

@@ -32,7 +32,7 @@ def test_recovers_a_linear_system_to_machine_precision(n_z: int) -> None:
     A, B = linear_system()
     lift = np.linalg.qr(np.random.default_rng(2).standard_normal((n_z, N_S)))[0]
     states, actions = trajectory(A, B)
-    model = identify(states @ lift.T, actions, p=N_S + N_A, n_s=N_S)
+    model = identify([(states @ lift.T, actions)], p=N_S + N_A, n_s=N_S)
     # U spans the columns of the lift, in another basis: T = U^T lift is orthogonal.
     T = model.U.T @ lift
     np.testing.assert_allclose(T @ T.T, np.eye(N_S), atol=1e-13)
@@ -46,7 +46,7 @@ def test_is_the_formula_of_the_paper() -> None:
     rng = np.random.default_rng(3)
     states, actions = rng.standard_normal((STEPS + 1, 12)), rng.standard_normal((STEPS, N_A))
     p, n_s = 7, 4
-    model = identify(states, actions, p=p, n_s=n_s)
+    model = identify([(states, actions)], p=p, n_s=n_s)
     psi, xi, lam_t = np.linalg.svd(np.vstack([states[:-1].T, actions.T]), full_matrices=False)
     truncated = lam_t[:p].T @ np.diag(1.0 / xi[:p])
     left = model.U.T @ states[1:].T @ truncated
@@ -56,12 +56,12 @@ def test_is_the_formula_of_the_paper() -> None:
 
 def test_basis_is_unique_and_repeatable() -> None:
     states, actions = trajectory(*linear_system())
-    first = identify(states, actions, p=5, n_s=N_S)
-    again = identify(states.copy(), actions.copy(), p=5, n_s=N_S)
+    first = identify([(states, actions)], p=5, n_s=N_S)
+    again = identify([(states.copy(), actions.copy())], p=5, n_s=N_S)
     for name in ("A", "B", "U"):
         assert np.array_equal(getattr(first, name), getattr(again, name))
     # The opposite trajectory has opposite singular vectors; the sign rule gives the same basis.
-    opposite = identify(-states, -actions, p=5, n_s=N_S)
+    opposite = identify([(-states, -actions)], p=5, n_s=N_S)
     np.testing.assert_allclose(opposite.U, first.U, atol=1e-13)
     largest = np.abs(first.U).argmax(axis=0)
     assert (first.U[largest, np.arange(N_S)] > 0).all()
@@ -82,31 +82,31 @@ def test_refuses_more_than_the_trajectory_holds(p: int, n_s: int, message: str) 
     lift = np.linalg.qr(np.random.default_rng(2).standard_normal((20, N_S)))[0]
     states, actions = trajectory(*linear_system())
     with pytest.raises(ValueError, match=message):
-        identify(states @ lift.T, actions, p=p, n_s=n_s)
+        identify([(states @ lift.T, actions)], p=p, n_s=n_s)
 
 
 def test_refuses_a_trajectory_shorter_than_p() -> None:
     states, actions = trajectory(*linear_system())
     with pytest.raises(ValueError, match="= 4, but p is 5"):
-        identify(states[:5], actions[:4], p=5, n_s=3)
+        identify([(states[:5], actions[:4])], p=5, n_s=3)
 
 
 def test_refuses_malformed_trajectories() -> None:
     states, actions = trajectory(*linear_system())
     with pytest.raises(ValueError, match="40 actions belong to 41 states, but 40"):
-        identify(states[:-1], actions, p=5, n_s=3)
+        identify([(states[:-1], actions)], p=5, n_s=3)
     with pytest.raises(ValueError, match="non-empty matrix"):
-        identify(states[0], actions, p=5, n_s=3)
+        identify([(states[0], actions)], p=5, n_s=3)
     with pytest.raises(ValueError, match="non-empty matrix"):
-        identify(states[:1], actions[:0], p=5, n_s=3)
+        identify([(states[:1], actions[:0])], p=5, n_s=3)
     broken = states.copy()
     broken[7, 1] = np.nan
     with pytest.raises(ValueError, match="row 7"):
-        identify(broken, actions, p=5, n_s=3)
+        identify([(broken, actions)], p=5, n_s=3)
     broken = actions.copy()
     broken[3, 0] = np.inf
     with pytest.raises(ValueError, match="actions must be finite, but row 3"):
-        identify(states, broken, p=5, n_s=3)
+        identify([(states, broken)], p=5, n_s=3)
 
 
 def test_reduced_model_checks_itself_and_is_read_only() -> None:

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from loop_interfaces import model_rows
 from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn
-from tuner_node import noise
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, TrainingSettings, batch_of
 from tuner_node.budget import Budget
 from tuner_node.checkpoint import taken
@@ -35,7 +34,7 @@ from tuner_node.optimizers import (
     Trajectory,
 )
 from tuner_node.published_law import follows
-from tuner_node.seeds import Purpose, derive
+from tuner_node.seeds import NOISE, Purpose, derive, evaluation_noise, rollout_noise
 
 Array = NDArray[np.float64]
 PHASES = ("identify", "check", "adapt", "evaluate", "done")
@@ -304,12 +303,12 @@ class Training:
         """The seed of the noise of every row of a batch."""
         settings, counts = self.settings, self.attempts
         if self.phase == "evaluate":
-            fields = noise.evaluation_noise(settings.evaluation_seed, settings.evaluation_fields)
+            fields = evaluation_noise(settings.evaluation_seed, settings.evaluation_fields)
             return fields * (settings.seeds * len(CONTROLLERS))
         if self.phase == "adapt":
             counts = [optimizer.tells for optimizer in self.optimizers]
         owners = rows[:, StartColumn.MODEL].astype(int).tolist()
-        return noise.rollout_noise(noise.PURPOSES[self.phase], self._seeds(), owners, counts)
+        return rollout_noise(NOISE[self.phase], self._seeds(), owners, counts)
 
     def _identified(self, models: Array) -> list[dict[str, Any]]:
         if len(models) == self.settings.seeds:  # perhaps of another order than before

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces import model_rows
-from loop_interfaces.frames import Frame, Recent
+from loop_interfaces.frames import Frame
 from loop_interfaces.topics import COMPLETED, START_COLUMNS, CostColumn, StartColumn
 
 Array = NDArray[np.float64]
@@ -48,11 +48,36 @@ class Rollouts:
         return float(self.mean[rows].mean()) if rows.any() else None
 
 
+class Recent:
+    """The newest frames of a topic by run and episode: of several episodes all starts may come before
+    all costs.
+    """
+
+    def __init__(self) -> None:
+        self._frames: OrderedDict[tuple[int, int], Frame] = OrderedDict()
+
+    def add(self, frame: Frame) -> None:
+        """Keep it, in place of one of the same episode, or of the oldest."""
+        key = frame.run, frame.episode
+        self._frames[key] = frame
+        self._frames.move_to_end(key)
+        if len(self._frames) > MAX_KEPT:
+            self._frames.popitem(last=False)
+
+    def get(self, run: int, episode: int) -> Frame | None:
+        """The one of this episode."""
+        return self._frames.get((run, episode))
+
+    @property
+    def newest(self) -> Frame | None:
+        return next(reversed(self._frames.values()), None)
+
+
 class RolloutCosts:
     """Joins starts, policies, models and costs, in whatever order they come."""
 
     def __init__(self) -> None:
-        self._starts, self._policies = Recent(MAX_KEPT), Recent(MAX_KEPT)
+        self._starts, self._policies = Recent(), Recent()
         self._models: OrderedDict[tuple[int, int], Frame] = OrderedDict()
 
     def start(self, frame: Frame) -> None:
@@ -72,7 +97,9 @@ class RolloutCosts:
 
     def cost(self, frame: Frame) -> Rollouts | None:
         """What the costs of an episode are of; None if its start is not known."""
-        start, policy = self._starts.of(frame), self._policies.of(frame)
+        start, policy = (
+            kept.get(frame.run, frame.episode) for kept in (self._starts, self._policies)
+        )
         if start is None or len(start.values) != len(frame.values):
             return None
         return Rollouts(
@@ -98,7 +125,7 @@ class RolloutCosts:
     def gains(self, environment: int) -> tuple[Array | None, Array | None]:
         """Gains of an environment in the newest episode, and its LQT gains; None where not known."""
         start = self._starts.newest
-        policy = None if start is None else self._policies.of(start)
+        policy = None if start is None else self._policies.get(start.run, start.episode)
         if start is None or policy is None or len(start.values) != len(policy.values):
             return None, None
         row = min(environment, len(policy.values) - 1)

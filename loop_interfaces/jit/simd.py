@@ -19,7 +19,7 @@ from numba import types
 from numba.core.cgutils import get_or_insert_function
 from numba.core.datamodel import models
 from numba.extending import intrinsic as numba_intrinsic
-from numba.extending import overload, register_model
+from numba.extending import overload, register_jitable, register_model
 
 WIDTH = 8
 NUMBER = ir.DoubleType()
@@ -27,8 +27,9 @@ VECTOR = ir.VectorType(NUMBER, WIDTH)
 WORD = ir.IntType(64)
 
 
+@register_jitable  # type: ignore[untyped-decorator, unused-ignore]
 def whole_lanes(n: int) -> int:
-    """The least multiple of WIDTH that is at least n."""
+    """The least multiple of WIDTH that is at least n, also inside compiled functions."""
     return -(-n // WIDTH) * WIDTH
 
 

@@ -21,7 +21,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.jit.cache import inlined_njit, jit
-from loop_interfaces.jit.simd import WIDTH, fma, load, minus_product, read, splat, store, transpose
+from loop_interfaces.jit.simd import (
+    WIDTH,
+    fma,
+    load,
+    minus_product,
+    read,
+    splat,
+    store,
+    transpose,
+    whole_lanes,
+)
 
 SQRT_HALF = math.sqrt(0.5)
 SIN_60 = math.sqrt(0.75)
@@ -40,11 +50,7 @@ def is_transform_length(m: int) -> bool:
 
 def plane_size(m: int) -> int:
     """Elements a plane needs for length m, a multiple of eight."""
-    return WIDTH * padded(m // WIDTH) + WIDTH
-
-
-def padded(n: int) -> int:
-    return -(-n // WIDTH) * WIDTH
+    return WIDTH * whole_lanes(m // WIDTH) + WIDTH
 
 
 def radices_of(m: int) -> list[int]:
@@ -60,7 +66,7 @@ def radices_of(m: int) -> list[int]:
 def twiddles_of(m: int) -> NDArray[np.complex128]:
     """Twiddle factors of all passes, in the order in which `fft` reads them."""
     b = m // WIDTH
-    first = np.ones((WIDTH - 1, padded(b)), dtype=np.complex128)
+    first = np.ones((WIDTH - 1, whole_lanes(b)), dtype=np.complex128)
     first[:, :b] = root(np.outer(np.arange(1, WIDTH), np.arange(b)), m)
     parts, n = [first], b
     for radix in radices_of(m):
@@ -125,7 +131,7 @@ def butterfly8(w: int, x: int, d: int, t: int) -> Any:
 @jit
 def first_pass(w: int, x: int, y: int, d: int, b: int, c: int, v: int, e: int) -> None:
     """Radix 8 at stride 1, eight butterflies at once, whose outputs a transpose makes neighbours."""
-    s = -(-b // 8) * 8
+    s = whole_lanes(b)
     for p in range(0, b, 8):
         z = butterfly8(w, x + p, d, b)
         u = v + p
@@ -226,7 +232,7 @@ def fft(w: int, x: int, y: int, d: int, t: Any, c: int, e: int) -> int:
     b = t.m // 8
     v = t.twiddles
     first_pass(w, x, y, d, b, c, v, e)
-    v += 7 * (-(-b // 8) * 8)
+    v += 7 * whole_lanes(b)
     s = 8
     m = b
     passes = t.radices

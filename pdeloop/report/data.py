@@ -25,9 +25,8 @@ from pdeloop.reproduce.experiment import ASKED, asked
 from pdeloop.reproduce.table import runs_of
 from tuner_node.build import build_training
 from tuner_node.checkpoint import taken
-from tuner_node.noise import evaluation_noise
 from tuner_node.results import RunFolderError
-from tuner_node.seeds import Purpose, derive
+from tuner_node.seeds import Purpose, derive, evaluation_noise
 
 Array = NDArray[np.float64]
 SAME_LAW = 0.05

@@ -26,9 +26,8 @@ from pdeloop.in_process import LocalPair
 from pdeloop.training_run import resolve
 from tuner_node.batch import Batch
 from tuner_node.build import build_training
-from tuner_node.noise import evaluation_noise
 from tuner_node.results import RunFolder
-from tuner_node.seeds import Purpose, derive
+from tuner_node.seeds import Purpose, derive, evaluation_noise
 from tuner_node.training import Training
 
 Array = NDArray[np.float64]
