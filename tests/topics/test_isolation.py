@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import socket
 import subprocess
@@ -19,22 +20,29 @@ from tests.topics.test_loop import LIMIT
 pytestmark = pytest.mark.topics
 
 
-def udp_addresses(pid: int) -> set[str]:
-    """Local addresses (hexadecimal) of the UDP sockets of a process."""
+def udp_sockets(pid: int) -> list[tuple[str, int]]:
+    """Local address (hexadecimal) and port of the UDP sockets of a process."""
     inodes = set()
     for entry in Path(f"/proc/{pid}/fd").iterdir():
         target = str(entry.readlink())
         if target.startswith("socket:["):
             inodes.add(target[8:-1])
     lines = Path(f"/proc/{pid}/net/udp").read_text().splitlines()[1:]
-    return {line.split()[1].split(":")[0] for line in lines if line.split()[9] in inodes}
+    own = [line.split()[1].split(":") for line in lines if line.split()[9] in inodes]
+    return [(address, int(port, 16)) for address, port in own]
 
 
-def test_a_nodes_sockets_are_on_loopback_only(loop: Processes):
-    node = loop.node("controller_node")
-    until(lambda: "tracking law" in loop.output(node), LIMIT, "start of the node")
-    assert udp_addresses(node.pid) <= {"0100007F", "0100FFEF"}  # 127.0.0.1, 239.255.0.1
-    assert "0100007F" in udp_addresses(node.pid)
+def test_the_hundred_and_third_node_of_a_domain_has_its_ports_and_all_on_loopback(loop: Processes):
+    first = 7410 + 250 * int(loop.environment["ROS_DOMAIN_ID"])
+    with contextlib.ExitStack() as held:
+        for port in range(first, first + 2 * 102):
+            taken = held.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+            taken.bind(("127.0.0.1", port))
+        node = loop.node("controller_node")
+        until(lambda: "tracking law" in loop.output(node), LIMIT, "start of the node")
+        own = udp_sockets(node.pid)
+    assert {address for address, _ in own} == {"0100007F", "0100FFEF"}  # 127.0.0.1, 239.255.0.1
+    assert ("0100007F", first + 2 * 102) in own, "no port on which others tell it what they have"
 
 
 def test_a_profile_without_effect_is_noticed_and_refused(loop: Processes, tmp_path):
