@@ -150,6 +150,16 @@ def parser() -> argparse.ArgumentParser:
     environments.add_argument("--problem", metavar="PROBLEM", help="[burgers]")
     environments.add_argument("--num-envs", type=int, nargs="+", metavar="M", help="[1 4 16]")
     environments.add_argument("--turns", type=int, metavar="N", help="turns of each [3]")
+    participants = _add(
+        programs,
+        "participants",
+        "memory and processor time of many idle nodes that know each other",
+        "--pairs 10 60",
+    )
+    participants.add_argument(
+        "--pairs", type=int, nargs="+", metavar="K", help="of plant and controller [1 15 30 60]"
+    )
+    participants.add_argument("--seconds", type=float, metavar="S", help="of a measurement [20]")
     kernel = _add(
         programs, "kernel", "time of a step beside other implementations", "--batches 1 12 --json"
     )

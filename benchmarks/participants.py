@@ -1,0 +1,132 @@
+"""`python -m benchmarks participants`: what it costs that many idle nodes know each other.
+
+A tuner and K pairs of plant and controller, a process each, on the loopback interface only. Nobody
+computes: the tuner waits for a recorder that does not come. Meanwhile it says in its log whom else
+it has not found.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.processes import BenchError, BenchProcess, bench, machine, markdown
+from pdeloop.pairs import PAIR, namespaces, tuner_parameter
+
+NODE_MEMORY = 0.12
+"""GB of a node, for the check that all of them fit."""
+GROUP = 5
+"""Pairs that are started at the same time."""
+LIMIT = 600.0
+"""Seconds within which they have to be found."""
+REPORT = 6.0
+"""Seconds between two lines of the tuner on who is missing, at the most."""
+
+
+def run(pairs: Sequence[int] = (1, 15, 30, 60), seconds: float = 20.0) -> dict[str, Any]:
+    """Memory and processor time with each number of pairs, and before there are any."""
+    names = namespaces(max(pairs))
+    need, before = NODE_MEMORY * (2 * len(names) + 1), memory_available()
+    if need > before:
+        raise BenchError(
+            f"{len(names)} pairs take about {need:.0f} GB of memory, and {before:.0f} GB are "
+            "available; choose fewer with --pairs"
+        )
+    rows = []
+    with bench() as running:
+        waiting = ["recorder:=required", *tuner_parameter(len(names))]
+        tuner = running.start("tuner_node", *waiting, problem="burgers")
+        nodes = [tuner]
+        for count in sorted({0, *pairs}):
+            while (present := len(nodes) // 2) < count:
+                for name in names[present : min(present + GROUP, count)]:
+                    clock = f"publish_clock:={str(name == names[0]).lower()}"
+                    for package, own in zip(PAIR, ([clock], []), strict=True):
+                        nodes.append(
+                            running.start(package, *own, problem="burgers", namespace=name)
+                        )
+                _wait_until_found(tuner, nodes)
+            processors = _processors(nodes, seconds)
+            time.sleep(REPORT)
+            rows.append(
+                {
+                    "pairs": count,
+                    "participants": len(nodes),
+                    "lost": len(_missing(tuner, count)),
+                    "memory": sum(map(_memory, nodes)),
+                    **processors,
+                }
+            )
+    return {"machine": machine(), "available": before, "seconds": seconds, "rows": rows}
+
+
+def _wait_until_found(tuner: BenchProcess, nodes: Sequence[BenchProcess]) -> None:
+    limit = time.monotonic() + LIMIT
+    time.sleep(REPORT)
+    while missing := _missing(tuner, len(nodes) // 2):
+        if time.monotonic() > limit:
+            raise BenchError(f"not found within {LIMIT:.0f} s: {', '.join(missing)}")
+        for node in nodes:
+            if node.process.poll() is not None:
+                raise BenchError(f"a node has ended: {node.log().strip().splitlines()[-1:]}")
+        time.sleep(REPORT)
+
+
+def _missing(tuner: BenchProcess, pairs: int) -> list[str]:
+    """Whom of the first pairs the tuner has not found, by its newest line."""
+    lines = [line for line in tuner.log().splitlines() if "waiting for" in line]
+    if not lines:
+        return ["tuner"]
+    words = re.findall(r"(plant|controller) of pair (\d+)", lines[-1])
+    return [f"{node} of pair {number}" for node, number in words if int(number) < pairs]
+
+
+def _processors(nodes: Sequence[BenchProcess], seconds: float) -> dict[str, float]:
+    """Cores that all nodes keep busy together: their own threads, and those of the middleware."""
+
+    def used() -> dict[str, float]:
+        times = [node.processor_times() for node in nodes]
+        return {name: sum(own[name] for own in times) for name in times[0]}
+
+    before, start = used(), time.monotonic()
+    time.sleep(seconds)
+    after, passed = used(), time.monotonic() - start
+    return {name: (after[name] - before[name]) / passed for name in before}
+
+
+def _memory(node: BenchProcess) -> float:
+    """GB of a node; what it shares with others counts in parts (PSS, Linux)."""
+    return _gigabytes("Pss", Path(f"/proc/{node.process.pid}/smaps_rollup"))
+
+
+def memory_available() -> float:
+    """GB that new processes could have (Linux)."""
+    return _gigabytes("MemAvailable", Path("/proc/meminfo"))
+
+
+def _gigabytes(name: str, file: Path) -> float:
+    found = re.search(rf"^{name}:\s+(\d+) kB", file.read_text(), re.MULTILINE)
+    assert found
+    return int(found[1]) * 1024 / 1e9
+
+
+def text(result: dict[str, Any]) -> str:
+    """A table of `result`."""
+    head = (
+        *("pairs", "participants", "not found", "memory, GB", "cores busy: nodes"),
+        "cores busy: middleware",
+    )
+    rows = [
+        (
+            *(row["pairs"], row["participants"], row["lost"], f"{row['memory']:.1f}"),
+            *(f"{row[name]:.2f}" for name in ("own", "middleware")),
+        )
+        for row in result["rows"]
+    ]
+    return (
+        f"{result['machine']['cores']} cores, {result['available']:.1f} GB available before; means "
+        f"over {result['seconds']:.0f} s\n{markdown(head, rows)}"
+    )
