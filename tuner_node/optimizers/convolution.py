@@ -25,8 +25,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # which loads scipy.linalg when it is first used: a two-point training never does
 from numpy.typing import NDArray
-from scipy import linalg
 
 __all__ = ["ConvolutionModel", "fit_convolutions"]
 
@@ -133,7 +133,7 @@ def fit_convolutions(
             matrices = grams[:, kept[:, None], kept] + np.diag(penalty)
             solution = np.stack(
                 [
-                    linalg.solve(matrix, moment, assume_a="her", check_finite=False)
+                    scipy.linalg.solve(matrix, moment, assume_a="her", check_finite=False)
                     for matrix, moment in zip(matrices, moments[:, kept], strict=True)
                 ]
             )
