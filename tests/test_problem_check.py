@@ -120,3 +120,26 @@ def test_new_overwrites_nothing(
     assert main(["new", "own"]) == FAILED
     assert "there already" in capsys.readouterr().err
     assert list((tmp_path / "own").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "wrong"),
+    [
+        (["burgers", "--n-a", "2"], "--n-a: only for the check of a node"),
+        (["burgers", "--patience", "10"], "--patience: only for the check of a node"),
+        (["burgers", "--network"], "--network: only for the check of a node"),
+        (["tuner", "--equation", "burgers"], "--equation: only for the check of a problem's FILE"),
+        (["plant", "--picture", "x.png"], "--picture: only for the check of a problem's FILE"),
+    ],
+)
+def test_an_option_of_the_other_check_is_refused(
+    words: list[str], wrong: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["check", *words])
+    assert ended.value.code == 2
+    assert (
+        capsys.readouterr()
+        .err.splitlines()[-1]
+        .startswith(f"pdeloop check: error: leave out {wrong}")
+    )

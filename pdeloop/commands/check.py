@@ -6,9 +6,13 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
-from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import Commands, add_equation, add_json, allow_equation, command
 from pdeloop.output import print_json
+
+ROLES = ("plant", "controller", "tuner")
+OF_A_NODE = {"n_a": 1, "patience": 10.0, "network": False}
+"""The options that only the check of a node has, and their defaults."""
+OF_A_FILE = ("equation", "picture")
 
 
 def add(commands: Commands) -> None:
@@ -30,11 +34,11 @@ def add(commands: Commands) -> None:
         metavar="FILE",
         help="a problem's YAML file, or a shipped name; or plant, controller, tuner",
     )
-    check.add_argument("--n-a", type=int, default=1, metavar="N", help="actuators of the node [1]")
+    check.add_argument("--n-a", type=int, metavar="N", help="actuators of the node [1]")
+    check.add_argument("--patience", type=float, metavar="S", help="seconds that it may take [10]")
     check.add_argument(
-        "--patience", type=float, default=10.0, metavar="S", help="seconds that it may take [10]"
+        "--network", action="store_true", default=None, help="also a node on another machine"
     )
-    check.add_argument("--network", action="store_true", help="also a node on another machine")
     add_equation(check)
     check.add_argument(
         "--picture",
@@ -46,18 +50,21 @@ def add(commands: Commands) -> None:
 
 
 def _check(options: argparse.Namespace) -> int:
-    from pdeloop.problem_check import check, draw
-    from pdeloop.training_run import resolve
-
-    if options.problem in ("plant", "controller", "tuner"):
+    of_a_node = options.problem in ROLES
+    given = {name: getattr(options, name) for name in (*OF_A_NODE, *OF_A_FILE)}
+    given = {name: value for name, value in given.items() if value is not None}
+    if wrong := [name for name in given if (name in OF_A_NODE) != of_a_node]:
+        flags = ", ".join(f"--{name.replace('_', '-')}" for name in wrong)
+        what = "a problem's FILE" if of_a_node else f"a node ({', '.join(ROLES)})"
+        options.refuse(f"leave out {flags}: only for the check of {what}")
+    if of_a_node:
         from pdeloop.conformance.node import check_node
 
-        if options.picture is not None:
-            raise ParameterError("--picture is of a problem's file; leave it out")
-        found = check_node(
-            options.problem, n_a=options.n_a, patience=options.patience, network=options.network
-        )
+        found = check_node(options.problem, **{**OF_A_NODE, **given})
     else:
+        from pdeloop.problem_check import check, draw
+        from pdeloop.training_run import resolve
+
         values = resolve(options.problem, allow_equation(options))
         found = check(values)
     findings = []

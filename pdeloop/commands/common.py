@@ -25,7 +25,8 @@ def command(
 ) -> argparse.ArgumentParser:
     """Declare a command, or a group of commands (without `run`); every one shows an example.
 
-    description: `help` as a sentence if not given.
+    description: `help` as a sentence if not given. A handler refuses options that do not go together
+    by `options.refuse(text)`, which ends as argparse does.
     """
     parser = commands.add_parser(
         name,
@@ -34,7 +35,7 @@ def command(
         epilog=f"example: {example}",
     )
     if run is not None:
-        parser.set_defaults(command=run)
+        parser.set_defaults(command=run, refuse=parser.error)
     return parser
 
 
