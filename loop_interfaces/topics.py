@@ -101,3 +101,26 @@ RECORDER_STATUS = "recorder/status"
 
 # Not `episode/paused`, which says nothing about an episode's numbers.
 ARRAYS = (START, STATE, ACTION, POLICY, COST, MODEL_IDENTIFIED, MODEL, TARGET)
+
+VIEW_NUMBERS = {
+    "cost": "mean stage cost of the last adapted policies (neither zero nor the LQT gains)",
+    "cost_no_control": "mean stage cost of the last rollouts without control",
+    "cost_lqt": "mean stage cost of the last rollouts with the LQT gains",
+    "reduction": "100 (1 - cost / cost_lqt), in percent",
+    "stage_cost": "l_k = q |z_k - z_r|^2 + r |a_k|^2 of the newest sample",
+    "tracking_error": "root of the mean square of z_k - z_r of the newest sample",
+    "final_error": "the same at the last step of the last episode",
+    "action_norm": "|a_k| of the newest sample",
+    "gain_norm": "Frobenius norm of the present gains [K_a K_b]",
+    "gain_change": "Frobenius norm of their difference to the LQT gains, relative to these",
+    "step": "k of the newest sample",
+}
+"""Names of the numbers that a viewer publishes below `view/`, and what they are."""
+
+VIEWS = {
+    "view/field": "visualization_msgs/msg/Marker",
+    "view/target": "visualization_msgs/msg/Marker",
+    "view/spacetime": "sensor_msgs/msg/Image",
+    **{f"view/{name}": "std_msgs/msg/Float64" for name in VIEW_NUMBERS},
+}
+"""What a viewer publishes for people's tools, with the types."""

@@ -6,7 +6,7 @@ Only states, actions and the target are used, so the plant may be any, this one 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -47,9 +47,7 @@ class Identified:
     """A model from trajectories.
 
     sources: which trajectories, by episode and environment or by number; study: the orders on held-out
-    data, None where these are too few; sample_time in s, None where it is not known; live: whether the
-    controller, from the same trajectory and the same settings, published the same model to the bit,
-    None if it did not.
+    data, None where these are too few; sample_time in s, None where it is not known.
     """
 
     model: ModelRows
@@ -57,7 +55,6 @@ class Identified:
     steps: int
     study: OrderStudy | None
     sample_time: float | None = None
-    live: bool | None = None
 
     def summary(self) -> dict[str, Any]:
         """The result as data, without the arrays, which `save` writes."""
@@ -72,7 +69,6 @@ class Identified:
             "trajectories": self.sources,
             "poles": [[pole.real, pole.imag] for pole in poles],
             "spectral_radius": float(np.abs(poles).max()),
-            "same_as_published": self.live,
             "suggested_order": study and study.suggested,
             "singular_values": [] if study is None else study.singular_values.tolist(),
             "orders": [] if study is None else study.rows(),
@@ -95,9 +91,6 @@ class Identified:
         if self.sample_time is not None:
             rates = np.log(np.abs(np.linalg.eigvals(self.model.A))) / self.sample_time
             lines.append(f"  modes grow at rates of {rates.min():.3g} to {rates.max():.3g} 1/s")
-        if self.live is not None:
-            same = "the same, to the bit, as" if self.live else "not the same as"
-            lines.append(f"  {same} the model that the controller published")
         if self.study is None:
             lines.append("  too few steps to hold some out: no order is suggested")
         else:
@@ -141,15 +134,7 @@ def identify_bag(
     if not trajectories:
         raise BagError(f"the chosen episodes have no environment {environment}")
     known = as_recorded(bag.parameters().get(chosen[-1].key[1], {}))
-    found = _identified(trajectories, target, sources, wanted, known)
-    ran_with = {"identification", "reduced_order", "state_weight", "action_weight"} <= set(known)
-    if ran_with and len(sources) == 1 and not _differs(wanted, known):
-        number, env = sources[0].values()
-        published = next(e.model for e in chosen if e.number == number)
-        if published is not None:
-            same = published.values[env].tobytes() == pack(found.model).tobytes()
-            return replace(found, live=bool(same))
-    return found
+    return _identified(trajectories, target, sources, wanted, known)
 
 
 def _identified(
@@ -191,11 +176,6 @@ def _settings(
         identification=method,
         dmdc_rank=pick(wanted.rank, known.get("dmdc_rank"), 0),
     )
-
-
-def _differs(wanted: Wanted, known: Mapping[str, Any]) -> bool:
-    """Whether anything else is wanted than what the recorded run had."""
-    return _settings(wanted, known, 1, 1) != _settings(Wanted(), known, 1, 1)
 
 
 def save(found: Identified, path: Path) -> None:

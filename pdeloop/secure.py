@@ -10,7 +10,6 @@ import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 
 from loop_interfaces import topics
-from viewer_node.loop_view import NUMBERS
 
 
 @dataclass(frozen=True)
@@ -29,8 +28,6 @@ class Role:
 
 _ARRAYS = tuple(topic.name for topic in topics.ARRAYS)
 _SAMPLED = (topics.STATE.name, topics.ACTION.name)
-VIEWS = tuple(f"view/{name}" for name in ("field", "target", "spacetime", *NUMBERS))
-"""What viewer_node publishes for people's tools."""
 ROLES = (
     Role(
         "pde_sim_node",
@@ -70,11 +67,11 @@ ROLES = (
             *(n for n in _ARRAYS if n not in _SAMPLED),
             *(topics.SAMPLES, topics.MODEL_FAILED, "/diagnostics", "/rosout"),
         ),
-        of_others=(*_SAMPLED, "/clock", *VIEWS),
+        of_others=(*_SAMPLED, "/clock", *topics.VIEWS),
     ),
     Role(
         "viewer_node",
-        VIEWS,
+        tuple(topics.VIEWS),
         (
             *(topics.START.name, topics.POLICY.name, topics.MODEL.name, topics.COST.name),
             *(topics.TARGET.name, topics.PAUSED.name, topics.SAMPLES_THROTTLED),

@@ -31,27 +31,14 @@ class BagError(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Definition:
-    """A message type: the text that defines it and all it refers to, its language, its RIHS01 hash."""
-
-    text: str
-    encoding: str = "ros2msg"
-    hash: str = ""
-
-
-@dataclass(frozen=True)
 class Channel:
-    """A recorded topic: its full name, its type, and what its publisher offers.
-
-    definition: None for a type that ROS 2 Jazzy brings along.
-    """
+    """A recorded topic: its full name, its type, and what its publisher offers."""
 
     topic: str
     type: str
     latched: bool = False
     reliable: bool = True
     depth: int = 1
-    definition: Definition | None = None
 
     def qos(self) -> dict[str, Any]:
         """The offered quality of service, as rosbag2 writes it."""
@@ -70,11 +57,11 @@ class Channel:
 
 
 @cache
-def definition(kind: str) -> Definition:
-    """The definition of a message type of ROS 2 Jazzy. KeyError for another one."""
+def definition(kind: str) -> tuple[str, str]:
+    """The text that defines a message type of ROS 2 Jazzy and all it refers to, and its RIHS01 hash."""
     types = _jazzy()
     text, _ = types.generate_msgdef(kind, ros_version=2)
-    return Definition(text, hash=types.hash_rihs01(kind))
+    return text, types.hash_rihs01(kind)
 
 
 @cache
@@ -104,15 +91,14 @@ class BagWriter:
         except OSError as error:
             raise BagError(f"cannot write a bag to {path}: {_reason(error)}") from error
         for channel in channels:
-            self.add(channel)
+            self._add(channel)
 
-    def add(self, channel: Channel) -> None:
+    def _add(self, channel: Channel) -> None:
         """Declare a topic."""
-        known, kind = channel.definition or definition(channel.type), channel.type
+        kind, (text, hashed) = channel.type, definition(channel.type)
         if kind not in self._schemas:
-            content = known.text.encode()
-            self._schemas[kind] = self._mcap.register_schema(kind, known.encoding, content)
-        metadata = {QOS: _yaml([channel.qos()]), HASH: known.hash}
+            self._schemas[kind] = self._mcap.register_schema(kind, "ros2msg", text.encode())
+        metadata = {QOS: _yaml([channel.qos()]), HASH: hashed}
         number = self._mcap.register_channel(channel.topic, "cdr", self._schemas[kind], metadata)
         self._numbers[channel.topic], self._channels[channel.topic] = number, channel
 
@@ -171,7 +157,7 @@ class BagWriter:
                     "type": channel.type,
                     "serialization_format": "cdr",
                     "offered_qos_profiles": [channel.qos()],
-                    "type_description_hash": (channel.definition or definition(channel.type)).hash,
+                    "type_description_hash": definition(channel.type)[1],
                 },
                 "message_count": self._counts[channel.topic],
             }
@@ -194,7 +180,7 @@ class BagWriter:
         self._file.close()
         return BagError(
             f"cannot write to {self.path}: {_reason(error)}; recording stopped, what was written "
-            f"before can be read (pdeloop bag recover {self.path} makes it an ordinary bag)"
+            "before can be read (docs/recording.md)"
         )
 
 

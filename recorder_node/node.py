@@ -32,11 +32,11 @@ from loop_interfaces.ros.parameters import declare, given_parameters
 from loop_interfaces.ros.sample_subscription import SampleSubscription, SerializedSubscription
 from loop_interfaces.samples import ACTION_KIND, CLOCK_KIND, STATE_KIND
 from loop_interfaces.topics import ACTION, RECORDER_STATUS, START, STATE
-from recorder_node.bag import BagError, Channel
+from recorder_node.bag import BagError
 from recorder_node.diagnostics import RecorderHealth
 from recorder_node.peers import Peers
 from recorder_node.recording import Recording
-from recorder_node.sources import CLOCK, DIAGNOSTICS, ROSOUT, Source, sources
+from recorder_node.sources import CLOCK, DIAGNOSTICS, ROSOUT, Source, sources, views
 
 RECORDING_FAILED = 3
 """Exit code when writing fails later on; 1 is a recording that cannot begin."""
@@ -73,8 +73,8 @@ class RecorderNode:
         ]
         self._sources = [source for name in self._namespaces for source in sources(name)]
         self._sources += [DIAGNOSTICS, ROSOUT, *([CLOCK] if values["record_clock"] else [])]
-        self._views: bool = values["record_views"]
-        self._unknown: set[str] = set()
+        if values["record_views"]:
+            self._sources += [source for name in self._namespaces for source in views(name)]
         folder = str(values["bag"]) or time.strftime("bags/%Y%m%d-%H%M%S")
         self._recording = Recording(Path(folder), self._sources)
         self._health = RecorderHealth(self._recording)
@@ -193,8 +193,6 @@ class RecorderNode:
         for samples, _ in self._samples:
             samples.look()
         self._peers.look(now)
-        if self._views:
-            self._look_for_views()
         run = self._recording.run
         if run and self._peers.changed(run):
             self._recording.note(run, self._peers.parameters())
@@ -213,25 +211,6 @@ class RecorderNode:
                 "incomplete": recording.incomplete,
             }
             self._status.publish(String(data=json.dumps(status)))
-
-    def _look_for_views(self) -> None:
-        """Record the topics of viewers that were not there before."""
-        known = self._unknown | {source.channel.topic for source in self._sources}
-        prefixes = tuple(f"{namespace}view/" for namespace in self._namespaces)
-        for topic, types in self._node.get_topic_names_and_types():
-            if topic in known or not topic.startswith(prefixes):
-                continue
-            source = Source(Channel(topic, types[0]))
-            try:
-                if message_class(types[0]) is None:
-                    raise KeyError(types[0])
-                self._recording.add(source)
-            except KeyError:
-                self._log.warning(f"{topic} is not recorded: its type {types[0]} is not known here")
-                self._unknown.add(topic)
-                continue
-            self._sources.append(source)
-            self._subscribe(source)
 
 
 def _make(node: Node, loop: Observer) -> RecorderNode:

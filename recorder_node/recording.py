@@ -63,10 +63,6 @@ class Recording:
         """By namespace: one that came early, and what came after it."""
         self._append_index("")
 
-    def add(self, source: Source) -> None:
-        """Record one more topic."""
-        self._bag.add(source.channel)
-
     def take(self, source: Source, when: int, raw: bytes) -> None:
         """Record one message that arrived at `when` (ns since the epoch)."""
         self.messages += 1

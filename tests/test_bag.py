@@ -29,12 +29,10 @@ from rosbags.interfaces import QosDurability
 
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.topics import ACTION, COST, POLICY, START, STATE
-from pdeloop.bags.playback import Playback
 from pdeloop.bags.reader import Bag
-from pdeloop.bags.tools import recover
 from pdeloop.bags.verify import verify
 from pdeloop.identification import Wanted, identify_bag
-from recorder_node.bag import BagError, BagWriter, Channel, Definition, definition
+from recorder_node.bag import BagError, definition
 from recorder_node.recording import Recording
 from recorder_node.sources import CLOCK, DIAGNOSTICS, ROSOUT, Source, sources
 from tests.small_disk import read_only_folder, small_disk
@@ -163,7 +161,7 @@ def test_the_hash_of_a_type_is_that_of_the_installed_ros(source):
     hashes = json.loads(installed.read_text())["type_hashes"]
     assert {
         "type_name": source.channel.type,
-        "hash_string": definition(source.channel.type).hash,
+        "hash_string": definition(source.channel.type)[1],
     } in hashes
 
 
@@ -187,7 +185,7 @@ def test_a_lost_sample_makes_the_episode_incomplete(tmp_path):
     assert [episode.missing for episode in bag.episodes()] == [["1 of 6 states"]] * 2
 
 
-def test_what_was_flushed_is_readable_without_an_end_and_can_be_recovered(tmp_path):
+def test_what_was_flushed_is_readable_without_an_end(tmp_path):
     path = tmp_path / "bag"
     recording = Recording(path, WHAT)
     recorded_episode(recording, 7)
@@ -199,11 +197,7 @@ def test_what_was_flushed_is_readable_without_an_end_and_can_be_recovered(tmp_pa
     bag = Bag(path)
     assert not bag.finished
     assert [episode.number for episode in bag.episodes()] == [7]
-    target, messages = recover(path, None)
-    assert messages == 14
-    with AnyReader([target]) as reader:
-        assert reader.message_count == 14
-    assert Bag(target).finished
+    assert len(list(bag.messages())) == 14
 
 
 @pytest.mark.parametrize("lost", [False, True])
@@ -304,9 +298,7 @@ def test_a_full_disk_stops_the_recording_and_keeps_what_was_written(tmp_path):
             fill()
         episodes = [e for e in Bag(disk / "bag").episodes() if not e.missing]
         assert len(episodes) > 5
-        target, _ = recover(disk / "bag", tmp_path / "recovered")
-        with AnyReader([target]) as reader:
-            assert reader.message_count >= len(episodes) * 104
+        assert len(list(Bag(disk / "bag").messages())) >= len(episodes) * 104
 
 
 def test_what_is_no_bag_is_a_clear_error(tmp_path):
@@ -392,17 +384,6 @@ def test_bags_of_other_writers_are_read(tmp_path, finished):
         assert {channel.topic for channel in Bag(folder).channels()} == set(channels)
 
 
-def test_a_type_that_is_not_of_ros_keeps_its_definition_when_it_is_recovered(tmp_path):
-    own = Channel("/own", "mine/msg/Own", definition=Definition("float64 x", hash="RIHS01_0"))
-    writer = BagWriter(tmp_path / "bag", [own])
-    writer.write("/own", SECOND, b"\0\1\0\0" + bytes(8))
-    writer.flush()
-    target, count = recover(tmp_path / "bag", None)
-    writer.close({})
-    (channel,) = Bag(target).channels()
-    assert (count, channel) == (1, own)
-
-
 def record_bytes(record: McapRecord) -> bytes:
     builder = RecordBuilder()
     record.write(builder)
@@ -452,9 +433,7 @@ print(code, (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 102
     ("told", "words"),
     [(2 * 2**30, "decompresses to more than 100 times"), (1000, "a chunk is not")],
 )
-@pytest.mark.parametrize(
-    "command", [("bag", "info"), ("bag", "verify"), ("bag", "recover"), ("identify", "--bag")]
-)
+@pytest.mark.parametrize("command", [("bag", "info"), ("bag", "verify"), ("identify", "--bag")])
 def test_a_small_file_that_becomes_gigabytes_is_refused_in_one_sentence(
     tmp_path, told, words, command
 ):
@@ -533,10 +512,7 @@ def test_a_bag_of_the_version_before_is_read_verified_and_identified_from(tmp_pa
     for text in report.differences:  # on another machine than that which recorded it
         recorded, again = map(float, re.findall(r"re(?:corded|computed) (\S+?)(?:,|$)", text))
         assert again == pytest.approx(recorded, rel=1e-6), text
-    assert identify_bag(OLD, Wanted()).live is not None
-    playback = Playback(bag, rate=1.0, again=False)
-    taken = [*playback.take(0.0), *playback.take(1e6)]
-    assert taken == list(bag.messages()) and playback.over
+    assert identify_bag(OLD, Wanted()).steps > 0
     topics = {channel.topic: channel for channel in bag.channels()}
     assert topics["/target"].latched and not topics["/state"].latched
 

@@ -11,8 +11,9 @@ import yaml
 
 from loop_interfaces.controllers import CONTROLLERS
 from loop_interfaces.problem import config_folder
+from loop_interfaces.topics import VIEW_NUMBERS
 from pdeloop.secure import ROLES
-from viewer_node.loop_view import COSTS, NUMBERS
+from viewer_node.loop_view import COSTS
 
 VIEWS = config_folder() / "views"
 FLOAT, MARKER, IMAGE = (
@@ -87,7 +88,7 @@ def named_topics() -> dict[str, str]:
 
 def published() -> dict[str, str]:
     """What viewer_node publishes, by its own table."""
-    own = {f"/view/{name}": FLOAT for name in NUMBERS}
+    own = {f"/view/{name}": FLOAT for name in VIEW_NUMBERS}
     return own | {"/view/field": MARKER, "/view/target": MARKER, "/view/spacetime": IMAGE} | OTHERS
 
 
@@ -99,7 +100,7 @@ def test_every_topic_of_the_layouts_is_published_with_that_type():
 
 def test_every_number_is_plotted():
     curves = {curve.attrib["name"] for curve in plotjuggler().iter("curve")}
-    assert curves == {f"/view/{name}/data" for name in NUMBERS}
+    assert curves == {f"/view/{name}/data" for name in VIEW_NUMBERS}
 
 
 def test_the_costs_have_the_names_and_colours_of_their_controllers():
@@ -132,7 +133,7 @@ def test_the_plotjuggler_layout_has_its_form():
     assert plugin.attrib["ID"] == "ROS2 Topic Subscriber"
     assert root.find("previouslyLoaded_Streamer").attrib["name"] == plugin.attrib["ID"]
     topics = {topic.attrib["name"] for topic in plugin.iter("topic")}
-    assert topics == {f"/view/{name}" for name in NUMBERS}
+    assert topics == {f"/view/{name}" for name in VIEW_NUMBERS}
 
 
 def test_the_foxglove_layout_places_every_panel_once_and_calls_services_that_there_are():

@@ -8,9 +8,10 @@ import pytest
 from loop_interfaces.diagnostics import Level
 from loop_interfaces.frames import Frame
 from loop_interfaces.model_rows import ModelRows, pack
+from loop_interfaces.topics import VIEW_NUMBERS
 from viewer_node.diagnostics import ViewerHealth
 from viewer_node.episode_samples import COLUMNS
-from viewer_node.loop_view import NUMBERS, LoopView
+from viewer_node.loop_view import LoopView
 from viewer_node.picture import UNSEEN, diverging
 
 RUN, PLANT, N_Z, N_A, N_S = 5, 9, 8, 2, 3
@@ -65,7 +66,7 @@ def test_the_numbers_of_a_sample_are_those_of_their_definitions():
     field, target = shown.profile()
     assert field.tolist() == z[0].tolist()
     assert target.tolist() == TARGET.tolist()
-    assert set(numbers) <= set(NUMBERS)
+    assert set(numbers) <= set(VIEW_NUMBERS)
 
 
 def test_the_chosen_environment_is_shown_and_of_a_smaller_episode_the_last():

@@ -32,20 +32,6 @@ STEADY = 0.15
 MAX_KEPT = 100
 """Plants whose targets are remembered."""
 
-NUMBERS = {
-    "cost": "mean stage cost of the last adapted policies (neither zero nor the LQT gains)",
-    "cost_no_control": "mean stage cost of the last rollouts without control",
-    "cost_lqt": "mean stage cost of the last rollouts with the LQT gains",
-    "reduction": "100 (1 - cost / cost_lqt), in percent",
-    "stage_cost": "l_k = q |z_k - z_r|^2 + r |a_k|^2 of the newest sample",
-    "tracking_error": "root of the mean square of z_k - z_r of the newest sample",
-    "final_error": "the same at the last step of the last episode",
-    "action_norm": "|a_k| of the newest sample",
-    "gain_norm": "Frobenius norm of the present gains [K_a K_b]",
-    "gain_change": "Frobenius norm of their difference to the LQT gains, relative to these",
-    "step": "k of the newest sample",
-}
-"""Names of the numbers, published below `view/`, and what they are."""
 COSTS = {"none": "cost_no_control", "lqt": "cost_lqt", "adapted": "cost"}
 """The number with the cost of each controller (loop_interfaces.controllers)."""
 
@@ -206,7 +192,7 @@ class LoopView:
         return self.current is not None and self.current.ended and self.current.whole
 
     def numbers(self) -> dict[str, float]:
-        """The numbers of NUMBERS that are known by now."""
+        """The numbers of VIEW_NUMBERS that are known by now."""
         found = dict(self._numbers)
         if self.current is not None:
             found["step"] = float(self.current.last)

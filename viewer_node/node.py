@@ -26,9 +26,10 @@ from loop_interfaces.parameters import VIEWER, taken_by
 from loop_interfaces.ros.node_main import node_main
 from loop_interfaces.ros.observer import Observer
 from loop_interfaces.ros.parameters import declare, given_parameters, on_change
+from loop_interfaces.topics import VIEW_NUMBERS
 from viewer_node.diagnostics import ViewerHealth
 from viewer_node.loop_reader import PERIOD, LoopReader
-from viewer_node.loop_view import NUMBERS, LoopView
+from viewer_node.loop_view import LoopView
 from viewer_node.picture import diverging
 
 GRAPH_PERIOD = 0.5
@@ -69,7 +70,7 @@ class ViewerNode:
         self._markers = {name: node.create_publisher(Marker, f"view/{name}", 1) for name in COLOURS}
         self._image = node.create_publisher(Image, "view/spacetime", 1)
         self._numbers = {
-            name: node.create_publisher(Float64, f"view/{name}", 1) for name in NUMBERS
+            name: node.create_publisher(Float64, f"view/{name}", 1) for name in VIEW_NUMBERS
         }
         loop.every(PERIOD, self._read)
         loop.every(GRAPH_PERIOD, self._reader.poll_graph)

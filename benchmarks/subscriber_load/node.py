@@ -15,7 +15,7 @@ from std_msgs.msg import Float64
 from visualization_msgs.msg import Marker
 
 from loop_interfaces.isolation import keep_on_this_machine
-from viewer_node.loop_view import NUMBERS
+from loop_interfaces.topics import VIEW_NUMBERS
 
 
 def main() -> int:
@@ -34,7 +34,7 @@ def main() -> int:
     node.create_subscription(Marker, "view/field", field, 1, raw=True)
     node.create_subscription(Marker, "view/target", lambda _: None, 1, raw=True)
     node.create_subscription(Image, "view/spacetime", lambda _: None, 1, raw=True)
-    for name in NUMBERS:
+    for name in VIEW_NUMBERS:
         node.create_subscription(Float64, f"view/{name}", lambda _: None, 1, raw=True)
     try:
         rclpy.spin(node)

@@ -1,1 +1,1 @@
-"""Recorded bags: reading, verifying, recovering, identifying from them."""
+"""Recorded bags: reading, describing, verifying and playing them."""

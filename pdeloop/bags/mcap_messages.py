@@ -29,13 +29,12 @@ from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
-from recorder_node.bag import HASH, METADATA, QOS, BagError, Channel, Definition
+from recorder_node.bag import METADATA, QOS, BagError, Channel
 
 RATIO, SLACK = 100, 64 * 2**20
 """A file of n bytes may decompress to RATIO n + SLACK bytes."""
 MAX_TEXT = 100_000_000
 """Bytes that are read of a text beside the bag."""
-_NO_SCHEMA = Schema(id=0, name="", encoding="", data=b"")
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,7 @@ class McapMessages:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._schemas: dict[int, Schema] = {}
+        self._types: dict[int, str] = {}
         self.channels: dict[int, Channel] = {}
         outside = self._records(lambda chunk: False)
         self.finished = any(isinstance(record, Footer) for record in outside)
@@ -102,11 +101,10 @@ class McapMessages:
     def _note(self, record: McapRecord) -> None:
         """Keep what declares a topic; refuse a message of a topic that is not declared."""
         if isinstance(record, Schema):
-            self._schemas[record.id] = record
+            self._types[record.id] = record.name
         elif isinstance(record, McapChannel):
-            schema = self._schemas.get(record.schema_id, _NO_SCHEMA)
-            known = Definition(schema.data.decode(), schema.encoding, record.metadata.get(HASH, ""))
-            self.channels[record.id] = _channel(record, schema.name, known)
+            kind = self._types.get(record.schema_id, "")
+            self.channels[record.id] = _channel(record, kind)
         elif isinstance(record, McapMessage) and record.channel_id not in self.channels:
             raise ValueError(f"a message of channel {record.channel_id}, which it does not declare")
 
@@ -162,7 +160,7 @@ def _decompressed(chunk: Chunk) -> Chunk:
     return replace(chunk, compression="", data=data)
 
 
-def _channel(found: McapChannel, kind: str, known: Definition) -> Channel:
+def _channel(found: McapChannel, kind: str) -> Channel:
     """A topic with what its publishers offered; the strictest offer serves every reader."""
     offers = _offers(found.metadata.get(QOS, ""))
 
@@ -176,7 +174,6 @@ def _channel(found: McapChannel, kind: str, known: Definition) -> Channel:
         latched=any_offers("durability", "transient_local", 1),
         reliable=any_offers("reliability", "reliable", 1) or not offers,
         depth=max((offer["depth"] for offer in offers), default=1),
-        definition=known,
     )
 
 

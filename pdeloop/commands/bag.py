@@ -17,9 +17,9 @@ def add(commands: Commands) -> None:
         commands,
         "bag",
         None,
-        help="look into a recorded bag, verify it, recover it, play it",
-        description="Look into a bag that --record or recorder_node wrote, verify it, recover "
-        "it, or play it (docs/recording.md).",
+        help="look into a recorded bag, verify it, play it",
+        description="Look into a bag that --record or recorder_node wrote, verify it, or play it "
+        "(docs/recording.md).",
         example="pdeloop bag info runs/burgers-20260101-120000-1",
     )
     actions = bag.add_subparsers(required=True, metavar="ACTION")
@@ -39,15 +39,7 @@ def add(commands: Commands) -> None:
         "the bit. Exit code 1 if anything differs.",
         example="pdeloop bag verify runs/burgers-20260101-120000-1",
     )
-    recover = command(
-        actions,
-        "recover",
-        _bag_recover,
-        help="make an ordinary bag of an unfinished one",
-        example="pdeloop bag recover runs/lab/bag --out runs/lab/whole",
-    )
-    for action in (info, recover):
-        action.add_argument("bag", type=Path, metavar="BAG", help="folder of a bag or of a run")
+    info.add_argument("bag", type=Path, metavar="BAG", help="folder of a bag or of a run")
     verify.add_argument(
         "bag",
         type=Path,
@@ -59,8 +51,7 @@ def add(commands: Commands) -> None:
         "--parameters", type=Path, metavar="FILE", help="instead of those in the bag"
     )
     add_equation(verify)
-    recover.add_argument("--out", type=Path, metavar="DIR", help="new folder [BAG-recovered]")
-    for action in (info, verify, recover):
+    for action in (info, verify):
         add_json(action)
     _add_play(actions)
 
@@ -73,13 +64,11 @@ def _add_play(actions: Commands) -> None:
         help="publish a bag's messages over topics",
         description="Publish a bag's messages again: the recorded bytes under the recorded names and "
         "quality of service, in the recorded time. In a ROS domain of its own (pdeloop monitor finds "
-        "it), or in ROS_DOMAIN_ID if that is set; never beside a live loop.",
-        example="pdeloop bag play runs/lab/bag --rate 0.1 --wait",
+        "it), or in ROS_DOMAIN_ID if that is set; not beside a live loop.",
+        example="pdeloop bag play runs/lab/bag --rate 0.1",
     )
     play.add_argument("bag", type=Path, metavar="BAG", help="folder of a bag or of a run")
     play.add_argument("--rate", type=float, default=1.0, metavar="R", help="times as fast [1]")
-    play.add_argument("--loop", action="store_true", help="begin again at the end, until Ctrl-C")
-    play.add_argument("--wait", action="store_true", help="begin when somebody subscribes")
     play.add_argument(
         "--network",
         action="store_true",
@@ -88,7 +77,7 @@ def _add_play(actions: Commands) -> None:
 
 
 def _bag_info(options: argparse.Namespace) -> int:
-    from pdeloop.bags.tools import describe, info_text
+    from pdeloop.bags.info import describe, info_text
 
     content = describe(options.bag)
     if options.json:
@@ -110,27 +99,14 @@ def _bag_verify(options: argparse.Namespace) -> int:
     return 1 if report.count else 0
 
 
-def _bag_recover(options: argparse.Namespace) -> int:
-    from pdeloop.bags.tools import recover
-
-    path, messages = recover(options.bag, options.out)
-    if options.json:
-        print_json({"bag": str(path), "messages": messages})
-    else:
-        print(f"{messages} messages in {path}")
-    return 0
-
-
 def _bag_play(options: argparse.Namespace) -> int:
-    from pdeloop.bags.player.node import play
+    from pdeloop.bags.node import play
 
     if not 1e-6 <= options.rate <= 1e6:
         raise ParameterError(f"--rate is {options.rate:g}; expected a number from 1e-6 to 1e6")
     return play(
         options.bag,
         rate=options.rate,
-        again=options.loop,
-        wait=options.wait,
         network=options.network,
         tell=lambda text: print(text, flush=True),
     )

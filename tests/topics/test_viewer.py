@@ -8,13 +8,13 @@ import signal
 
 import pytest
 
+from loop_interfaces.topics import VIEW_NUMBERS
 from tests.loop_harness import Processes, until
 from tests.operator_harness import operator
 from tests.small import SMALL
 from tests.test_layouts import named_topics
 from tests.topics.test_faults import PARAMETERS, start_pair, start_tuner
 from tests.topics.test_loop import LIMIT, assert_same_training, in_process, iterations_done
-from viewer_node.loop_view import NUMBERS
 
 pytestmark = pytest.mark.topics
 ITERATIONS = 300
@@ -60,7 +60,9 @@ rclpy.shutdown()
 
 def watched(loop: Processes, count: int) -> list:
     """Start somebody who reads all views until each has come `count` times; its answer on `read`."""
-    return loop.start("-c", WATCH, json.dumps(list(NUMBERS)), str(count), str(LIMIT), name="watch")
+    return loop.start(
+        "-c", WATCH, json.dumps(list(VIEW_NUMBERS)), str(count), str(LIMIT), name="watch"
+    )
 
 
 def test_the_views_are_those_of_the_loop_and_the_policy_is_the_same(loop: Processes, tmp_path):
@@ -70,7 +72,7 @@ def test_the_views_are_those_of_the_loop_and_the_policy_is_the_same(loop: Proces
     out = tmp_path / "run"
     with operator(loop) as desk:
         until(
-            lambda: int(desk.values("viewer_node").get("subscribers", 0)) >= len(NUMBERS) + 3,
+            lambda: int(desk.values("viewer_node").get("subscribers", 0)) >= len(VIEW_NUMBERS) + 3,
             LIMIT,
             "subscribers",
         )

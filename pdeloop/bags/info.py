@@ -1,15 +1,12 @@
-"""`pdeloop bag info` and `pdeloop bag recover`."""
+"""`pdeloop bag info`."""
 
 from __future__ import annotations
 
-import shutil
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
 from pdeloop.bags.reader import Bag
-from recorder_node.bag import BagError, BagWriter
-from recorder_node.recording import INDEX, PARAMETERS
 
 
 def describe(path: Path) -> dict[str, Any]:
@@ -64,8 +61,7 @@ def info_text(content: dict[str, Any]) -> str:
     ]
     if not content["finished"]:
         lines.append(
-            "  not finished: its recorder was stopped; what follows is what it had written "
-            f"(pdeloop bag recover {content['bag']} makes an ordinary bag of it)"
+            "  not finished: its recorder was stopped; what follows is what it had written"
         )
     width = max((len(topic["topic"]) for topic in content["topics"]), default=0)
     lines += [
@@ -82,25 +78,3 @@ def info_text(content: dict[str, Any]) -> str:
         for episode in incomplete[:10]
     ]
     return "\n".join(lines)
-
-
-def recover(path: Path, out: Path | None) -> tuple[Path, int]:
-    """Write an ordinary bag with what an unfinished one holds; returns its path and its messages.
-
-    out: the new folder; PATH-recovered if not given. The old bag stays as it is.
-    """
-    bag = Bag(path)
-    target = out or bag.path.with_name(f"{bag.path.name}-recovered")
-    if target.exists():
-        raise BagError(f"{target} already exists; give another folder with --out")
-    writer = BagWriter(target, bag.channels())
-    count = 0
-    for message in bag.messages():
-        count += 1
-        writer.write(message.topic, message.when, message.data)
-        writer.pause()
-    writer.close({})
-    for name in (INDEX, PARAMETERS):
-        if (bag.path / name).exists():
-            shutil.copyfile(bag.path / name, target / name)
-    return target, count

@@ -1,1 +1,0 @@
-"""A node that publishes what a bag holds."""
