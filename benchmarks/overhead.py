@@ -81,7 +81,7 @@ def measure(
             return setting.start(command, node)
 
         try:
-            cores = pair_cores(1, "shared")
+            cores = pair_cores(1)
             setting.others = [core for core in usable_cores() if core not in cores]
             nodes = [start(node.package, *node.parameters) for node in pair_nodes(cores)]
             start("tuner_node", f"out:={run}", "iterations:=100000", "optimizer:=two_point", *tuner)

@@ -43,7 +43,9 @@ def _measure(
     ping = running.start("benchmarks.ping", f"pin:={one}")
     running.start("benchmarks.ping", "end:=pong", f"pin:={two}")
     horizon = "horizon:=1000"
-    plant, controller = pair_nodes(pair_cores(1, cores), solver_polls=cores == "pinned")
+    pinned = cores == "pinned"
+    chosen = [None] if cores == "any" else pair_cores(1, pinned)
+    plant, controller = pair_nodes(chosen, solver_polls=pinned)
     pair = (
         running.start(plant.package, horizon, *plant.parameters, problem=PROBLEM),
         running.start(controller.package, *controller.parameters, problem=PROBLEM),

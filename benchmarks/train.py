@@ -30,7 +30,6 @@ def run(
     """One row for each way to train."""
     ways: dict[str, list[str]] = {"in-process": ["--in-process"], "topics": []}
     if pin:
-        ways["topics --spread"] = ["--spread"]
         ways["topics --pin"] = ["--pin"]
     runs: dict[str, list[dict[str, Any]]] = {way: [] for way in ways}
     with tempfile.TemporaryDirectory() as folder:

@@ -96,7 +96,7 @@ def pairs_of_nodes(context: LaunchContext) -> list[Any]:
     own["equation"] = load_parameters(given["problem"], own)["equation"]
     problem = find_problem(given["problem"]).resolve()
     pinned = given["pin"] == "true"
-    cores = pair_cores(PAIRS.parse(given["pairs"]), "pinned" if pinned else "shared")
+    cores = pair_cores(PAIRS.parse(given["pairs"]), pinned)
     for number, (pair, core) in enumerate(zip(namespaces(len(cores)), cores, strict=True)):
         for executable in ("pde_sim_node", "controller_node"):
             parameters = {**own, **core_parameters(executable, core, solver_polls=pinned)}

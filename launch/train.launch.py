@@ -81,7 +81,7 @@ def training(context: LaunchContext) -> list[Any]:
     """Begin a run, or go on with one, in its folder, and start the nodes for it."""
     given = context.launch_configurations
     pairs = PAIRS.parse(given["pairs"])
-    check_pairs(pairs, "pinned" if given["pin"] == "true" else "shared")
+    check_pairs(pairs, given["pin"] == "true")
     own = {spec.name: spec.parse(given[spec.name]) for spec in FLAGS if given[spec.name]}
     if given["model"]:
         own["model"] = str(Path(given["model"]).resolve())

@@ -21,10 +21,6 @@ MAX_PAIRS = 64
 """On one machine; on several, start the pairs by hand (docs/scaling.md)."""
 PAIRS = Spec("pairs", 1, 1, MAX_PAIRS).means("plants with a controller each")
 """How many pairs a command or a launch file starts."""
-PLACEMENTS = ("shared", "pinned", "any")
-"""Where plant and controller of a pair run, for good: on one core for both, which they take in turns,
-so that a message wakes no idle core; the same, with a core for each pair and the plant's helpers
-polling on the others; or wherever the scheduler puts them."""
 
 
 @dataclass(frozen=True)
@@ -62,36 +58,31 @@ PAIR = ("pde_sim_node", "controller_node")
 """The packages of a pair's nodes."""
 
 
-@dataclass(frozen=True)
-class Recording:
-    """How a run is recorded; required: it stops if the recorder does; views: with a viewer's topics."""
-
-    required: bool = False
-    views: bool = False
-
-
 def namespaces(pairs: int) -> list[str]:
     """Namespaces of the pairs; one alone needs none."""
     return [f"pair{i}" for i in range(pairs)] if pairs > 1 else [""]
 
 
-def check_pairs(pairs: int, placement: str = "shared") -> None:
-    """ParameterError when there are too many pairs for this machine."""
+def check_pairs(pairs: int, pin: bool = False) -> None:
+    """ParameterError when there are too many pairs for this machine; pin: with a core for each."""
     if not 1 <= pairs <= MAX_PAIRS:
         raise ParameterError(f"--pairs is {pairs}; expected a whole number from 1 to {MAX_PAIRS}")
     cores = len(usable_cores())
-    if placement == "pinned" and cores < pairs:
+    if pin and cores < pairs:
         raise ParameterError(
             f"--pin gives each of the {pairs} pairs of plant and controller a core of its own, but "
             f"there are {cores}; leave out --pin, or use fewer pairs"
         )
 
 
-def pair_cores(pairs: int, placement: str) -> list[int | None]:
-    """The core that each pair shares, the least busy ones first; None: any."""
-    check_pairs(pairs, placement)
-    choice = len(usable_cores()) > 1 and hasattr(os, "sched_setaffinity")
-    if placement == "any" or not (choice or placement == "pinned"):
+def pair_cores(pairs: int, pin: bool = False) -> list[int | None]:
+    """The core that plant and controller of each pair share, the least busy ones first; None: any.
+
+    They take turns, so that a message on one core wakes no idle one. On a machine with a single core
+    there is nothing to choose, unless `pin` asks for it.
+    """
+    check_pairs(pairs, pin)
+    if not pin and (len(usable_cores()) == 1 or not hasattr(os, "sched_setaffinity")):
         return [None] * pairs
     return list(least_busy_cores(pairs))
 
@@ -129,8 +120,10 @@ class Transport:
     ----------
     in_process : bool
         Without ROS.
-    recording : Recording, optional
-        How it is recorded; None: not at all.
+    recorder : {"none", "start", "required"}
+        Whether it is recorded, as the tuner's parameter says it.
+    record_views : bool
+        Record a viewer's topics, too.
     network : bool
         Let the messages leave this machine.
     pairs : int
@@ -139,40 +132,34 @@ class Transport:
         Keep each pair on a core of its own, and its solver's helpers polling.
     view : bool
         With a viewer_node of the first pair.
-    spread : bool
-        Leave the cores to the scheduler (PLACEMENTS).
     """
 
     in_process: bool = False
-    recording: Recording | None = None
+    recorder: str = "none"
+    record_views: bool = False
     network: bool = False
     pairs: int = 1
     pin: bool = False
     view: bool = False
-    spread: bool = False
 
     def __post_init__(self) -> None:
-        if self.in_process and (self.recording or self.network):
+        if self.in_process and (self.recorded or self.network):
             raise ParameterError("--record and --network are about topics; leave out --in-process")
         if self.network and os.environ.get(PROFILE):
             raise ParameterError(
                 f"--network and {PROFILE}={os.environ[PROFILE]} both say where messages go; leave "
                 "out --network to use that profile, or unset the variable"
             )
-        if self.in_process and (self.pairs > 1 or self.pin or self.spread or self.view):
+        if self.in_process and (self.pairs > 1 or self.pin or self.view):
             raise ParameterError(
-                "--pairs, --pin, --spread and --view are about nodes; leave out --in-process"
+                "--pairs, --pin and --view are about nodes; leave out --in-process"
             )
-        if self.pin and self.spread:
-            raise ParameterError(
-                "--pin keeps each pair on a core, --spread on none; leave out one of them"
-            )
-        check_pairs(self.pairs, self.placement)
+        check_pairs(self.pairs, self.pin)
 
     @property
-    def placement(self) -> str:
-        """One of PLACEMENTS."""
-        return "pinned" if self.pin else "any" if self.spread else "shared"
+    def recorded(self) -> bool:
+        """Whether there is a recorder."""
+        return self.recorder != "none"
 
     def nodes(self, folder: Path) -> list[LoopNode]:
         """The nodes of the training in `folder`, a run that was begun (RunFolder.create).
@@ -180,20 +167,23 @@ class Transport:
         The recorder, if any, comes first; it is told its bag when it is started. Recorder and viewer
         leave the cores of the pairs to them, if there are others.
         """
-        recording, serving = self.recording, tuner_parameter(self.pairs)
-        cores = pair_cores(self.pairs, self.placement)
+        serving = tuner_parameter(self.pairs)
+        cores = pair_cores(self.pairs, self.pin)
         nodes = pair_nodes(cores, solver_polls=self.pin)
         others = tuple(core for core in usable_cores() if core not in cores)
-        if self.view or (recording is not None and recording.views):
+        if self.view or self.record_views:
             first = namespaces(self.pairs)[0]
             nodes.append(LoopNode("viewer_node", "viewer_node", namespace=first, cores=others))
-        wait = "none"
-        if recording is not None:
-            wait = "required" if recording.required else "start"
-            own = [*serving, *["record_views:=true"] * recording.views]
+        if self.recorded:
+            own = [*serving, f"record_views:={argument(self.record_views)}"]
             nodes.insert(0, LoopNode("recorder_node", "recorder_node", own, cores=others))
         # resume: one that is started again goes on where it was.
-        tuner = [f"out:={quoted(folder.resolve())}", "resume:=true", f"recorder:={wait}", *serving]
+        tuner = [
+            f"out:={quoted(folder.resolve())}",
+            "resume:=true",
+            f"recorder:={self.recorder}",
+            *serving,
+        ]
         tuner.append(f"plant:={fingerprint(RunFolder(folder).values())}")
         return [*nodes, LoopNode("tuner_node", "tuner_node", tuner)]
 

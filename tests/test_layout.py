@@ -45,7 +45,7 @@ def test_pairs_get_the_least_busy_cores_and_pinning_one_each(
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {3, 5, 6, 7})
     busy = iter([{}, {3: 10, 5: 4, 6: 0, 7: 9}])
     monkeypatch.setattr(affinity, "_busy_ticks", lambda: next(busy))
-    cores = pairs.pair_cores(3, "pinned")
+    cores = pairs.pair_cores(3, pin=True)
     assert cores == [6, 5, 7]
     nodes = pairs.pair_nodes(cores, solver_polls=True)
     pins = [word for node in nodes for word in node.parameters if word.startswith("pin")]
@@ -56,20 +56,17 @@ def test_pairs_get_the_least_busy_cores_and_pinning_one_each(
         ("solver_polls:=true" in node.parameters) == (node.name in helpers) for node in nodes
     )
     with pytest.raises(ParameterError, match="a core of its own, but there are 4"):
-        pairs.pair_cores(5, "pinned")
+        pairs.pair_cores(5, pin=True)
     with pytest.raises(ParameterError, match="--pairs is 0; expected a whole number from 1 to 64"):
         pairs.check_pairs(0)
     with pytest.raises(ValueError, match=r"'pin' is 4; expected -1 or one of the cores \[3, 5"):
         affinity.pin_process(4)
 
 
-def test_pairs_are_anywhere_if_asked_for_or_where_there_is_one_core(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    assert pairs.pair_cores(2, "any") == [None, None]
+def test_pairs_are_anywhere_where_there_is_one_core(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {3})
-    assert pairs.pair_cores(2, "shared") == [None, None]
-    assert pairs.pair_cores(1, "pinned") == [3]
+    assert pairs.pair_cores(2) == [None, None]
+    assert pairs.pair_cores(1, pin=True) == [3]
 
 
 def test_the_busy_time_of_a_core_is_what_it_neither_idled_nor_waited(tmp_path: Path) -> None:
@@ -83,7 +80,7 @@ def test_the_busy_time_of_a_core_is_what_it_neither_idled_nor_waited(tmp_path: P
 def test_recorder_and_viewer_leave_the_core_of_the_pair_to_it(tmp_path: Path) -> None:
     folder, values = tmp_path / "run", resolve(str(SMALL), {})
     RunFolder(folder).create(values)
-    started = pairs.Transport(recording=pairs.Recording(), view=True).nodes(folder)
+    started = pairs.Transport(recorder="start", view=True).nodes(folder)
     nodes = {node.package: node for node in started}
     (pin,) = (word for word in nodes["controller_node"].parameters if word.startswith("pin"))
     others = os.sched_getaffinity(0) - {int(pin.removeprefix("pin:="))}
@@ -107,8 +104,6 @@ def test_recorder_and_viewer_leave_the_core_of_the_pair_to_it(tmp_path: Path) ->
         (["--in-process", "--pairs", "2"], "leave out --in-process"),
         (["--in-process", "--pin"], "leave out --in-process"),
         (["--in-process", "--view"], "leave out --in-process"),
-        (["--in-process", "--spread"], "leave out --in-process"),
-        (["--pin", "--spread"], "leave out one of them"),
         (["--pairs", "65"], "--pairs is 65"),
     ],
 )

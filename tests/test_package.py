@@ -254,7 +254,7 @@ def test_what_train_takes_is_a_launch_argument_too(tmp_path: Path) -> None:
     ).read_text()
     known = {spec.name for spec in flags()} | set(re.findall(r'"([a-z_]+)"', text))
     # About processes that `pdeloop train` starts itself.
-    others = {"help", "in_process", "json", "spread"}
+    others = {"help", "in_process", "json"}
     assert {action.dest for action in actions} - others <= known
 
 

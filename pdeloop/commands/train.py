@@ -89,30 +89,23 @@ def add(commands: Commands) -> None:
         help="a core of its own for each plant and its controller, and let the plant's helpers on the "
         "others look for work all the time: less time per step, more power",
     )
-    add(
-        "--spread",
-        action="store_true",
-        help="plant and controller on any cores, instead of one for both (docs/performance.md)",
-    )
 
 
 def _train(options: argparse.Namespace) -> int:
-    from pdeloop.pairs import Recording, Transport
+    from pdeloop.pairs import Transport
     from pdeloop.training_run import begin, reopen, run
 
-    recording = None
-    if options.record or options.record_or_stop or options.record_views:
+    recorded = options.record or options.record_or_stop or options.record_views
+    if recorded:
         import recorder_node.bag  # noqa: F401  # the recorder would only say so in its log
-
-        recording = Recording(options.record_or_stop, options.record_views)
     transport = Transport(
         options.in_process,
-        recording,
-        options.network,
-        options.pairs,
-        options.pin,
-        options.view,
-        options.spread,
+        recorder="required" if options.record_or_stop else "start" if recorded else "none",
+        record_views=options.record_views,
+        network=options.network,
+        pairs=options.pairs,
+        pin=options.pin,
+        view=options.view,
     )
     given = given_flags(options)
     if (

@@ -69,9 +69,9 @@ def test_a_pinned_training_is_the_same(loop: Processes, tmp_path) -> None:
 
 
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
-@pytest.mark.parametrize(("seeds", "flags"), [("1", ()), ("1", ("--spread",)), ("5", ())])
-def test_plant_and_controller_share_a_core(loop, tmp_path, seeds, flags) -> None:
-    options = ("--optimizer", "two_point", "--iterations", "100000", "--seeds", seeds, *flags)
+@pytest.mark.parametrize("seeds", ["1", "5"])
+def test_plant_and_controller_share_a_core(loop, tmp_path, seeds) -> None:
+    options = ("--optimizer", "two_point", "--iterations", "100000", "--seeds", seeds)
     run = loop.pdeloop("train", str(SMALL), *options, "--out", str(tmp_path / "a"))
     until(lambda: iterations_done(tmp_path / "a") >= 3, LIMIT, "iteration 3")
     free = {frozenset(os.sched_getaffinity(0))}
@@ -86,7 +86,7 @@ def test_plant_and_controller_share_a_core(loop, tmp_path, seeds, flags) -> None
 
     plant, controller = places("pde_sim_node"), places("controller_node")
     assert plant == controller
-    assert plant == free if flags else [len(cores) for cores in plant] == [1]
+    assert [len(cores) for cores in plant] == [1]
     assert places("tuner_node") == free
     run.send_signal(signal.SIGINT)
     loop.wait(run, LIMIT, code=130)
