@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from rclpy.node import Node
 
 from loop_interfaces.parameters import table
-from loop_interfaces.ros.introspection import NAMELESS
+from loop_interfaces.ros.introspection import NAMELESS, full_name
 from loop_interfaces.ros.parameters import RemoteParameters
 
 PATIENCE = 3.0
@@ -57,7 +57,7 @@ class Peers:
                 seen.add(process)
                 peer = self._peers.setdefault(process, _Peer(now))
                 if not peer.name and endpoint.node_name != NAMELESS:
-                    peer.name = f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
+                    peer.name = full_name(endpoint)
                     peer.parameters = RemoteParameters(self._node, peer.name)
         for process in set(self._peers) - seen:
             self._drop(process)

@@ -14,9 +14,11 @@ from loop_interfaces.model_rows import unpack
 from loop_interfaces.parameters import model_order, noisy
 from loop_interfaces.spec import ParameterError
 from tuner_node.batch import UNKNOWN_PLANT, TrainingSettings
+from tuner_node.dispatch import Dispatcher
 from tuner_node.exploration import least_variance
 from tuner_node.optimizers import NEED_TRAJECTORIES, OPTIMIZERS, Context, Optimizer, TwoPoint
 from tuner_node.optimizers.gauss_newton import FIELDS
+from tuner_node.results import RunIdentity
 from tuner_node.training import CHECK, EXPLORATION, Training
 
 
@@ -140,3 +142,20 @@ def build_training(values: Mapping[str, Any]) -> Training:
         model=read_model(Path(values["model"]), values["n_a"]) if values["model"] else None,
     )
     return Training(settings, make_optimizer, plant=values["plant"] or UNKNOWN_PLANT)
+
+
+def build_dispatcher(
+    values: Mapping[str, Any], training: Training, identity: RunIdentity
+) -> Dispatcher:
+    """The dispatcher that serves a training with the pairs of the tuner's parameters."""
+    return Dispatcher.create(
+        run=identity.run,
+        n_a=values["n_a"],
+        pairs=len(values["pairs"]),
+        incarnation=identity.incarnation,
+        max_batch=values["max_batch"],
+        episode_timeout=values["episode_timeout"],
+        max_attempts=values["max_attempts"],
+        plant=training.plant,
+        action_limit=values["action_limit"],
+    )

@@ -46,6 +46,11 @@ class Narration:
         costs = list(self._costs.values())
         return f"cost {_spread(costs)}" if any(cost is not None for cost in costs) else "diverged"
 
+    @property
+    def progress(self) -> str:
+        """How far the adaptation is."""
+        return f"  {self.done} of {self.budget} rollouts: {self.status}"
+
     def lines(self, row: Row) -> list[str]:
         """What is to be said when this row has come."""
         event = row.get("event")

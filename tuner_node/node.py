@@ -10,23 +10,21 @@ Messages, order and parameters: docs/interfaces.md. What it does is in tuner_nod
 from __future__ import annotations
 
 import contextlib
-import secrets
 import sys
 from collections import deque
 from collections.abc import Callable, Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from loop_interfaces.diagnostics import Lasting
-from loop_interfaces.frames import MAX_ID, Frame
+from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.parameters import TUNER, taken_by, with_budget
 from loop_interfaces.protocol import NO_CONTROLLER, STOPPED, ModelFailure
 from loop_interfaces.ros.endpoints import Sender, reader_qos, scoped
+from loop_interfaces.ros.introspection import full_name
 from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.node_main import ConfigurationError, node_main
 from loop_interfaces.ros.parameters import declare, given_parameters, on_change
@@ -46,16 +44,15 @@ from loop_interfaces.topics import (
     TARGET,
 )
 from tuner_node import narration
-from tuner_node.build import build_training
+from tuner_node.build import build_dispatcher, build_training
 from tuner_node.diagnostics import TunerHealth
-from tuner_node.dispatch import Dispatcher, DispatchError, PairPublication
+from tuner_node.dispatch import DispatchError, PairPublication
 from tuner_node.narration import Narration
-from tuner_node.results import RunFolder, RunIdentity, summarise
-from tuner_node.run_store import RunWriter
+from tuner_node.participants import Participants, Publishers
+from tuner_node.results import summarise
+from tuner_node.run_store import open_run
 from tuner_node.session import Session
 
-RIVAL_GRACE = 6.0
-"""Seconds a second tuner may be seen before it counts as one: a killed one is seen for 3 s."""
 FAREWELL = 0.5
 """Seconds in which the last messages, and the answer to a request to stop, are taken: when a writer
 is gone, its readers lose what they have not taken yet."""
@@ -82,46 +79,22 @@ class TunerNode:
     def __init__(self, node: Node, loop: NodeLoop, held: contextlib.ExitStack) -> None:
         """`held` keeps the run folder from other processes, as long as this one lives."""
         values = declare_parameters(node)
-        self._log = node.get_logger()
+        log = node.get_logger()
         training = build_training(values)
-        self._recorder: RunWriter | None = None
-        identity = RunIdentity(1 + secrets.randbelow(MAX_ID - 1), 0)
-        if values["out"]:
-            folder = RunFolder(Path(values["out"]))
-            if values["resume"]:
-                folder.parameters()
-            else:
-                folder.create(values)
-            held.enter_context(folder.held())
-            self._recorder = RunWriter(folder.path, values, training, warn=self._log.warning)
-            identity = self._recorder.identity
-        pairs: list[str] = values["pairs"]
-        dispatcher = Dispatcher.create(
-            run=identity.run,
-            n_a=values["n_a"],
-            pairs=len(pairs),
-            incarnation=identity.incarnation,
-            max_batch=values["max_batch"],
-            episode_timeout=values["episode_timeout"],
-            max_attempts=values["max_attempts"],
-            plant=training.plant,
-            action_limit=values["action_limit"],
-        )
+        self._writer, identity = open_run(values, training, held, log.warning)
         self._news: deque[Mapping[str, Any]] = deque()
         self._problem, self._out = values["problem"], values["out"]
         self._narration = Narration(values["seed"], values["seeds"])
+        dispatcher = build_dispatcher(values, training, identity)
         self._session = Session(training, dispatcher, self._news.append)
         self._health = TunerHealth(self._session)
-        self._pairs = pairs
+        self._participants = Participants(self._session, values["recorder"])
+        self._pairs: list[str] = values["pairs"]
         self._changed: dict[str, Any] = {}
-        self._wire(node, loop)
-        self._recording = str(values["recorder"])
-        self._recorder_seen = self._recording == "none"
         self._failure: str | None = None
-        self._plants_paused: list[int] = []
-        self._rival = Lasting()
         self._several_publishers: dict[str, list[str]] = {}
-        self._log.info(f"run {identity.run} of {values['problem']}, seed {values['seed']}")
+        self._wire(node, loop)
+        log.info(f"run {identity.run} of {values['problem']}, seed {values['seed']}")
 
     def run(self) -> int:
         """Train to the end; 0 when done, 130 when interrupted, STOPPED on request."""
@@ -140,8 +113,8 @@ class TunerNode:
         if self._session.done:
             return self._finish()
         self._send(self._session.dispatcher.release())
-        if self._recorder:
-            self._recorder.keep(now=self._loop.now(), force=True)
+        if self._writer:
+            self._writer.keep(now=self._loop.now(), force=True)
         if self._failure:
             raise ConfigurationError(self._failure)
         if self._session.stopped:
@@ -158,8 +131,8 @@ class TunerNode:
     def _wire(self, node: Node, loop: NodeLoop) -> None:
         self._node, self._loop, self._log = node, loop, node.get_logger()
         self._senders: list[dict[str, Sender]] = []
-        self._cost_topics: list[str] = []
-        self._model_topics: list[str] = []
+        self._costs: list[str] = []
+        self._models: list[str] = []
         session, dispatcher = self._session, self._session.dispatcher
         for number, namespace in enumerate(self._pairs):
             self._senders.append(
@@ -174,9 +147,9 @@ class TunerNode:
             model = loop.receive(
                 MODEL_IDENTIFIED, self._handler(dispatcher.model, number), namespace
             )
-            self._cost_topics.append(cost.name)
-            self._model_topics.append(model.name)
-            self._node.create_subscription(
+            self._costs.append(cost.name)
+            self._models.append(model.name)
+            node.create_subscription(
                 String,
                 scoped(namespace, MODEL_FAILED),
                 partial(self._on_failure, number),
@@ -243,19 +216,15 @@ class TunerNode:
                 publications = session.advance(event(now), now)
             self._send(publications)
         except DispatchError as error:
-            self._fail(str(error))
+            self._failure = self._failure or str(error)
+            self._loop.stop("failure")
         while self._news:  # once everybody has been told what to do next, and before it is kept
             self._report(self._news.popleft())
-        if self._recorder:
+        if self._writer:
             with self._loop.introspection.working("writing the checkpoint"):
-                self._recorder.keep(now=self._loop.now())
+                self._writer.keep(now=self._loop.now())
         if session.done or session.stopped:
             self._loop.stop("done")
-
-    def _fail(self, reason: str) -> None:
-        """End with an error, the first one that there is."""
-        self._failure = self._failure or reason
-        self._loop.stop("failure")
 
     def _send(self, publications: list[PairPublication]) -> None:
         for pair, publication in publications:
@@ -264,77 +233,41 @@ class TunerNode:
     def _housekeeping(self, now: float) -> None:
         if self._loop.stopped:  # by a service, in this round
             return
-        absent = self._absent_recorder()
-        for pair in range(len(self._senders)):
-            missing = [
-                name
-                for name, topic in (
-                    ("plant", self._cost_topics[pair]),
-                    ("controller", self._model_topics[pair]),
-                )
-                if not self._node.count_publishers(topic)
-            ] + absent
-            self._guarded(partial(self._session.dispatcher.presence, pair, missing))
-        self._guarded(self._session.dispatcher.tick)
+        self._guarded(partial(self._participants.look, self._publishers()))
         missing, seconds = self._health.absent(now)
         if missing:
             self._log.warning(
                 f"waiting for {' and '.join(missing)} for {seconds:.0f} s",
                 throttle_duration_sec=ABSENCE_REPORT,
             )
-        self._report_pauses(now)
-        self._refuse_rival(now)
+        if told := self._participants.newly_paused(now):
+            self._log.info(told)
 
-    def _absent_recorder(self) -> list[str]:
-        """The recorder, as long as the first episode waits for it; fails if a required one is gone."""
-        if self._recording == "none" or (self._recorder_seen and self._recording == "start"):
-            return []
-        there = self._node.count_publishers(self._node.resolve_topic_name(RECORDER_STATUS)) > 0
-        if self._recorder_seen and not there:
-            self._fail(
-                "the recorder is gone, and this training is required to be recorded; "
-                "it can be continued from its folder with resume:=true"
-            )
-        self._recorder_seen |= there
-        return [] if self._recorder_seen else ["recorder"]
-
-    def _report_pauses(self, now: float) -> None:
-        paused = self._session.dispatcher.paused_pairs(now)
-        if paused != self._plants_paused:
-            self._plants_paused = paused
-            which = f" of pair {', '.join(map(str, paused))}" if len(self._pairs) > 1 else ""
-            self._log.info(f"the plant{which} is paused" if paused else "no plant is paused")
-
-    def _refuse_rival(self, now: float) -> None:
-        """Fail if another tuner publishes, unless a pair serves this one already and refuses it."""
-        topics = [senders[START.name].publisher.topic_name for senders in self._senders]
-        shared = [topic for topic in topics if self._node.count_publishers(topic) > 1]
-        rival = bool(shared) and not self._session.established
-        if self._rival.seconds(rival, now) > RIVAL_GRACE:
-            self._fail(
-                f"another tuner publishes {shared[0]}; "
-                "stop it, or start this one in another namespace or ROS domain"
-            )
+    def _publishers(self) -> Publishers:
+        count, resolve = self._node.count_publishers, self._node.resolve_topic_name
+        starts = [senders[START.name].publisher.topic_name for senders in self._senders]
+        return Publishers(
+            plants=[count(topic) for topic in self._costs],
+            controllers=[count(topic) for topic in self._models],
+            tuners={topic: count(topic) for topic in starts},
+            recorders=count(resolve(RECORDER_STATUS)),
+        )
 
     def _report(self, row: Mapping[str, Any]) -> None:
-        if self._recorder:
-            self._recorder.note(row)
+        if self._writer:
+            self._writer.note(row)
         for line in self._narration.lines(row):
             if row["event"] == "repeated":
                 self._log.warning(line)
             else:  # a call of its own: rclpy refuses another severity at the same place
                 self._log.info(line)
         if row["event"] == "adapted":  # hundreds a second of a small problem
-            known = self._narration
-            self._log.info(
-                f"  {known.done} of {known.budget} rollouts: {known.status}",
-                throttle_duration_sec=PROGRESS_PERIOD,
-            )
+            self._log.info(self._narration.progress, throttle_duration_sec=PROGRESS_PERIOD)
 
     def _controller(self) -> dict[str, Any]:
         """Who answered the states, and by which law as far as that was seen."""
         found = {
-            f"{there.node_namespace.rstrip('/')}/{there.node_name}"
+            full_name(there)
             for namespace in self._pairs
             for there in self._node.get_publishers_info_by_topic(
                 self._node.resolve_topic_name(scoped(namespace, ACTION.name))
@@ -344,9 +277,9 @@ class TunerNode:
         return {"nodes": sorted(found), "law": "affine" if seen else "not seen"}
 
     def _finish(self) -> int:
-        if self._recorder:
+        if self._writer:
             try:
-                summary = self._recorder.finish(
+                summary = self._writer.finish(
                     {
                         "transport": "topics",
                         "controller": self._controller(),

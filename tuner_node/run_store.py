@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import secrets
 import time
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.frames import MAX_ID
 from tuner_node import checkpoint
-from tuner_node.results import RunFolder
+from tuner_node.results import RunFolder, RunIdentity
 from tuner_node.training import Training
 
 CHECKPOINT_PERIOD = 1.0
@@ -87,3 +90,25 @@ class RunWriter:
         instead = "using an older checkpoint" if found else "beginning again from the start"
         for sentence in passed_over:
             self._warn(f"{sentence}; {instead}")
+
+
+def open_run(
+    values: Mapping[str, Any],
+    training: Training,
+    held: ExitStack,
+    warn: Callable[[str], None],
+) -> tuple[RunWriter | None, RunIdentity]:
+    """Begin the run in the folder `out` of the tuner's parameters, or go on with it (`resume`).
+
+    held: keeps the folder from other processes until it is closed. Without a folder nothing is kept.
+    """
+    if not values["out"]:
+        return None, RunIdentity(1 + secrets.randbelow(MAX_ID - 1), 0)
+    folder = RunFolder(Path(values["out"]))
+    if values["resume"]:
+        folder.parameters()
+    else:
+        folder.create(values)
+    held.enter_context(folder.held())
+    writer = RunWriter(folder.path, values, training, warn=warn)
+    return writer, writer.identity

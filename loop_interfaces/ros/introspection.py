@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
@@ -33,6 +34,11 @@ WORKING = 1.0
 """Seconds of one computation after which it is reported while it lasts."""
 NAMESAKE_GRACE = 6.0
 """Seconds a second node of our name may be seen before it counts: a killed one is seen for 3 s."""
+
+
+def full_name(endpoint: Any) -> str:
+    """The full name of the node that an endpoint in the ROS graph belongs to."""
+    return f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
 
 
 class Introspection:
@@ -157,10 +163,7 @@ class Introspection:
             if count < 2 and count == self._known.get(topic):
                 continue
             there = [
-                (
-                    f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}",
-                    endpoint.qos_profile,
-                )
+                (full_name(endpoint), endpoint.qos_profile)
                 for endpoint in self._node.get_publishers_info_by_topic(topic)
                 if endpoint.node_name != NAMELESS  # one that was just started again may be
             ]

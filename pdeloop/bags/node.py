@@ -17,6 +17,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from loop_interfaces.isolation import keep_on_this_machine
+from loop_interfaces.ros.introspection import full_name
 from loop_interfaces.ros.message_types import message_class
 from loop_interfaces.ros.node_main import ConfigurationError, ros_node
 from loop_interfaces.ros.observer import Observer
@@ -101,7 +102,7 @@ class PlayerNode:
         for topic in {channel.topic for channel in self._channels}.difference(everybodys):
             for info in self._node.get_publishers_info_by_topic(topic):
                 raise PlayerError(
-                    f"{info.node_namespace.rstrip('/')}/{info.node_name} publishes {topic} in this ROS "
+                    f"{full_name(info)} publishes {topic} in this ROS "
                     "domain; a bag is not played beside a live loop, which would take its messages for "
                     "its own. Stop that loop (what was killed is seen for 3 s more), or play in "
                     "another ROS_DOMAIN_ID"

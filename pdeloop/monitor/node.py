@@ -20,7 +20,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 
 from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.ros.introspection import NAMELESS
+from loop_interfaces.ros.introspection import NAMELESS, full_name
 from loop_interfaces.ros.node_main import ConfigurationError, ros_node
 from loop_interfaces.ros.observer import Observer
 from loop_interfaces.ros.parameters import RemoteParameters
@@ -148,7 +148,7 @@ class MonitorNode:
             for endpoint in self._node.get_publishers_info_by_topic(f"{prefix}/{topic}"):
                 if endpoint.node_name == NAMELESS:
                     continue
-                name = f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
+                name = full_name(endpoint)
                 process = bytes(endpoint.endpoint_gid)[:12]
                 by_role[role].append(Endpoint(name, process))
                 if role != "controller" and process not in self._asked:

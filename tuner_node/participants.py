@@ -1,0 +1,100 @@
+"""Who else is on the network, and what follows for a session. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from loop_interfaces.diagnostics import Lasting
+from tuner_node.dispatch import DispatchError, PairPublication
+from tuner_node.session import Session
+
+RIVAL_GRACE = 6.0
+"""Seconds a second tuner may be seen before it counts as one: a killed one is seen for 3 s."""
+
+
+@dataclass(frozen=True)
+class Publishers:
+    """How many publishers there are of the topics that tell who is there.
+
+    Attributes
+    ----------
+    plants, controllers : sequence of int
+        Of `episode/cost` and `model/identified`, by pair.
+    tuners : dict of str to int
+        Of each `episode/start`, this tuner's own among them.
+    recorders : int
+        Of `recorder/status`.
+    """
+
+    plants: Sequence[int]
+    controllers: Sequence[int]
+    tuners: Mapping[str, int]
+    recorders: int
+
+
+class Participants:
+    """Tells a session's dispatcher who is missing, and who should not be there.
+
+    Parameters
+    ----------
+    recorder : {"none", "start", "required"}
+        As the tuner's parameter of this name.
+    """
+
+    def __init__(self, session: Session, recorder: str) -> None:
+        self._session, self._recorder = session, recorder
+        self._recorder_seen = False
+        self._rival = Lasting()
+        self._paused: list[int] = []
+
+    def look(self, there: Publishers, now: float) -> list[PairPublication]:
+        """What is to be sent, now that these publishers are there (now: monotonic s).
+
+        Raises
+        ------
+        DispatchError
+            The recording is required and its recorder has gone, or another tuner publishes.
+        """
+        self._refuse_rival(there.tuners, now)
+        absent = ["recorder"] if self._awaits_recorder(there.recorders > 0) else []
+        publications = []
+        for pair, counts in enumerate(zip(there.plants, there.controllers, strict=True)):
+            roles = zip(("plant", "controller"), counts, strict=True)
+            missing = [role for role, count in roles if not count] + absent
+            publications += self._session.dispatcher.presence(pair, missing, now)
+        return publications + self._session.dispatcher.tick(now)
+
+    def newly_paused(self, now: float) -> str:
+        """That plants were paused or go on since the last call, in words; empty if neither is so."""
+        dispatcher = self._session.dispatcher
+        paused, before = dispatcher.paused_pairs(now), self._paused
+        if paused == before:
+            return ""
+        self._paused = paused
+        if not paused:
+            return "no plant is paused"
+        which = f" of pair {', '.join(map(str, paused))}" if len(dispatcher.pairs) > 1 else ""
+        return f"the plant{which} is paused"
+
+    def _awaits_recorder(self, there: bool) -> bool:
+        """Whether the first episode still waits for the recorder."""
+        if self._recorder == "none":
+            return False
+        if self._recorder == "required" and self._recorder_seen and not there:
+            raise DispatchError(
+                "the recorder is gone, and this training is required to be recorded; "
+                "it can be continued from its folder with resume:=true"
+            )
+        self._recorder_seen |= there
+        return not self._recorder_seen
+
+    def _refuse_rival(self, tuners: Mapping[str, int], now: float) -> None:
+        """DispatchError if another tuner publishes, unless a pair serves this one and refuses it."""
+        shared = [topic for topic, count in tuners.items() if count > 1]
+        rival = bool(shared) and not self._session.established
+        if self._rival.seconds(rival, now) > RIVAL_GRACE:
+            raise DispatchError(
+                f"another tuner publishes {shared[0]}; "
+                "stop it, or start this one in another namespace or ROS domain"
+            )
