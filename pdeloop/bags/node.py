@@ -42,18 +42,29 @@ class PlayerError(RuntimeError):
     """The bag is not played; the text says why and what to do."""
 
 
-def timed(messages: Iterable[Message], rate: float) -> Iterator[tuple[float, Message]]:
-    """Each message, and how many seconds after the first one it is due at `rate` times the speed."""
-    first: int | None = None
-    for message in messages:
-        first = message.when if first is None else first
-        yield (message.when - first) / 1e9 / rate, message
+def timed(
+    messages: Callable[[], Iterable[Message]], rate: float, again: bool = False
+) -> Iterator[tuple[float, Message]]:
+    """Each message, and when it is due: seconds after the first one, at `rate` times the speed.
+
+    again: begin anew at the end, for ever.
+    """
+    begun = 0.0
+    while True:
+        first, due = None, begun
+        for message in messages():
+            first = message.when if first is None else first
+            due = begun + (message.when - first) / 1e9 / rate
+            yield due, message
+        if first is None or not again:
+            return
+        begun = due
 
 
 class PlayerNode:
     """Publishes the messages of one bag, where no live loop would take them for its own."""
 
-    def __init__(self, node: Node, loop: Observer, bag: Bag, rate: float) -> None:
+    def __init__(self, node: Node, loop: Observer, bag: Bag, rate: float, again: bool) -> None:
         self._node, self._loop, self._channels = node, loop, bag.channels()
         self._publishers: dict[str, Publisher] = {}
         self.published = 0
@@ -61,7 +72,7 @@ class PlayerNode:
         for name, value in parameters.items():
             if name not in TRANSIENT and isinstance(value, str | bool | int | float):
                 node.declare_parameter(name, value, ParameterDescriptor(read_only=True))
-        self._messages = timed(bag.messages(), rate)
+        self._messages = timed(bag.messages, rate, again)
         self._next = next(self._messages, None)
         if self._next is None:
             raise BagError(f"{bag.path} holds no messages")
@@ -118,7 +129,9 @@ def _qos(channel: Channel) -> QoSProfile:
     )
 
 
-def play(path: Path, *, rate: float, network: bool, tell: Callable[[str], None]) -> int:
+def play(
+    path: Path, *, rate: float, again: bool, network: bool, tell: Callable[[str], None]
+) -> int:
     """Play the bag at `path` in a domain of its own or ROS_DOMAIN_ID; the exit code."""
     bag = Bag(path)
     if not network:
@@ -129,7 +142,7 @@ def play(path: Path, *, rate: float, network: bool, tell: Callable[[str], None])
         try:
             arguments = ["--ros-args", "--disable-external-lib-logs"]
             with ros_node(NAME, arguments, Observer) as (node, loop):
-                player = PlayerNode(node, loop, bag, rate)
+                player = PlayerNode(node, loop, bag, rate, again)
                 reason: str = loop.run()
         except ConfigurationError as error:
             raise PlayerError(str(error)) from error

@@ -69,6 +69,7 @@ def _add_play(actions: Commands) -> None:
     )
     play.add_argument("bag", type=Path, metavar="BAG", help="folder of a bag or of a run")
     play.add_argument("--rate", type=float, default=1.0, metavar="R", help="times as fast [1]")
+    play.add_argument("--loop", action="store_true", help="begin again at the end, until Ctrl-C")
     play.add_argument(
         "--network",
         action="store_true",
@@ -107,6 +108,7 @@ def _bag_play(options: argparse.Namespace) -> int:
     return play(
         options.bag,
         rate=options.rate,
+        again=options.loop,
         network=options.network,
         tell=lambda text: print(text, flush=True),
     )

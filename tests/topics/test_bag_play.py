@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import signal
 from pathlib import Path
@@ -84,9 +85,9 @@ def test_a_bag_is_not_played_beside_a_live_loop(loop, bag):
 
 
 def test_the_monitor_shows_a_bag_that_is_played(loop: Processes, tmp_path, bag):
-    rate = str(lasting(bag, 60.0))
+    rate = str(lasting(bag, 20.0))
     with without_domain(loop), browser(tmp_path) as page:
-        player = loop.pdeloop("bag", "play", str(bag), "--rate", rate)
+        player = loop.pdeloop("bag", "play", str(bag), "--loop", "--rate", rate)
         monitor = loop.pdeloop("monitor", "--port", "0")
         page.go(address(loop, monitor))
         page.until(f"{STATE} === 'running'", LIMIT)
@@ -131,5 +132,8 @@ def test_messages_are_due_in_the_recorded_time():
         Message("/state", "", when, b"") for when in (5_000_000_000, 4_000_000_000, 7_000_000_000)
     ]
     # A cost stands behind the samples that it is about, which came after it.
-    assert list(timed(messages, 4.0)) == list(zip((0.0, -0.25, 0.5), messages, strict=True))
-    assert list(timed([], 1.0)) == []
+    due = (0.0, -0.25, 0.5)
+    assert list(timed(lambda: messages, 4.0)) == list(zip(due, messages, strict=True))
+    twice = list(itertools.islice(timed(lambda: messages, 4.0, again=True), 6))
+    assert [when for when, _ in twice] == [*due, 0.5, 0.25, 1.0]
+    assert list(timed(list, 1.0, again=True)) == []
