@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pdeloop.cli import run
-from pdeloop.commands.common import DEFAULTS, Commands, add_json, command
+from pdeloop.commands.common import Commands, add_json, command
 from pdeloop.output import print_json
 
 
@@ -71,7 +71,7 @@ def parser() -> argparse.ArgumentParser:
     pairs.add_argument("--loss", type=float, default=0.01, help="share of lost messages [0.01]")
     pairs.add_argument("--delay", type=float, default=0.002, help="largest delay in s [0.002]")
     pairs.add_argument("--problem", default="burgers", metavar="PROBLEM", help="[burgers]")
-    _add_optimizers(programs)
+    _add_baselines(programs)
     optimum = _add(
         programs,
         "optimum",
@@ -171,53 +171,34 @@ def parser() -> argparse.ArgumentParser:
     return root
 
 
-def _add_optimizers(programs: Commands) -> None:
-    """The comparison of optimisers; its defaults are those of the program."""
+def _add_baselines(programs: Commands) -> None:
+    """The comparison of methods; its defaults are those of the program."""
     add = _add(
         programs,
-        "optimizers",
-        "what an optimiser reaches in so many rollouts",
-        "--problem allen-cahn --seeds 2",
+        "baselines",
+        "optimisers and methods of others at equal rollouts, with intervals over seeds",
+        "kdv --rollouts 20 --seeds 2",
     ).add_argument
-    add("--optimizer", choices=DEFAULTS["optimizer"].choices, help="[gauss_newton]")
-    add(
-        "--problem",
-        action="append",
-        metavar="PROBLEM",
-        help="a shipped problem or a YAML file, may be repeated [those of the paper]",
-    )
-    add("--seeds", type=int, metavar="N", help="number of seeds [6]")
-    add("--first-seed", type=int, metavar="S", help="the first seed [0]")
-    add("--rollouts", type=int, metavar="N", help="of the adaptation [80]")
-    add("--evaluation-seed", type=int, metavar="S", help="draws the held-out fields [2024]")
-    add("--evaluation-fields", type=int, metavar="N", help="held-out fields [10]")
-    add(
-        "--fresh-fields",
-        type=int,
-        metavar="N",
-        help="further fields on which the final policy must not diverge [0]",
-    )
-    add(
-        "--marks",
-        type=int,
-        nargs="+",
-        metavar="N",
-        help="rollouts after which to evaluate [a quarter and half of the budget]",
-    )
+    add("problem", metavar="PROBLEM", help="one of benchmarks/studies, or a YAML file like those")
+    add("--rollouts", type=int, nargs="+", metavar="N", help="budgets, in all [20 40 80]")
+    add("--seeds", type=int, metavar="N", help="number of seeds [the study's]")
+    add("--methods", nargs="+", metavar="NAME", help="only these [all of the file]")
     add(
         "--set",
-        action="append",
-        metavar="NAME=VALUE",
+        nargs="+",
+        metavar="NAME=JSON",
         dest="settings",
-        help="a parameter of the optimiser, as JSON",
+        help="parameters of the problem for all methods, like sensors=16",
     )
     add(
-        "--attempts",
-        type=int,
-        metavar="N",
-        help="identifications until one beats no control [as in a training]",
+        "--tune",
+        nargs="+",
+        metavar="NAME=JSON",
+        help="compare values of constants or parameters on the validation split, like sigma=[0.1,0.3]",
     )
-    add("--jobs", type=int, metavar="N", help="processes [1]")
+    add("--folder", type=Path, metavar="DIR", help="of the runs [runs/baselines-PROBLEM]")
+    add("--processes", type=int, metavar="N", help="trainings at the same time [one a core]")
+    add("--figure", type=Path, metavar="FILE", help="draw the costs against the rollouts")
 
 
 def _add(programs: Commands, name: str, text: str, example: str) -> argparse.ArgumentParser:

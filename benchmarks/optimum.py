@@ -30,10 +30,12 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from benchmarks.descent import WINDOW, Descent, descend
-from benchmarks.optimizers import warm_start
+from benchmarks.warm_start import warm_start
+from loop_interfaces.model_rows import unpack
 from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from pdeloop.gradients import Gradients, features
+from pdeloop.in_process import LocalPair
 from pdeloop.reference import FORMAT, bound_parameters, no_control_cost
 from pdeloop.reproduce.table import PAPER
 from tuner_node.results import RunFolderError, versions
@@ -94,8 +96,10 @@ def optimise_law(job: LawJob) -> dict[str, Any]:
         values = load_parameters(job.problem, {})
         gradients = Gradients(build_plant(values))
         plant = gradients.plant
-        policy, context = warm_start(plant, values, job.seed)
-        U, target, n_s = context.U, plant.target, context.U.shape[1]
+        training = warm_start({**values, "seed": job.seed}, LocalPair(values, plant))
+        assert training.models is not None
+        policy, U = training.starts()[0], unpack(training.models[0], plant.n_a).U
+        target, n_s = plant.target, U.shape[1]
         warm = np.column_stack([policy[:, :n_s], policy[:, n_s:] @ (U.T @ target)])
         fields = evaluation_seeds(TRAINING_SEED, job.fields)
         theta = np.zeros_like(warm) if job.from_zero else warm

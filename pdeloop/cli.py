@@ -23,6 +23,8 @@ _EXTRAS = {
     "shtab": "completion",
     "gymnasium": "gym",
     "distributed": "cluster",
+    "cmaes": "bench",
+    "osqp": "bench",
 }
 """Modules that only some commands need, and the extra that installs them."""
 _ROS = ("rclpy", "rcl_interfaces", "rosgraph_msgs", "rosidl_runtime_py", "builtin_interfaces")

@@ -10,6 +10,7 @@ from pde_sim_node.build import build_plant
 from pde_sim_node.equations import Burgers
 from pde_sim_node.plant import Plant
 from pde_sim_node.solver.adjoint import Adjoint
+from pdeloop.episode import projected_law, rollout
 from pdeloop.gradients import Gradients
 
 PROBLEMS = ("burgers", "allen-cahn", "kdv")
@@ -175,15 +176,12 @@ def test_gradients_of_whole_episodes_agree_with_finite_differences(problem):
 
 def test_the_law_of_a_policy_costs_what_the_controller_makes_it_cost():
     """theta = [K_a, K_b s_r] is the projected law that runs in the loop."""
-    from benchmarks.optimizers import run_rollouts
-    from tuner_node.optimizers import Rollout
-
     plant = plant_of("burgers", horizon=40)
     rng = np.random.default_rng(3)
     U = np.linalg.qr(rng.standard_normal((plant.n_z, 3)))[0]
     policy = 0.2 * rng.standard_normal((plant.n_a, 6))
     theta = np.column_stack([policy[:, :3], policy[:, 3:] @ (U.T @ plant.target)])
-    measured = [r.cost for r in run_rollouts(plant, U, [Rollout(policy, s) for s in (7, 8)])]
+    measured = rollout(plant, projected_law(plant, U, policy), [7, 8]).costs.mean
     np.testing.assert_allclose(Gradients(plant).law(U, theta, [7, 8]).costs, measured, rtol=1e-11)
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.optimizers import warm_start
+from benchmarks.warm_start import warm_start
 from loop_interfaces.problem import load_parameters
-from pde_sim_node.build import build_plant
+from pdeloop.in_process import LocalPair
 from tuner_node.optimizers.differential import DifferentialModel, fit_differential
 from tuner_node.optimizers.proposal import Proposer
 from tuner_node.optimizers.simulation import Loop, mismatch
@@ -58,8 +58,10 @@ def test_jacobians_are_derivatives_of_the_step_to_second_order_in_its_length(
 
 def test_burgers_is_recognised_and_simulated_where_fronts_cross_six_points_a_sample() -> None:
     values = load_parameters("burgers", {"optimizer": "gauss_newton"})
-    plant = build_plant(values)
-    policy, context = warm_start(plant, values, 0)
+    pair = LocalPair(values)
+    plant, training = pair.plant, warm_start(values, pair)
+    policy, context = training.starts()[0], training._context(0)
+    assert context is not None
     rollouts = [context.exploration, *(m.trajectory for m in context.measured)]
     z, after = (
         np.concatenate([r.states[part] for r in rollouts]) for part in (slice(-1), slice(1, None))

@@ -31,6 +31,9 @@ POLL = 0.1
 """Seconds between two calls of `tell`."""
 
 Progress = Callable[[int, int, str], None]
+Task = Callable[[Mapping[str, Any], Mapping[str, str] | None], dict[str, bytes]]
+"""(resolved parameters, expected environment) -> content of each file, result.json the last."""
+_NO_TASKS: Mapping[str, Task] = {}
 
 
 class Failure(NamedTuple):
@@ -75,6 +78,7 @@ def run(
     folder: Path,
     executor: Callable[[], AbstractContextManager[Executor]],
     *,
+    tasks: Mapping[str, Task] = _NO_TASKS,
     any_environment: bool = False,
     tell: Progress = lambda done, total, status: None,
 ) -> list[Failure]:
@@ -89,6 +93,9 @@ def run(
     executor : callable
         Makes the `concurrent.futures.Executor` that runs the trainings, as a context manager
         (`pdeloop.study.executors`); called again if an executor breaks.
+    tasks : dict of str to callable
+        What is carried out instead of a training, by the variant's name. A worker must be able to
+        import it, and its result.json have the entry `environment`.
     any_environment : bool
         Take results of workers with other versions or another processor, which may differ in the
         last bits; each result.json says which.
@@ -117,7 +124,10 @@ def run(
         try:
             with executor() as pool:
                 todo = {n: v for n, v in trainings.items() if n not in finished}
-                waiting = {pool.submit(train_one, v, expected): n for n, v in todo.items()}
+                waiting = {
+                    pool.submit(tasks.get(n.split("/")[1], train_one), v, expected): n
+                    for n, v in todo.items()
+                }
                 _collect(waiting, folder, finished, failures, len(trainings), tell)
             return failures
         except (BrokenExecutor, CancelledError) as error:

@@ -32,6 +32,19 @@ def environment() -> dict[str, str]:
     return {**known, "processor": str(llvmlite.binding.get_host_cpu_name())}
 
 
+def require_environment(expected: Mapping[str, str] | None) -> dict[str, str]:
+    """The `environment` of this process; EnvironmentMismatchError if another one is expected."""
+    here = environment()
+    if expected is not None and here != dict(expected):
+        other = [
+            f"{name} {here.get(name, 'missing')} instead of {expected.get(name, 'none')}"
+            for name in sorted({*here, *expected})
+            if here.get(name) != expected.get(name)
+        ]
+        raise EnvironmentMismatchError(f"a worker has {', '.join(other)}")
+    return here
+
+
 def train_one(
     parameters: Mapping[str, Any], expected: Mapping[str, str] | None = None
 ) -> dict[str, bytes]:
@@ -57,14 +70,7 @@ def train_one(
     ValueError, RuntimeError
         The training cannot be carried out.
     """
-    here = environment()
-    if expected is not None and here != dict(expected):
-        other = [
-            f"{name} {here.get(name, 'missing')} instead of {expected.get(name, 'none')}"
-            for name in sorted({*here, *expected})
-            if here.get(name) != expected.get(name)
-        ]
-        raise EnvironmentMismatchError(f"a worker has {', '.join(other)}")
+    here = require_environment(expected)
     with _ONE_AT_A_TIME, TemporaryDirectory(prefix="pdeloop-") as place:
         folder = RunFolder(Path(place) / "run")
         folder.create(parameters)

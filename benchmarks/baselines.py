@@ -1,0 +1,278 @@
+"""Methods at equal rollouts, one table a problem: `python -m benchmarks baselines PROBLEM`.
+
+benchmarks/studies/PROBLEM.yaml is a study of the project's optimisers, and names the methods of others
+(benchmarks/methods.py), which are further tasks of that study: it runs on all cores, and is interrupted
+and continued. A budget counts every rollout before the closing evaluation, explorations and checks
+among them.
+
+Initial fields are split by the seeds that draw them: a method learns from those of its training's seed,
+constants are chosen on the fields of `VALIDATION` after trainings of `TUNING_SEEDS`, and the tables are
+about the fields of `TEST` after other trainings.
+"""
+
+from __future__ import annotations
+
+import importlib
+import itertools
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import trim_mean
+
+from benchmarks.methods import LIBRARIES, METHODS, measure
+from loop_interfaces.files import read_json
+from loop_interfaces.parameters import table as parameters
+from loop_interfaces.problem import load_parameters
+from loop_interfaces.spec import read_document
+from pde_sim_node.plant import DIVERGED_COST
+from pdeloop.finished_run import CONFIDENCE, interval
+from pdeloop.reference import find
+from pdeloop.study import Study
+from pdeloop.study import run as carry_out
+from pdeloop.study.executors import processes as pool
+
+__all__ = ["run", "text"]
+
+Array = NDArray[np.float64]
+STUDIES = Path(__file__).parent / "studies"
+TEST, VALIDATION = 0, 2024
+"""Evaluation seeds, which draw the initial fields of the tables, and those that choose constants."""
+TUNING_SEEDS = (100, 101, 102, 103)
+BUDGETS = (20, 40, 80)
+
+
+def run(
+    problem: str = "burgers",
+    *,
+    rollouts: Sequence[int] = BUDGETS,
+    seeds: int | None = None,
+    methods: Sequence[str] = (),
+    settings: Sequence[str] = (),
+    tune: Sequence[str] = (),
+    folder: Path | None = None,
+    processes: int | None = None,
+    figure: Path | None = None,
+) -> dict[str, Any]:
+    """A row for each budget and method, the best first; the command line explains the parameters.
+
+    Raises
+    ------
+    ValueError
+        There is no such study or method, or a setting is not NAME=JSON.
+    """
+    path = Path(problem) if problem.endswith(".yaml") else STUDIES / f"{problem}.yaml"
+    if not path.is_file():
+        known = ", ".join(sorted(each.stem for each in STUDIES.glob("*.yaml")))
+        raise ValueError(f"no study {path}; expected one of {known}, or a YAML file like theirs")
+    content = read_document(path)
+    entries = {**content["variants"], **content.pop("methods", {})}
+    study = Study.of(content, path.parent)
+    unknown = sorted(set(methods) - set(entries))
+    if unknown:
+        raise ValueError(f"no method {', '.join(unknown)}; expected some of {', '.join(entries)}")
+    entries = {name: entries[name] for name in methods or entries}
+    for library in (LIBRARIES[name] for name in entries if name in LIBRARIES):
+        importlib.import_module(library)  # says what to install, before anything runs
+    study = replace(study, settings={**study.settings, "evaluation_seed": TEST, **pairs(settings)})
+    if seeds is not None:
+        study = replace(study, seeds=tuple(range(seeds)))
+    if tune:
+        entries = candidates(entries, pairs(tune))
+        settings_ = {**study.settings, "evaluation_seed": VALIDATION}
+        study = replace(study, seeds=TUNING_SEEDS, settings=settings_)
+    folder = folder or Path("runs") / f"baselines-{path.stem}{'-tuning' if tune else ''}"
+    rows: list[dict[str, Any]] = []
+    for budget in rollouts:
+        print(f"{budget} rollouts ...", file=sys.stderr, flush=True)
+        own, tasks = with_methods(study, entries, budget)
+        place = folder / str(budget)
+        refuse_other_constants(place, tasks)
+        failures = carry_out(own, place, partial(pool, processes), tasks=tasks)
+        for failure in failures:
+            print(f"failed: {failure.training}: {failure.reason}", file=sys.stderr)
+        rows += table(place / next(iter(study.problems)), budget)
+    result = {"problem": path.stem, "limit": limit(study), "rows": rows}
+    if figure is not None:
+        plot(result, figure)
+    return result
+
+
+def pairs(words: Sequence[str]) -> dict[str, Any]:
+    """What NAME=JSON words say."""
+    found = {}
+    for word in words:
+        name, _, value = word.partition("=")
+        try:
+            found[name] = json.loads(value)
+        except json.JSONDecodeError as error:
+            raise ValueError(
+                f"{word!r} is no setting; expected NAME=JSON like sigma=0.1"
+            ) from error
+    return found
+
+
+def candidates(
+    entries: Mapping[str, Mapping[str, Any]], grid: Mapping[str, Sequence[Any]]
+) -> dict[str, dict[str, Any]]:
+    """Every method with every combination of the values of `grid`, by a name that says which.
+
+    Examples
+    --------
+    >>> candidates({"mpc": {"gain": 0.0}}, {"steps": [5, 10]})
+    {'mpc+steps-5': {'gain': 0.0, 'steps': 5}, 'mpc+steps-10': {'gain': 0.0, 'steps': 10}}
+    """
+    found = {}
+    for name, table in entries.items():
+        for values in itertools.product(*grid.values()):
+            own = dict(zip(grid, values, strict=True))
+            label = "+".join([name, *(f"{key}-{value}" for key, value in own.items())])
+            found[label] = {**table, **own}
+    return found
+
+
+def with_methods(
+    study: Study, entries: Mapping[str, Mapping[str, Any]], budget: int
+) -> tuple[Study, dict[str, Any]]:
+    """The study with these variants at a budget, and the tasks of those that are no trainings."""
+    known = {spec.name for spec in parameters()}
+    variants, tasks = {}, {}
+    for label, table in entries.items():
+        variants[label] = {name: value for name, value in table.items() if name in known}
+        constants = {name: value for name, value in table.items() if name not in known}
+        method = label.partition("+")[0]
+        if method in METHODS:
+            tasks[label] = partial(measure, method, constants)
+        elif constants:
+            raise ValueError(f"{method} has no constants {', '.join(constants)}")
+    settings = {**study.settings, "rollouts": budget}
+    return replace(study, variants=variants, settings=settings), tasks
+
+
+def refuse_other_constants(folder: Path, tasks: Mapping[str, Any]) -> None:
+    """ValueError if a result in the folder is that of a method with other constants."""
+    for label, task in tasks.items():
+        for path in folder.glob(f"*/{label}/*/result.json"):
+            known, wanted = read_json(path)["constants"], task.args[1]
+            if known != wanted:
+                raise ValueError(
+                    f"{path} has constants {known}, not {wanted}; give another --folder"
+                )
+
+
+def iqm(values: Array, axis: int = -1) -> Any:
+    """The interquartile mean: of the middle half of the values.
+
+    Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice", NeurIPS
+    2021 (rliable), whose stratified bootstrap is the plain one over the seeds for a single problem.
+
+    Examples
+    --------
+    >>> float(iqm(np.array([0.0, 1.0, 3.0, 1e9])))
+    2.0
+    """
+    return trim_mean(values, 0.25, axis=axis)
+
+
+def table(folder: Path, budget: int) -> list[dict[str, Any]]:
+    """A row for each method that has results in DIR/METHOD/SEED, the best first."""
+    rows = []
+    for place in sorted(folder.iterdir()):
+        results = [read_json(path) for path in sorted(place.glob("*/result.json"))]
+        if not results:
+            continue
+        costs = np.array([result["costs_by_field"]["adapted"][0] for result in results])
+        means = costs.mean(axis=1)
+        rows.append(
+            {
+                "budget": budget,
+                "method": place.name,
+                "rollouts": int(max(result["rollouts"][0]["total"] for result in results)),
+                "seeds": len(results),
+                "cost": float(iqm(means)),
+                "interval": interval((means,), iqm),
+                "mean": float(means.mean()),
+                "worst": float(means.max()),
+                "diverged": int((costs >= DIVERGED_COST).any(axis=1).sum()),
+            }
+        )
+    return sorted(rows, key=lambda row: row["cost"])
+
+
+def limit(study: Study) -> float | None:
+    """The cost of the best inputs for each field, below which no controller comes; None: unknown."""
+    (file,) = study.problems.values()
+    own = {**study.settings, "identification": "dmdc", "identification_attempts": 10}
+    # Fewer sensors or weaker actuators do not lower it.
+    known = find(load_parameters(file, {**own, "sensors": 0, "action_limit": 0.0}))
+    return None if known is None else float(known.open_loop.mean())
+
+
+def text(result: Mapping[str, Any]) -> str:
+    """The rows as a Markdown table for each budget."""
+    bound, lines = result["limit"], []
+    for budget in dict.fromkeys(row["budget"] for row in result["rows"]):
+        lines += ["", f"**{result['problem']}, {budget} rollouts**", ""]
+        head = ["method", "rollouts", "seeds", "cost", f"{100 * CONFIDENCE:.0f} % interval", "mean"]
+        lines.append(f"| {' | '.join([*head, 'worst seed', 'over the limit', 'diverged'])} |")
+        lines.append("|---" * 9 + "|")
+        for row in (row for row in result["rows"] if row["budget"] == budget):
+            between = " to ".join(number(end) for end in row["interval"] or ()) or "-"
+            over = "-" if bound is None else f"{100 * (row['cost'] / bound - 1):.1f} %"
+            shown = [row["method"], row["rollouts"], row["seeds"], number(row["cost"]), between]
+            shown += [
+                number(row["mean"]),
+                number(row["worst"]),
+                over if finished(row["cost"]) else "-",
+                row["diverged"],
+            ]
+            lines.append(f"| {' | '.join(map(str, shown))} |")
+        if bound is not None:
+            lines.append(f"| any controller (limit) | | | {bound:.4g} | | | | 0.0 % | |")
+    return "\n".join(lines[1:])
+
+
+def number(value: float) -> str:
+    """A cost, or that the rollouts diverged."""
+    return f"{value:.4g}" if finished(value) else "diverged"
+
+
+def finished(cost: float) -> bool:
+    """Whether no rollout that diverged counts in a mean cost."""
+    return cost < 1e-3 * DIVERGED_COST
+
+
+def plot(result: Mapping[str, Any], path: Path) -> None:
+    """Cost against rollouts, with the intervals, as a picture; methods without adaptation are lines."""
+    from matplotlib import rc_context
+
+    from pdeloop.report.style import STYLE, panels, plain_log
+
+    with rc_context(STYLE):
+        figure, (ax,) = panels(1, 3.4, 4.6, 4.6)
+        shown = [row for row in result["rows"] if finished(row["cost"])]
+        for number_, method in enumerate(dict.fromkeys(row["method"] for row in shown)):
+            own = [row for row in shown if row["method"] == method]
+            x, y = [row["budget"] for row in own], [row["cost"] for row in own]
+            ends = np.array([row["interval"] or (row["cost"],) * 2 for row in own]).T
+            marker = "osD^vPX*<>"[number_ % 10]
+            ax.plot(x, y, marker=marker, ms=4, lw=1, color=f"C{number_ % 10}", label=method)
+            ax.fill_between(x, *ends, color=f"C{number_ % 10}", alpha=0.15, lw=0)
+        if result["limit"] is not None:
+            ax.axhline(result["limit"], color="0.4", ls="--", lw=1, label="limit of any controller")
+        low, high = ax.get_ylim()
+        plain_log(ax, high / max(low, 1e-9))
+        ax.set_xscale("log", base=2)
+        ticks = sorted({row["budget"] for row in shown})
+        ax.set_xticks(ticks, [str(tick) for tick in ticks])
+        ax.set_xlabel("rollouts")
+        ax.set_ylabel("mean stage cost, test fields")
+        ax.set_title(result["problem"])
+        ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+        figure.savefig(path, bbox_inches="tight")

@@ -1,0 +1,35 @@
+"""The beginning of a training, which every method has and pays for: exploration, model, check."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pdeloop.in_process import LocalPair
+from tuner_node.build import build_training
+from tuner_node.training import Training
+
+
+def warm_start(values: Mapping[str, Any], pair: LocalPair) -> Training:
+    """A training of one seed that is about to adapt, with the trajectories that it has measured.
+
+    Parameters
+    ----------
+    values
+        Resolved parameters.
+    pair
+        Runs the rollouts, and has the training's model afterwards.
+
+    Returns
+    -------
+    Training
+        `starts()[0]` is the law it begins with, `models[0]` the reduced model, `explorations[0]` and
+        `measured[0]` are trajectories, and `budget.paid[0]` is what they cost.
+    """
+    training = build_training({**values, "optimizer": "gauss_newton", "seeds": 1})
+    while training.phase in ("identify", "check"):
+        batch = training.next_batch()
+        assert batch is not None
+        training.finish(pair.run(batch))
+        pair.follow(training)
+    return training
