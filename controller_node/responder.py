@@ -26,10 +26,10 @@ from loop_interfaces.topics import (
     COMPLETED,
     MAX_GAIN,
     MODEL_IDENTIFIED,
-    START_COLUMNS,
     VOID,
     CostColumn,
     StartColumn,
+    start_rows,
 )
 
 MAX_KEPT = 8
@@ -140,22 +140,10 @@ class Responder:
 
     def start(self, frame: Frame) -> Sequence[Publication | ModelFailure]:
         """Learn of an episode: who explores, which model each environment uses."""
-        rows = frame.values
-        if rows.shape[1] not in (START_COLUMNS, len(StartColumn)):
-            raise FrameError(
-                f"expected rows of {START_COLUMNS} numbers, or one more, got {rows.shape[1]}"
-            )
+        rows = start_rows(frame)
         if not len(rows):
             self._runs.pop(frame.run, None)
             return []
-        exploring = rows[:, StartColumn.EXCITATION] >= 0
-        if exploring.any() and not exploring.all():
-            raise FrameError("expected all environments of an episode to explore, or none")
-        whole = rows[:, [StartColumn.EXCITATION, StartColumn.MODEL]]
-        if (rows[:, StartColumn.MODEL] < 0).any() or (whole != np.floor(whole)).any():
-            raise FrameError("expected seeds and model indices that are whole numbers")
-        if (rows[:, StartColumn.VARIANCE] < 0).any():
-            raise FrameError("expected exploration variances of at least 0")
         run = self._run(frame.run, rows.nbytes)
         if run.episode_start(frame) is None:
             run.begin(replace(frame, values=rows.copy()))

@@ -12,6 +12,8 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.frames import Frame, FrameError
+
 
 @dataclass(frozen=True)
 class Topic:
@@ -43,6 +45,40 @@ class StartColumn(IntEnum):
 
 START_COLUMNS = 4
 """Columns of every `episode/start`; with noise there is one more."""
+
+
+_WHOLE_NUMBERS = {
+    StartColumn.SEED: ("seeds", -1),
+    StartColumn.EXCITATION: ("excitation seeds", -1),
+    StartColumn.MODEL: ("model indices", 0),
+    StartColumn.NOISE: ("noise seeds", 0),
+}
+"""What is in these columns, and its least value."""
+
+
+def start_rows(frame: Frame) -> NDArray[np.float64]:
+    """The rows of an `episode/start`, (M, 4) or (M, 5); none at the end of a run.
+
+    Raises
+    ------
+    FrameError
+        They are not as StartColumn says, or some environments of the episode explore and others do not.
+    """
+    rows = frame.values
+    if rows.shape[1] not in (START_COLUMNS, len(StartColumn)):
+        raise FrameError(
+            f"expected rows of {START_COLUMNS} numbers (seed, excitation, variance, model), "
+            f"or one more (noise), got {rows.shape[1]}"
+        )
+    for column, (what, least) in _WHOLE_NUMBERS.items():
+        numbers = rows[:, column : column + 1]  # empty where there is no such column
+        if (numbers < least).any() or (numbers != np.floor(numbers)).any():
+            raise FrameError(f"expected {what} that are whole numbers of at least {least}")
+    if (rows[:, StartColumn.VARIANCE] < 0).any():
+        raise FrameError("expected exploration variances of at least 0")
+    if len(set(rows[:, StartColumn.EXCITATION] >= 0)) > 1:
+        raise FrameError("expected all environments of an episode to explore, or none")
+    return rows
 
 
 def noise_seeds(rows: NDArray[np.float64]) -> NDArray[np.int64] | None:

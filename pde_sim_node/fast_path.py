@@ -139,9 +139,9 @@ class PlantFastPath(FastPath):
         if self._log.shape[1] != plant.actions.size:
             self._log = np.zeros((max(LOG // plant.actions.size, 1), plant.actions.size))
         plan["values"], plan["log"] = state.values.size, self._log.ctypes.data
-        plan["steps"], plan["limit"] = 0, min(lockstep.horizon - lockstep.step, len(self._log))
+        plan["steps"], plan["limit"] = 0, min(plant.horizon - plant.step_index, len(self._log))
         plan["signature"] = signature
-        plan["time"], plan["sample_time"] = lockstep.time, lockstep.sample_time
+        plan["time"], plan["sample_time"] = lockstep.time, plant.sample_time
         plan["timed"] = self._batcher.timed
         plan["begin"], plan["length"] = self.answer.begin, len(self.answer.raw)
         self._batcher.lend(plan["batches"], 2 * SAMPLE_HEADER + sum(self._lengths))

@@ -32,7 +32,7 @@ from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.diagnostics import PlantHealth
 from pde_sim_node.equations import configured_equation
 from pde_sim_node.fast_path import PlantFastPath, load_compiled
-from pde_sim_node.lockstep import Lockstep
+from pde_sim_node.lockstep import Lockstep, Timing
 from pde_sim_node.pause_record import PauseRecord
 from pde_sim_node.plant import Plant
 from pde_sim_node.solver.workers import use_cores
@@ -77,12 +77,8 @@ class PlantNode:
         self._pause_record = PauseRecord(node.get_fully_qualified_name(), domain)
         self._lockstep = Lockstep(
             plant,
+            Timing(**{spec.name: values[spec.name] for spec in PLANT if spec.live}),
             fingerprint=fingerprint(values),
-            sample_time=values["sample_time"],
-            action_timeout=values["action_timeout"],
-            max_repeats=values["max_repeats"],
-            run_hold=values["run_hold"],
-            real_time_factor=values["real_time_factor"],
             paused_run=self._pause_record.run,
         )
         self._health = PlantHealth(self._lockstep)
@@ -165,7 +161,7 @@ class PlantNode:
     def _adjust(self, values: dict[str, Any]) -> None:
         self._report_pace()
         self._changed = values
-        self._send(self._lockstep.adjust(self._loop.now(), **values))
+        self._send(self._lockstep.adjust(self._loop.now(), Timing(**values)))
         self._paced = self._lockstep.pacer is not None
 
     def _on_start(self, frame: Frame) -> None:

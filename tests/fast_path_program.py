@@ -198,7 +198,7 @@ def plant_on_topics(*, timed: bool = False, helped: bool = False, **overrides: o
         ]
 
         # Up to the last state, never its answer.
-        while plant.lockstep.step < plant.lockstep.horizon:
+        while plant.lockstep.step < plant.lockstep.plant.horizon:
             peer.say(next_action())
             assert answer_for(path) is None
         peer.say(last := plant.action(state))

@@ -22,6 +22,7 @@ from loop_interfaces.ros.endpoints import writer_qos
 from loop_interfaces.ros.introspection import Introspection
 from loop_interfaces.topics import COST, STATE, TARGET, VOID
 from pde_sim_node.diagnostics import PlantHealth
+from pde_sim_node.lockstep import Timing
 from recorder_node.diagnostics import RecorderHealth
 from recorder_node.recording import Recording
 from recorder_node.sources import sources
@@ -115,7 +116,7 @@ def test_a_plant_is_ready_runs_is_overdue_is_paused_and_is_void():
     assert (paused.level, paused.message) == (Level.WARN, "paused at step 10 of episode 1")
     protocol.resume(3.0)
     slow = plant_protocol()
-    slow.adjust(0.0, action_timeout=1.0, max_repeats=3, run_hold=10.0, real_time_factor=0.0)
+    slow.adjust(0.0, Timing(action_timeout=1.0, max_repeats=3, run_hold=10.0))
     slow.start(start(1), 0.0)
     slow_health = PlantHealth(slow)
     for now in (1.1, 2.2, 3.3):
@@ -151,7 +152,9 @@ def test_a_plant_tells_the_cost_of_the_environments_that_completed():
 
 def test_states_that_are_late_for_real_time_are_a_warning_once():
     protocol = plant_protocol()
-    protocol.adjust(0.0, action_timeout=0.5, max_repeats=3, run_hold=10.0, real_time_factor=1.0)
+    protocol.adjust(
+        0.0, Timing(action_timeout=0.5, max_repeats=3, run_hold=10.0, real_time_factor=1.0)
+    )
     health = PlantHealth(protocol)
     (send,) = protocol.start(start(1), 0.0)
     protocol.action(answer(send.frame), 0.3)  # due at 0.05

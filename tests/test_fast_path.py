@@ -281,7 +281,7 @@ def test_a_plant_goes_on_with_the_same_bytes(overrides: dict, at_once: int) -> N
                 assert plant.sent.encode(last) == found
         assert topic is COST
         # All but the last, and the first from a peer that has not sent such an action before.
-        assert taken == plant.lockstep.horizon - (episode in (1, 7))
+        assert taken == plant.lockstep.plant.horizon - (episode in (1, 7))
     assert plant.lockstep.counters == plant.judge.counters
     assert (plant.lockstep.steps_total, plant.lockstep.rounds_total, plant.lockstep.time) == (
         plant.judge.steps_total,

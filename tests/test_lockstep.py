@@ -10,7 +10,7 @@ import pytest
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.topics import COMPLETED, COST, PAUSED, STATE, VOID, CostColumn
 from pde_sim_node.build import build_plant
-from pde_sim_node.lockstep import Lockstep
+from pde_sim_node.lockstep import Lockstep, Timing
 from pde_sim_node.pause_record import PauseRecord
 from tests.small import parameters
 
@@ -23,11 +23,8 @@ def plant_protocol(paused_run: int = 0, **overrides) -> Lockstep:
     values = parameters(**overrides)
     return Lockstep(
         build_plant(values),
+        Timing(action_timeout=0.1, max_repeats=3, run_hold=10.0),
         fingerprint=PLANT,
-        sample_time=0.05,
-        action_timeout=0.1,
-        max_repeats=3,
-        run_hold=10.0,
         paused_run=paused_run,
     )
 
@@ -342,7 +339,7 @@ def test_pace_and_times_may_change_within_an_episode_and_change_no_number():
 
     def change(protocol, state, now):
         if state.step in factors:
-            return protocol.adjust(now, **times, real_time_factor=factors[state.step])
+            return protocol.adjust(now, Timing(**times, real_time_factor=factors[state.step]))
         return []
 
     protocol = plant_protocol()
@@ -353,7 +350,9 @@ def test_pace_and_times_may_change_within_an_episode_and_change_no_number():
 def test_a_pause_moves_the_instants_of_a_paced_plant():
     quiet = run_episode(plant_protocol(), 1)
     protocol = plant_protocol()
-    protocol.adjust(0.0, action_timeout=0.1, max_repeats=3, run_hold=10.0, real_time_factor=1.0)
+    protocol.adjust(
+        0.0, Timing(action_timeout=0.1, max_repeats=3, run_hold=10.0, real_time_factor=1.0)
+    )
 
     def change(protocol, state, now):
         if state.step == 10:

@@ -13,7 +13,7 @@ from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.topics import StartColumn
 from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.equations import Equation
-from pde_sim_node.lockstep import Lockstep
+from pde_sim_node.lockstep import Lockstep, Timing
 from pde_sim_node.measurement import (
     InstrumentedPlant,
     Instruments,
@@ -295,10 +295,7 @@ def test_every_option_makes_another_plant(options: dict[str, Any]) -> None:
 def test_a_start_may_carry_seeds_of_the_noise() -> None:
     protocol = Lockstep(
         build_plant(parameters(measurement_noise=0.1)),
-        sample_time=0.05,
-        action_timeout=0.1,
-        max_repeats=3,
-        run_hold=10.0,
+        Timing(action_timeout=0.1, max_repeats=3, run_hold=10.0),
     )
 
     def start(episode: int, *noise: float) -> Frame:

@@ -8,7 +8,7 @@ import pytest
 from loop_interfaces.frames import Frame
 from loop_interfaces.topics import STATE
 from pde_sim_node.build import build_plant
-from pde_sim_node.lockstep import Lockstep
+from pde_sim_node.lockstep import Lockstep, Timing
 from pde_sim_node.real_time import RealTimePacer
 from tests.small import parameters, same_bits
 
@@ -60,11 +60,7 @@ def test_a_paced_plant_sends_each_state_at_its_instant_and_steps_before_it() -> 
     plant = build_plant(values)
     lockstep = Lockstep(
         plant,
-        sample_time=values["sample_time"],
-        action_timeout=0.05,
-        max_repeats=3,
-        run_hold=10.0,
-        real_time_factor=0.5,
+        Timing(action_timeout=0.05, max_repeats=3, run_hold=10.0, real_time_factor=0.5),
     )
     rows = np.array([[3.0, -1.0, 0.0, 0.0]])
     (first,) = lockstep.start(Frame(5, 1, 0, 0.0, rows), 1.0)
@@ -94,11 +90,7 @@ def test_the_end_of_a_run_drops_a_state_that_waits_for_its_instant() -> None:
     values = parameters()
     lockstep = Lockstep(
         build_plant(values),
-        sample_time=values["sample_time"],
-        action_timeout=0.05,
-        max_repeats=3,
-        run_hold=10.0,
-        real_time_factor=1.0,
+        Timing(action_timeout=0.05, max_repeats=3, run_hold=10.0, real_time_factor=1.0),
     )
     rows = np.array([[3.0, -1.0, 0.0, 0.0]])
     lockstep.start(Frame(5, 1, 0, 0.0, rows), 1.0)

@@ -28,7 +28,7 @@ from loop_interfaces.topics import (
     Topic,
 )
 from pde_sim_node.build import build_plant, fingerprint
-from pde_sim_node.lockstep import Lockstep
+from pde_sim_node.lockstep import Lockstep, Timing
 from tests.simulation.plan import PROCESSES, Fault, Plan
 from tests.small import parameters
 from tuner_node.build import build_training
@@ -96,11 +96,8 @@ class PlantProcess(Process):
         given = history.values
         self.lockstep = Lockstep(
             build_plant(given),
+            Timing(action_timeout=0.05, max_repeats=100, run_hold=5.0),
             fingerprint=fingerprint(given),
-            sample_time=given["sample_time"],
-            action_timeout=0.05,
-            max_repeats=100,
-            run_hold=5.0,
             paused_run=history.disk.get("pause", 0),
         )
         self._samples: list[tuple[Topic, bytes]] = []
