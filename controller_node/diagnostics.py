@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from controller_node.responder import Responder
-from loop_interfaces.diagnostics import Health, Lasting, Level, Rate
+from loop_interfaces.diagnostics import ConditionTimer, Level, Rate, Status
 
 SILENT = 5.0
 """Seconds without a state, within an episode, after which what is known of the plant is old."""
@@ -11,7 +11,7 @@ WAITING = 2.0
 """Seconds that a state may wait for what its answer needs, before somebody should look."""
 
 
-class ControllerHealth:
+class ControllerDiagnostics:
     """Reports on a responder, from one call to the next."""
 
     def __init__(self, responder: Responder) -> None:
@@ -19,7 +19,7 @@ class ControllerHealth:
         self._answers = Rate()
         self._answered = 0
         self._heard = float("-inf")
-        self._waiting = Lasting()
+        self._waiting = ConditionTimer()
         self.plant_paused = False
         """What the plant said on `episode/paused`."""
         self.plants: int | None = None
@@ -30,13 +30,13 @@ class ControllerHealth:
         lacking = self._responder.waits_for()
         return lacking if self._waiting.seconds(bool(lacking), now) > WAITING else []
 
-    def report(self, now: float) -> Health:
+    def report(self, now: float) -> Status:
         """Level, sentence and values at time `now` (monotonic s)."""
         responder = self._responder
         if responder.answered != self._answered or self._heard == float("-inf"):
             self._answered, self._heard = responder.answered, now
         level, message = self._state(now)
-        return Health(
+        return Status(
             level,
             message,
             {

@@ -15,11 +15,11 @@ from functools import partial
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from controller_node.diagnostics import ControllerHealth
+from controller_node.diagnostics import ControllerDiagnostics
 from controller_node.fast_path import ControllerFastPath, load_compiled
 from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
-from loop_interfaces.diagnostics import Health
+from loop_interfaces.diagnostics import Status
 from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.parameters import model_order, taken_by
@@ -54,7 +54,7 @@ class ControllerNode:
         loop.pin(values["pin"])
         responder = Responder(DesignSettings(**settings))
         self._responder = responder
-        self._health = ControllerHealth(responder)
+        self._diagnostics = ControllerDiagnostics(responder)
         load_compiled()  # before there is a publisher: who sees one expects answers
         self._wire(node, loop)
         order = model_order(values) or "suggested by the data"
@@ -101,12 +101,14 @@ class ControllerNode:
                     f"no reduced model: {send.reason}", throttle_duration_sec=1.0
                 )
 
-    def _report(self, now: float) -> Health:
-        self._health.plants = self._node.count_publishers(self._node.resolve_topic_name(STATE.name))
-        return self._health.report(now)
+    def _report(self, now: float) -> Status:
+        self._diagnostics.plants = self._node.count_publishers(
+            self._node.resolve_topic_name(STATE.name)
+        )
+        return self._diagnostics.report(now)
 
     def _on_paused(self, frame: Frame) -> None:
-        self._health.plant_paused = bool(frame.values.any())
+        self._diagnostics.plant_paused = bool(frame.values.any())
 
     def run(self) -> int:
         self._loop.run(
@@ -115,7 +117,7 @@ class ControllerNode:
         return 0
 
     def _housekeeping(self, now: float) -> None:
-        if lacking := self._health.waiting(now):
+        if lacking := self._diagnostics.waiting(now):
             self._node.get_logger().warning(
                 f"a state waits for its action until there is: {', '.join(lacking)}",
                 throttle_duration_sec=5.0,

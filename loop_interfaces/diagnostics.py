@@ -1,4 +1,4 @@
-"""What a node tells of itself on /diagnostics: a level, a sentence, named values. No ROS import.
+"""What a node reports on /diagnostics: a level, a sentence, named values. No ROS import.
 
 Levels as in diagnostic_msgs/DiagnosticStatus: OK; WARN, somebody should look (a message was
 refused, an operator holds the node, a neighbour is missing); ERROR, the node cannot do its work; STALE,
@@ -22,35 +22,35 @@ class Level(IntEnum):
 
 
 @dataclass
-class Health:
-    """One report. values: what an operator asks, by name, in the order of showing."""
+class Status:
+    """One report, as in diagnostic_msgs/DiagnosticStatus; values: by name, in the order of showing."""
 
     level: Level
     message: str
     values: Mapping[str, object] = field(default_factory=dict)
 
-    def worsened(self, level: Level, message: str) -> Health:
-        """The same with one thing more to say."""
+    def merged(self, level: Level, message: str) -> Status:
+        """With another level and message; the worse level counts."""
         if self.level is Level.OK:
-            return Health(level, message, self.values)
-        return Health(max(self.level, level), f"{self.message}; {message}", self.values)
+            return Status(level, message, self.values)
+        return Status(max(self.level, level), f"{self.message}; {message}", self.values)
 
     def texts(self) -> list[tuple[str, str]]:
         """Names and values as text: numbers with six digits, yes and no, nothing for None."""
         return [(name, _text(value)) for name, value in self.values.items()]
 
 
-class Lasting:
-    """How long a condition has held, from one look at it to the next."""
+class ConditionTimer:
+    """How long a condition has been true, from one check to the next."""
 
     def __init__(self) -> None:
         self._since: float | None = None
 
     def seconds(self, holds: bool, now: float) -> float:
-        """Seconds since the look that first saw it hold; 0 where it does not.
+        """Seconds since the check that first found it true; 0 where it is not.
 
-        >>> lasting = Lasting()
-        >>> [lasting.seconds(holds, now) for holds, now in ((True, 1.0), (True, 3.5), (False, 4.0))]
+        >>> timer = ConditionTimer()
+        >>> [timer.seconds(holds, now) for holds, now in ((True, 1.0), (True, 3.5), (False, 4.0))]
         [0.0, 2.5, 0.0]
         """
         if not holds:
@@ -61,7 +61,7 @@ class Lasting:
 
 
 class Rate:
-    """How fast a counter grows, from one look at it to the next."""
+    """How fast a counter grows, from one check to the next."""
 
     def __init__(self) -> None:
         self._count = 0

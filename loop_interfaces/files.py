@@ -103,14 +103,14 @@ def is_private(path: Path) -> bool:
     return stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid()
 
 
-def open_own(path: Path, flags: int, mode: int = 0o666) -> BinaryIO:
+def open_own(path: Path, flags: int) -> BinaryIO:
     """Open or make a file for reading and writing. OSError if it is a link, or no ordinary file.
 
     flags: further ones of os.open, for instance os.O_APPEND.
     """
     flags |= os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     try:
-        descriptor = os.open(path, flags, mode)
+        descriptor = os.open(path, flags, 0o666)
     except OSError as error:
         if error.errno == errno.ELOOP:
             raise OSError(errno.ELOOP, "it is a symbolic link", str(path)) from error

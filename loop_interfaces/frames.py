@@ -59,10 +59,6 @@ class Frame:
     values: NDArray[np.float64]
     plant: int = 0
 
-    def digest(self) -> int:
-        """See `digest`."""
-        return digest(self.values)
-
 
 def digest(values: NDArray[np.float64]) -> int:
     """A number that tells other values from these, in this process."""

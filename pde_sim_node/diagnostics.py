@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from loop_interfaces.diagnostics import Health, Level, Rate
+from loop_interfaces.diagnostics import Level, Rate, Status
 from loop_interfaces.topics import VOID, CostColumn
 from pde_sim_node.lockstep import Lockstep
 
 
-class PlantHealth:
+class PlantDiagnostics:
     """Reports on a lock-step protocol, from one call to the next."""
 
     def __init__(self, lockstep: Lockstep) -> None:
@@ -17,7 +17,7 @@ class PlantHealth:
         self._rounds, self._steps = Rate(), Rate()
         self._missed = 0
 
-    def report(self, now: float) -> Health:
+    def report(self, now: float) -> Status:
         """Level, sentence and values at time `now` (monotonic s)."""
         lockstep = self._lockstep
         level, message = self._state()
@@ -28,7 +28,7 @@ class PlantHealth:
             level = Level.WARN
             message += f"; {pacer.missed - self._missed} states too late for real time"
         self._missed = pacer.missed if pacer else 0
-        return Health(
+        return Status(
             level,
             message,
             {

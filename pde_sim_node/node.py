@@ -29,7 +29,7 @@ from loop_interfaces.samples import ACTION_KIND, clock_message
 from loop_interfaces.spec import Spec
 from loop_interfaces.topics import ACTION, COST, PAUSED, START, STATE, TARGET
 from pde_sim_node.build import build_plant, fingerprint
-from pde_sim_node.diagnostics import PlantHealth
+from pde_sim_node.diagnostics import PlantDiagnostics
 from pde_sim_node.equations import configured_equation
 from pde_sim_node.fast_path import PlantFastPath, load_compiled
 from pde_sim_node.lockstep import Lockstep, Timing
@@ -81,7 +81,7 @@ class PlantNode:
             fingerprint=fingerprint(values),
             paused_run=self._pause_record.run,
         )
-        self._health = PlantHealth(self._lockstep)
+        self._diagnostics = PlantDiagnostics(self._lockstep)
         self._paced = self._lockstep.pacer is not None
         self._changed: dict[str, Any] = {}
         self._wire(node, loop, publish_clock=values["publish_clock"])
@@ -112,7 +112,7 @@ class PlantNode:
         if type(self._lockstep.plant) is Plant:
             self._fast_path = PlantFastPath(self._lockstep, actions.codec, self._batcher)
             loop.answer_fast(actions, self._senders[STATE], self._fast_path)
-        loop.introspection.report("lock-step", self._health.report)
+        loop.introspection.report("lock-step", self._diagnostics.report)
         loop.introspection.offer("~/pause", self._pause)
         loop.introspection.offer("~/resume", self._resume)
         loop.introspection.offer("~/step", self._step)
@@ -199,9 +199,9 @@ class PlantNode:
             if send.topic is COST:
                 self._batcher.flush()  # after it: most who wait for the cost need no samples
             if self._clock_wanted and send.topic is STATE:
-                self._tell_time(send.frame.time)
+                self._publish_clock(send.frame.time)
 
-    def _tell_time(self, simulated: float) -> None:
+    def _publish_clock(self, simulated: float) -> None:
         raw = clock_message(simulated)
         if raw is not None and self._clock is not None:
             self._clock.publish(raw)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from loop_interfaces.diagnostics import Health, Level, Rate
+from loop_interfaces.diagnostics import Level, Rate, Status
 from recorder_node.recording import Recording
 
 
-class RecorderHealth:
+class RecorderDiagnostics:
     """Reports on a recording, from one call to the next."""
 
     def __init__(self, recording: Recording) -> None:
@@ -14,7 +14,7 @@ class RecorderHealth:
         self._messages = Rate()
         self._incomplete = 0
 
-    def report(self, now: float, matched: bool) -> Health:
+    def report(self, now: float, matched: bool) -> Status:
         """Level, sentence and values at time `now` (monotonic s).
 
         matched: whether every publisher of the loop knows of the recorder, so that nothing is missed.
@@ -27,7 +27,7 @@ class RecorderHealth:
             new = recording.incomplete - self._incomplete
             level, message = Level.WARN, f"recording; {new} more episode(s) are incomplete"
         self._incomplete = recording.incomplete
-        return Health(
+        return Status(
             level,
             message,
             {

@@ -33,7 +33,7 @@ from loop_interfaces.ros.sample_subscription import SampleSubscription, Serializ
 from loop_interfaces.samples import ACTION_KIND, CLOCK_KIND, STATE_KIND
 from loop_interfaces.topics import ACTION, RECORDER_STATUS, START, STATE
 from recorder_node.bag import BagError
-from recorder_node.diagnostics import RecorderHealth
+from recorder_node.diagnostics import RecorderDiagnostics
 from recorder_node.peers import Peers
 from recorder_node.recording import Recording
 from recorder_node.sources import CLOCK, DIAGNOSTICS, ROSOUT, Source, sources, views
@@ -77,7 +77,7 @@ class RecorderNode:
             self._sources += [source for name in self._namespaces for source in views(name)]
         folder = str(values["bag"]) or time.strftime("bags/%Y%m%d-%H%M%S")
         self._recording = Recording(Path(folder), self._sources)
-        self._health = RecorderHealth(self._recording)
+        self._diagnostics = RecorderDiagnostics(self._recording)
         self._until = 0
         """Everything that arrived by then (ns since the epoch) was recorded."""
         self._batch_at = self._index_at = self._report_at = 0.0
@@ -107,7 +107,7 @@ class RecorderNode:
         )
         self._status: Publisher | None = None
         loop.introspection.report(
-            "recording", lambda now: self._health.report(now, self._status is not None)
+            "recording", lambda now: self._diagnostics.report(now, self._status is not None)
         )
         loop.every(DRAIN, self._record)
         loop.every(FLUSH, self._flush)

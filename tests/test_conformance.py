@@ -92,7 +92,7 @@ def controller(heard: Mistake = none, said: Mistake = none) -> Check:
 
 def tuner(heard: Mistake = none, said: Mistake = none) -> Check:
     values = parameters(optimizer="two_point", rollouts=40, seeds=1)
-    dispatcher = Dispatcher.create(
+    dispatcher = Dispatcher(
         run=9, n_a=4, pairs=1, incarnation=0, max_batch=1, episode_timeout=9.0, max_attempts=3
     )
     session = Session(build_training(values), dispatcher, lambda row: None)

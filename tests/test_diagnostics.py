@@ -12,33 +12,33 @@ from rclpy.qos import QoSProfile
 
 import controller_node.node
 import pde_sim_node.node
-from controller_node.diagnostics import ControllerHealth
+from controller_node.diagnostics import ControllerDiagnostics
 from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
-from loop_interfaces.diagnostics import Health, Level, Rate
+from loop_interfaces.diagnostics import Level, Rate, Status
 from loop_interfaces.frames import Frame
 from loop_interfaces.parameters import taken_by
 from loop_interfaces.ros.endpoints import writer_qos
 from loop_interfaces.ros.introspection import Introspection
 from loop_interfaces.topics import COST, STATE, TARGET, VOID
-from pde_sim_node.diagnostics import PlantHealth
+from pde_sim_node.diagnostics import PlantDiagnostics
 from pde_sim_node.lockstep import Timing
-from recorder_node.diagnostics import RecorderHealth
+from recorder_node.diagnostics import RecorderDiagnostics
 from recorder_node.recording import Recording
 from recorder_node.sources import sources
 from tests.small import parameters
 from tests.test_lockstep import RUN, answer, plant_protocol, run_episode, start
 from tests.test_session import ITERATIONS, Loop, values
 from tuner_node.build import build_training
-from tuner_node.diagnostics import TunerHealth
+from tuner_node.diagnostics import TunerDiagnostics
 
 
 def test_texts_and_worse_levels():
-    health = Health(Level.OK, "fine", {"a": 1 / 3, "b": True, "c": None, "d": 2**40})
+    health = Status(Level.OK, "fine", {"a": 1 / 3, "b": True, "c": None, "d": 2**40})
     assert health.texts() == [("a", "0.333333"), ("b", "yes"), ("c", ""), ("d", "1099511627776")]
-    worse = health.worsened(Level.WARN, "odd")
+    worse = health.merged(Level.WARN, "odd")
     assert (worse.level, worse.message) == (Level.WARN, "odd")
-    worst = worse.worsened(Level.ERROR, "broken").worsened(Level.WARN, "odd again")
+    worst = worse.merged(Level.ERROR, "broken").merged(Level.WARN, "odd again")
     assert (worst.level, worst.message) == (Level.ERROR, "odd; broken; odd again")
 
 
@@ -96,7 +96,7 @@ def test_a_rate_is_the_growth_since_the_last_look():
 
 def test_a_plant_is_ready_runs_is_overdue_is_paused_and_is_void():
     protocol = plant_protocol()
-    health = PlantHealth(protocol)
+    health = PlantDiagnostics(protocol)
     idle = health.report(0.0)
     assert (idle.level, idle.message) == (Level.OK, "no run; ready for one")
     assert idle.values["run"] is None
@@ -118,7 +118,7 @@ def test_a_plant_is_ready_runs_is_overdue_is_paused_and_is_void():
     slow = plant_protocol()
     slow.adjust(0.0, Timing(action_timeout=1.0, max_repeats=3, run_hold=10.0))
     slow.start(start(1), 0.0)
-    slow_health = PlantHealth(slow)
+    slow_health = PlantDiagnostics(slow)
     for now in (1.1, 2.2, 3.3):
         slow.tick(now)
     overdue = slow_health.report(3.5)
@@ -134,7 +134,7 @@ def test_a_plant_is_ready_runs_is_overdue_is_paused_and_is_void():
 
 def test_a_plant_tells_the_cost_of_the_environments_that_completed():
     protocol = plant_protocol()
-    health = PlantHealth(protocol)
+    health = PlantDiagnostics(protocol)
     cost = run_episode(protocol, 1)[-1]
     done = health.report(0.0)
     assert done.values["last cost"] == cost.values[:, 0].mean()
@@ -155,7 +155,7 @@ def test_states_that_are_late_for_real_time_are_a_warning_once():
     protocol.adjust(
         0.0, Timing(action_timeout=0.5, max_repeats=3, run_hold=10.0, real_time_factor=1.0)
     )
-    health = PlantHealth(protocol)
+    health = PlantDiagnostics(protocol)
     (send,) = protocol.start(start(1), 0.0)
     protocol.action(answer(send.frame), 0.3)  # due at 0.05
     (send,) = protocol.tick(0.3)
@@ -175,7 +175,7 @@ def exploration(episode: int) -> Frame:
 
 def test_a_controller_waits_answers_grows_stale_and_is_at_rest():
     controller = responder()
-    health = ControllerHealth(controller)
+    health = ControllerDiagnostics(controller)
     assert health.report(0.0).message == "no episode under way"
     state = Frame(RUN, 1, 0, 0.0, np.ones((1, 8)), 9)
     controller.state(state)
@@ -218,7 +218,7 @@ def test_a_controller_waits_answers_grows_stale_and_is_at_rest():
 
 def test_a_tuner_tells_how_far_it_is_who_is_missing_and_what_holds_it():
     loop = Loop(build_training(values()))
-    health = TunerHealth(loop.session)
+    health = TunerDiagnostics(loop.session)
     first = health.report(0.0)
     assert (first.level, first.message) == (Level.OK, "identify")
     while loop.iterations() < 2:
@@ -249,23 +249,23 @@ def test_a_tuner_tells_how_far_it_is_who_is_missing_and_what_holds_it():
     assert "an episode had to be repeated" in repeated.message
     assert repeated.values["episodes repeated"] == 1
     assert health.report(30.0).level is Level.OK
-    dispatcher.hold()
+    dispatcher.pause()
     assert health.report(31.0).message == f"paused in {where}"
     loop.handle(dispatcher.resume(31.0))
-    dispatcher.paused(0, Frame(7, 1, 0, 0.0, np.array([1.0]), 1), 31.0)
+    dispatcher.plant_paused(0, Frame(7, 1, 0, 0.0, np.array([1.0]), 1), 31.0)
     assert health.report(32.0).message == f"the plant is paused in {where}"
     assert health.report(32.0).values["paused plants"] == 1
     assert health.report(50.0).values["paused plants"] == 0
     loop.session.stop()
     assert health.report(50.0).message.endswith("stopping after it")
     restarted = Loop(build_training(values()), incarnation=3)
-    assert TunerHealth(restarted.session).report(0.0).values["restarts"] == 3
+    assert TunerDiagnostics(restarted.session).report(0.0).values["restarts"] == 3
 
 
 def test_a_recorder_warns_until_it_is_matched_and_once_for_what_it_missed(tmp_path):
     what = sources("/")
     recording = Recording(tmp_path / "bag", what)
-    health = RecorderHealth(recording)
+    health = RecorderDiagnostics(recording)
     assert health.report(0.0, matched=False).level is Level.WARN
     good = health.report(1.0, matched=True)
     assert (good.level, good.message) == (Level.OK, "recording")

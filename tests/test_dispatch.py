@@ -18,7 +18,7 @@ RUN = 42
 
 def dispatcher(pairs: int = 1, **settings) -> Dispatcher:
     defaults = {"max_batch": 4, "episode_timeout": 10.0, "max_attempts": 3, "incarnation": 1}
-    made = Dispatcher.create(run=RUN, n_a=2, pairs=pairs, **{**defaults, **settings})
+    made = Dispatcher(run=RUN, n_a=2, pairs=pairs, **{**defaults, **settings})
     for pair in range(pairs):
         made.presence(pair, (), 0.0)
     return made
@@ -182,7 +182,7 @@ def test_a_void_episode_is_repeated_under_a_new_number_and_given_up_at_last():
 
 
 def test_nothing_is_handed_to_an_absent_pair_and_a_silent_one_is_repeated():
-    served = Dispatcher.create(
+    served = Dispatcher(
         run=RUN,
         n_a=2,
         pairs=1,
@@ -277,12 +277,12 @@ def test_a_paused_plant_is_not_silent_as_long_as_it_says_so():
     served = dispatcher()
     ((_, start),) = starts(served.assign(batch(1), 0.0))
     for now in np.arange(1.0, 200.0, 1.0):  # an episode_timeout is 10 s
-        served.paused(0, said(1.0), now)
+        served.plant_paused(0, said(1.0), now)
         for _, frame in starts(served.tick(now + 0.5)):
             assert frame.episode == start.episode  # asks again, which keeps the plant for this run
     assert served.paused_pairs(199.0) == [0]
     assert served.notes == []
-    served.paused(0, said(0.0), 200.0)
+    served.plant_paused(0, said(0.0), 200.0)
     assert served.paused_pairs(200.0) == []
     served.cost(0, costs_of(start), 205.0)
     assert served.result() is not None
@@ -291,7 +291,7 @@ def test_a_paused_plant_is_not_silent_as_long_as_it_says_so():
 def test_a_paused_plant_that_says_nothing_more_is_silent_in_the_end():
     served = dispatcher()
     ((_, start),) = starts(served.assign(batch(1), 0.0))
-    served.paused(0, said(1.0), 1.0)
+    served.plant_paused(0, said(1.0), 1.0)
     served.tick(10.9)
     served.tick(20.0)
     ((_, again),) = starts(served.tick(21.1))
@@ -301,20 +301,20 @@ def test_a_paused_plant_that_says_nothing_more_is_silent_in_the_end():
 def test_a_paused_pair_gets_no_new_episode_and_loses_none():
     served = dispatcher(pairs=2)
     (left, right) = starts(served.assign(batch(2), 0.0))
-    served.paused(left[0], said(1.0), 1.0)
+    served.plant_paused(left[0], said(1.0), 1.0)
     assert starts(served.cost(right[0], costs_of(right[1]), 2.0)) == []  # not taken from it
     served.cost(left[0], costs_of(left[1]), 3.0)
     assert served.result() is not None
     ((pair, _), *more) = starts(served.assign(batch(2), 4.0))
     assert pair == right[0]
     assert more == []
-    ((pair, _),) = starts(served.paused(left[0], said(0.0), 5.0))
+    ((pair, _),) = starts(served.plant_paused(left[0], said(0.0), 5.0))
     assert pair == left[0]
 
 
 def test_a_plant_that_left_in_a_pause_is_not_paused_when_it_is_back():
     served = dispatcher()
-    served.paused(0, said(1.0), 1.0)
+    served.plant_paused(0, said(1.0), 1.0)
     served.presence(0, ("plant",), 2.0)
     served.presence(0, (), 3.0)
     assert served.paused_pairs(3.0) == []
@@ -322,7 +322,7 @@ def test_a_plant_that_left_in_a_pause_is_not_paused_when_it_is_back():
 
 def test_the_only_pair_gets_its_next_episode_in_a_pause_too_so_that_it_can_be_stepped_through():
     served = dispatcher()
-    served.paused(0, said(1.0), 1.0)
+    served.plant_paused(0, said(1.0), 1.0)
     ((_, first),) = starts(served.assign(batch(1), 1.5))
     served.cost(0, costs_of(first), 2.0)
     served.result()
@@ -333,7 +333,7 @@ def test_the_only_pair_gets_its_next_episode_in_a_pause_too_so_that_it_can_be_st
 def test_a_word_about_a_pause_that_is_neither_yes_nor_no_is_refused(values):
     served = dispatcher()
     with pytest.raises(FrameError, match="0 or 1"):
-        served.paused(0, Frame(RUN, 1, 0, 0.0, np.array(values)), 0.0)
+        served.plant_paused(0, Frame(RUN, 1, 0, 0.0, np.array(values)), 0.0)
 
 
 def test_what_another_plant_says_of_a_pause_does_not_count():
@@ -341,14 +341,14 @@ def test_what_another_plant_says_of_a_pause_does_not_count():
     ((_, start),) = starts(served.assign(batch(1), 0.0))
     served.cost(0, replace(costs_of(start), plant=5), 0.0)
     served.result()
-    served.paused(0, said(1.0, plant=6), 1.0)
+    served.plant_paused(0, said(1.0, plant=6), 1.0)
     assert served.paused_pairs(1.0) == []
 
 
 def test_a_held_dispatcher_ends_what_is_under_way_hands_out_nothing_and_keeps_the_plant():
     served = dispatcher(max_batch=1)
     ((_, first),) = starts(served.assign(batch(2), 0.0))
-    served.hold()
+    served.pause()
     assert served.cost(0, costs_of(first), 1.0) == []
     for now in np.arange(2.5, 100.0, 2.5):
         ((_, kept),) = served.tick(now)

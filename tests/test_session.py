@@ -33,7 +33,7 @@ class Loop:
     """A session and a plant and controller that answer its publications, one episode a call."""
 
     def __init__(self, training: Training, incarnation: int = 0) -> None:
-        dispatcher = Dispatcher.create(
+        dispatcher = Dispatcher(
             run=7,
             n_a=values()["n_a"],
             pairs=1,
@@ -94,7 +94,7 @@ def same(a: Training, b: Training) -> bool:
 def test_a_paused_session_begins_no_episode_and_goes_on_with_the_same_bits():
     loop = Loop(build_training(values()))
     while not loop.session.done:
-        loop.session.dispatcher.hold()
+        loop.session.dispatcher.pause()
         loop.episode()
         if loop.session.done:
             break
@@ -134,7 +134,7 @@ def test_stopping_a_paused_session_ends_it_at_once():
     loop = Loop(build_training(values()))
     for _ in range(6):
         loop.episode()
-    loop.session.dispatcher.hold()
+    loop.session.dispatcher.pause()
     loop.take(loop.session.stop())
     assert loop.session.stopped
     assert loop.released

@@ -44,7 +44,7 @@ class Loop:
 
     def __init__(self, rows: np.ndarray = ROWS) -> None:
         self.plant, self.rows = plant_protocol(), rows
-        self.tuner = Dispatcher.create(
+        self.tuner = Dispatcher(
             run=5, n_a=N_A, pairs=1, incarnation=1, max_batch=4, episode_timeout=9.0, max_attempts=3
         )
         self.tuner.presence(0, (), 0.0)

@@ -6,8 +6,7 @@ from collections import Counter
 
 import pytest
 
-from loop_interfaces.frames import Frame
-from pde_sim_node.lockstep import Lockstep
+from pde_sim_node.lockstep import Episode, Lockstep
 from tests.simulation.audit import audit, failure, shrunk
 from tests.simulation.history import History
 from tests.simulation.plan import Fault, Plan, draw
@@ -49,6 +48,8 @@ def test_the_auditor_finds_a_plant_that_takes_any_action_and_the_smallest_plan(
     bad = plan(rival, *others)
     assert not failure(bad)
     monkeypatch.setattr(Lockstep, "_is_signed", lambda self, frame: True)
-    monkeypatch.setattr(Frame, "digest", lambda self: 0)  # no action contradicts another
+    monkeypatch.setattr(Episode, "contradicted_by", lambda self, action: False)
+    for module in ("dispatch", "dispatch_state"):
+        monkeypatch.setattr(f"tuner_node.{module}.digest", lambda values: 0)
     assert failure(bad) == "AssertionError: another policy"
     assert shrunk(bad).faults == (rival,)

@@ -12,7 +12,7 @@ from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.topics import COMPLETED
 from tests.test_dispatch import RUN, batch, costs_of, dispatcher, starts
 from tuner_node.batch import Batch
-from tuner_node.trajectory_collector import Observer
+from tuner_node.trajectory_collector import TrajectoryCollector
 
 STEPS = 30
 
@@ -78,7 +78,7 @@ def test_a_late_sample_is_waited_for_and_a_lost_one_repeats_the_episode():
 
 
 def test_samples_of_other_runs_episodes_and_plants_are_not_mixed_in():
-    observer = Observer()
+    observer = TrajectoryCollector()
     start = Frame(RUN, 5, 0, 0.0, np.zeros((1, 4)))
     observer.begin(RUN, 5)
     for frame, actions in samples(start, plant=1):

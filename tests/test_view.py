@@ -9,7 +9,7 @@ from loop_interfaces.diagnostics import Level
 from loop_interfaces.frames import Frame
 from loop_interfaces.model_rows import ModelRows, pack
 from loop_interfaces.topics import VIEW_NUMBERS
-from viewer_node.diagnostics import ViewerHealth
+from viewer_node.diagnostics import ViewerDiagnostics
 from viewer_node.episode_samples import COLUMNS
 from viewer_node.loop_view import LoopView
 from viewer_node.picture import UNSEEN, diverging
@@ -157,7 +157,7 @@ def test_more_steps_than_expected_are_squeezed_in_and_other_batches_are_left_out
 
 def test_a_viewer_that_sees_nothing_any_more_is_stale():
     shown = view()
-    health = ViewerHealth(shown)
+    health = ViewerDiagnostics(shown)
     assert health.report(0.0, 0).message == "nothing seen yet"
     shown.state(frame([np.zeros(N_Z)], step=4), 1.0)
     good = health.report(2.0, 3)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from loop_interfaces.diagnostics import Health, Lasting, Level, Rate
+from loop_interfaces.diagnostics import ConditionTimer, Level, Rate, Status
 from tuner_node.session import Session
 
 FOUND = 1.0
@@ -13,12 +13,12 @@ RECENT = 10.0
 """Seconds for which a repeated episode is worth a warning."""
 
 
-class TunerHealth:
+class TunerDiagnostics:
     """Reports on a session, from one call to the next."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._rate, self._missing = Rate(), Lasting()
+        self._rate, self._missing = Rate(), ConditionTimer()
         self._repeated = 0
         self._repeated_at = float("-inf")
 
@@ -28,7 +28,7 @@ class TunerHealth:
         seconds = self._missing.seconds(bool(missing), now)
         return (missing, seconds) if seconds > FOUND else ([], 0.0)
 
-    def report(self, now: float) -> Health:
+    def report(self, now: float) -> Status:
         """Level, sentence and values at time `now` (monotonic s)."""
         absent, _ = self.absent(now)
         session, dispatcher = self._session, self._session.dispatcher
@@ -41,7 +41,7 @@ class TunerHealth:
         level, message = self._state(now, absent)
         paid, budget = (sum(counts) for counts in training.progress.values())
         costs = dispatcher.last_costs
-        return Health(
+        return Status(
             level,
             message,
             {
@@ -62,7 +62,7 @@ class TunerHealth:
                     dispatcher.counters["answers of another run"]
                     + dispatcher.counters["answers of another episode"]
                 ),
-                "paused": dispatcher.held,
+                "paused": dispatcher.paused,
                 "paused plants": len(dispatcher.paused_pairs(now)),
                 "waiting for": " and ".join(absent),
             },
@@ -76,7 +76,7 @@ class TunerHealth:
             where = f"rollout {paid} of {budget}"
         if absent:
             return Level.WARN, f"waiting for {' and '.join(absent)}"
-        if session.dispatcher.held:
+        if session.dispatcher.paused:
             return Level.WARN, f"paused in {where}"
         if session.dispatcher.paused_pairs(now):
             return Level.WARN, f"the plant is paused in {where}"

@@ -1,10 +1,21 @@
 """Hands the rollouts of a batch to plant and controller pairs as episodes. Pure: no ROS, no clock.
 
-A batch is cut into episodes of at most `max_batch` environments, each goes to a pair that is free,
-and what a pair does not finish (void, silent, or gone) is started again with the same rows under a
-new episode number, on any pair. A rollout's cost does not depend on which episode or pair it ran in,
-so neither does the batch's result. Episode numbers only grow, also across restarts of the tuner
-(`incarnation` is in their upper part): an answer to an earlier tuner's episode is recognised.
+A batch is cut into chunks of at most `max_batch` rows. Each becomes an episode of a pair that is free,
+and what a pair does not finish is started again with the same rows under a new episode number, on any
+pair. A rollout's cost does not depend on which episode or pair it ran in, so neither does the batch's
+result. Episode numbers only grow, also across restarts of the tuner (`incarnation` is in their upper
+part): an answer to an earlier tuner's episode is recognised.
+
+    pair        event                               next        what follows
+    FREE        a chunk waits                       BUSY        policy and start are sent
+    BUSY        no answer for REQUEST_PERIOD        BUSY        model, policy and start are sent again
+    BUSY        cost, or model of an exploration    FREE        once the batch needs no more
+    BUSY        cost, and samples still missing     COLLECTING
+    COLLECTING  the last sample                     FREE
+    COLLECTING  SAMPLE_GRACE is over                FREE        the chunk is started again
+    BUSY        void cost; failure to be retried    FREE        the chunk is started again
+    BUSY        silent for `episode_timeout`        FREE        the chunk is started again
+    BUSY        its nodes are gone, a pair is free  FREE        the chunk is started again, there
 """
 
 from __future__ import annotations
@@ -12,12 +23,11 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loop_interfaces.frames import Frame, FrameError
+from loop_interfaces.frames import Frame, FrameError, digest
 from loop_interfaces.protocol import Counters, ModelFailure, Publication
 from loop_interfaces.signature import digest_of
 from loop_interfaces.topics import (
@@ -38,55 +48,45 @@ Array = NDArray[np.float64]
 PairPublication = tuple[int, Publication]
 """(pair, message): publish the message in that pair's namespace."""
 EPISODES_PER_INCARNATION = 2**32
-STRANGE = 20.0
-"""Seconds with costs of another plant only after which the run stops."""
-LATE = 0.5
+FOREIGN_PLANT_GRACE = 20.0
+"""Seconds with costs of another plant only, after which the run stops."""
+SAMPLE_GRACE = 0.5
 """Seconds after its cost within which the last samples of an episode must have come in."""
 MAX_TARGETS = 64
 """Plants whose target is remembered."""
-ASK_AGAIN = 2.0
+REQUEST_PERIOD = 2.0
 """Seconds without an answer after which an episode's policy and start are sent once more."""
 PAUSE_LEASE = 10.0
-"""Seconds that a plant's word that it is paused holds; it says so once a second."""
+"""Seconds for which a plant's report that it is paused holds; it comes once a second."""
 
 
 class DispatchError(RuntimeError):
     """An episode that cannot be run: attempts used up, or a model that cannot be designed."""
 
 
-@dataclass
 class Dispatcher:
     """Serves one batch at a time. `now` is any monotonic time in s.
 
-    plant: fingerprint of the plant that this run is about; that of the first cost, if not known.
+    Parameters
+    ----------
+    run : int
+        Id of the run, in every message.
+    n_a : int
+        Actuators.
+    pairs : int
+        How many pairs there are.
+    incarnation : int
+        Starts of this run's tuner so far.
+    max_batch, episode_timeout, max_attempts
+        See loop_interfaces.parameters.TUNER; they may be set later.
+    plant : int
+        Fingerprint of the plant that this run is about; that of the first cost, if not known.
+    action_limit : float
+        Magnitude at which actions saturate; 0: none.
     """
 
-    run: int
-    n_a: int
-    incarnation: int
-    max_batch: int
-    episode_timeout: float
-    max_attempts: int
-    pairs: list[Pair]
-    counters: Counters = field(default_factory=Counters)
-    notes: list[str] = field(default_factory=list)
-    sim_time: float = 0.0
-    plant: int = UNKNOWN_PLANT
-    action_limit: float = 0.0
-    held: bool = False
-    """Whether an operator lets no new episode begin."""
-    last_costs: Array | None = None
-    """Mean stage costs of the last episode that was answered."""
-    _batch: Batch | None = None
-    _models: Frame | None = None
-    _models_digest: int = 0
-    _targets: dict[int, Array] = field(default_factory=dict)
-    _chunks: list[Chunk] = field(default_factory=list)
-    _waiting: list[Chunk] = field(default_factory=list)
-    _issued: int = 0
-
-    @staticmethod
-    def create(
+    def __init__(
+        self,
         *,
         run: int,
         n_a: int,
@@ -97,18 +97,27 @@ class Dispatcher:
         max_attempts: int,
         plant: int = UNKNOWN_PLANT,
         action_limit: float = 0.0,
-    ) -> Dispatcher:
-        return Dispatcher(
-            run=run,
-            n_a=n_a,
-            incarnation=incarnation,
-            max_batch=max_batch,
-            episode_timeout=episode_timeout,
-            max_attempts=max_attempts,
-            plant=plant,
-            action_limit=action_limit,
-            pairs=[Pair() for _ in range(pairs)],
-        )
+    ) -> None:
+        self.run, self.n_a, self.incarnation = run, n_a, incarnation
+        self.max_batch, self.episode_timeout = max_batch, episode_timeout
+        self.max_attempts = max_attempts
+        self.plant, self.action_limit = plant, action_limit
+        self.pairs = [Pair() for _ in range(pairs)]
+        self.counters = Counters()
+        self.notes: list[str] = []
+        """Why episodes were started again, for people."""
+        self.sim_time = 0.0
+        self.paused = False
+        """Whether an operator lets no new episode begin."""
+        self.last_costs: Array | None = None
+        """Mean stage costs of the last episode that was answered."""
+        self._batch: Batch | None = None
+        self._models: Frame | None = None
+        self._models_digest = 0
+        self._targets: dict[int, Array] = {}
+        self._chunks: list[Chunk] = []
+        self._waiting: list[Chunk] = []
+        self._issued = 0
 
     def assign(self, batch: Batch, now: float) -> list[PairPublication]:
         """Begin a batch; the previous one must be complete."""
@@ -118,7 +127,7 @@ class Dispatcher:
         self._batch = batch
         self._chunks = [Chunk(slice(a, b)) for a, b in itertools.pairwise(edges)]
         self._waiting = list(self._chunks)
-        return self._hand_out(now)
+        return self._begin_episodes(now)
 
     def models(self, models: Array, generation: int) -> list[PairPublication]:
         """Give every pair the run's reduced models.
@@ -136,12 +145,12 @@ class Dispatcher:
         return [(pair, Publication(START, frame)) for pair in range(len(self.pairs))]
 
     def presence(self, pair: int, missing: Sequence[str], now: float) -> list[PairPublication]:
-        """Learn which nodes of a pair are on the network."""
+        """Take which nodes of a pair are not on the network."""
         known = self.pairs[pair]
         known.missing = tuple(missing)
         if "plant" in missing:
             known.paused_until = -math.inf
-        return self._hand_out(now)
+        return self._begin_episodes(now)
 
     def cost(self, pair: int, frame: Frame, now: float) -> list[PairPublication]:
         """Take an episode's costs. Raises FrameError when their shape is not the episode's."""
@@ -156,8 +165,8 @@ class Dispatcher:
         if self.plant == UNKNOWN_PLANT:
             self.plant = frame.plant
         if frame.plant != self.plant:
-            known.strange_since = min(known.strange_since, now)
-            if now - known.strange_since > STRANGE:
+            known.foreign_since = min(known.foreign_since, now)
+            if now - known.foreign_since > FOREIGN_PLANT_GRACE:
                 raise DispatchError(
                     f"the plant has other parameters (fingerprint {frame.plant}) than the one this "
                     f"run began with ({self.plant}); continue it with that one, or start a new run"
@@ -167,7 +176,7 @@ class Dispatcher:
                 f"(fingerprint {frame.plant}) than this run's ({self.plant}); stop that plant"
             )
         self.sim_time = max(self.sim_time, frame.time)
-        known.heard, known.strange_since = now, math.inf
+        known.last_heard, known.foreign_since = now, math.inf
         if (frame.values[:, CostColumn.ENDED] == VOID).any():
             self._retry(
                 known,
@@ -178,22 +187,22 @@ class Dispatcher:
             known.chunk.costs = frame.values.copy()
             self.last_costs = known.chunk.costs[:, CostColumn.MEAN]
             if self._batch.trajectories:
-                known.held, known.held_since = frame, now
+                known.pending_cost, known.pending_since = frame, now
                 self._collect(known)
             self._release_if_done(known)
-        return self._hand_out(now)
+        return self._begin_episodes(now)
 
-    def hold(self) -> None:
-        """Hand out no new episode; those under way go on."""
-        self.held = True
+    def pause(self) -> None:
+        """Begin no new episode; those under way go on."""
+        self.paused = True
 
     def resume(self, now: float) -> list[PairPublication]:
-        """Hand out episodes again."""
-        self.held = False
-        return self._hand_out(now)
+        """Begin episodes again."""
+        self.paused = False
+        return self._begin_episodes(now)
 
-    def paused(self, pair: int, frame: Frame, now: float) -> list[PairPublication]:
-        """Learn whether a pair's plant is paused: it is not silent then.
+    def plant_paused(self, pair: int, frame: Frame, now: float) -> list[PairPublication]:
+        """Take whether a pair's plant is paused: it is not silent then.
 
         It gets a new episode only if no other pair can take it, so that it can be stepped through.
         """
@@ -202,7 +211,7 @@ class Dispatcher:
         if self.plant in (UNKNOWN_PLANT, frame.plant):
             paused = bool(frame.values[0])
             self.pairs[pair].paused_until = now + PAUSE_LEASE if paused else -math.inf
-        return self._hand_out(now)
+        return self._begin_episodes(now)
 
     def paused_pairs(self, now: float) -> list[int]:
         """The pairs whose plants are paused."""
@@ -214,12 +223,12 @@ class Dispatcher:
 
     @property
     def newest_episode(self) -> int | None:
-        """Number of the episode that was handed out last."""
+        """Number of the episode that was begun last."""
         newest = max(pair.episode for pair in self.pairs)
         return newest if newest >= 0 else None
 
     def target(self, pair: int, frame: Frame, now: float) -> list[PairPublication]:
-        """Learn the target z_r of a plant. DispatchError if that of the run's plant was another one."""
+        """Take the target z_r of a plant. DispatchError if that of the run's plant was another one."""
         known = self._targets.get(frame.plant)
         if known is None:
             if len(self._targets) < MAX_TARGETS:
@@ -238,13 +247,13 @@ class Dispatcher:
         known = self.pairs[pair]
         target = self._targets.get(frame.plant)
         if self._is_sample(known, frame, frame.values.shape[1] if target is None else len(target)):
-            known.observer.state(frame)
-        return known.held is not None and frame.step == known.held.step
+            known.samples.state(frame)
+        return known.pending_cost is not None and frame.step == known.pending_cost.step
 
     def action(self, pair: int, frame: Frame) -> None:
         """Take a sample a_k of a pair's episode. Raises FrameError for one of another shape."""
         if self._is_sample(self.pairs[pair], frame, self.n_a):
-            self.pairs[pair].observer.action(frame)
+            self.pairs[pair].samples.action(frame)
 
     def model(self, pair: int, frame: Frame, now: float) -> list[PairPublication]:
         """Take the reduced models of an exploratory episode."""
@@ -256,21 +265,21 @@ class Dispatcher:
             raise FrameError(f"expected {count} models, got {len(frame.values)}")
         if self.plant not in (UNKNOWN_PLANT, frame.plant):
             raise FrameError(f"expected a model of plant {self.plant}, got one of {frame.plant}")
-        known.heard = now
+        known.last_heard = now
         known.remember(MODEL_IDENTIFIED.name, frame)
         known.chunk.models = frame.values.copy()
         self._release_if_done(known)
-        return self._hand_out(now)
+        return self._begin_episodes(now)
 
     def failure(self, pair: int, failure: ModelFailure, now: float) -> list[PairPublication]:
-        """Take the news that an exploratory episode gave no model."""
+        """Take the report that an exploratory episode gave no model."""
         known = self.pairs[pair]
         if known.chunk is None or (failure.run, failure.episode) != (self.run, known.episode):
             return []
         if not failure.retry:
             raise DispatchError(f"no reduced model: {failure.reason}")
         self._retry(known, failure.reason)
-        return self._hand_out(now)
+        return self._begin_episodes(now)
 
     def tick(self, now: float) -> list[PairPublication]:
         """Ask again for what is not answered; start again what has been silent for too long.
@@ -279,39 +288,40 @@ class Dispatcher:
         """
         publications: list[PairPublication] = []
         for number, pair in enumerate(self.pairs):
+            due = now - pair.last_sent > REQUEST_PERIOD
             if pair.chunk is None:
-                if self.held and pair.last is not None and now - pair.sent > ASK_AGAIN:
-                    pair.sent = now
-                    publications.append((number, pair.last))
+                if self.paused and pair.last_start is not None and due:
+                    pair.last_sent = now
+                    publications.append((number, pair.last_start))
                 continue
-            if pair.held is not None:
+            if pair.pending_cost is not None:
                 self._collect(pair)
-                if pair.held is not None and now - pair.held_since > LATE:
-                    width = len(self._targets.get(pair.held.plant, ()))
-                    lost = pair.observer.lost(pair.held.plant, pair.held.step, width)
+                if pair.pending_cost is not None and now - pair.pending_since > SAMPLE_GRACE:
+                    width = len(self._targets.get(pair.pending_cost.plant, ()))
+                    lost = pair.samples.lost(pair.pending_cost.plant, pair.pending_cost.step, width)
                     self._retry(pair, f"the tuner missed {lost} samples of episode {pair.episode}")
                 else:
                     self._release_if_done(pair)
-            elif pair.missing:
-                pair.heard = now  # absent, not silent: the latched topics serve it when it is back
-            elif now < pair.paused_until:
-                pair.heard = now  # neither is a paused one
-                if now - pair.sent > ASK_AGAIN:  # keeps the plant for this run
-                    publications += self._ask(number, pair, now)
-            elif now - pair.heard > self.episode_timeout:
+            elif pair.missing:  # not silent: the latched topics serve it when it is back
+                pair.last_heard = now
+            elif now < pair.paused_until:  # not silent either
+                pair.last_heard = now
+                if due:  # keeps the plant for this run
+                    publications += self._request(number, pair, now)
+            elif now - pair.last_heard > self.episode_timeout:
                 self._retry(
                     pair,
                     f"pair {number} was silent for {self.episode_timeout:g} s "
                     f"in episode {pair.episode}",
                 )
-            elif now - pair.sent > ASK_AGAIN:
-                publications += self._ask(number, pair, now)
-        return publications + self._hand_out(now)
+            elif due:
+                publications += self._request(number, pair, now)
+        return publications + self._begin_episodes(now)
 
-    def ask_again(self, now: float) -> list[PairPublication]:
+    def resend(self, now: float) -> list[PairPublication]:
         """Everything that is under way, once more."""
         busy = [(number, pair) for number, pair in enumerate(self.pairs) if pair.chunk]
-        return [order for number, pair in busy for order in self._ask(number, pair, now)]
+        return [message for number, pair in busy for message in self._request(number, pair, now)]
 
     def result(self) -> BatchResult | None:
         """The batch's result once every row has one, in the batch's order."""
@@ -331,7 +341,7 @@ class Dispatcher:
         )
 
     def missing(self) -> list[str]:
-        """Who is not on the network, in words, of pairs that have work."""
+        """Which nodes are not on the network, in words."""
         return [
             f"{node} of pair {number}" if len(self.pairs) > 1 else node
             for number, pair in enumerate(self.pairs)
@@ -354,13 +364,13 @@ class Dispatcher:
         taken = known.answers.get(topic.name, {}).get(frame.episode)
         void = topic is COST and bool((frame.values[:, -1:] == VOID).any())
         same_plant = self.plant in (UNKNOWN_PLANT, frame.plant)
-        if taken is not None and same_plant and not void and frame.digest() != taken:
+        if taken is not None and same_plant and not void and digest(frame.values) != taken:
             raise DispatchError(
                 f"two different messages on {topic.name} answer episode {frame.episode}; expected one "
                 "plant and one controller in this namespace: stop the other and start a new run"
             )
         used = known.chunk is None or frame.episode != known.episode
-        if taken is not None and same_plant and void and used and not self.held:
+        if taken is not None and same_plant and void and used and not self.paused:
             raise DispatchError(
                 f"the plant took back the cost of episode {frame.episode}, which this run has used, "
                 "because different actions came for one step: stop the second controller and start "
@@ -389,17 +399,17 @@ class Dispatcher:
             pair.chunk = None
 
     def _collect(self, pair: Pair) -> None:
-        """Take the held episode's trajectories, if all samples and the target are there."""
-        held, chunk = pair.held, pair.chunk
-        assert held is not None and chunk is not None
-        if pair.observer.contradiction:
-            self._retry(pair, pair.observer.contradiction)
+        """Take the episode's trajectories, if all samples and the target are there."""
+        cost, chunk = pair.pending_cost, pair.chunk
+        assert cost is not None and chunk is not None
+        if pair.samples.contradiction:
+            self._retry(pair, pair.samples.contradiction)
             return
-        target = self._targets.get(held.plant)
-        if target is not None and not pair.observer.lost(held.plant, held.step, len(target)):
-            ended = held.values[:, CostColumn.ENDED]
-            chunk.trajectories = pair.observer.trajectories(held.plant, held.step, ended)
-            pair.held = None
+        target = self._targets.get(cost.plant)
+        if target is not None and not pair.samples.lost(cost.plant, cost.step, len(target)):
+            ended = cost.values[:, CostColumn.ENDED]
+            chunk.trajectories = pair.samples.trajectories(cost.plant, cost.step, ended)
+            pair.pending_cost = None
 
     def _retry(self, pair: Pair, reason: str) -> None:
         chunk = pair.chunk
@@ -409,26 +419,26 @@ class Dispatcher:
         chunk.attempts += 1
         if chunk.attempts >= self.max_attempts:
             raise DispatchError(f"gave up after {chunk.attempts} attempts: {reason}")
-        chunk.forget()
-        pair.chunk = pair.held = None
+        chunk.clear()
+        pair.chunk = pair.pending_cost = None
         self._waiting.append(chunk)
 
-    def _hand_out(self, now: float) -> list[PairPublication]:
+    def _begin_episodes(self, now: float) -> list[PairPublication]:
         publications: list[PairPublication] = []
-        if self.held:
+        if self.paused:
             return publications
         others = any(now >= pair.paused_until for pair in self._present())
         for number, pair in enumerate(self.pairs):
             if pair.chunk is not None or pair.missing or (others and now < pair.paused_until):
                 continue
             if not self._waiting:
-                self._take_from_the_absent()
+                self._reclaim_from_absent()
             if self._waiting:
                 publications += self._begin(number, pair, self._waiting.pop(0), now)
         return publications
 
-    def _take_from_the_absent(self) -> None:
-        """Let go of an absent pair's episode, for a pair that is free to run it."""
+    def _reclaim_from_absent(self) -> None:
+        """Take an absent pair's episode back, for a pair that is free to run it."""
         for number, pair in enumerate(self.pairs):
             if pair.missing and pair.chunk is not None:
                 self.notes.append(
@@ -436,24 +446,24 @@ class Dispatcher:
                     f"{pair.episode}; another pair starts it again with the same seeds"
                 )
                 self.counters["episodes taken over"] += 1
-                pair.chunk.forget()
+                pair.chunk.clear()
                 self._waiting.append(pair.chunk)
-                pair.chunk = pair.held = None
+                pair.chunk = pair.pending_cost = None
                 return
 
     def _begin(self, number: int, pair: Pair, chunk: Chunk, now: float) -> list[PairPublication]:
         self._issued += 1
-        pair.chunk, pair.heard = chunk, now
+        pair.chunk, pair.last_heard = chunk, now
         pair.episode = self.incarnation * EPISODES_PER_INCARNATION + self._issued
-        pair.observer.begin(self.run, pair.episode)
-        return self._ask(number, pair, now, again=False)
+        pair.samples.begin(self.run, pair.episode)
+        return self._request(number, pair, now, again=False)
 
-    def _ask(
+    def _request(
         self, number: int, pair: Pair, now: float, *, again: bool = True
     ) -> list[PairPublication]:
         chunk = pair.chunk
         assert self._batch is not None and chunk is not None
-        pair.sent = now
+        pair.last_sent = now
 
         generation = self._models.step if self._models is not None else 0
 
@@ -463,11 +473,11 @@ class Dispatcher:
         # The policy first: it is then mostly there when the first state arrives.
         sends = [Publication(MODEL, self._models)] if again and self._models is not None else []
         rows = self._batch.rows[chunk.rows]
-        told: list[ArrayLike] = [rows, self.action_limit]
+        signed: list[ArrayLike] = [rows, self.action_limit]
         if self._batch.policies is not None:
             policies = self._batch.policies[chunk.rows]
             sends.append(Publication(POLICY, frame(policies)))
-            told += [policies, self._models_digest]
-        pair.last = Publication(START, frame(rows, digest_of(*told)))
-        sends.append(pair.last)
+            signed += [policies, self._models_digest]
+        pair.last_start = Publication(START, frame(rows, digest_of(*signed)))
+        sends.append(pair.last_start)
         return [(number, send) for send in sends]

@@ -28,7 +28,7 @@ from loop_interfaces.ros.introspection import full_name
 from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.node_main import ConfigurationError, node_main
 from loop_interfaces.ros.parameters import declare, given_parameters, on_change
-from loop_interfaces.ros.suspend_watchdog import nap
+from loop_interfaces.ros.suspend_watchdog import sleep_for
 from loop_interfaces.topics import (
     ACTION,
     ARRAYS,
@@ -45,7 +45,7 @@ from loop_interfaces.topics import (
 )
 from tuner_node import narration
 from tuner_node.build import build_dispatcher, build_training
-from tuner_node.diagnostics import TunerHealth
+from tuner_node.diagnostics import TunerDiagnostics
 from tuner_node.dispatch import DispatchError, PairPublication
 from tuner_node.narration import Narration
 from tuner_node.participants import Participants, Publishers
@@ -53,7 +53,7 @@ from tuner_node.results import summarise
 from tuner_node.run_store import open_run
 from tuner_node.session import Session
 
-FAREWELL = 0.5
+LINGER = 0.5
 """Seconds in which the last messages, and the answer to a request to stop, are taken: when a writer
 is gone, its readers lose what they have not taken yet."""
 PROGRESS_PERIOD = 2.0
@@ -82,12 +82,12 @@ class TunerNode:
         log = node.get_logger()
         training = build_training(values)
         self._writer, identity = open_run(values, training, held, log.warning)
-        self._news: deque[Mapping[str, Any]] = deque()
+        self._rows: deque[Mapping[str, Any]] = deque()
         self._problem, self._out = values["problem"], values["out"]
         self._narration = Narration(values["seed"], values["seeds"])
         dispatcher = build_dispatcher(values, training, identity)
-        self._session = Session(training, dispatcher, self._news.append)
-        self._health = TunerHealth(self._session)
+        self._session = Session(training, dispatcher, self._rows.append)
+        self._diagnostics = TunerDiagnostics(self._session)
         self._participants = Participants(self._session, values["recorder"])
         self._pairs: list[str] = values["pairs"]
         self._changed: dict[str, Any] = {}
@@ -107,7 +107,7 @@ class TunerNode:
         try:
             return self._end(reason)
         finally:
-            nap(FAREWELL)
+            sleep_for(LINGER)
 
     def _end(self, reason: str) -> int:
         if self._session.done:
@@ -155,23 +155,23 @@ class TunerNode:
                 partial(self._on_failure, number),
                 reader_qos(MODEL),
             )
-            loop.listen(PAUSED, self._handler(dispatcher.paused, number), namespace)
+            loop.listen(PAUSED, self._handler(dispatcher.plant_paused, number), namespace)
             for topic in ARRAYS:
                 name = scoped(namespace, topic.name)
                 loop.introspection.supervise(node.resolve_topic_name(name), topic)
-        loop.introspection.report("training", self._health.report)
+        loop.introspection.report("training", self._diagnostics.report)
         loop.introspection.offer("~/pause", self._pause)
         loop.introspection.offer("~/resume", self._resume)
         loop.introspection.offer("~/stop", self._stop)
         on_change(node, TUNER, self._adjust)
 
     def _pause(self) -> str:
-        self._session.dispatcher.hold()
+        self._session.dispatcher.pause()
         under_way = len(self._session.dispatcher.episodes())
         return "paused" + (f"; {under_way} episode(s) under way will end" if under_way else "")
 
     def _resume(self) -> str:
-        was = "resumed" if self._session.dispatcher.held else "was not paused"
+        was = "resumed" if self._session.dispatcher.paused else "was not paused"
         self._guarded(self._session.dispatcher.resume)
         return was
 
@@ -218,8 +218,8 @@ class TunerNode:
         except DispatchError as error:
             self._failure = self._failure or str(error)
             self._loop.stop("failure")
-        while self._news:  # once everybody has been told what to do next, and before it is kept
-            self._report(self._news.popleft())
+        while self._rows:  # once everybody has been told what to do next, and before it is kept
+            self._report(self._rows.popleft())
         if self._writer:
             with self._loop.introspection.working("writing the checkpoint"):
                 self._writer.keep(now=self._loop.now())
@@ -234,7 +234,7 @@ class TunerNode:
         if self._loop.stopped:  # by a service, in this round
             return
         self._guarded(partial(self._participants.look, self._publishers()))
-        missing, seconds = self._health.absent(now)
+        missing, seconds = self._diagnostics.absent(now)
         if missing:
             self._log.warning(
                 f"waiting for {' and '.join(missing)} for {seconds:.0f} s",

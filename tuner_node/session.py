@@ -39,7 +39,7 @@ class Session:
         Called again when the network was joined again: what is under way is asked for once more.
         """
         if self._phase:
-            return self.dispatcher.ask_again(now)
+            return self.dispatcher.resend(now)
         return self._hand_out_models() + self._next(now)
 
     def baseline(self, name: str) -> float | None:
@@ -54,7 +54,7 @@ class Session:
         identically.
         """
         self.stopping = True
-        return self._end() if self.dispatcher.held else []
+        return self._end() if self.dispatcher.paused else []
 
     def advance(self, publications: list[PairPublication], now: float) -> list[PairPublication]:
         """What is to be sent after an event: `publications` of the dispatcher, and what follows.

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass
-class Observer:
+class TrajectoryCollector:
     """The samples of one episode of one pair, by (plant, step)."""
 
     run: int = -1

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from loop_interfaces.diagnostics import Health, Level, Rate
+from loop_interfaces.diagnostics import Level, Rate, Status
 from viewer_node.loop_view import SILENT, LoopView
 
 
-class ViewerHealth:
+class ViewerDiagnostics:
     """Reports on a view, from one call to the next."""
 
     def __init__(self, view: LoopView) -> None:
         self._view = view
         self._rate = Rate()
 
-    def report(self, now: float, subscribers: int) -> Health:
+    def report(self, now: float, subscribers: int) -> Status:
         """Level, sentence and values at time `now` (monotonic s)."""
         view, current, quiet = self._view, self._view.current, self._view.quiet(now)
         level, message = Level.OK, "nothing seen yet"
@@ -21,7 +21,7 @@ class ViewerHealth:
             message = f"step {current.last} of episode {current.key[1]}"
             if quiet is not None and quiet > SILENT:
                 level, message = Level.STALE, f"nothing heard for {quiet:.0f} s"
-        return Health(
+        return Status(
             level,
             message,
             {

@@ -27,7 +27,7 @@ from loop_interfaces.ros.node_main import node_main
 from loop_interfaces.ros.observer import Observer
 from loop_interfaces.ros.parameters import declare, given_parameters, on_change
 from loop_interfaces.topics import VIEW_NUMBERS
-from viewer_node.diagnostics import ViewerHealth
+from viewer_node.diagnostics import ViewerDiagnostics
 from viewer_node.loop_reader import PERIOD, LoopReader
 from viewer_node.loop_view import LoopView
 from viewer_node.picture import diverging
@@ -50,7 +50,7 @@ class ViewerNode:
         self._length = float(values["length"])
         weights = float(values["state_weight"]), float(values["action_weight"])
         self._view = LoopView(horizon=values["horizon"], weights=weights, curve_from_topics=False)
-        self._health = ViewerHealth(self._view)
+        self._diagnostics = ViewerDiagnostics(self._view)
         self._due = loop.now()
         self._adjust({spec.name: values[spec.name] for spec in VIEWER})
         self._wire(node, loop)
@@ -75,7 +75,7 @@ class ViewerNode:
         loop.every(PERIOD, self._read)
         loop.every(GRAPH_PERIOD, self._reader.poll_graph)
         loop.introspection.report(
-            "views", lambda now: self._health.report(now, self._subscribers())
+            "views", lambda now: self._diagnostics.report(now, self._subscribers())
         )
         on_change(node, VIEWER, self._adjust)
 

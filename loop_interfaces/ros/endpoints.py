@@ -33,7 +33,7 @@ KEPT = 16
 """Batches of samples that their writer keeps for a reader which lost one."""
 
 
-class OutsideExecutor(CallbackGroup):
+class NeverExecuted(CallbackGroup):
     """Entities of this group are never taken by an executor."""
 
     def can_execute(self, entity: Any) -> bool:
@@ -51,9 +51,9 @@ def raw_subscription(node: Node, message_type: Any, name: str, qos: QoSProfile) 
     return node.create_subscription(
         message_type,
         name,
-        lambda _: None,  # never called: see OutsideExecutor
+        lambda _: None,  # never called: see NeverExecuted
         qos,
-        callback_group=OutsideExecutor(),
+        callback_group=NeverExecuted(),
         raw=True,
     )
 

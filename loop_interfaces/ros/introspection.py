@@ -1,4 +1,5 @@
-"""What every node of the loop offers to ROS tools: /diagnostics, trigger services, a look around.
+"""What every node of the loop offers to ROS tools: /diagnostics and trigger services; and who else is
+in the graph.
 
 All of it runs in the node's housekeeping, off the hot path: nothing here is called for a message of
 the loop.
@@ -19,7 +20,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from std_srvs.srv import Trigger
 
-from loop_interfaces.diagnostics import Health, Lasting, Level
+from loop_interfaces.diagnostics import ConditionTimer, Level, Status
 from loop_interfaces.ros.endpoints import reader_qos
 from loop_interfaces.topics import Topic
 
@@ -29,7 +30,7 @@ WAITING_REQUESTS = 100
 """Requests to a service that are kept until it answers."""
 DIAGNOSTICS = "/diagnostics"
 PERIOD = 1.0
-"""Seconds between two reports, and between two looks at the graph."""
+"""Seconds between two reports, and between two inspections of the graph."""
 WORKING = 1.0
 """Seconds of one computation after which it is reported while it lasts."""
 NAMESAKE_GRACE = 6.0
@@ -42,20 +43,20 @@ def full_name(endpoint: Any) -> str:
 
 
 class Introspection:
-    """Tells how a node is, and who else is there who should not be."""
+    """Publishes a node's diagnostics, and warns of other nodes that should not be there."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
         self._topics: dict[str, Topic] = {}
         self._refused, self._reported, self._reason = 0, 0, ""
         self._publisher: Publisher | None = None
-        self._health: Callable[[float], Health] = lambda now: Health(Level.OK, "")
+        self._diagnostics: Callable[[float], Status] = lambda now: Status(Level.OK, "")
         self._status = DiagnosticStatus(hardware_id=socket.gethostname())
         self._due = 0.0
         self._working_due = 0.0
         self._began = time.monotonic()
-        self._namesake = Lasting()
-        self._last = Health(Level.OK, "")
+        self._namesake = ConditionTimer()
+        self._last = Status(Level.OK, "")
         self._working: tuple[str, float] | None = None
         self._publishing = threading.Lock()
         self.several_publishers: dict[str, list[str]] = {}
@@ -72,18 +73,18 @@ class Introspection:
         self._refused += count
         self._reason = f"{topic}: {reason}"[:300]
 
-    def report(self, task: str, health: Callable[[float], Health]) -> None:
-        """Publish what `health(now)` says once a second, under the node's name and `task`."""
+    def report(self, task: str, status: Callable[[float], Status]) -> None:
+        """Publish what `status(now)` says once a second, under the node's name and `task`."""
         self._publisher = self._node.create_publisher(DiagnosticArray, DIAGNOSTICS, 1)
         name = self._node.get_fully_qualified_name().removeprefix("/")
         self._status.name = f"{name}: {task}"
-        self._health = health
+        self._diagnostics = status
 
     def round(self, now: float) -> None:
         """To be called at every housekeeping; works once a second."""
         if now < self._due:
             return
-        # A steady beat, though the housekeeping comes a little late each time.
+        # A steady period, though the housekeeping comes a little late each time.
         self._due = max(self._due + PERIOD, now + PERIOD / 2)
         self._look_at_publishers()
         namesakes, refused = self._namesakes(now), self._refused - self._reported
@@ -94,14 +95,14 @@ class Introspection:
             )
         if self._publisher is None:
             return
-        health = self._health(now)
+        status = self._diagnostics(now)
         if refused:
-            health = health.worsened(Level.WARN, f"refused {refused} message(s): {self._reason}")
+            status = status.merged(Level.WARN, f"refused {refused} message(s): {self._reason}")
         if namesakes:
-            health = health.worsened(Level.WARN, "another node has this name")
+            status = status.merged(Level.WARN, "another node has this name")
         uptime = round(now - self._began, 1)
-        values = {**health.values, "refused messages": self._refused, "uptime": uptime}
-        self._last = Health(health.level, health.message, values)
+        values = {**status.values, "refused messages": self._refused, "uptime": uptime}
+        self._last = Status(status.level, status.message, values)
         self._publish(self._publisher, self._last)
 
     def offer(self, name: str, act: Callable[[], str]) -> None:
@@ -145,14 +146,14 @@ class Introspection:
         self._working_due = now + PERIOD
         seconds = now - since
         values = {**self._last.values, "activity": what, "activity for": round(seconds, 1)}
-        self._publish(publisher, Health(self._last.level, f"{what} for {seconds:.0f} s", values))
+        self._publish(publisher, Status(self._last.level, f"{what} for {seconds:.0f} s", values))
 
-    def _publish(self, publisher: Publisher, health: Health) -> None:
+    def _publish(self, publisher: Publisher, status: Status) -> None:
         with self._publishing:
-            status = self._status
-            status.level, status.message = bytes([health.level]), health.message
-            status.values = [KeyValue(key=key, value=value) for key, value in health.texts()]
-            message = DiagnosticArray(status=[status])
+            own = self._status
+            own.level, own.message = bytes([status.level]), status.message
+            own.values = [KeyValue(key=key, value=value) for key, value in status.texts()]
+            message = DiagnosticArray(status=[own])
             message.header.stamp = self._node.get_clock().now().to_msg()
             publisher.publish(message)
 

@@ -27,7 +27,7 @@ from loop_interfaces.topics import ACTION, SAMPLES, SAMPLES_THROTTLED, STATE
 
 SAMPLE_DEPTH = 4000
 """Single states or actions that wait for a reader: most of a second of the fastest loop."""
-BUNDLE_DEPTH = 512
+BATCH_DEPTH = 512
 """Batches that wait for a reader: seconds of the fastest loop, for a batch is not repeated."""
 _SINGLES: dict[int, tuple[Any, str]] = {
     STATE_KIND: (Float64MultiArray, STATE.name),
@@ -94,7 +94,7 @@ class SampleSubscription:
         self._kinds = (STATE_KIND, ACTION_KIND, *((CLOCK_KIND,) if single_clock else ()))
         self._offset = ClockOffset()
         name = SAMPLES_THROTTLED if throttled else SAMPLES
-        depth = BUNDLE_DEPTH
+        depth = BATCH_DEPTH
         self._batches = self._subscribe(UInt8MultiArray, name, samples_qos(depth), depth)
         self._singles: dict[int, SerializedSubscription] = {}
         self._state_topic = node.resolve_topic_name(scoped(namespace, STATE.name))

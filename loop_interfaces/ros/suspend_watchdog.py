@@ -14,7 +14,7 @@ IDLE = 0.05
 most PERIOD before it was stopped. One that is starved by others still gets more."""
 
 
-def nap(seconds: float) -> None:
+def sleep_for(seconds: float) -> None:
     """Sleep for so long, and not until a point of a clock: clocks jump, and tools that move them for
     tests (libfaketime) let time.sleep fail.
     """
@@ -57,7 +57,7 @@ class SuspendWatchdog:
 
     def _run(self) -> None:
         while not self._stopped:
-            nap(PERIOD)
+            sleep_for(PERIOD)
             self._tick()
             if self._on_tick and not self._stopped:
                 self._on_tick()

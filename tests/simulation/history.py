@@ -178,7 +178,7 @@ class TunerProcess(Process):
         if "checkpoint" in history.disk:
             training.restore(deepcopy(history.disk["checkpoint"]))
         incarnation = history.disk["starts"] = history.disk.get("starts", -1) + 1
-        self.dispatcher = Dispatcher.create(
+        self.dispatcher = Dispatcher(
             run=RUN,
             n_a=history.values["n_a"],
             pairs=1,
@@ -197,7 +197,7 @@ class TunerProcess(Process):
             COST: self.dispatcher.cost,
             MODEL_IDENTIFIED: self.dispatcher.model,
             TARGET: self.dispatcher.target,
-            PAUSED: self.dispatcher.paused,
+            PAUSED: self.dispatcher.plant_paused,
         }[topic]
         self._guarded(lambda now: handler(0, frame, now))
 
@@ -219,7 +219,7 @@ class TunerProcess(Process):
 
     def hold(self, on: bool) -> None:
         if on:
-            self.dispatcher.hold()
+            self.dispatcher.pause()
         else:
             self._guarded(self.dispatcher.resume)
 

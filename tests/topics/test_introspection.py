@@ -251,10 +251,10 @@ def test_a_second_node_of_the_same_name_is_reported(loop: Processes):
 
 COMPUTES = """
 import time
-from loop_interfaces.diagnostics import Health, Level
+from loop_interfaces.diagnostics import Status, Level
 from loop_interfaces.ros.node_main import ros_node
 with ros_node("busy_node", ["--ros-args"]) as (node, loop):
-    loop.introspection.report("work", lambda now: Health(Level.OK, "idle", {"run": 1}))
+    loop.introspection.report("work", lambda now: Status(Level.OK, "idle", {"run": 1}))
     began = time.monotonic()
     def housekeeping(now):
         if now > began + 2.5:
@@ -281,7 +281,7 @@ def test_a_node_that_computes_for_long_tells_what_and_since_when(loop: Processes
 
 COMPUTES_AGAIN_AND_AGAIN = """
 import time
-from loop_interfaces.diagnostics import Health, Level
+from loop_interfaces.diagnostics import Status, Level
 from loop_interfaces.ros.node_main import ros_node
 fits = 0
 def housekeeping(now):
@@ -292,7 +292,7 @@ def housekeeping(now):
             sum(range(10_000))
     fits += 1
 with ros_node("busy_node", ["--ros-args"]) as (node, loop):
-    loop.introspection.report("work", lambda now: Health(Level.OK, "idle", {"fits": fits}))
+    loop.introspection.report("work", lambda now: Status(Level.OK, "idle", {"fits": fits}))
     loop.run(tick=lambda now: None, deadline=lambda: None, housekeeping=housekeeping)
 """
 
