@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["ACCURACY", "least_variance"]
-
 ACCURACY = 0.045
 """Standard error of an entry of B, relative to the norm of its column, that exploration aims at."""
 

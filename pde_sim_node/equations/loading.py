@@ -20,8 +20,6 @@ from typing import Any
 from pde_sim_node.equations.base import Equation
 from pde_sim_node.equations.registry import EQUATIONS
 
-__all__ = ["ALLOWED", "GROUP", "allow", "configured_equation", "load_equation"]
-
 GROUP = "pdeloop.equations"
 """The group of entry points by which an installed package offers equations."""
 ALLOWED = "PDELOOP_EQUATIONS"

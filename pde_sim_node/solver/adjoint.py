@@ -25,7 +25,6 @@ Trapp, SIAM Review 40 (1998) (the complex step for g').
 from __future__ import annotations
 
 import ctypes
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numba
@@ -169,18 +168,15 @@ def compile_pull_back(sources: str) -> Any:
         on_states: Array,
         on_actions: Array,
         plans: NDArray[np.void],
-        which: int,
-        begin: int,
-        end: int,
     ) -> None:
-        """Environments begin..end, with the scratch of plans[which]; writes after, on_states and
-        on_actions: f(z, a) and the two products with its transposed derivatives.
+        """Write f(z, a) and the two products with its transposed derivatives: after, on_states and
+        on_actions.
         """
         sources  # noqa: B018  # closed over to be part of the key on disk
-        plan = plans[which]
+        plan = plans[0]
         w, d, c, e = plan.scratch, plan.scratch_apart, plan.constants, plan.constants_apart
         last, block = plan.n_z // 2, 4 * plan.fine.m
-        for i in range(begin, end):
+        for i in range(len(states)):
             state = states.ctypes.data + 8 * plan.n_z * i
             record(state, actions.ctypes.data + 8 * plan.n_a * i, w, d, plan, c, e)
             synthesise(after.ctypes.data + 8 * plan.n_z * i, w, d, plan, c, e)
@@ -223,8 +219,6 @@ class Adjoint:
     ----------
     plant
         Whose step it is; it is not changed.
-    threads
-        Environments computed at the same time.
 
     Raises
     ------
@@ -232,7 +226,7 @@ class Adjoint:
         The equation's nonlinearity has no derivative that can be computed.
     """
 
-    def __init__(self, plant: Plant, threads: int = 1) -> None:
+    def __init__(self, plant: Plant) -> None:
         self._plant = plant
         if isinstance(plant.equation, LinearEquation):
             raise ValueError(
@@ -242,7 +236,8 @@ class Adjoint:
         step = plant.parallel
         self._constants = step.constants  # kept alive: the plan has its address
         self._loop = derivative_loop(plant.equation)
-        plan = np.zeros(1, PLAN_AND_TAPE)[0]
+        self._plans = np.zeros(1, PLAN_AND_TAPE)
+        plan = self._plans[0]
         for name in PLAN.names or ():
             plan[name] = step.plans[0][name]
         offset = int(plan["scratch_apart"])
@@ -252,10 +247,8 @@ class Adjoint:
             plan[name] = offset
             offset += int(size)
         plan["scratch_apart"], plan["derivative"] = offset, self._loop.address
-        self._scratch = [aligned(2 * offset) for _ in range(threads)]
-        self._plans = np.repeat(plan, threads)
-        self._plans["scratch"] = [scratch.ctypes.data for scratch in self._scratch]
-        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
+        self._scratch = aligned(2 * offset)
+        plan["scratch"] = self._scratch.ctypes.data
 
     def step(self, states: Array, actions: Array) -> Array:
         """f(z, a) as it is recorded for the way back: the plant's own step, to the bit.
@@ -296,16 +289,7 @@ class Adjoint:
         if y.shape != z.shape:
             raise ValueError(f"covectors must have the states' shape {z.shape}, got {y.shape}")
         after, on_states, on_actions = np.empty_like(z), np.empty_like(z), np.empty_like(a)
-        count = len(self._scratch)
-
-        def work(part: int) -> None:
-            begin, end = batch * part // count, batch * (part + 1) // count
-            _pull_back(z, a, y, after, on_states, on_actions, self._plans, part, begin, end)
-
-        if self._pool is None:
-            work(0)
-        else:
-            list(self._pool.map(work, range(count)))
+        _pull_back(z, a, y, after, on_states, on_actions, self._plans)
         return after, on_states, on_actions
 
 
