@@ -11,12 +11,12 @@ import pytest
 
 from loop_interfaces.frames import Frame
 from tuner_node.dispatch import PAUSE_LEASE, Dispatcher, DispatchError
-from tuner_node.participants import RIVAL_GRACE, Participants, Publishers
+from tuner_node.participants import SECOND_TUNER_GRACE, Participants, Publishers
 
 
 def participants(recorder: str = "none", *, pairs: int = 1, established: bool = False) -> Any:
     """Participants of a session that has begun nothing yet, and its dispatcher."""
-    dispatcher = Dispatcher.create(
+    dispatcher = Dispatcher(
         run=7,
         n_a=1,
         pairs=pairs,
@@ -65,13 +65,13 @@ def test_a_recorder_that_goes_ends_the_training_only_where_it_is_required():
 def test_another_tuner_ends_this_one_unless_it_came_first_or_is_only_seen_for_a_while():
     company, _ = participants()
     company.look(there(tuners=2), 0.0)
-    company.look(there(tuners=2), RIVAL_GRACE)
-    company.look(there(tuners=1), RIVAL_GRACE + 1)  # it was one that had been killed
+    company.look(there(tuners=2), SECOND_TUNER_GRACE)
+    company.look(there(tuners=1), SECOND_TUNER_GRACE + 1)  # it was one that had been killed
     company.look(there(tuners=2), 20.0)
     with pytest.raises(DispatchError, match="another tuner publishes /episode/start; stop it"):
-        company.look(there(tuners=2), 20.1 + RIVAL_GRACE)
+        company.look(there(tuners=2), 20.1 + SECOND_TUNER_GRACE)
     company, _ = participants(established=True)
-    for now in (0.0, 2 * RIVAL_GRACE):
+    for now in (0.0, 2 * SECOND_TUNER_GRACE):
         company.look(there(tuners=2), now)
 
 
@@ -79,7 +79,7 @@ def test_another_tuner_ends_this_one_unless_it_came_first_or_is_only_seen_for_a_
 def test_a_pause_is_told_once(pairs: int, which: str):
     company, dispatcher = participants(pairs=pairs)
     assert company.newly_paused(0.0) == ""
-    dispatcher.paused(pairs - 1, Frame(7, 0, 0, 0.0, np.ones(1)), 1.0)
+    dispatcher.plant_paused(pairs - 1, Frame(7, 0, 0, 0.0, np.ones(1)), 1.0)
     assert re.fullmatch(f"the plant{which} is paused", company.newly_paused(1.5))
     assert company.newly_paused(2.0) == ""
     assert company.newly_paused(1.1 + PAUSE_LEASE) == "no plant is paused"

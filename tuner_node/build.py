@@ -148,7 +148,7 @@ def build_dispatcher(
     values: Mapping[str, Any], training: Training, identity: RunIdentity
 ) -> Dispatcher:
     """The dispatcher that serves a training with the pairs of the tuner's parameters."""
-    return Dispatcher.create(
+    return Dispatcher(
         run=identity.run,
         n_a=values["n_a"],
         pairs=len(values["pairs"]),

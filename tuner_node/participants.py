@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from loop_interfaces.diagnostics import Lasting
+from loop_interfaces.diagnostics import ConditionTimer
 from tuner_node.dispatch import DispatchError, PairPublication
 from tuner_node.session import Session
 
-RIVAL_GRACE = 6.0
+SECOND_TUNER_GRACE = 6.0
 """Seconds a second tuner may be seen before it counts as one: a killed one is seen for 3 s."""
 
 
@@ -45,7 +45,7 @@ class Participants:
     def __init__(self, session: Session, recorder: str) -> None:
         self._session, self._recorder = session, recorder
         self._recorder_seen = False
-        self._rival = Lasting()
+        self._second_tuner = ConditionTimer()
         self._paused: list[int] = []
 
     def look(self, there: Publishers, now: float) -> list[PairPublication]:
@@ -56,7 +56,7 @@ class Participants:
         DispatchError
             The recording is required and its recorder has gone, or another tuner publishes.
         """
-        self._refuse_rival(there.tuners, now)
+        self._refuse_second_tuner(there.tuners, now)
         absent = ["recorder"] if self._awaits_recorder(there.recorders > 0) else []
         publications = []
         for pair, counts in enumerate(zip(there.plants, there.controllers, strict=True)):
@@ -89,11 +89,11 @@ class Participants:
         self._recorder_seen |= there
         return not self._recorder_seen
 
-    def _refuse_rival(self, tuners: Mapping[str, int], now: float) -> None:
+    def _refuse_second_tuner(self, tuners: Mapping[str, int], now: float) -> None:
         """DispatchError if another tuner publishes, unless a pair serves this one and refuses it."""
         shared = [topic for topic, count in tuners.items() if count > 1]
-        rival = bool(shared) and not self._session.established
-        if self._rival.seconds(rival, now) > RIVAL_GRACE:
+        unserved = bool(shared) and not self._session.established
+        if self._second_tuner.seconds(unserved, now) > SECOND_TUNER_GRACE:
             raise DispatchError(
                 f"another tuner publishes {shared[0]}; "
                 "stop it, or start this one in another namespace or ROS domain"
