@@ -18,8 +18,8 @@ def plant(seed: int = 0, cubic: float = -0.3) -> ConvolutionModel:
     linear = 1.04 * np.exp(-0.004 * wavenumbers**2 + 0.1j * wavenumbers)
     # Of an even number of points the highest wavenumber has a real symbol.
     linear[-1] = abs(linear[-1])
-    symbols = np.stack([linear, 0.02j * wavenumbers, cubic + 0.0 * linear], axis=1)
-    symbols[-1, 1] = 0.0
+    symbols = np.stack([linear, 0.02j * wavenumbers, cubic + 0.0 * linear])[:, None, None]
+    symbols[1, ..., -1] = 0.0
     B = np.random.default_rng(seed).standard_normal((N_Z, N_A))
     return ConvolutionModel(symbols, 0.1 * B, 0.02 * np.ones(N_Z))
 
@@ -34,10 +34,24 @@ def episode(model: ConvolutionModel, seed: int, size: float = 1.0) -> tuple[Arra
     return np.array(states), actions
 
 
-def fitted(states: Array, actions: Array, ridge: float = 1e-14) -> ConvolutionModel:
+def coupled_plant(seed: int = 0) -> ConvolutionModel:
+    """Two components that drive each other, differently at every wavenumber; the second is moved."""
+    turn = 0.1 * np.arange(1, N_Z // 4 + 2)
+    symbols = 0.99 * np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    B = np.random.default_rng(seed).standard_normal((N_Z, N_A))
+    B[: N_Z // 2] = 0.0
+    return ConvolutionModel(symbols[None].astype(np.complex128), 0.1 * B, 0.02 * np.ones(N_Z))
+
+
+def fitted(
+    states: Array, actions: Array, ridge: float = 1e-14, degree: int = 3, components: int = 1
+) -> ConvolutionModel:
     weights = np.ones(len(actions))
     (model,) = fit_convolutions(
-        states[:-1], actions, states[1:], weights, degrees=(3,), ridges=(ridge,)
+        *(states[:-1], actions, states[1:], weights),
+        degrees=(degree,),
+        ridges=(ridge,),
+        components=components,
     )
     return model
 
@@ -53,6 +67,14 @@ def test_one_episode_determines_a_convolution_model() -> None:
     np.testing.assert_allclose(model.step(z[:-1], a), z[1:], atol=1e-4)
 
 
+def test_one_episode_determines_how_components_drive_each_other() -> None:
+    true = coupled_plant()
+    model = fitted(*episode(true, 1), degree=1, components=2)
+    np.testing.assert_allclose(model.symbols, true.symbols, atol=1e-7)
+    z, a = episode(true, 2)
+    np.testing.assert_allclose(model.step(z[:-1], a), z[1:], atol=1e-7)
+
+
 def test_a_shifted_field_has_a_shifted_future() -> None:
     model = plant()
     z = np.random.default_rng(3).standard_normal(N_Z)
@@ -62,8 +84,9 @@ def test_a_shifted_field_has_a_shifted_future() -> None:
         np.testing.assert_allclose(ahead, np.roll(model.step(z, none), shift), atol=1e-13)
 
 
-def test_jacobians_are_derivatives_of_the_step() -> None:
-    model, rng = plant(), np.random.default_rng(4)
+@pytest.mark.parametrize("model", [plant(), coupled_plant()])
+def test_jacobians_are_derivatives_of_the_step(model: ConvolutionModel) -> None:
+    rng = np.random.default_rng(4)
     V = np.linalg.qr(rng.standard_normal((N_Z, 5)))[0]
     z = rng.standard_normal((2, N_Z))
     found = model.jacobians(z, V)

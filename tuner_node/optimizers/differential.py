@@ -68,6 +68,7 @@ class DifferentialModel:
     constant: Array
 
     name = "differential"
+    components = 1
 
     def step(self, z: Array, a: Array) -> Array:
         """z_{k+1} of the states z (..., n_z) and the actions a (..., n_a)."""

@@ -39,7 +39,7 @@ _LEAST_WEIGHT = 0.05
 _REPRODUCED = 0.05
 _COMPARED = 8
 # Measured initial fields that a law is improved on, the newest, and how far from their mean further
-# ones are. Coordinates of the sensitivities, at least.
+# ones are. Coordinates of the sensitivities of each component, at least.
 _FIELDS = 8
 _BEYOND = 1.5
 _SENSITIVITY_MODES = 48
@@ -245,7 +245,7 @@ class Proposer:
             return None
         policy = incumbents[0].policy
         fields = list({record.states[0].tobytes(): record.states[0] for record in data}.values())
-        modes = max(self._modes, min(_SENSITIVITY_MODES, self.n_z))
+        modes = max(self._modes, min(model.components * _SENSITIVITY_MODES, self.n_z))
         improved = improve(
             self._loop,
             model,
@@ -265,20 +265,28 @@ class Proposer:
         data: z, a, z after, and weights of all steps. The simpler kind of model comes first.
         """
         z, a, after, weights = data
+
+        def convolutions(degrees: Sequence[int], components: int) -> Sequence[FieldModel]:
+            return fit_convolutions(
+                *(z, a, after, weights),
+                degrees=degrees,
+                ridges=_CONVOLUTION_RIDGES,
+                components=components,
+            )
+
         kinds: tuple[Callable[[], Sequence[FieldModel]], ...] = (
-            lambda: fit_convolutions(
-                z, a, after, weights, degrees=_DEGREES, ridges=_CONVOLUTION_RIDGES
-            ),
+            lambda: convolutions(_DEGREES, 1),
             lambda: [fit_differential(z, a, after)],
+            lambda: [] if self.n_z % 2 else convolutions((1,), 2),
         )
         for fitted in kinds if measured else ():
-            models = fitted()
-            errors = [
-                mismatch(self._loop, model, measured, _REPRODUCED, self._noise) for model in models
+            judged: list[tuple[float, FieldModel | None]] = [
+                (mismatch(self._loop, model, measured, _REPRODUCED, self._noise), model)
+                for model in fitted()
             ]
-            best = int(np.argmin(errors))
-            if errors[best] <= _REPRODUCED:
-                return models[best], errors[best]
+            error, best = min(judged, key=lambda pair: pair[0], default=(np.inf, None))
+            if error <= _REPRODUCED:
+                return best, error
         return None, np.inf
 
     def _ranks(self, model: FieldModel, rejected: Sequence[tuple[Record, Record]]) -> bool:
