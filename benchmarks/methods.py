@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,16 +18,17 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.warm_start import warm_start
 from controller_node import lqt
-from controller_node.identification import DesignSettings, identify
+from controller_node.identification import identify
 from controller_node.lqt import Gains
 from controller_node.policy import excitation
 from controller_node.reduced_model import ReducedModel
 from loop_interfaces.model_rows import unpack
+from pde_sim_node.build import build_plant
+from pde_sim_node.measurement import InstrumentedPlant
 from pde_sim_node.plant import Plant
 from pdeloop.episode import Law, projected_law, rollout
 from pdeloop.in_process import LocalPair
 from pdeloop.study.training import require_environment
-from tuner_node.optimizers import Trajectory
 from tuner_node.seeds import Purpose, derive
 
 Array = NDArray[np.float64]
@@ -137,48 +138,56 @@ def cma_es(values: Values, *, sigma: float, population: int) -> tuple[LocalPair,
     return pair, projected_law(plant, U, policy(search.mean)), paid
 
 
+class Experiment(NamedTuple):
+    """A rollout: states that a model is identified from (N + 1, n), actions, and what was measured."""
+
+    states: Array
+    actions: Array
+    measured: Array
+
+
+class Identified(NamedTuple):
+    """A reduced model with its LQ-tracking gains and reduced target, and the data it is from."""
+
+    model: ReducedModel
+    gains: Gains
+    s_r: Array
+    data: Sequence[Experiment]
+
+
 class Predictive:
     """Linear model predictive control on a reduced model, its quadratic programs solved by OSQP.
 
-        min  sum_{j<N} q |s_j - s_r|^2 + r |a_j|^2 + V(s_N),
-        s_{j+1} = A s_j + B a_j + d,    |a_j| <= limit
+        min  sum_{j<N} q |s_j - s_r|^2 + r |a_j|^2 + V(s_N),    s_{j+1} = A s_j + B a_j,  |a_j| <= limit
 
-    V is the value of LQ tracking, so that without limit and with d = 0 it is the LQT law, whatever N.
-    d estimates the model's error, d <- d + gain (s_k - A s_{k-1} - B a_{k-1} - d), so that a constant
-    one leaves no offset. Rawlings, Mayne, Diehl, *Model Predictive Control*, 2nd edition, sections
-    1.3 and 1.5; Stellato et al., "OSQP", Math. Prog. Comp. 12, 2020.
+    V is the value of LQ tracking, so that without limit it is the LQT law, whatever N. Rawlings, Mayne,
+    Diehl, *Model Predictive Control*, 2nd edition, section 1.3; Stellato et al., "OSQP", Math. Prog.
+    Comp. 12, 2020.
     """
 
-    def __init__(
-        self, plant: Plant, model: ReducedModel, gains: Gains, values: Values, N: int, gain: float
-    ) -> None:
+    def __init__(self, known: Identified, values: Values, N: int) -> None:
         import osqp
 
-        self._model, self._gain, self._N = model, gain, N
-        A, B, n_s, n_a = model.A, model.B, model.n_s, model.n_a
-        self._s_r = model.U.T @ plant.target
+        A, B, n_s, n_a = known.model.A, known.model.B, known.model.n_s, known.model.n_a
         q, r = values["state_weight"], values["action_weight"]
         limit = values["action_limit"] or np.inf
+        # s_{1..N} = free s_0 + forced a
         powers = [np.linalg.matrix_power(A, j) for j in range(N + 1)]
-        # s_{1..N} = free s_0 + forced a + drift d
-        self._free = np.vstack(powers[1:])
-        forced = np.zeros((N * n_s, N * n_a))
+        free, forced = np.vstack(powers[1:]), np.zeros((N * n_s, N * n_a))
         for j in range(N):
             for i in range(j + 1):
                 forced[j * n_s : (j + 1) * n_s, i * n_a : (i + 1) * n_a] = powers[j - i] @ B
-        self._drift = np.cumsum(powers[:N], axis=0).reshape(N * n_s, n_s)
-        weight = np.kron(np.eye(N), q * np.eye(n_s))
-        weight[-n_s:, -n_s:] = gains.P
+        weight = q * np.eye(N * n_s)
+        weight[-n_s:, -n_s:] = known.gains.P
+        linear = np.tile(-q * known.s_r, N)
         # V = s'Ps + 2 p's + const.
-        p = -linalg.solve(np.eye(n_s) - (A + B @ gains.K_a).T, q * self._s_r)
-        linear = np.tile(-q * self._s_r, N)
-        linear[-n_s:] = p
-        self._weighted, self._linear = forced.T @ weight, forced.T @ linear
-        hessian = self._weighted @ forced + r * np.eye(N * n_a)
-        self._s, self._d, self._actions, self._plan = (np.zeros((0, 0)) for _ in range(4))
+        closed_loop = A + B @ known.gains.K_a
+        linear[-n_s:] = -linalg.solve(np.eye(n_s) - closed_loop.T, q * known.s_r)
+        self._U, self._n_a, self._plan = known.model.U, n_a, np.zeros((0, N * n_a))
+        self._from_state, self._constant = forced.T @ weight @ free, forced.T @ linear
         self._solver = osqp.OSQP()
         self._solver.setup(
-            sparse.csc_matrix(np.triu(hessian)),
+            sparse.csc_matrix(np.triu(forced.T @ weight @ forced + r * np.eye(N * n_a))),
             np.zeros(N * n_a),
             sparse.eye(N * n_a, format="csc"),
             np.full(N * n_a, -limit),
@@ -189,77 +198,119 @@ class Predictive:
         )
 
     def __call__(self, k: int, states: Array) -> Array:
-        model, s = self._model, states @ self._model.U
         if k == 0:
-            self._d = np.zeros_like(s)
-            self._plan = np.zeros((len(s), self._N * model.n_a))
-        else:
-            error = s - self._s @ model.A.T - self._actions @ model.B.T - self._d
-            self._d += self._gain * error
-        for m, (own, d) in enumerate(zip(s, self._d, strict=True)):
-            ahead = self._free @ own + self._drift @ d
-            self._solver.update(q=self._weighted @ ahead + self._linear)
+            self._plan = np.zeros((len(states), self._plan.shape[1]))
+        for m, s in enumerate(states @ self._U):
+            self._solver.update(q=self._from_state @ s + self._constant)
             self._solver.warm_start(x=self._plan[m])
             self._plan[m] = self._solver.solve(raise_error=True).x
-        self._s, self._actions = s, self._plan[:, : model.n_a].copy()
-        return self._actions
+        return self._plan[:, : self._n_a].copy()
+
+
+class KalmanLaw:
+    """LQG: LQ tracking of the reduced state that a Kalman filter estimates from the newest readings.
+
+        s_{k+1} = A s_k + B a_k + w_k,    y_k = C s_k + v_k
+
+    C is the regression of the readings on the reduced states in the data, and the covariances of w, v
+    and s_0 are those found there. Anderson, Moore, *Optimal Filtering*, section 3.1.
+    """
+
+    def __init__(self, known: Identified, n_y: int, limit: float) -> None:
+        model, data = known.model, known.data
+        self._known, self._n_y, self._limit = known, n_y, limit or np.inf
+        s = [each.states @ model.U for each in data]
+        w = [
+            own[1:] - own[:-1] @ model.A.T - each.actions @ model.B.T
+            for own, each in zip(s, data, strict=True)
+        ]
+        y = np.vstack([each.measured[:, :n_y] for each in data])
+        self._C = linalg.lstsq(np.vstack(s), y)[0].T
+        v = y - np.vstack(s) @ self._C.T
+        self._W, self._V = (e.T @ e / len(e) for e in (np.vstack(w), v))
+        self._V += 1e-9 * np.trace(y.T @ y / len(y)) * np.eye(n_y)
+        self._first = np.stack([own[0] for own in s])
+
+    def __call__(self, k: int, states: Array) -> Array:
+        (A, B), C, n_s = (self._known.model.A, self._known.model.B), self._C, len(self._C.T)
+        if k == 0:
+            mean = self._first.mean(axis=0)
+            spread = self._first - mean
+            prior = spread.T @ spread / len(spread) + 1e-3 * (mean @ mean) * np.eye(n_s)
+            self._s, self._P = np.tile(mean, (len(states), 1)), prior
+        gain = linalg.solve(C @ self._P @ C.T + self._V, C @ self._P, assume_a="pos").T
+        s = self._s + (states[:, : self._n_y] - self._s @ C.T) @ gain.T
+        P = (np.eye(n_s) - gain @ C) @ self._P
+        actions = s @ self._known.gains.K_a.T + self._known.gains.K_b @ self._known.s_r
+        actions = np.clip(actions, -self._limit, self._limit)
+        self._s, self._P = s @ A.T + actions @ B.T, A @ P @ A.T + self._W
+        return actions
 
 
 def identified_again(
-    values: Values, controller: Callable[[Plant, ReducedModel, Gains], Law], feedback: bool
+    values: Values, controller: Callable[[Plant, Identified], Law], whole: bool = False
 ) -> tuple[LocalPair, Law, int]:
     """A controller designed for a model from all rollouts of the budget.
 
-    The model is identified again whenever the data have doubled, from further explorations, or with
-    `feedback` from rollouts of the controller itself, excited in the same way.
+    The first rollout is an exploration, the others are the controller's own, excited in the same way.
+    The model is identified again whenever the data have doubled; with `whole` from the fields
+    themselves, whatever is measured of them.
     """
     pair = LocalPair(values)
-    plant, settings = pair.plant, DesignSettings.of(values)
-
-    def design(data: Sequence[Trajectory]) -> Law:
-        known = [(each.states, each.actions) for each in data]
-        model = identify(known, method="regression", n_s=settings.reduced_order)
-        weights = {name: values[name] for name in ("state_weight", "action_weight")}
-        return controller(plant, model, lqt.track(model, **weights))
-
-    training = warm_start(values, pair)
-    assert training.explorations[0] is not None
-    data, paid = [training.explorations[0]], int(training.budget.paid[0])
-    law = design(data)
+    plant, weights = pair.plant, {name: values[name] for name in ("state_weight", "action_weight")}
+    target = build_plant({**values, "sensors": 0}).target if whole else plant.target
+    variance, limit = values["exploration_variance"], values["action_limit"] or np.inf
+    data: list[Experiment] = []
+    law: Law | None = None
+    paid = 0
     while paid < values["rollouts"]:
-        count = min(len(data), values["rollouts"] - paid)
+        count = min(max(len(data), 1), values["rollouts"] - paid)
         fields = [training_field(values, paid + i) for i in range(count)]
 
-        def excited(k: int, states: Array, fields: list[int] = fields, law: Law = law) -> Array:
-            variance, limit = values["exploration_variance"], values["action_limit"]
-            drawn = np.stack([excitation(f, k, plant.n_a, variance) for f in fields])
-            actions = law(k, states) + drawn if feedback else drawn
-            return np.clip(actions, -limit, limit) if limit else actions
+        def excited(
+            k: int, states: Array, fields: list[int] = fields, law: Law | None = law
+        ) -> Array:
+            actions = np.stack([excitation(f, k, plant.n_a, variance) for f in fields])
+            return np.clip(actions + law(k, states) if law else actions, -limit, limit)
 
         episode = rollout(plant, excited, fields)
         paid += count
+        states = episode.fields if whole else episode.states
         data += [
-            Trajectory(episode.states[:, m], episode.actions[:, m])
+            Experiment(states[:, m], episode.actions[:, m], episode.states[:, m])
             for m in np.flatnonzero(episode.costs.diverged_step < 0)
         ]
-        law = design(data)
+        model = identify(
+            [each[:2] for each in data], method="regression", n_s=values["reduced_order"]
+        )
+        known = Identified(model, lqt.track(model, **weights), model.U.T @ target, data)
+        law = controller(plant, known)
+    assert law is not None
     return pair, law, paid
 
 
-def lqt_again(values: Values, *, feedback: bool) -> tuple[LocalPair, Law, int]:
+def lqt_again(values: Values) -> tuple[LocalPair, Law, int]:
     """LQ tracking on a model from all rollouts of the budget."""
     return identified_again(
-        values, lambda plant, model, gains: projected_law(plant, model.U, gains.policy), feedback
+        values, lambda plant, known: projected_law(plant, known.model.U, known.gains.policy)
     )
 
 
-def mpc(values: Values, *, steps: int, gain: float, feedback: bool) -> tuple[LocalPair, Law, int]:
+def mpc(values: Values, *, steps: int) -> tuple[LocalPair, Law, int]:
     """`Predictive` on a model from all rollouts of the budget."""
-    return identified_again(
-        values,
-        lambda plant, model, gains: Predictive(plant, model, gains, values, steps, gain),
-        feedback,
-    )
+    return identified_again(values, lambda plant, known: Predictive(known, values, steps))
+
+
+def lqg(values: Values, *, whole: bool) -> tuple[LocalPair, Law, int]:
+    """`KalmanLaw` on a model from all rollouts of the budget, for plants with few sensors."""
+
+    def controller(plant: Plant, known: Identified) -> Law:
+        assert isinstance(plant, InstrumentedPlant)
+        return KalmanLaw(known, plant.positions.size, values["action_limit"])
+
+    if not values["sensors"]:
+        raise ValueError("lqg is for plants with few sensors: give --set sensors=16")
+    return identified_again(values, controller, whole)
 
 
 METHODS: dict[str, Method] = {
@@ -268,6 +319,7 @@ METHODS: dict[str, Method] = {
     "lqt-again": lqt_again,
     "mpc": mpc,
     "cma-es": cma_es,
+    "lqg": lqg,
 }
 LIBRARIES = {"mpc": "osqp", "cma-es": "cmaes"}
 """What a method needs besides the project's own dependencies: the extra `bench`."""

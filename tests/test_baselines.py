@@ -15,7 +15,14 @@ import pytest
 
 from benchmarks import baselines, robustness
 from benchmarks.baselines import TEST, TUNING_SEEDS, VALIDATION, iqm, refuse_other_constants, run
-from benchmarks.methods import LIBRARIES, METHODS, Predictive, evaluation_fields, measure
+from benchmarks.methods import (
+    LIBRARIES,
+    METHODS,
+    Identified,
+    Predictive,
+    evaluation_fields,
+    measure,
+)
 from controller_node import lqt
 from controller_node.reduced_model import ReducedModel
 from pde_sim_node.build import build_plant
@@ -28,16 +35,17 @@ from tests.small import SMALL, parameters
 
 CONSTANTS: dict[str, dict[str, Any]] = {
     "cma-es": {"sigma": 0.01, "population": 4},
-    "mpc": {"steps": 5, "gain": 0.0, "feedback": True},
-    "lqt-again": {"feedback": True},
+    "mpc": {"steps": 5},
+    "lqg": {"whole": False},
 }
 ROLLOUTS = 11
 
 
-def values_of(method: str, **more: Any) -> dict[str, Any]:
+def values_of(method: str) -> dict[str, Any]:
     if library := LIBRARIES.get(method):
         pytest.importorskip(library, reason=f"needs {library}: pip install 'pdeloop[bench]'")
-    return {**parameters(rollouts=ROLLOUTS, optimizer="gauss_newton"), **more}
+    sensors = {"sensors": 8} if method == "lqg" else {}
+    return {**parameters(rollouts=ROLLOUTS, optimizer="gauss_newton"), **sensors}
 
 
 def costs(files: dict[str, bytes]) -> tuple[np.ndarray, int]:
@@ -97,7 +105,8 @@ def designs(plant: Plant, limit: float, steps: int) -> tuple[Predictive, Any, np
         U=np.linalg.qr(rng.standard_normal((plant.n_z, 3)))[0],
     )
     gains = lqt.track(model, state_weight=1.0, action_weight=1.0)
-    law = Predictive(plant, model, gains, parameters(action_limit=limit), steps, 0.0)
+    known = Identified(model, gains, model.U.T @ plant.target, ())
+    law = Predictive(known, parameters(action_limit=limit), steps)
     S = np.eye(plant.n_a) + model.B.T @ gains.P @ model.B
     return law, projected_law(plant, model.U, gains.policy), S
 
@@ -166,7 +175,7 @@ STUDY = f"""
 problems: [{SMALL}]
 seeds: 2
 variants: {{two-point: {{optimizer: two_point}}}}
-methods: {{no-control: {{}}, lqt-again: {{feedback: true}}}}
+methods: {{no-control: {{}}, lqt-again: {{}}}}
 """
 
 
