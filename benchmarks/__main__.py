@@ -215,7 +215,7 @@ def _bench(options: argparse.Namespace) -> int:
     given = {
         name: value
         for name, value in vars(options).items()
-        if name not in ("command", "program", "json", "out") and value is not None
+        if name not in ("command", "refuse", "program", "json", "out") and value is not None
     }
     result, text = _measure(options.program, given)
     if options.out is not None:

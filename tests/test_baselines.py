@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from benchmarks import baselines, robustness
+from benchmarks.__main__ import parser
 from benchmarks.baselines import TEST, TUNING_SEEDS, VALIDATION, iqm, refuse_other_constants, run
 from benchmarks.methods import (
     LIBRARIES,
@@ -27,6 +28,7 @@ from controller_node import lqt
 from controller_node.reduced_model import ReducedModel
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import DIVERGED_COST, Plant
+from pdeloop import cli
 from pdeloop.episode import projected_law
 from pdeloop.finished_run import interval
 from pdeloop.study import StudyError
@@ -206,6 +208,15 @@ def test_a_comparison_is_a_study_that_is_continued(
     assert [p for p, at in written.items() if p.stat().st_mtime_ns != at] == [lost]
     with pytest.raises(StudyError, match="holds another study"):
         run(str(file), **{**how, "seeds": 1})
+
+
+def test_the_command_line_hands_the_program_its_options_alone(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert cli.run(parser, ["baselines", "kdv", "--methods", "mcp"]) == 1
+    assert capsys.readouterr().err.startswith(
+        "pdeloop: no method mcp; expected some of gauss-newton"
+    )
 
 
 @pytest.mark.parametrize(
