@@ -241,7 +241,7 @@ class KalmanLaw:
         gain = linalg.solve(C @ self._P @ C.T + self._V, C @ self._P, assume_a="pos").T
         s = self._s + (states[:, : self._n_y] - self._s @ C.T) @ gain.T
         P = (np.eye(n_s) - gain @ C) @ self._P
-        actions = s @ self._known.gains.K_a.T + self._known.gains.K_b @ self._known.s_r
+        actions: Array = s @ self._known.gains.K_a.T + self._known.gains.K_b @ self._known.s_r
         actions = np.clip(actions, -self._limit, self._limit)
         self._s, self._P = s @ A.T + actions @ B.T, A @ P @ A.T + self._W
         return actions
@@ -271,7 +271,9 @@ def identified_again(
             k: int, states: Array, fields: list[int] = fields, law: Law | None = law
         ) -> Array:
             actions = np.stack([excitation(f, k, plant.n_a, variance) for f in fields])
-            return np.clip(actions + law(k, states) if law else actions, -limit, limit)
+            if law is not None:
+                actions += law(k, states)
+            return actions.clip(-limit, limit)
 
         episode = rollout(plant, excited, fields)
         paid += count
