@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from controller_node.policy import ProjectedLaw, excitation
 from loop_interfaces import model_rows
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import Counters, ModelFailure, Publication
-from loop_interfaces.signature import NOT_SIGNED, digest_of, signature
+from loop_interfaces.signature import NOT_SIGNED, design_digest, digest_of, signature
 from loop_interfaces.topics import (
     ACTION,
     COMPLETED,
@@ -94,6 +94,7 @@ class Responder:
 
     def __init__(self, settings: DesignSettings) -> None:
         self._settings = settings
+        self._design = design_digest(asdict(settings))
         self._targets: OrderedDict[int, np.ndarray] = OrderedDict()
         self._runs: OrderedDict[int, _Run] = OrderedDict()
         self._served = (-1, -1)
@@ -212,11 +213,16 @@ class Responder:
         if start is None or not start.plant:
             return NOT_SIGNED
         if state.plant not in run.signatures:
-            told: list[Any] = [start.values, self._settings.action_limit]
-            if start.values[0, StartColumn.EXCITATION] < 0 and run.policy is not None:
-                told += [run.policy.values, run.models_digest]
-            run.signatures[state.plant] = signature(digest_of(*told), self._targets[state.plant])
+            target = self._targets[state.plant]
+            run.signatures[state.plant] = signature(self._told(run, start), target)
         return run.signatures[state.plant]
+
+    def _told(self, run: _Run, start: Frame) -> int:
+        """D: what the tuner said of an episode; 0 if it asks for no signature."""
+        told: list[Any] = [start.values, self._settings.action_limit]
+        if start.values[0, StartColumn.EXCITATION] < 0 and run.policy is not None:
+            told += [run.policy.values, run.models_digest]
+        return digest_of(*told) if start.plant else 0
 
     def law_for(self, state: Frame) -> ProjectedLaw | None:
         """The law that answers the states of an episode, like one that was answered before.
@@ -410,7 +416,8 @@ class Responder:
         except ValueError as error:
             return failure(False, str(error))
         rows = np.stack([model_rows.pack(model) for model in models])
-        return Publication(MODEL_IDENTIFIED, replace(cost, step=0, values=rows))
+        time = signature(self._told(run, start), self._design) or cost.time
+        return Publication(MODEL_IDENTIFIED, replace(cost, step=0, time=time, values=rows))
 
     def _answer_pending(self) -> list[Publication]:
         return self.state(self._pending) if self._pending is not None else []

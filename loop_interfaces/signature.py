@@ -1,10 +1,11 @@
-"""Signatures: with which policy, model and target an action was computed.
+"""Signatures: with which policy, model and target an action was computed, and how a model was.
 
 Tuner, controller and plant compute the same numbers from what each of them knows, so the plant can
 tell whether an action comes from a controller that was told what the tuner published:
 
     D = h(rows, action_limit, policy, h(model))    in the header of `episode/start`, as `plant`
     s = -h(D, z_r)                                 in the header of every `action`, as `time`
+    s = -h(D, h(the parameters DESIGN))            in that of `model/identified`, as `time`
 
 with h the first 53 bits of BLAKE2b over the numbers as little-endian float64. Where the controller
 explores there is neither policy nor model. A simulated time is never negative, so a controller that
@@ -14,13 +15,19 @@ who reads the wire and copies the number.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from hashlib import blake2b
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 NOT_SIGNED = 0.0
-"""In place of D: the tuner asks for no signature. In place of s: the action carries none."""
+"""In place of D: the tuner asks for no signature. In place of s: the message carries none."""
+DESIGN = (
+    "identification", "reduced_order", "dmdc_rank", "dmdc_order", "state_weight", "action_weight",
+)  # fmt: skip
+"""What a model depends on beside the episode that it comes from."""
 
 
 def digest_of(*arrays: ArrayLike) -> int:
@@ -35,11 +42,20 @@ def digest_of(*arrays: ArrayLike) -> int:
     return (int.from_bytes(state.digest(), "big") >> 11) or 1
 
 
-def signature(told: int, target: ArrayLike) -> float:
-    """s for the D that a start carries; NOT_SIGNED where it carries none."""
-    return -float(digest_of(told, target)) if told else NOT_SIGNED
+def design_digest(parameters: Mapping[str, Any]) -> int:
+    """h of the parameters DESIGN; text as the numbers of its UTF-8 bytes."""
+    values = [parameters[name] for name in DESIGN]
+    return digest_of(*(list(v.encode()) if isinstance(v, str) else v for v in values))
+
+
+def signature(told: int, known: ArrayLike) -> float:
+    """s for the D that a start carries; NOT_SIGNED where it carries none.
+
+    known: z_r of an action, the design's digest of a model.
+    """
+    return -float(digest_of(told, known)) if told else NOT_SIGNED
 
 
 def signature_in(time: float) -> float:
-    """The signature in an action's header; NOT_SIGNED if it has an ordinary time there."""
+    """The signature in a header; NOT_SIGNED if it has an ordinary time there."""
     return min(time, NOT_SIGNED)

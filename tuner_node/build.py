@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from loop_interfaces.array_files import read_arrays
 from loop_interfaces.model_rows import unpack
 from loop_interfaces.parameters import model_order, noisy
+from loop_interfaces.signature import design_digest
 from loop_interfaces.spec import ParameterError
 from tuner_node.batch import UNKNOWN_PLANT, TrainingSettings
 from tuner_node.dispatch import Dispatcher
@@ -158,4 +159,5 @@ def build_dispatcher(
         max_attempts=values["max_attempts"],
         plant=training.plant,
         action_limit=values["action_limit"],
+        design=design_digest(values),
     )

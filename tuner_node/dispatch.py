@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from loop_interfaces.frames import Frame, FrameError, digest
 from loop_interfaces.protocol import Counters, ModelFailure, Publication
-from loop_interfaces.signature import digest_of
+from loop_interfaces.signature import NOT_SIGNED, digest_of, signature, signature_in
 from loop_interfaces.topics import (
     COST,
     MODEL,
@@ -83,6 +83,8 @@ class Dispatcher:
         Fingerprint of the plant that this run is about; that of the first cost, if not known.
     action_limit : float
         Magnitude at which actions saturate; 0: none.
+    design : int
+        Digest of how the run's models are identified, see loop_interfaces.signature; 0: not known.
     """
 
     def __init__(
@@ -97,11 +99,12 @@ class Dispatcher:
         max_attempts: int,
         plant: int = UNKNOWN_PLANT,
         action_limit: float = 0.0,
+        design: int = 0,
     ) -> None:
         self.run, self.n_a, self.incarnation = run, n_a, incarnation
         self.max_batch, self.episode_timeout = max_batch, episode_timeout
         self.max_attempts = max_attempts
-        self.plant, self.action_limit = plant, action_limit
+        self.plant, self.action_limit, self.design = plant, action_limit, design
         self.pairs = [Pair() for _ in range(pairs)]
         self.counters = Counters()
         self.notes: list[str] = []
@@ -256,7 +259,20 @@ class Dispatcher:
             self.pairs[pair].samples.action(frame)
 
     def model(self, pair: int, frame: Frame, now: float) -> list[PairPublication]:
-        """Take the reduced models of an exploratory episode."""
+        """Take the reduced models of an exploratory episode.
+
+        Raises
+        ------
+        FrameError
+            They are of another shape or plant, or signed by a controller that was told something else.
+        """
+        signed = self.pairs[pair].signed.get(frame.episode, 0) if frame.run == self.run else 0
+        expected = NOT_SIGNED, signature(signed, self.design)
+        if signed and self.design and signature_in(frame.time) not in expected:
+            raise FrameError(
+                "expected a model identified with the parameters of this run's tuner; stop the other "
+                "controller, or start both with the same parameters"
+            )
         known = self._answering(pair, frame, MODEL_IDENTIFIED)
         if known is None or known.chunk is None or self._batch is None:
             return []
@@ -478,6 +494,7 @@ class Dispatcher:
             policies = self._batch.policies[chunk.rows]
             sends.append(Publication(POLICY, frame(policies)))
             signed += [policies, self._models_digest]
-        pair.last_start = Publication(START, frame(rows, digest_of(*signed)))
-        sends.append(pair.last_start)
+        start = Publication(START, frame(rows, digest_of(*signed)))
+        pair.begin(start)
+        sends.append(start)
         return [(number, send) for send in sends]

@@ -61,6 +61,8 @@ class Pair:
     """How long the plant's report that it is paused holds."""
     answers: dict[str, dict[int, int]] = field(default_factory=dict)
     """By topic and episode, of the last REMEMBERED: a digest of the answer that was taken."""
+    signed: dict[int, int] = field(default_factory=dict)
+    """D of the last REMEMBERED episodes, see loop_interfaces.signature."""
     last_start: Publication | None = None
     """Sent again while nothing new is begun, to keep the plant for this run."""
 
@@ -68,5 +70,15 @@ class Pair:
         """An answer was taken: another one for its episode contradicts it."""
         known = self.answers.setdefault(topic, {})
         known[answer.episode] = digest(answer.values)
-        if len(known) > REMEMBERED:
-            del known[min(known)]
+        _forget(known)
+
+    def begin(self, start: Publication) -> None:
+        """A start is published."""
+        self.last_start = start
+        self.signed[start.frame.episode] = start.frame.plant
+        _forget(self.signed)
+
+
+def _forget(known: dict[int, int]) -> None:
+    if len(known) > REMEMBERED:
+        del known[min(known)]
