@@ -132,12 +132,19 @@ class Lockstep:
         See there. `now` is any monotonic time in s.
     fingerprint : int
         Of the plant's parameters, see build.fingerprint.
-    paused_run : int
-        The run that this plant was paused in when its process ended: it begins paused; 0: none.
+    paused_run, signed_run : int
+        The runs in which this plant was paused, and had a controller that signs, when its process
+        ended; 0: none.
     """
 
     def __init__(
-        self, plant: Plant, timing: Timing, *, fingerprint: int = 0, paused_run: int = 0
+        self,
+        plant: Plant,
+        timing: Timing,
+        *,
+        fingerprint: int = 0,
+        paused_run: int = 0,
+        signed_run: int = 0,
     ) -> None:
         self.plant = plant
         self.counters = Counters()
@@ -165,6 +172,8 @@ class Lockstep:
         """What was measured last."""
         self._signs: bool | None = None
         """Whether the run's controller signs; None before its first action."""
+        self.signed_run = signed_run
+        """The last run whose controller signs."""
         self._repeats = 0
         self._tuner_heard = -math.inf
         self._timing = timing
@@ -354,6 +363,8 @@ class Lockstep:
             self._tuner_heard = now
             return [self._finish(now, void=False)]
         self._signs = frame.time < 0.0
+        if self._signs:
+            self.signed_run = self.run
         self._state = plant.step(frame.values)
         self.advance_counters([digest(frame.values)], now)
         if self.pacer and not self.paused:
@@ -415,7 +426,7 @@ class Lockstep:
     def _serve(self, run: int, now: float) -> None:
         """Belong to a run, 0: to none, and forget the one before."""
         self.run, self.episode = run, -1
-        self._ended, self._signs = {}, None
+        self._ended, self._signs = {}, True if run == self.signed_run else None
         self._end_episode(now)
 
     def _answer_again(self) -> list[Publication]:

@@ -33,8 +33,8 @@ from pde_sim_node.diagnostics import PlantDiagnostics
 from pde_sim_node.equations import configured_equation
 from pde_sim_node.fast_path import PlantFastPath, load_compiled
 from pde_sim_node.lockstep import Lockstep, Timing
-from pde_sim_node.pause_record import PauseRecord
 from pde_sim_node.plant import Plant
+from pde_sim_node.run_record import RunRecord
 from pde_sim_node.solver.workers import use_cores
 
 
@@ -74,12 +74,13 @@ class PlantNode:
         if type(plant) is Plant:  # what instruments do to a step is not compiled
             load_compiled()  # before there is a publisher: who sees one expects answers
         domain = node.context.get_domain_id()
-        self._pause_record = PauseRecord(node.get_fully_qualified_name(), domain)
+        self._run_record = RunRecord(node.get_fully_qualified_name(), domain)
         self._lockstep = Lockstep(
             plant,
             Timing(**{spec.name: values[spec.name] for spec in PLANT if spec.live}),
             fingerprint=fingerprint(values),
-            paused_run=self._pause_record.run,
+            paused_run=self._run_record.paused,
+            signed_run=self._run_record.signed,
         )
         self._diagnostics = PlantDiagnostics(self._lockstep)
         self._paced = self._lockstep.pacer is not None
@@ -132,7 +133,7 @@ class PlantNode:
 
     def _pause(self) -> str:
         self._send(self._lockstep.pause(self._loop.now()))
-        self._record_pause()
+        self._record_run()
         last = self._lockstep.last_state
         self._batcher.show(self._senders[STATE].encoded(last) if last else None)
         return f"paused at step {self._lockstep.step}; an answer on its way is still taken"
@@ -140,17 +141,17 @@ class PlantNode:
     def _resume(self) -> str:
         was = "resumed" if self._lockstep.paused else "was not paused"
         self._send(self._lockstep.resume(self._loop.now()))
-        self._record_pause()
+        self._record_run()
         return was
 
-    def _record_pause(self) -> None:
-        """So that a plant that is started again in this run stays paused."""
+    def _record_run(self) -> None:
+        """So that a plant that is started again in this run stays paused, and asks for signatures."""
         lockstep = self._lockstep
         try:
-            self._pause_record.keep(lockstep.run if lockstep.paused else 0)
+            self._run_record.keep(lockstep.run if lockstep.paused else 0, lockstep.signed_run)
         except (OSError, FileError) as error:
             self._node.get_logger().warning(
-                f"a pause does not outlive this process, as it cannot be recorded: {error}",
+                f"a pause and a signing controller are forgotten with this process: {error}",
                 throttle_duration_sec=10.0,
             )
 
@@ -166,13 +167,14 @@ class PlantNode:
 
     def _on_start(self, frame: Frame) -> None:
         self._send(self._lockstep.start(frame, self._loop.now()))
-        self._record_pause()
+        self._record_run()
         if not self._lockstep.run:
             self._report_pace()
 
     def _on_action(self, frame: Frame) -> None:
         taken = self._lockstep.awaits(frame)
         sends = self._lockstep.action(frame, self._loop.now())
+        self._record_run()
         if taken and self._batcher.wanted:
             self._batcher.add(ACTION_KIND, self._actions.codec.encode(frame))
         self._send(sends)

@@ -11,7 +11,7 @@ from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.topics import COMPLETED, COST, PAUSED, STATE, VOID, CostColumn
 from pde_sim_node.build import build_plant
 from pde_sim_node.lockstep import Lockstep, Timing
-from pde_sim_node.pause_record import PauseRecord
+from pde_sim_node.run_record import RunRecord
 from tests.small import parameters
 
 RUN = 11
@@ -19,13 +19,14 @@ PLANT = 77
 SEEDS = (3, 4)
 
 
-def plant_protocol(paused_run: int = 0, **overrides) -> Lockstep:
+def plant_protocol(paused_run: int = 0, signed_run: int = 0, **overrides) -> Lockstep:
     values = parameters(**overrides)
     return Lockstep(
         build_plant(values),
         Timing(action_timeout=0.1, max_repeats=3, run_hold=10.0),
         fingerprint=PLANT,
         paused_run=paused_run,
+        signed_run=signed_run,
     )
 
 
@@ -225,13 +226,14 @@ def test_a_paused_plant_holds_the_next_state_back_and_times_nothing_out():
 
 def test_a_plant_that_was_paused_in_a_run_is_paused_in_it_when_it_is_started_again(tmp_path):
     quiet = run_episode(plant_protocol(), 1)
-    record = PauseRecord("/pair/plant", 7, tmp_path / "records")
-    assert record.run == 0
-    record.keep(RUN)
+    record = RunRecord("/pair/plant", 7, tmp_path / "records")
+    assert (record.paused, record.signed) == (0, 0)
+    record.keep(RUN, 5)
     for other in (("/pair/other", 7), ("/pair/plant", 8)):
-        assert PauseRecord(*other, tmp_path / "records").run == 0
-    again = PauseRecord("/pair/plant", 7, tmp_path / "records")
-    protocol = plant_protocol(paused_run=again.run)
+        assert RunRecord(*other, tmp_path / "records").paused == 0
+    again = RunRecord("/pair/plant", 7, tmp_path / "records")
+    assert again.signed == 5
+    protocol = plant_protocol(paused_run=again.paused)
     (report,) = protocol.start(start(1), 0.0)  # latched: it is there at once
     assert (report.topic, report.frame.values.tolist()) == (PAUSED, [1.0])
     assert {send.topic for now in range(1, 60) for send in protocol.tick(float(now))} == {PAUSED}
@@ -242,7 +244,7 @@ def test_a_plant_that_was_paused_in_a_run_is_paused_in_it_when_it_is_started_aga
     # Another run has nothing to do with it, nor has a damaged record.
     assert plant_protocol(paused_run=RUN).start(start(1, run=RUN + 1), 0.0)[0].topic is STATE
     (tmp_path / "records" / "7+pair+plant").write_text("x")
-    assert PauseRecord("/pair/plant", 7, tmp_path / "records").run == 0
+    assert RunRecord("/pair/plant", 7, tmp_path / "records").paused == 0
 
 
 def test_a_paused_plant_says_so_once_a_second():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -11,6 +11,7 @@ from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.model_rows import ModelRows, pack
+from loop_interfaces.signature import design_digest
 from loop_interfaces.topics import COST, MODEL, POLICY, START, TARGET, VOID, CostColumn, Topic
 from tests.test_lockstep import plant_protocol
 from tuner_node.batch import Batch
@@ -45,8 +46,9 @@ class Loop:
     def __init__(self, rows: np.ndarray = ROWS) -> None:
         self.plant, self.rows = plant_protocol(), rows
         self.tuner = Dispatcher(
-            run=5, n_a=N_A, pairs=1, incarnation=1, max_batch=4, episode_timeout=9.0, max_attempts=3
-        )
+            run=5, n_a=N_A, pairs=1, incarnation=1, max_batch=4, episode_timeout=9.0, max_attempts=3,
+            design=design_digest(asdict(DesignSettings(N_A, N_S, 1.0, 1.0))),
+        )  # fmt: skip
         self.tuner.presence(0, (), 0.0)
         self.told: dict[Topic, Frame] = {TARGET: self.plant.announcement().frame}
         self.take(self.tuner.models(MODELS, 1))
@@ -64,9 +66,9 @@ class Loop:
                 (state,) = self.plant.start(send.frame, 0.0)
                 self.state = state.frame
 
-    def controller_told(self, limit: float = 0.0, **others: object) -> Responder:
+    def controller_told(self, limit: float = 0.0, order: int = N_S, **others: object) -> Responder:
         """A controller that was told of the episode what the tuner published, but for `others`."""
-        made = Responder(DesignSettings(N_A, N_S, 1.0, 1.0, action_limit=limit))
+        made = Responder(DesignSettings(N_A, order, 1.0, 1.0, action_limit=limit))
         handlers = {
             TARGET: made.target, MODEL: made.model, POLICY: made.policy, START: made.start,
         }  # fmt: skip
@@ -139,6 +141,33 @@ def test_once_an_action_was_signed_no_unsigned_one_is_taken_for_the_whole_run(ro
         with pytest.raises(FrameError, match=REFUSED):
             loop.plant.action(replace(unsigned(loop.state), time=time), 0.0)
     assert loop.plant.step == 0
+
+
+def test_a_plant_that_is_started_again_still_knows_that_the_controller_of_its_run_signs():
+    loop = Loop()
+    loop.act(loop.controller)
+    again = plant_protocol(signed_run=loop.plant.signed_run)
+    (state,) = again.start(loop.told[START], 0.0)
+    with pytest.raises(FrameError, match=REFUSED):
+        again.action(unsigned(state.frame), 0.0)
+    (action,) = loop.controller.state(state.frame)
+    assert again.action(action.frame, 0.0)[0].frame.step == 1
+
+
+def test_a_model_of_a_controller_with_other_parameters_is_refused_also_when_it_comes_first():
+    loop = Loop(EXPLORING)
+    other = loop.controller_told(order=2)
+    loop.finish(lambda: other.state(loop.state))
+    (cost,) = loop.plant.start(loop.told[START], 0.0)
+    other.state(loop.state)
+    (foreign,), (own,) = other.cost(cost.frame), loop.controller.cost(cost.frame)
+    loop.tuner.cost(0, cost.frame, 0.0)
+    for _ in range(2):  # before its own and after it
+        with pytest.raises(FrameError, match="with the parameters of this run's tuner"):
+            loop.tuner.model(0, foreign.frame, 0.0)
+        loop.tuner.model(0, own.frame, 0.0)
+    result = loop.tuner.result()
+    assert result is not None and np.array_equal(result.models, own.frame.values)
 
 
 def test_a_run_with_a_controller_that_does_not_sign_is_void_as_soon_as_another_signs():
