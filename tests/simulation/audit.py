@@ -1,26 +1,32 @@
-"""Whether a history kept what the loop promises; the smallest plan that does not."""
+"""Whether a history kept what the loop promises; the smallest plan that does not.
+
+It knows nothing of the protocols: only the training in one process, and what an error may say.
+"""
 
 from __future__ import annotations
 
 import re
 from functools import cache
 
-from tests.simulation.history import History, values
+from tests.simulation.history import History
 from tests.simulation.plan import Plan
+from tests.simulation.processes import remembering, values
 from tests.small import same_bits, train_here
 from tuner_node.dispatch import DispatchError
 from tuner_node.training import Training
 
+GAVE_UP = "gave up after"
 CAUSES = re.compile(
-    r"gave up after \d+ attempts|expected one|stop the|two different|took back the cost"
+    rf"{GAVE_UP} \d+ attempts|expected one|stop the|two different|took back the cost"
+    "|plant has other parameters"
 )
 """What an error says that names a cause."""
 
 
 @cache
-def undisturbed(trajectories: bool) -> Training:
+def undisturbed(iterations: int) -> Training:
     """The training in one process."""
-    return train_here(values(trajectories))
+    return train_here(values(iterations))
 
 
 def audit(plan: Plan) -> str:
@@ -31,12 +37,13 @@ def audit(plan: Plan) -> str:
     AssertionError
         Other bits, an error that names no cause, or one although only the network was bad.
     """
-    end = History(plan).run()
+    expected = undisturbed(plan.iterations)
+    with remembering():
+        end = History(plan).run()
     if isinstance(end, DispatchError):
         assert CAUSES.search(str(end)), f"names no cause: {end}"
-        assert plan.hostile or str(end).startswith("gave up after"), f"nobody else was there: {end}"
+        assert plan.hostile or str(end).startswith(GAVE_UP), f"nobody else was there: {end}"
         return f"error: {end}"
-    expected = undisturbed(plan.trajectories)
     assert same_bits(end.policies(), expected.policies()), "another policy"
     assert end.evaluation is not None and expected.evaluation is not None
     assert same_bits(end.evaluation, expected.evaluation), "other costs"
@@ -53,8 +60,8 @@ def failure(plan: Plan) -> str:
 
 
 def shrunk(plan: Plan) -> Plan:
-    """A plan that still fails, of which no fault can be left out."""
-    for index in range(len(plan.faults)):
-        if failure(smaller := plan.without(index)):
+    """A plan that still fails, of which nothing can be left out."""
+    for smaller in plan.smaller():
+        if failure(smaller):
             return shrunk(smaller)
     return plan

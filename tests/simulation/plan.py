@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
+import random
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-import numpy as np
-
-PROCESSES = ("plant", "controller", "tuner")
+MAIN = ("plant", "controller", "tuner")
+"""The processes of the loop."""
+KINDS = {
+    "crash": 30,  # of one process, at any moment, also within a write to its disk
+    "power cut": 6,  # of all of them; what was not synced is lost
+    "bit rot": 4,  # a power cut after which a bit of a file of the tuner has changed
+    "cut": 15,  # a line from one process to another, one way
+    "stall": 8,  # a process stands still, and goes on later
+    "pause plant": 6,
+    "step plant": 4,  # a pause in which the operator lets single steps happen
+    "hold tuner": 5,
+    "stop tuner": 5,  # and the training is continued later
+    "replay": 6,  # a message from before is delivered again
+    "second controller": 14,  # that was told something else, or answers anything and does not sign
+    "second tuner": 5,  # of a training of its own, on the same plant and controller
+}
+"""Faults, and how often each is drawn."""
 HOSTILE = ("second controller", "second tuner")
 """Faults after which a training may also end with an error that names the cause."""
-
-ROUNDS = 250
-"""Steps of the simulated training, about."""
 
 
 @dataclass(frozen=True)
@@ -28,59 +41,60 @@ class Fault:
 class Plan:
     """A history is a function of its plan.
 
-    loss, duplicates: probabilities of a message on a topic that is not reliable; delay: mean (s);
-    rates: of the clocks of the processes; saved: probability that a checkpoint reaches the disk;
-    trajectories: whether the tuner reads states and actions (Gauss-Newton), or costs alone.
+    loss, duplicates, damage: probabilities that a message on a topic that is not reliable is lost,
+    comes twice, or has a bit changed in what is in front of its values; delay: mean (s); rates: of
+    the clocks of the processes; iterations: of the two-point method, 0 for Gauss-Newton, for which
+    the tuner reads states and actions.
     """
 
     seed: int
-    loss: float
-    duplicates: float
-    delay: float
-    rates: tuple[float, ...]
-    saved: float
-    trajectories: bool
-    faults: tuple[Fault, ...]
+    loss: float = 0.0
+    duplicates: float = 0.0
+    damage: float = 0.0
+    delay: float = 1e-3
+    rates: tuple[float, ...] = (1.0, 1.0, 1.0)
+    iterations: int = 1
+    faults: tuple[Fault, ...] = ()
 
     @property
     def hostile(self) -> bool:
-        return any(fault.kind in HOSTILE for fault in self.faults)
+        return self.damage > 0.0 or any(fault.kind in HOSTILE for fault in self.faults)
 
-    def without(self, index: int) -> Plan:
-        """The plan with one fault less, to find the smallest that still fails."""
-        return replace(self, faults=self.faults[:index] + self.faults[index + 1 :])
+    def smaller(self) -> Iterator[Plan]:
+        """Plans with one thing less, to find the smallest that still fails."""
+        for i in range(len(self.faults)):
+            yield replace(self, faults=self.faults[:i] + self.faults[i + 1 :])
+        quiet = Plan(self.seed)
+        for name in ("loss", "duplicates", "damage", "delay", "rates", "iterations"):
+            if getattr(self, name) != getattr(quiet, name):
+                yield replace(self, **{name: getattr(quiet, name)})
 
 
 def draw(seed: int) -> Plan:
     """The plan of a seed."""
-    rng = np.random.default_rng(seed)
-    delay = float(rng.choice([1e-4, 1e-3, 2e-2]))
-    length = 0.1 + ROUNDS * 2 * delay  # of the training, if nothing happens
+    rng = random.Random(seed)
+    delay = rng.choice([1e-4, 1e-3, 2e-2])
+    iterations = rng.choice([0, 0, 0, 1, 1, 1, 4])
+    length = 0.1 + (70 + 20 * iterations) * delay  # of the training, if nothing happens
     faults = []
-    for _ in range(rng.integers(0, 6)):
-        time, duration = float(rng.uniform(0.0, length)), float(rng.exponential(length / 4))
-        kind = str(
-            rng.choice(
-                ["crash", "cut", "pause plant", "hold tuner", *HOSTILE],
-                p=[0.4, 0.2, 0.1, 0.1, 0.15, 0.05],
-            )
-        )
-        if kind == "crash":
-            who = str(rng.choice(PROCESSES))
-        elif kind == "cut":  # one way
-            who = ">".join(rng.choice(PROCESSES, 2, replace=False))
+    for _ in range(rng.randrange(6)):
+        (kind,) = rng.choices(list(KINDS), KINDS.values())
+        who = ""
+        if kind in ("crash", "stall"):
+            who = rng.choice(MAIN)
+        elif kind == "cut":
+            who = ">".join(rng.sample(MAIN, 2))
         elif kind == "second controller":
-            who = str(rng.choice(["signs", "does not sign"]))
-        else:
-            who = ""
-        faults.append(Fault(time, kind, who, duration))
+            who = rng.choice(["signs", "does not sign"])
+        duration = rng.expovariate(1.0 / rng.choice([length / 4, 2.0]))
+        faults.append(Fault(rng.uniform(0.0, length), kind, who, duration))
     return Plan(
         seed,
-        loss=float(rng.choice([0.0, 0.01, 0.05])),
-        duplicates=float(rng.choice([0.0, 0.02])),
+        loss=rng.choice([0.0, 0.0, 0.01, 0.05]),
+        duplicates=rng.choice([0.0, 0.02]),
+        damage=rng.choice([0.0, 0.0, 0.0, 0.01]),
         delay=delay,
-        rates=tuple(rng.choice([1.0, 1.0, 0.5, 2.0], len(PROCESSES)).tolist()),
-        saved=float(rng.choice([0.0, 0.3, 1.0])),
-        trajectories=bool(rng.integers(2)),
+        rates=tuple(rng.choices([1.0, 0.5, 2.0], k=len(MAIN))),
+        iterations=iterations,
         faults=tuple(sorted(faults, key=lambda fault: fault.time)),
     )

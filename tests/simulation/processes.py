@@ -1,0 +1,317 @@
+"""The processes of a simulated loop: the project's protocols as they are, and strangers."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import cache
+from typing import TYPE_CHECKING, Any
+from unittest import mock
+
+import numpy as np
+
+from controller_node import responder
+from controller_node.identification import DesignSettings
+from controller_node.responder import Responder
+from loop_interfaces.frames import Frame
+from loop_interfaces.protocol import ModelFailure, Publication
+from loop_interfaces.signature import design_digest
+from loop_interfaces.topics import (
+    ACTION,
+    COST,
+    MODEL,
+    MODEL_IDENTIFIED,
+    PAUSED,
+    POLICY,
+    START,
+    STATE,
+    TARGET,
+    Topic,
+)
+from pde_sim_node import build as plant_build
+from pde_sim_node.lockstep import Lockstep
+from pde_sim_node.plant import Plant
+from tests.simulation.disk import Disk
+from tests.small import parameters
+from tuner_node.build import build_training
+from tuner_node.dispatch import Dispatcher
+from tuner_node.optimizers.proposal import Proposer
+from tuner_node.session import Session
+
+if TYPE_CHECKING:
+    from tests.simulation.history import History
+
+RUN = 7
+
+
+@cache
+def values(iterations: int) -> dict[str, Any]:
+    """The parameters of the training: as few and as short episodes as have all of its phases."""
+    budget: dict[str, Any] = {"optimizer": "gauss_newton", "rollouts": 9}
+    return parameters(
+        **({"iterations": iterations} if iterations else budget),
+        n_z=16,
+        n_a=2,
+        horizon=4,
+        integration_time=0.05,
+        reduced_order=2,
+        evaluation_fields=1,
+        identification_attempts=2,
+        max_attempts=8,
+    )
+
+
+_known: dict[bytes, Any] = {}
+
+
+@contextmanager
+def remembering() -> Iterator[None]:
+    """While it lasts, what the method computes from the same numbers is computed once.
+
+    Nearly all histories compute the same, and it is not what they are about.
+    """
+    own_design, own_propose = responder.design, Proposer.propose
+
+    def design(*args: Any) -> Any:
+        return _once(lambda: own_design(*args), args)
+
+    def propose(self: Proposer, *args: Any, **how: Any) -> Any:
+        return _once(lambda: own_propose(self, *args, **how), (self._U, self._before, args, how))
+
+    with (
+        mock.patch.object(responder, "design", design),
+        mock.patch.object(responder, "AHEAD", 5),  # the steps of an episode
+        mock.patch.object(Proposer, "propose", propose),
+    ):
+        yield
+
+
+def _once(compute: Callable[[], Any], of: Any) -> Any:
+    key = pickle.dumps(of)
+    if key not in _known:
+        if len(_known) > 1000:
+            _known.clear()
+        _known[key] = compute()
+    return copy.deepcopy(_known[key])
+
+
+@cache
+def _plant(iterations: int) -> tuple[Plant, int]:
+    given = values(iterations)
+    return plant_build.build_plant(given), plant_build.fingerprint(given)
+
+
+class Process:
+    """What a process is handed, and what it publishes. Dead once `alive` is False.
+
+    name: of the process; role: whose messages it gets.
+    """
+
+    def __init__(self, history: History, name: str, role: str, rate: float = 1.0) -> None:
+        self.history, self.name, self.role = history, name, role
+        self.alive, self.stalled = True, 0.0
+        self._offset, self._rate = history.rng.uniform(0.0, 1e4), rate
+
+    @property
+    def now(self) -> float:
+        """Its monotonic clock."""
+        return self._offset + self._rate * self.history.time
+
+    def publish(self, publications: Iterable[Publication | ModelFailure]) -> None:
+        for sent in publications:
+            self.history.send(self, sent)
+
+    def begin(self) -> None:
+        """Say what is said at the start."""
+
+    def tick(self) -> float:
+        """Look at the deadlines; seconds until it wants to do so again."""
+        return np.inf
+
+    def take(self, topic: Topic, frame: Frame) -> None:
+        """Handle a message; a FrameError refuses it."""
+
+
+class PlantProcess(Process):
+    def __init__(self, history: History, rate: float) -> None:
+        super().__init__(history, "plant", "plant", rate)
+        plant, fingerprint = _plant(history.plan.iterations)
+        self.lockstep = Lockstep(
+            copy.copy(plant),
+            fingerprint=fingerprint,
+            sample_time=history.values["sample_time"],
+            action_timeout=0.05,
+            max_repeats=100,
+            run_hold=5.0,
+            paused_run=history.record[0],
+            signed_run=history.record[1],
+        )
+        self._samples: list[tuple[Topic, Frame]] = []
+
+    def begin(self) -> None:
+        self._send([self.lockstep.announcement(), self.lockstep.paused_report()])
+
+    def take(self, topic: Topic, frame: Frame) -> None:
+        if topic is START:
+            self._send(self.lockstep.start(frame, self.now))
+        else:
+            if self.lockstep.awaits(frame):
+                self._samples.append((ACTION, frame))
+            self._send(self.lockstep.action(frame, self.now))
+        self._record()
+
+    def tick(self) -> float:
+        self._send(self.lockstep.tick(self.now))
+        deadline = self.lockstep.deadline
+        return 0.05 if deadline is None else max((deadline - self.now) / self._rate, 1e-3)
+
+    def operate(self, how: str) -> None:
+        """Pause, resume or step, as an operator's call."""
+        if how == "pause":
+            self._send(self.lockstep.pause(self.now))
+        elif how == "resume":
+            self._send(self.lockstep.resume(self.now))
+        else:
+            try:
+                self._send(self.lockstep.step_once(self.now))
+            except ValueError:
+                return  # nothing to step, says the answer to the call
+        self._record()
+
+    def _record(self) -> None:
+        run = self.lockstep.run if self.lockstep.paused else 0
+        self.history.record = run, self.lockstep.signed_run
+
+    def _send(self, publications: Iterable[Publication]) -> None:
+        """Samples go in one message, before the cost."""
+        for sent in publications:
+            if sent.topic is STATE:
+                values = sent.frame.values.copy()
+                self._samples.append((STATE, replace(sent.frame, values=values)))
+            elif sent.topic is COST:
+                self.history.show(self, self._samples)
+                self._samples = []
+            self.publish([sent])
+
+
+class ControllerProcess(Process):
+    def __init__(self, history: History, name: str, rate: float = 1.0, **changed: Any) -> None:
+        super().__init__(history, name, "controller", rate)
+        made = Responder(DesignSettings.of({**history.values, **changed}))
+        self._handlers: dict[Topic, Callable[[Frame], Any]] = {
+            TARGET: made.target,
+            START: made.start,
+            POLICY: made.policy,
+            MODEL: made.model,
+            COST: made.cost,
+            STATE: made.state,
+        }
+
+    def take(self, topic: Topic, frame: Frame) -> None:
+        self.publish(self._handlers[topic](frame))
+
+
+class Stranger(Process):
+    """Answers every state with zeros and, as stand-ins may, without a signature."""
+
+    def take(self, topic: Topic, frame: Frame) -> None:
+        if topic is STATE:
+            zeros = np.zeros((len(frame.values), self.history.values["n_a"]))
+            answer = Frame(frame.run, frame.episode, frame.step, frame.time, zeros, frame.plant)
+            self.publish([Publication(ACTION, answer)])
+
+
+class TunerProcess(Process):
+    """A tuner with its disk, from which it goes on.
+
+    power, rot: how its predecessor ended, see Disk.restart.
+    """
+
+    def __init__(
+        self,
+        history: History,
+        name: str,
+        disk: Disk,
+        rate: float = 1.0,
+        *,
+        run: int = RUN,
+        incarnation: int = 0,
+        power: bool = False,
+        rot: bool = False,
+    ) -> None:
+        super().__init__(history, name, "tuner", rate)
+        given = history.values
+        training = build_training(given)
+        disk.restart(training.restore, power=power, rot=rot)
+        self._disk = disk
+        self.dispatcher = Dispatcher.create(
+            run=run,
+            n_a=given["n_a"],
+            pairs=1,
+            incarnation=incarnation,
+            max_batch=2,
+            episode_timeout=10.0,
+            max_attempts=given["max_attempts"],
+            plant=training.plant,
+            action_limit=given["action_limit"],
+            design=design_digest(given),
+        )
+        self._changed = False
+        self.session = Session(training, self.dispatcher, self._report)
+
+    def begin(self) -> None:
+        self._guarded(self.session.begin)
+
+    def take(self, topic: Topic, frame: Frame) -> None:
+        handler = {
+            COST: self.dispatcher.cost,
+            MODEL_IDENTIFIED: self.dispatcher.model,
+            TARGET: self.dispatcher.target,
+            PAUSED: self.dispatcher.paused,
+        }[topic]
+        if topic is not TARGET or self.session.training.settings.trajectories:
+            self._guarded(lambda now: handler(0, frame, now))
+
+    def see(self, samples: list[tuple[Topic, Frame]]) -> None:
+        """Take samples of an episode."""
+        for topic, frame in samples:
+            if topic is ACTION:
+                self.dispatcher.action(0, frame)
+            elif self.dispatcher.state(0, frame):
+                self._guarded(self.dispatcher.tick)
+
+    def fail(self, failure: ModelFailure) -> None:
+        self._guarded(lambda now: self.dispatcher.failure(0, failure, now))
+
+    def tick(self) -> float:
+        missing = [role for role in ("plant", "controller") if not self.history.present(role)]
+        self._guarded(lambda now: self.dispatcher.presence(0, missing, now))
+        self._guarded(self.dispatcher.tick)
+        return 0.1
+
+    def operate(self, how: str) -> None:
+        """Hold, resume or stop, as an operator's call."""
+        if how == "hold":
+            self.dispatcher.hold()
+        elif how == "resume":
+            self._guarded(self.dispatcher.resume)
+        else:
+            self._guarded(lambda now: self.session.stop())
+
+    def _guarded(self, event: Callable[[float], Any]) -> None:
+        """As the node does it: perform, send, then keep."""
+        session = self.session
+        if session.done or session.stopped:
+            return
+        sent = session.advance(event(self.now), self.now)
+        self.publish(publication for _, publication in sent)
+        if self._changed and (session.stopped or self.history.rng.random() < 0.5):
+            self._disk.save(session.training.state())
+            self._changed = False
+
+    def _report(self, row: Any) -> None:
+        self._changed = True
+        self.history.rows.append(row)
