@@ -18,7 +18,6 @@ from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
 from loop_interfaces.frames import Frame
 from loop_interfaces.protocol import ModelFailure, Publication
-from loop_interfaces.signature import design_digest
 from loop_interfaces.topics import (
     ACTION,
     COST,
@@ -36,9 +35,9 @@ from pde_sim_node.lockstep import Lockstep
 from pde_sim_node.plant import Plant
 from tests.simulation.disk import Disk
 from tests.small import parameters
-from tuner_node.build import build_training
-from tuner_node.dispatch import Dispatcher
+from tuner_node.build import build_dispatcher, build_training
 from tuner_node.optimizers.proposal import Proposer
+from tuner_node.results import RunIdentity
 from tuner_node.session import Session
 
 if TYPE_CHECKING:
@@ -61,6 +60,8 @@ def values(iterations: int) -> dict[str, Any]:
         evaluation_fields=1,
         identification_attempts=2,
         max_attempts=8,
+        max_batch=2,
+        episode_timeout=10.0,
     )
 
 
@@ -247,18 +248,7 @@ class TunerProcess(Process):
         training = build_training(given)
         disk.restart(training.restore, power=power, rot=rot)
         self._disk = disk
-        self.dispatcher = Dispatcher.create(
-            run=run,
-            n_a=given["n_a"],
-            pairs=1,
-            incarnation=incarnation,
-            max_batch=2,
-            episode_timeout=10.0,
-            max_attempts=given["max_attempts"],
-            plant=training.plant,
-            action_limit=given["action_limit"],
-            design=design_digest(given),
-        )
+        self.dispatcher = build_dispatcher(given, training, RunIdentity(run, incarnation))
         self._changed = False
         self.session = Session(training, self.dispatcher, self._report)
 
