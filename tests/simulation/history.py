@@ -242,8 +242,8 @@ class History:
                         lambda: self._call("plant", "step"),
                     )
             self._at(end, lambda: self._call("plant", "resume", until_done=True))
-        elif kind == "hold tuner":
-            self._call("tuner", "hold")
+        elif kind == "pause tuner":
+            self._call("tuner", "pause")
             self._at(end, lambda: self._call("tuner", "resume", until_done=True))
         elif kind == "stop tuner":
             self._call("tuner", "stop")

@@ -16,7 +16,7 @@ KINDS = {
     "stall": 8,  # a process stands still, and goes on later
     "pause plant": 6,
     "step plant": 4,  # a pause in which the operator lets single steps happen
-    "hold tuner": 5,
+    "pause tuner": 5,
     "stop tuner": 5,  # and the training is continued later
     "replay": 6,  # a message from before is delivered again
     "second controller": 14,  # that was told something else, or answers anything and does not sign

@@ -31,7 +31,7 @@ from loop_interfaces.topics import (
     Topic,
 )
 from pde_sim_node import build as plant_build
-from pde_sim_node.lockstep import Lockstep
+from pde_sim_node.lockstep import Lockstep, Timing
 from pde_sim_node.plant import Plant
 from tests.simulation.disk import Disk
 from tests.small import parameters
@@ -142,11 +142,8 @@ class PlantProcess(Process):
         plant, fingerprint = _plant(history.plan.iterations)
         self.lockstep = Lockstep(
             copy.copy(plant),
+            Timing(action_timeout=0.05, max_repeats=100, run_hold=5.0),
             fingerprint=fingerprint,
-            sample_time=history.values["sample_time"],
-            action_timeout=0.05,
-            max_repeats=100,
-            run_hold=5.0,
             paused_run=history.record[0],
             signed_run=history.record[1],
         )
@@ -260,7 +257,7 @@ class TunerProcess(Process):
             COST: self.dispatcher.cost,
             MODEL_IDENTIFIED: self.dispatcher.model,
             TARGET: self.dispatcher.target,
-            PAUSED: self.dispatcher.paused,
+            PAUSED: self.dispatcher.plant_paused,
         }[topic]
         if topic is not TARGET or self.session.training.settings.trajectories:
             self._guarded(lambda now: handler(0, frame, now))
@@ -283,9 +280,9 @@ class TunerProcess(Process):
         return 0.1
 
     def operate(self, how: str) -> None:
-        """Hold, resume or stop, as an operator's call."""
-        if how == "hold":
-            self.dispatcher.hold()
+        """Pause, resume or stop, as an operator's call."""
+        if how == "pause":
+            self.dispatcher.pause()
         elif how == "resume":
             self._guarded(self.dispatcher.resume)
         else:
