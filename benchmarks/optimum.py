@@ -37,7 +37,7 @@ from pde_sim_node.build import build_plant
 from pdeloop.gradients import Gradients, features
 from pdeloop.in_process import LocalPair
 from pdeloop.reference import FORMAT, bound_parameters, no_control_cost
-from pdeloop.reproduce.table import PAPER
+from pdeloop.reproduce.experiment import PAPER
 from tuner_node.results import RunFolderError, versions
 from tuner_node.seeds import Purpose, derive
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -64,6 +65,21 @@ def load(folder: Path) -> FinishedRun:
         models=[model_rows.unpack(rows, values["n_a"]) for rows in arrays["model"]],
         costs={name: np.array(result["costs_by_field"][name]) for name in CONTROLLERS},
         rollouts=result.get("rollouts", []),
+    )
+
+
+def merged(runs: Sequence[FinishedRun]) -> FinishedRun:
+    """The run of several seeds that is the same as these of one seed each, in their order."""
+    first = runs[0]
+    history = [row for run in runs for row in run.result["history"]]
+    return FinishedRun(
+        {**first.values, "seeds": len(runs)},
+        {**first.result, "history": history},
+        policies=np.concatenate([run.policies for run in runs]),
+        warm=np.concatenate([run.warm for run in runs]),
+        models=[model for run in runs for model in run.models],
+        costs={name: np.concatenate([run.costs[name] for run in runs]) for name in first.costs},
+        rollouts=[counted for run in runs for counted in run.rollouts],
     )
 
 

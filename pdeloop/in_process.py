@@ -118,7 +118,14 @@ def cost_table(costs: EpisodeCosts) -> Array:
     return np.column_stack([costs.mean, costs.total, ended.astype(np.float64)])
 
 
-def train(training: Training, pair: LocalPair, report: Report, *, max_batch: int = 1024) -> None:
+def train(
+    training: Training,
+    pair: LocalPair,
+    report: Report,
+    *,
+    max_batch: int = 1024,
+    after_batch: Callable[[], None] = lambda: None,
+) -> None:
     """Run `training` to its end on `pair`."""
     pair.follow(training)
     phase = ""
@@ -133,3 +140,4 @@ def train(training: Training, pair: LocalPair, report: Report, *, max_batch: int
         for row in training.finish(result):
             report(row)
         pair.follow(training)
+        after_batch()

@@ -101,7 +101,7 @@ def test_steps_damping_and_model_error_are_those_of_the_history(folder):
     """The figure's data against result.json; the paper's optimiser has none."""
     problem = gather(folder).problems[0]
     name = controllers_of(folder)[-1]
-    base = folder if is_run(folder) else folder / "small" / name
+    base = folder if is_run(folder) else folder / "small" / name / str(problem.shown)
     history = json.loads((base / "result.json").read_text())["history"]
     assert list(problem.steps) == [name]
     steps = problem.steps[name]

@@ -11,8 +11,9 @@ import pytest
 from loop_interfaces.topics import CostColumn
 from pdeloop.finished_run import reduction
 from pdeloop.in_process import LocalPair
-from pdeloop.reproduce.job import LEARNED
+from pdeloop.reproduce.experiment import LEARNED, command_of, reproduction_in, study_of
 from pdeloop.reproduce.table import beside_the_paper, rows_of, runs_of
+from pdeloop.study import StudyError
 from tests.loop_harness import until
 from tests.small import REPRODUCED, parameters, same_bits, train_here
 from tuner_node.batch import Batch
@@ -25,20 +26,24 @@ def test_every_number_is_that_of_the_trainings(reproduction):
     out, text = reproduction
     for words in ("below LQT", "LQT-PO", "pure PO", "Gauss-Newton", "bootstrap"):
         assert words in text, words
-    runs = runs_of(out, "small")
+    study = reproduction_in(out)
+    runs = runs_of(study, out, "small")
     for name, how in LEARNED.items():
         budget = {"rollouts": 24} if how["optimizer"] == "gauss_newton" else {"iterations": 12}
-        training = train_here(parameters(seeds=2, **how, **budget))
-        with np.load(out / "small" / name / "curve.npz") as curve:
-            assert same_bits(curve["policies"][-1], training.policies())
-            assert same_bits(curve["costs"][-1], training.evaluation[:, 2].copy())
-            start = training.evaluation[:, 0 if how["start"] == "zero" else 1]
-            assert same_bits(curve["costs"][0], start.copy())
-            assert curve["rollouts"][-1].tolist() == training.budget.paid.tolist()
+        training = train_here(parameters(seeds=2, identification="dmdc", **how, **budget))
+        for seed in range(2):
+            with np.load(out / "small" / name / str(seed) / "curve.npz") as curve:
+                assert same_bits(curve["policies"][-1], training.policies()[seed].copy())
+                assert same_bits(curve["costs"][-1], training.evaluation[seed, 2].copy())
+                start = training.evaluation[seed, 0 if how["start"] == "zero" else 1]
+                assert same_bits(curve["costs"][0], start.copy())
+                assert curve["rollouts"][-1] == training.budget.paid[seed]
+        assert same_bits(runs[name].policies, training.policies())
+        assert runs[name].result["history"] == sorted(training.history, key=lambda row: row["seed"])
         assert same_bits(runs[name].costs["adapted"], training.evaluation[:, 2].copy())
         assert same_bits(runs[name].warm, runs["lqt_po"].warm)
         assert same_bits(runs[name].costs["lqt"], runs["lqt_po"].costs["lqt"])
-    (row,) = rows_of(out, ["small"])
+    (row,) = rows_of(study, out)
     lqt, adapted = (runs["lqt_po"].costs[name].mean(axis=1) for name in ("lqt", "adapted"))
     below = row["lqt_po"]["below_lqt_percent"]
     assert below["mean_of_ratios"] == pytest.approx(100 * (1 - adapted / lqt).mean(), abs=1e-9)
@@ -55,17 +60,17 @@ def test_the_curve_is_the_cost_of_each_policy(reproduction):
     out, _ = reproduction
     values = parameters()
     for name in ("lqt_po", "gauss_newton"):
-        folder = out / "small" / name
+        folder = out / "small" / name / "1"
         with np.load(folder / "curve.npz") as curve, np.load(folder / "policy.npz") as final:
             pair = LocalPair(values)
             pair.use_models(final["model"])
             seeds = [derive(0, Purpose.EVALUATION_FIELD, i) for i in range(10)]
             for at in (0, 3, len(curve["costs"]) - 1):
-                policy = curve["policies"][at][1]
-                rows = np.array([(seed, -1, 0, 1) for seed in seeds], dtype=float)
+                policy = curve["policies"][at]
+                rows = np.array([(seed, -1, 0, 0) for seed in seeds], dtype=float)
                 again = pair.run(Batch(rows, np.stack([policy] * 10))).costs[:, CostColumn.MEAN]
-                assert same_bits(curve["costs"][at][1].copy(), again.copy())
-            assert (np.diff(curve["rollouts"], axis=0) >= 0).all()
+                assert same_bits(curve["costs"][at].copy(), again.copy())
+            assert (np.diff(curve["rollouts"]) >= 0).all()
 
 
 def test_the_interval_covers_the_truth_as_often_as_it_says():
@@ -109,7 +114,7 @@ def test_the_table_says_where_the_papers_figure_lies(ratio, mean, words):
 
 def test_an_interrupted_reproduction_continues_to_the_same_bits(loop, tmp_path, reproduction):
     run = loop.pdeloop("reproduce", *REPRODUCED, "--out", str(tmp_path / "a"))
-    until(lambda: list((tmp_path / "a").glob("small/*/run.json")), LIMIT, "first job")
+    until(lambda: list((tmp_path / "a").glob("small/*/*/result.json")), LIMIT, "first training")
     run.send_signal(signal.SIGINT)
     text = loop.wait(run, LIMIT, code=130)
     assert f"continue with: pdeloop reproduce --out {tmp_path / 'a'}" in text
@@ -117,21 +122,33 @@ def test_an_interrupted_reproduction_continues_to_the_same_bits(loop, tmp_path, 
     assert not (tmp_path / "a" / "table.json").exists()
     loop.wait(loop.pdeloop("reproduce", "--out", str(tmp_path / "a")), LIMIT)
     whole, _ = reproduction
-    for name in LEARNED:
-        with (
-            np.load(tmp_path / "a" / "small" / name / "curve.npz") as a,
-            np.load(whole / "small" / name / "curve.npz") as b,
-        ):
-            for array in ("costs", "policies", "rollouts"):
-                assert same_bits(a[array], b[array])
+    for path in whole.glob("small/*/*/*"):
+        assert (tmp_path / "a" / path.relative_to(whole)).read_bytes() == path.read_bytes()
 
 
 def test_what_cannot_be_done_is_one_line(loop, tmp_path, reproduction):
     out, _ = reproduction
     other = loop.pdeloop("reproduce", "--seeds", "3", "--out", str(out))
     text = loop.wait(other, LIMIT, code=1)
-    assert "asked for something else (seeds: 2 there, 3 now)" in text
+    assert f"{out} holds another study" in text
     text = loop.wait(loop.pdeloop("reproduce", "nothing"), LIMIT, code=1)
     assert text.startswith("pdeloop: unknown problem 'nothing'")
     text = loop.wait(loop.pdeloop("report", str(tmp_path)), LIMIT, code=1)
     assert "holds neither a run nor a reproduction" in text
+
+
+def test_the_command_of_a_reproduction_gives_it_again(reproduction):
+    out, _ = reproduction
+    study = reproduction_in(out)
+    words = command_of(study)
+    assert words.startswith("pdeloop reproduce ") and words.endswith(
+        "/small.yaml --seeds 2 --iterations 12 --seed 0"
+    )
+    assert study == study_of([words.split()[2]], {"seeds": 2, "iterations": 12, "seed": 0})
+
+
+def test_a_folder_of_an_older_version_is_refused_and_another_study_is_no_reproduction(tmp_path):
+    assert reproduction_in(tmp_path) is None
+    (tmp_path / "reproduction.json").write_text("{}")
+    with pytest.raises(StudyError, match=r"of an older version, .* make it again"):
+        reproduction_in(tmp_path)

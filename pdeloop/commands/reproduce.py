@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 import argparse
+import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import (
     DEFAULTS,
     Commands,
     add_equation,
-    add_json,
     allow_equation,
     command,
 )
+from pdeloop.commands.study import add_execution, carry_out
+from pdeloop.output import print_json
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from pdeloop.study import Failure, Study
 
 
 def add(commands: Commands) -> None:
@@ -46,9 +54,7 @@ def _add_reproduce(commands: Commands) -> None:
         f"unchecked, as in the paper [{DEFAULTS['identification_attempts'].default}]",
     )
     add_equation(reproduce)
-    add("--processes", type=int, metavar="N", help="jobs at the same time [one a core]")
-    add("--out", type=Path, metavar="DIR", help="folder of the results [runs/reproduce-TIME]")
-    add_json(reproduce, "print the table as JSON; progress goes to stderr")
+    add_execution(reproduce)
 
 
 def _add_report(commands: Commands) -> None:
@@ -74,7 +80,7 @@ def _add_report(commands: Commands) -> None:
 
 
 def _reproduce(options: argparse.Namespace) -> int:
-    from pdeloop.reproduce.experiment import reproduce
+    from pdeloop.reproduce.experiment import reproduction_in, study_of
 
     allow_equation(options)
     names = ("seeds", "iterations", "seed", "identification_attempts")
@@ -83,7 +89,31 @@ def _reproduce(options: argparse.Namespace) -> int:
         DEFAULTS[name].check(value)
     if options.iterations == 0:
         raise ParameterError("--iterations is 0; expected a whole number of at least 1")
-    return reproduce(options.problems, given, options.out, options.processes, options.json)
+
+    def study_in(folder: Path) -> Study:
+        there = reproduction_in(folder)
+        return (
+            there
+            if there and not (options.problems or given)
+            else study_of(options.problems, given)
+        )
+
+    return carry_out("reproduce", options, study_in, _show)
+
+
+def _show(study: Study, folder: Path, failures: list[Failure], console: Console) -> None:
+    from pdeloop.reproduce.table import rows_of, text
+    from tuner_node.results import versions
+
+    if failures:
+        return
+    rows = rows_of(study, folder)
+    (folder / "table.json").write_text(json.dumps({"rows": rows, "versions": versions()}, indent=1))
+    if console.stderr:  # the data alone go to stdout
+        print_json({"folder": str(folder), "rows": rows})
+        return
+    console.print(text(rows), markup=False)
+    console.print(f"results in {folder} (figures: pdeloop report {folder})", markup=False)
 
 
 def _report(options: argparse.Namespace) -> int:

@@ -3,10 +3,19 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import Commands, add_json, command
+from pdeloop.output import print_json
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from pdeloop.study import Failure, Study
 
 
 def add(commands: Commands) -> None:
@@ -21,15 +30,20 @@ def add(commands: Commands) -> None:
         "continues it. docs/scaling.md shows a study's file.",
         example="pdeloop study examples/study.yaml --out runs/study",
     )
-    add = study.add_argument
-    add(
+    study.add_argument(
         "file",
         nargs="?",
         type=Path,
         metavar="STUDY.yaml",
         help="problems, seeds, variants, settings",
     )
-    add("--out", type=Path, metavar="DIR", help="folder of the results [runs/study-TIME]")
+    add_execution(study)
+
+
+def add_execution(parser: argparse.ArgumentParser) -> None:
+    """The flags that say where a study's trainings run, and what is printed; see `carry_out`."""
+    name, add = parser.prog.rpartition(" ")[2], parser.add_argument
+    add("--out", type=Path, metavar="DIR", help=f"folder of the results [runs/{name}-TIME]")
     add("--processes", type=int, metavar="N", help="trainings at the same time [one a core]")
     add(
         "--scheduler",
@@ -42,19 +56,33 @@ def add(commands: Commands) -> None:
         help="also take results of workers with other versions or another processor, which may differ "
         "in the last bits",
     )
-    add_json(study, "print the table as JSON; progress goes to stderr")
+    add_json(parser, "print the table as JSON; progress goes to stderr")
 
 
-def _study(options: argparse.Namespace) -> int:
+def carry_out(
+    name: str,
+    options: argparse.Namespace,
+    study_in: Callable[[Path], Study],
+    show: Callable[[Study, Path, list[Failure], Console], None],
+) -> int:
+    """Train what is missing, as the flags of `add_execution` say; returns the exit code.
+
+    Parameters
+    ----------
+    name : str
+        Of the command.
+    options : Namespace
+        With the flags of `add_execution`.
+    study_in : callable
+        The study for a folder.
+    show : callable
+        Called with the study, its folder, what failed, and a console for what is not data.
+    """
     from rich.console import Console
 
-    from loop_interfaces.spec import ParameterError, read_document
-    from pdeloop.output import print_json
     from pdeloop.progress import Progress
-    from pdeloop.study.description import Study
     from pdeloop.study.executors import cluster, processes
-    from pdeloop.study.run import kept, run
-    from pdeloop.study.table import plot, rows, text
+    from pdeloop.study.run import run
     from pdeloop.training_run import Interruption, interruptible
     from tuner_node.results import timestamp
 
@@ -63,17 +91,10 @@ def _study(options: argparse.Namespace) -> int:
             "--processes is how many trainings run on this machine: expected at least 1, and no "
             "--scheduler"
         )
-    if options.file is None and options.out is None:
-        raise ParameterError(
-            "no study given; expected a YAML file, or --out DIR of one to continue"
-        )
-    folder: Path = options.out or Path("runs") / f"study-{timestamp()}"
-    if options.file is None:
-        study = kept(folder)
-    else:
-        study = Study.of(read_document(options.file), options.file.parent)
+    folder: Path = options.out or Path("runs") / f"{name}-{timestamp()}"
+    study = study_in(folder)
     console = Console(stderr=options.json, highlight=False, soft_wrap=True)
-    progress = Progress(console, "study", "trainings")
+    progress = Progress(console, name, "trainings")
     executor = (
         partial(cluster, options.scheduler)
         if options.scheduler
@@ -91,20 +112,44 @@ def _study(options: argparse.Namespace) -> int:
     except Interruption as signal_name:
         progress.close()
         console.print(
-            f"stopped by {signal_name}; continue with: pdeloop study --out {folder}", markup=False
+            f"stopped by {signal_name}; continue with: pdeloop {name} --out {folder}", markup=False
         )
         return 130
     finally:
         progress.close()
-    table = rows(study, folder)
-    if options.json:
-        print_json(
-            {"folder": str(folder), "rows": table, "failures": [f._asdict() for f in failures]}
-        )
-    else:
-        console.print(text(table), markup=False)
-        plot(table, folder / "costs.png")
-        console.print(f"results in {folder}, figure in {folder / 'costs.png'}", markup=False)
+    show(study, folder, failures, console)
     for failure in failures:
         console.print(f"failed: {failure.training}: {failure.reason}", markup=False)
     return int(bool(failures))
+
+
+def _study(options: argparse.Namespace) -> int:
+    from loop_interfaces.spec import read_document
+    from pdeloop.study.description import Study
+    from pdeloop.study.run import kept
+
+    if options.file is None and options.out is None:
+        raise ParameterError(
+            "no study given; expected a YAML file, or --out DIR of one to continue"
+        )
+
+    def study_in(folder: Path) -> Study:
+        if options.file is None:
+            return kept(folder)
+        return Study.of(read_document(options.file), options.file.parent)
+
+    return carry_out("study", options, study_in, _show)
+
+
+def _show(study: Study, folder: Path, failures: list[Failure], console: Console) -> None:
+    from pdeloop.study.table import plot, rows, text
+
+    table = rows(study, folder)
+    if console.stderr:  # the data alone go to stdout
+        print_json(
+            {"folder": str(folder), "rows": table, "failures": [f._asdict() for f in failures]}
+        )
+        return
+    console.print(text(table), markup=False)
+    plot(table, folder / "costs.png")
+    console.print(f"results in {folder}, figure in {folder / 'costs.png'}", markup=False)

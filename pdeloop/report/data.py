@@ -21,8 +21,10 @@ from pdeloop.evaluation import another_plant
 from pdeloop.finished_run import FinishedRun, field_means, load
 from pdeloop.in_process import LocalPair
 from pdeloop.reference import Reference, find
-from pdeloop.reproduce.experiment import ASKED, asked
+from pdeloop.reproduce.experiment import reproduction_in
 from pdeloop.reproduce.table import runs_of
+from pdeloop.study.description import Study
+from pdeloop.study.training import CURVE
 from tuner_node.build import build_training
 from tuner_node.checkpoint import taken
 from tuner_node.results import RunFolderError
@@ -150,11 +152,11 @@ class ProblemData:
 
 @dataclass(frozen=True)
 class ReportData:
-    """Everything a report shows; asked: what a reproduction was asked for."""
+    """Everything a report shows; study: the reproduction that it is about."""
 
     folder: Path
     problems: list[ProblemData]
-    asked: Mapping[str, Any] = field(default_factory=dict)
+    study: Study | None = None
 
     @property
     def missing(self) -> list[str]:
@@ -172,10 +174,9 @@ def gather(folder: Path, limits: Path | None = None) -> ReportData:
 
     limits: folder of what `python -m benchmarks optimum` saved; the shipped one if not given.
     """
-    if (folder / ASKED).exists():
-        content = asked(folder)
-        problems = [_reproduced(folder, name, limits) for name in content["problems"]]
-        return ReportData(folder, problems, content)
+    if (study := reproduction_in(folder)) is not None:
+        problems = [_reproduced(study, folder, name, limits) for name in study.problems]
+        return ReportData(folder, problems, study)
     if (folder / "parameters.yaml").exists():
         return ReportData(folder, [of_run(load(folder), limits)])
     raise RunFolderError(f"{folder} holds neither a run nor a reproduction")
@@ -186,19 +187,22 @@ def of_run(run: FinishedRun, limits: Path | None = None) -> ProblemData:
     return _problem({"adapted": run}, _history(run), 0, limits)
 
 
-def _reproduced(folder: Path, name: str, limits: Path | None) -> ProblemData:
-    runs = runs_of(folder, name)
+def _reproduced(study: Study, folder: Path, name: str, limits: Path | None) -> ProblemData:
+    runs = runs_of(study, folder, name)
     lqt = field_means(runs["lqt_po"].costs["lqt"])
     curves = []
-    for controller in runs:
-        path, seeds = folder / name / controller / "curve.npz", len(lqt)
-        try:
-            arrays = read_arrays(path)
-            used = taken(arrays, "rollouts", "f", (None, seeds)) - runs[controller].before
-            costs = field_means(taken(arrays, "costs", "f", (len(used), seeds, None)))
-        except ValueError as error:
-            raise RunFolderError(f"{path} cannot be read: {error}") from error
-        curves += _curve(controller, [(used[:, s], costs[:, s] / lqt[s]) for s in range(seeds)])
+    for controller, run in runs.items():
+        seeds = []
+        for seed, before, base in zip(study.seeds, run.before, lqt, strict=True):
+            path = folder / name / controller / str(seed) / CURVE
+            try:
+                arrays = read_arrays(path)
+                used = taken(arrays, "rollouts", "f", (None,)) - before
+                costs = field_means(taken(arrays, "costs", "f", (len(used), None)))
+            except ValueError as error:
+                raise RunFolderError(f"{path} cannot be read: {error}") from error
+            seeds.append((used, costs / base))
+        curves += _curve(controller, seeds)
     ratio = field_means(runs["lqt_po"].costs["adapted"]) / lqt
     known = max(1, int(np.isfinite(ratio).sum()))
     median = int(np.argsort(ratio, kind="stable")[(known - 1) // 2])

@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from pdeloop.report import figures, learning
 from pdeloop.report.data import ProblemData, ReportData, gather
 from pdeloop.report.style import NAMES, STYLE
+from pdeloop.reproduce.experiment import command_of
 from pdeloop.reproduce.table import CAVEAT, beside_the_paper, cost_text, reduction_texts, row_of
 from tuner_node.budget import PURPOSES
 from tuner_node.results import RunFolderError
@@ -173,7 +174,7 @@ def _page(data: ReportData, shared: list[Picture], own: list[list[Picture]]) -> 
     rows = [row_of(problem.name, problem.runs) for problem in problems]
     names = ", ".join(problem.name for problem in problems)
     return environment.get_template("page.html.j2").render(
-        title="Reproduction of the paper's experiment" if data.asked else f"Training of {names}",
+        title="Reproduction of the paper's experiment" if data.study else f"Training of {names}",
         facts=_facts(data),
         missing=data.missing,
         shared=shared,
@@ -196,9 +197,8 @@ def _facts(data: ReportData) -> list[tuple[str, str]]:
     """What the report is about."""
     first = data.problems[0]
     seeds, values = first.first.seeds, first.first.values
-    if data.asked:
-        options = [f"--{k.replace('_', '-')} {v}" for k, v in data.asked["options"].items()]
-        command = " ".join(["pdeloop reproduce", *data.asked["files"], *options])
+    if data.study is not None:
+        command = command_of(data.study)
     else:
         command = f"pdeloop train {data.folder}/parameters.yaml"
     facts = [("Command", command)]

@@ -9,11 +9,10 @@ from typing import Any
 
 from loop_interfaces.controllers import CONTROLLERS
 from pde_sim_node.plant import DIVERGED_COST
-from pdeloop.finished_run import CONFIDENCE, FinishedRun, load, reduction
-from pdeloop.reproduce.job import LEARNED
+from pdeloop.finished_run import CONFIDENCE, FinishedRun, load, merged, reduction
+from pdeloop.reproduce.experiment import LEARNED, PAPER
+from pdeloop.study.description import Study
 
-PAPER = {"burgers": 28.0, "allen-cahn": 15.8, "kdv": 36.4}
-"""Percent by which LQT-PO lies below LQT after 40 iterations, arXiv:2403.01005."""
 CAVEAT = (
     f"In brackets: {100 * CONFIDENCE:.0f} % percentile bootstrap over the seeds. The reduced model, "
     "and with it LQT's cost, varies much from seed to seed: with few seeds such an interval is wide, "
@@ -21,18 +20,21 @@ CAVEAT = (
 )
 
 
-def runs_of(folder: Path, problem: str) -> dict[str, FinishedRun]:
-    """The finished runs of a problem, by adapted controller."""
-    return {name: load(folder / problem / name) for name in LEARNED}
+def runs_of(study: Study, folder: Path, problem: str) -> dict[str, FinishedRun]:
+    """The finished runs of a problem over all seeds, by adapted controller."""
+    return {
+        name: merged([load(folder / problem / name / str(seed)) for seed in study.seeds])
+        for name in LEARNED
+    }
 
 
-def rows_of(folder: Path, problems: Sequence[str]) -> list[dict[str, Any]]:
+def rows_of(study: Study, folder: Path) -> list[dict[str, Any]]:
     """The figures of the table, a row for each problem.
 
     A controller's mean and standard deviation are over seeds and fields, without the rollouts that
     diverged, which are counted; the reductions are `pdeloop.finished_run.Reduction`.
     """
-    return [row_of(problem, runs_of(folder, problem)) for problem in problems]
+    return [row_of(problem, runs_of(study, folder, problem)) for problem in study.problems]
 
 
 def row_of(problem: str, runs: Mapping[str, FinishedRun]) -> dict[str, Any]:
@@ -43,7 +45,6 @@ def row_of(problem: str, runs: Mapping[str, FinishedRun]) -> dict[str, Any]:
     row: dict[str, Any] = {
         "problem": problem,
         "seeds": len(first["lqt"]),
-        "seconds": sum(run.result["seconds"] for run in runs.values()),
         "paper_percent": PAPER.get(problem),
     }
     for name, own in costs.items():

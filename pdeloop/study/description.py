@@ -34,12 +34,15 @@ class Study:
         Parameters that a variant sets, by the variant's name.
     settings : dict
         Parameters that all trainings set.
+    curves : bool
+        Keep the cost of every policy that a training has, on the evaluation fields.
     """
 
     problems: Mapping[str, str]
     seeds: tuple[int, ...]
     variants: Mapping[str, Mapping[str, Any]]
     settings: Mapping[str, Any]
+    curves: bool = False
 
     @classmethod
     def of(cls, content: object, folder: Path = Path()) -> Study:
@@ -57,10 +60,11 @@ class Study:
         """
         if not isinstance(content, dict):
             raise StudyError(f"the study is {content!r}; expected a table with 'problems'")
-        unknown = sorted(set(map(str, content)) - {"problems", "seeds", "variants", "settings"})
+        entries = ("problems", "seeds", "variants", "settings", "curves")
+        unknown = sorted(set(map(str, content)) - {*entries})
         if unknown:
             raise StudyError(
-                f"unknown entries: {', '.join(unknown)}; expected problems, seeds, variants, settings"
+                f"unknown entries: {', '.join(unknown)}; expected {', '.join(entries)}"
             )
         problems, seeds = content.get("problems"), content.get("seeds", 1)
         if not isinstance(problems, list) or not problems:
@@ -70,6 +74,9 @@ class Study:
         elif not isinstance(seeds, list) or not seeds or any(type(s) is not int for s in seeds):
             raise StudyError(f"'seeds' is {seeds!r}; expected how many, or a list of them")
         variants, settings = content.get("variants", {"default": {}}), content.get("settings", {})
+        curves = content.get("curves", False)
+        if type(curves) is not bool:
+            raise StudyError(f"'curves' is {curves!r}; expected true or false")
         for name, table in (("variants", variants), ("settings", settings)):
             if not isinstance(table, dict):
                 raise StudyError(f"'{name}' is {table!r}; expected a table")
@@ -86,7 +93,7 @@ class Study:
             if not _NAME.fullmatch(name) or name in files:
                 raise StudyError(f"problem '{name}' of {file}; expected names that differ")
             files[name] = file
-        return cls(files, tuple(sorted(set(seeds))), variants, settings)
+        return cls(files, tuple(sorted(set(seeds))), variants, settings, curves)
 
     def content(self) -> dict[str, Any]:
         """What `of` makes this study of."""
@@ -95,6 +102,7 @@ class Study:
             "seeds": list(self.seeds),
             "variants": {name: dict(table) for name, table in self.variants.items()},
             "settings": dict(self.settings),
+            "curves": self.curves,
         }
 
     def trainings(self) -> dict[str, dict[str, Any]]:

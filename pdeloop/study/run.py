@@ -1,7 +1,8 @@
 """Carries a study out, or on: what is not in its folder yet is trained.
 
 DIR/study.json                what was asked for
-DIR/PROBLEM/VARIANT/SEED/     parameters.yaml, policy.npz and result.json of a finished training
+DIR/PROBLEM/VARIANT/SEED/     parameters.yaml, policy.npz, result.json of a finished training, with
+                              `curves` also curve.npz (pdeloop.study.curve)
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from concurrent.futures import (
     wait,
 )
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -55,8 +57,8 @@ def keep(folder: Path, study: Study) -> None:
         if (folder / ASKED).exists():
             if kept(folder) != study:
                 raise StudyError(
-                    f"{folder} holds another study; choose another folder, or continue the one "
-                    f"there with: pdeloop study --out {folder}"
+                    f"{folder} holds another study; choose another folder, or give --out {folder} "
+                    "alone to continue the one there"
                 )
             return
         make_folder(folder)
@@ -113,19 +115,20 @@ def run(
         The executor broke `ATTEMPTS` times, a worker has another environment, or the folder cannot
         be written.
     """
+    trainings = study.trainings()  # refuses before there is a folder
     keep(folder, study)
-    trainings = study.trainings()
     expected = None if any_environment else environment()
     finished = {name for name in trainings if (folder / name / "result.json").exists()}
     if expected is not None:
         _check_finished(folder, finished, expected)
+    train = partial(train_one, curves=study.curves)
     failures: list[Failure] = []
     for _ in range(ATTEMPTS):
         try:
             with executor() as pool:
                 todo = {n: v for n, v in trainings.items() if n not in finished}
                 waiting = {
-                    pool.submit(tasks.get(n.split("/")[1], train_one), v, expected): n
+                    pool.submit(tasks.get(n.split("/")[1], train), v, expected): n
                     for n, v in todo.items()
                 }
                 _collect(waiting, folder, finished, failures, len(trainings), tell)

@@ -11,12 +11,15 @@ from typing import Any
 import llvmlite.binding
 
 from pdeloop.in_process import LocalPair, train
+from pdeloop.study.curve import Curve
 from pdeloop.training_run import BUILT_IN
 from tuner_node.build import build_training
 from tuner_node.results import RunFolder, versions
 
 FILES = ("parameters.yaml", "policy.npz", "result.json")
 """The files of a run folder that a training of a study leaves, in the order of writing."""
+CURVE = "curve.npz"
+"""The file of `pdeloop.study.curve`, of a study with curves."""
 _ONE_AT_A_TIME = Lock()
 """A worker that runs tasks in threads: a training uses NumPy's and Numba's own threads."""
 
@@ -46,7 +49,7 @@ def require_environment(expected: Mapping[str, str] | None) -> dict[str, str]:
 
 
 def train_one(
-    parameters: Mapping[str, Any], expected: Mapping[str, str] | None = None
+    parameters: Mapping[str, Any], expected: Mapping[str, str] | None = None, curves: bool = False
 ) -> dict[str, bytes]:
     """Train in this process.
 
@@ -56,12 +59,14 @@ def train_one(
         Resolved parameters.
     expected : dict, optional
         The `environment` in which alone the result may be computed; None: any.
+    curves : bool
+        With the cost of every policy that the training has.
 
     Returns
     -------
     dict of str to bytes
-        Content of each of `FILES`; `environment` is an entry of result.json. The same bytes for the
-        same parameters in the same environment.
+        Content of each of `FILES`, before them that of `CURVE`; `environment` is an entry of
+        result.json. The same bytes for the same parameters in the same environment.
 
     Raises
     ------
@@ -76,7 +81,15 @@ def train_one(
         folder.create(parameters)
         training = build_training(parameters)
         pair = LocalPair(parameters)
-        train(training, pair, lambda row: None, max_batch=parameters["max_batch"])
+        curve = Curve(training, pair, parameters)
+        train(
+            training,
+            pair,
+            lambda row: None,
+            max_batch=parameters["max_batch"],
+            after_batch=curve.look if curves else lambda: None,
+        )
         extra = {"transport": "in-process", "controller": BUILT_IN, "environment": here}
         folder.finish(training, extra)
-        return {name: (folder.path / name).read_bytes() for name in FILES}
+        kept = {name: (folder.path / name).read_bytes() for name in FILES}
+        return {CURVE: curve.archive(), **kept} if curves else kept

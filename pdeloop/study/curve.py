@@ -1,0 +1,76 @@
+"""The cost of every policy that a training of one seed had, on the evaluation fields. Pure.
+
+policies (N, n_a, 2 n_s)    at the start, and after every batch of the adaptation
+costs (N, fields)           theirs
+rollouts (N,)               paid until then
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loop_interfaces.parameters import noisy
+from loop_interfaces.topics import CostColumn
+from pdeloop.in_process import LocalPair
+from tuner_node.batch import Batch
+from tuner_node.seeds import Purpose, derive, evaluation_noise
+from tuner_node.training import Training
+
+Array = NDArray[np.float64]
+
+
+class Curve:
+    """Grows with a training of one seed that runs on `pair`.
+
+    Parameters
+    ----------
+    training : Training
+    pair : LocalPair
+        It rolls the policies out besides; these rollouts belong to no budget.
+    values : dict
+        Resolved parameters of the training.
+    """
+
+    def __init__(self, training: Training, pair: LocalPair, values: Mapping[str, Any]) -> None:
+        self._training, self._pair, self._values = training, pair, values
+        self._policies: list[Array] = []
+        self._costs: list[Array] = []
+        self._rollouts: list[int] = []
+
+    def look(self) -> None:
+        """Add the present policy; its cost is measured where it is another one than before."""
+        if not self._training.optimizers or self._training.phase == "done":
+            return
+        (policy,) = self._training.policies()
+        same = bool(self._policies) and np.array_equal(policy, self._policies[-1])
+        self._costs.append(self._costs[-1] if same else self._measured(policy))
+        self._policies.append(policy)
+        self._rollouts.append(int(self._training.budget.paid[0]))
+
+    def archive(self) -> bytes:
+        """The arrays as an .npz file."""
+        content = BytesIO()
+        np.savez(
+            content,
+            policies=np.stack(self._policies),
+            costs=np.stack(self._costs),
+            rollouts=np.array(self._rollouts, dtype=np.float64),
+        )
+        return content.getvalue()
+
+    def _measured(self, policy: Array) -> Array:
+        """Mean stage costs (fields,) of a policy, as in the closing evaluation."""
+        seed, count = self._values["evaluation_seed"], self._values["evaluation_fields"]
+        noise = evaluation_noise(seed, count) if noisy(self._values) else []
+        rows = [
+            (derive(seed, Purpose.EVALUATION_FIELD, i), -1, 0, 0, *noise[i : i + 1])
+            for i in range(count)
+        ]
+        batch = Batch(np.array(rows, dtype=np.float64), np.stack([policy] * count))
+        costs: Array = self._pair.run(batch, self._values["max_batch"]).costs[:, CostColumn.MEAN]
+        return costs.copy()
