@@ -217,7 +217,7 @@ def test_a_policy_that_does_not_fit_the_episode_is_refused_and_a_good_one_serves
 
 
 def test_a_run_of_a_stranger_fills_no_memory(monkeypatch):
-    monkeypatch.setattr("controller_node.responder.KEPT_BYTES", 100_000)
+    monkeypatch.setattr("controller_node.responder.MAX_BYTES", 100_000)
     responder = Responder(SETTINGS)
     responder.target(TARGET)
     states = PLANT.reset(np.array([1]))
@@ -225,7 +225,7 @@ def test_a_run_of_a_stranger_fills_no_memory(monkeypatch):
         responder.start(start(1, (1, 2, 0.1, 0), run=run))
         for k in range(2000):
             assert len(responder.state(Frame(run, 1, k, 0.0, states + k))) == 1
-        assert sum(known.kept for known in responder._runs.values()) <= 100_000
+        assert sum(known.nbytes for known in responder._runs.values()) <= 100_000
     costs = np.array([[1.0, 30.0, COMPLETED]])
     (failure,) = responder.cost(Frame(119, 1, 1999, 1.0, costs))
     assert isinstance(failure, ModelFailure) and not failure.retry

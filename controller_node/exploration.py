@@ -1,0 +1,135 @@
+"""An exploratory episode: its random actions, its states, and the model from them. Pure."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controller_node.identification import DesignSettings, design
+from controller_node.policy import excitation
+from loop_interfaces import model_rows
+from loop_interfaces.frames import Frame
+from loop_interfaces.protocol import ModelFailure, Publication
+from loop_interfaces.signature import design_digest, digest_of, signature
+from loop_interfaces.topics import COMPLETED, MODEL_IDENTIFIED, VOID, CostColumn, StartColumn
+
+Array = NDArray[np.float64]
+DRAWN_AT_ONCE = 32
+"""Exploratory actions that are drawn at once, of all environments: well below a millisecond."""
+
+
+class Exploration:
+    """The exploratory episode that a start begins.
+
+    Parameters
+    ----------
+    start : Frame
+        Its start.
+    settings : DesignSettings
+        How to identify, and what to design for.
+
+    Attributes
+    ----------
+    outcomes : dict
+        What came out of it, by plant; for who fills it in.
+    nbytes : int
+        Size of the states that are kept.
+    """
+
+    def __init__(self, start: Frame, settings: DesignSettings) -> None:
+        self.outcomes: dict[int, Publication | ModelFailure] = {}
+        self.nbytes = 0
+        self._start, self._settings = start, settings
+        seeds, variances = start.values[:, [StartColumn.EXCITATION, StartColumn.VARIANCE]].T
+        self._draws = list(zip(seeds.astype(int).tolist(), variances.tolist(), strict=True))
+        self._actions: dict[int, Array] = {}
+        """Of some steps of the episode."""
+        self._states: dict[tuple[int, int], Array] = {}
+        """By plant and step."""
+        self._unusable: ModelFailure | None = None
+
+    def actions(self, step: int) -> Array:
+        """The actions of a step, (M, n_a); those of the next steps are drawn with them.
+
+        To make a generator of random numbers takes several times as long in between as again at once.
+        """
+        if step not in self._actions:
+            steps = range(step, step + max(1, DRAWN_AT_ONCE // len(self._draws)))
+            self._actions = {k: np.stack([self._draw(*d, k) for d in self._draws]) for k in steps}
+        return self._actions[step]
+
+    def lacks(self, state: Frame) -> bool:
+        """Whether the state is to be kept. Two different ones of a step make the episode unusable."""
+        known = self._states.get((state.plant, state.step))
+        if known is None or self._unusable is not None:
+            return self._unusable is None
+        if not np.array_equal(known, state.values):
+            reason = f"two different states came for step {state.step} of the exploratory episode"
+            self.give_up(reason, retry=True)
+        return False
+
+    def keep(self, state: Frame) -> None:
+        """Keep a state for the identification."""
+        self._states[state.plant, state.step] = state.values.copy()
+        self.nbytes += state.values.nbytes
+
+    def give_up(self, reason: str, *, retry: bool) -> None:
+        """No model can come out of the episode, whatever its cost is."""
+        self._unusable = self._failure(reason, retry=retry)
+        self._states, self.nbytes = {}, 0
+
+    def identify(self, cost: Frame, target: Array | None) -> Publication | ModelFailure:
+        """The models of all environments, or why there are none, once the episode has its cost.
+
+        Parameters
+        ----------
+        cost : Frame
+            Of the episode, one row for each environment.
+        target : (n_z,) array
+            z_r; None where the plant's has not arrived.
+        """
+        ended = cost.values[:, CostColumn.ENDED]
+        if (ended == VOID).any():
+            return self._failure("the exploratory episode is void", retry=True)
+        if (ended != COMPLETED).any():
+            step = int(ended.max())
+            return self._failure(
+                f"the plant diverged under exploration at step {step}; lower exploration_variance",
+                retry=False,
+            )
+        if self._unusable is not None:
+            return self._unusable
+        known = {step: z for (plant, step), z in self._states.items() if plant == cost.plant}
+        if len(known) != cost.step + 1 or max(known) != cost.step:
+            return self._failure(
+                f"the controller holds {len(known)} of the {cost.step + 1} states "
+                "of the exploratory episode",
+                retry=True,
+            )
+        if target is None:  # as none of its states was answered, somebody else did
+            return self._failure("the plant's target has not arrived", retry=True)
+        states = np.stack([known[k] for k in range(cost.step + 1)])
+        try:
+            models = []
+            for env, draw in enumerate(self._draws):
+                actions = np.stack([self._draw(*draw, k) for k in range(cost.step)])
+                models.append(design([(states[:, env], actions)], target, self._settings))
+        except ValueError as error:
+            return self._failure(str(error), retry=False)
+        rows = np.stack([model_rows.pack(model) for model in models])
+        time = self._signature() or cost.time
+        return Publication(MODEL_IDENTIFIED, replace(cost, step=0, time=time, values=rows))
+
+    def _signature(self) -> float:
+        start, settings = self._start, self._settings
+        digest = digest_of(start.values, settings.action_limit) if start.plant else 0
+        return signature(digest, design_digest(asdict(settings)))
+
+    def _draw(self, seed: int, variance: float, step: int) -> Array:
+        settings = self._settings
+        return excitation(seed, step, settings.n_a, variance, settings.action_limit)
+
+    def _failure(self, reason: str, *, retry: bool) -> ModelFailure:
+        return ModelFailure(self._start.run, self._start.episode, retry, reason)
