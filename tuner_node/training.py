@@ -1,18 +1,23 @@
 """The training as a state machine: which rollouts it needs next, what it does with their costs.
 
-Phases: identify (one exploratory episode a seed, from which the controller designs the warm start),
-check (the warm start and no control on a field; where it is no better, another exploratory episode is
-drawn, and in the end the adaptation begins with no control), adapt (the optimiser's rollouts),
-evaluate (no control, LQT and the adapted policy on the same sampled fields). The first three share the
-budget of a seed. Pure: it knows neither topics nor time, so over topics and in one process it is the
-same training, to the bit.
+    phase     rollouts of each seed                     next phase
+    identify  an exploration, from which the            check; adapt where only one attempt is
+              controller designs the warm start         allowed, or the model is given
+    check     no control and the warm start on a field  identify again for seeds whose warm start is no
+                                                        better, while they may; else adapt
+    adapt     what the optimiser asks for               evaluate, once all optimisers are done
+    evaluate  no control, LQT and the adapted policy    done
+              on the same sampled fields
+
+The first three share the budget of a seed. A seed whose last warm start is no better than no control
+begins the adaptation with no control. Pure: it knows neither topics nor time, so over topics and in one
+process it is the same training, to the bit.
 
 Source: Zhang, Mowlavi, Benosman, Basar, arXiv:2403.01005, section IV; the check is ours.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -22,9 +27,9 @@ from numpy.typing import NDArray
 
 from loop_interfaces import model_rows
 from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn
+from tuner_node import training_state
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, TrainingSettings, batch_of
 from tuner_node.budget import Budget
-from tuner_node.checkpoint import taken
 from tuner_node.optimizers import (
     Context,
     Measured,
@@ -37,7 +42,6 @@ from tuner_node.published_law import follows
 from tuner_node.seeds import NOISE, Purpose, derive, evaluation_noise, rollout_noise
 
 Array = NDArray[np.float64]
-PHASES = ("identify", "check", "adapt", "evaluate", "done")
 CHECK_FIELDS = 1
 """Sampled fields on which a warm start must beat no control."""
 EXPLORATION = 1
@@ -162,6 +166,11 @@ class Training:
         return starts
 
     @property
+    def evaluation_shape(self) -> tuple[int, int, int]:
+        """(S, controllers, fields)."""
+        return self.settings.seeds, len(CONTROLLERS), self.settings.evaluation_fields
+
+    @property
     def generation(self) -> int:
         """Number of the present models: grows whenever one of them is another one."""
         return 1 + sum(self.attempts)
@@ -184,33 +193,7 @@ class Training:
 
     def state(self) -> dict[str, NDArray[Any]]:
         """Everything a checkpoint must hold, as arrays."""
-        arrays: dict[str, NDArray[Any]] = {
-            "phase": np.array(self.phase),
-            "plant": np.array(self.plant),
-            "attempts": np.array(self.attempts),
-            "pending": np.array(self.pending, dtype=np.int64),
-            "history": np.array(json.dumps(self.history)),
-            "budget": self.budget.state(),
-            "law_seen": np.array(self.law_seen),
-            "worse": np.array(self.worse),
-        }
-        for m, rollouts in enumerate(self.measured):
-            for i, rollout in enumerate(rollouts):
-                name = f"measured{m}.{i}"
-                arrays |= {f"{name}.policy": rollout.policy, f"{name}.cost": np.array(rollout.cost)}
-                arrays |= trajectory_arrays(name, rollout.trajectory)
-        if self.models is not None:
-            arrays["models"] = self.models
-        for m, exploration in enumerate(self.explorations):
-            if exploration is not None:
-                arrays |= trajectory_arrays(f"exploration{m}", exploration)
-        if self.target is not None:
-            arrays["target"] = self.target
-        if self.evaluation is not None and self.ended is not None:
-            arrays |= {"evaluation": self.evaluation, "ended": self.ended}
-        for m, optimizer in enumerate(self.optimizers):
-            arrays |= {f"optimizer{m}.{key}": value for key, value in optimizer.state().items()}
-        return arrays
+        return training_state.arrays_of(self)
 
     def restore(self, arrays: dict[str, NDArray[Any]]) -> None:
         """Continue from `state()`.
@@ -222,79 +205,10 @@ class Training:
         """
         restored = Training(self.settings, self.make_optimizer)
         try:
-            restored._take(arrays)
+            training_state.fill(restored, arrays)
         except (ValueError, LookupError, TypeError, OverflowError) as error:
             raise ValueError(f"does not fit this training ({error})") from error
         vars(self).update(vars(restored))
-
-    def _take(self, arrays: dict[str, NDArray[Any]]) -> None:
-        seeds, n_a = self.settings.seeds, self.settings.n_a
-        shape = (seeds, len(CONTROLLERS), self.settings.evaluation_fields)
-        self.phase = str(taken(arrays, "phase", "U", ()))
-        self.budget.restore(taken(arrays, "budget", "i", self.budget.state().shape))
-        self.law_seen = bool(taken(arrays, "law_seen", "b", ()))
-        self.plant = int(taken(arrays, "plant", "i", ()))
-        self.attempts = taken(arrays, "attempts", "i", (seeds,)).tolist()
-        self.pending = taken(arrays, "pending", "i", (None,)).tolist()
-        self.history = json.loads(str(taken(arrays, "history", "U", ())))
-        if "models" in arrays:
-            self.models = taken(arrays, "models", "f", (seeds, None, None))
-            self.warm_starts()
-        if "target" in arrays:
-            self.target = taken(arrays, "target", "f", (None,))
-        for m in range(seeds):
-            if f"exploration{m}.states" in arrays:
-                self.explorations[m] = taken_trajectory(arrays, f"exploration{m}", n_a)
-            while (name := f"measured{m}.{len(self.measured[m])}") + ".policy" in arrays:
-                self.measured[m].append(
-                    Measured(
-                        taken(arrays, f"{name}.policy", "f", (n_a, None)),
-                        float(taken(arrays, f"{name}.cost", "f", ())),
-                        taken_trajectory(arrays, name, n_a),
-                    )
-                )
-        self.worse = taken(arrays, "worse", "b", (seeds,)).tolist()
-        if "evaluation" in arrays:
-            self.evaluation = taken(arrays, "evaluation", "f", shape)
-            self.ended = taken(arrays, "ended", "f", shape)
-        self._check_taken()
-        if self.phase in ("adapt", "evaluate", "done"):
-            self._start_optimizers()
-        for m, optimizer in enumerate(self.optimizers):
-            prefix = f"optimizer{m}."
-            optimizer.restore(
-                {
-                    key.removeprefix(prefix): value
-                    for key, value in arrays.items()
-                    if key.startswith(prefix)
-                }
-            )
-
-    def _check_taken(self) -> None:
-        """A ValueError unless what was taken is a state that a training can be in."""
-        if self.phase not in PHASES:
-            raise ValueError(f"its phase is {self.phase!r}; expected one of {', '.join(PHASES)}")
-        if not set(self.pending) <= set(range(self.settings.seeds)) or min(self.attempts) < 0:
-            raise ValueError("its seeds or attempts are out of range")
-        if not isinstance(self.history, list) or not all(isinstance(r, dict) for r in self.history):
-            raise ValueError("its history is not a list of rows")
-        if self.models is None and self.phase != "identify":
-            raise ValueError("it has no models")
-        if self.evaluation is None and self.phase == "done":
-            raise ValueError("it has no evaluation")
-        if not self.pending and self.phase in ("identify", "check"):
-            raise ValueError("it has no seed to identify")
-        if self.settings.trajectories and self.phase != "identify":
-            self._check_trajectories()
-
-    def _check_trajectories(self) -> None:
-        assert self.models is not None
-        n_z = len(model_rows.unpack(self.models[0], self.settings.n_a).U)
-        if self.target is None or self.target.shape != (n_z,):
-            raise ValueError(f"it has no target of {n_z} numbers")
-        for known in self.explorations:
-            if known is None or known.states.shape != (len(known.actions) + 1, n_z):
-                raise ValueError(f"it has an exploration without states of {n_z} numbers")
 
     def _seeds(self) -> list[int]:
         return [self.settings.seed + s for s in range(self.settings.seeds)]
@@ -368,7 +282,7 @@ class Training:
     def _checked(self, result: BatchResult) -> list[dict[str, Any]]:
         costs = result.costs.reshape(len(self.pending), 2, CHECK_FIELDS, len(CostColumn))
         self.budget.count("check", np.repeat(self.pending, CHECK))
-        self._keep(result)
+        self._keep_measured(result)
         rows: list[dict[str, Any]] = []
         failed = []
         for m, (none, lqt) in zip(self.pending, costs, strict=True):
@@ -400,8 +314,8 @@ class Training:
             self._start_adapting()
         return rows
 
-    def _keep(self, result: BatchResult) -> None:
-        """Keep the trajectories of a check, as far as its rollouts came to their end."""
+    def _keep_measured(self, result: BatchResult) -> None:
+        """Keep the trajectories of a check's completed rollouts."""
         if result.trajectories is None:
             return
         asked = self._check_rollouts()
@@ -421,10 +335,11 @@ class Training:
 
     def _start_adapting(self) -> None:
         self.pending = []
-        self._start_optimizers()
+        self.start_optimizers()
         self._leave_adapt_if_done()
 
-    def _start_optimizers(self) -> None:
+    def start_optimizers(self) -> None:
+        """Make the optimiser of every seed, with its start and what is left of its budget."""
         budgets = self.budget.adaptation.tolist()
         self.optimizers = [
             self.make_optimizer(start, seed, self._context(m), rollouts)
@@ -463,7 +378,7 @@ class Training:
                 seen = result.trajectories[first : first + len(asked)]
                 self._check_law(m, asked, result.trajectories[first : first + len(asked)])
             first += len(asked)
-            told = optimizer.tell(
+            report = optimizer.tell(
                 [
                     RolloutResult(
                         cost=float(cost[CostColumn.MEAN]),
@@ -475,7 +390,7 @@ class Training:
             )
             self.budget.count("adapt", [m] * len(asked))
             paid = int(self.budget.paid[m])
-            rows.append({"event": "adapted", "seed": self._seeds()[m], **told, "rollouts": paid})
+            rows.append({"event": "adapted", "seed": self._seeds()[m], **report, "rollouts": paid})
         self.history += rows
         self._leave_adapt_if_done()
         return rows
@@ -513,9 +428,8 @@ class Training:
 
     def _evaluated(self, result: BatchResult) -> list[dict[str, Any]]:
         settings = self.settings
-        shape = (settings.seeds, len(CONTROLLERS), settings.evaluation_fields)
-        self.evaluation = result.costs[:, CostColumn.MEAN].reshape(shape)
-        self.ended = result.costs[:, CostColumn.ENDED].reshape(shape)
+        self.evaluation = result.costs[:, CostColumn.MEAN].reshape(self.evaluation_shape)
+        self.ended = result.costs[:, CostColumn.ENDED].reshape(self.evaluation_shape)
         self.budget.count("evaluate", np.repeat(np.arange(settings.seeds), self.ended[0].size))
         self.phase = "done"
         return [
@@ -529,16 +443,3 @@ class Training:
                 self._seeds(), self.evaluation, self.ended != COMPLETED, strict=True
             )
         ]
-
-
-def trajectory_arrays(name: str, trajectory: Trajectory) -> dict[str, NDArray[Any]]:
-    """A trajectory in a checkpoint, under a name."""
-    return {f"{name}.states": trajectory.states, f"{name}.actions": trajectory.actions}
-
-
-def taken_trajectory(arrays: dict[str, NDArray[Any]], name: str, n_a: int) -> Trajectory:
-    """The trajectory of that name; ValueError if there is none with n_a actuators."""
-    return Trajectory(
-        taken(arrays, f"{name}.states", "f", (None, None)),
-        taken(arrays, f"{name}.actions", "f", (None, n_a)),
-    )
