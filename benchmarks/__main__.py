@@ -72,6 +72,7 @@ def parser() -> argparse.ArgumentParser:
     pairs.add_argument("--delay", type=float, default=0.002, help="largest delay in s [0.002]")
     pairs.add_argument("--problem", default="burgers", metavar="PROBLEM", help="[burgers]")
     _add_baselines(programs)
+    _add_reinforcement(programs)
     optimum = _add(
         programs,
         "optimum",
@@ -199,6 +200,28 @@ def _add_baselines(programs: Commands) -> None:
     add("--folder", type=Path, metavar="DIR", help="of the runs [runs/baselines-PROBLEM]")
     add("--processes", type=int, metavar="N", help="trainings at the same time [one a core]")
     add("--figure", type=Path, metavar="FILE", help="draw the costs against the rollouts")
+
+
+def _add_reinforcement(programs: Commands) -> None:
+    """Reinforcement learning, which needs a virtual environment of its own."""
+    add = _add(
+        programs,
+        "reinforcement",
+        "learning curve of PPO or SAC of stable-baselines3 (docs/optimizers.md says how to install it)",
+        "burgers --algorithm ppo --minutes 2",
+    ).add_argument
+    add("problem", metavar="PROBLEM", help="a shipped problem or a YAML file")
+    add("--algorithm", choices=("ppo", "sac"), help="[ppo]")
+    add("--seed", type=int, metavar="S", help="[0]")
+    add("--minutes", type=float, metavar="N", help="of processor time at most [20]")
+    add(
+        "--reach",
+        type=float,
+        metavar="X",
+        help="bound of the actions over LQ tracking's largest [1]",
+    )
+    add("--environments", type=int, metavar="M", help="advanced in a batch [4]")
+    add("--folder", type=Path, metavar="DIR", help="that of baselines, for a row at 80 rollouts")
 
 
 def _add(programs: Commands, name: str, text: str, example: str) -> argparse.ArgumentParser:

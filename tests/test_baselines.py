@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import itertools
 import json
 from collections.abc import Iterator
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import baselines, robustness
+from benchmarks import baselines, reinforcement, robustness
 from benchmarks.__main__ import parser
 from benchmarks.baselines import TEST, TUNING_SEEDS, VALIDATION, iqm, refuse_other_constants, run
 from benchmarks.methods import (
@@ -208,6 +209,14 @@ def test_a_comparison_is_a_study_that_is_continued(
     assert [p for p, at in written.items() if p.stat().st_mtime_ns != at] == [lost]
     with pytest.raises(StudyError, match="holds another study"):
         run(str(file), **{**how, "seeds": 1})
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("stable_baselines3") is not None, reason="stable-baselines3 is there"
+)
+def test_reinforcement_learning_says_what_it_needs() -> None:
+    with pytest.raises(ValueError, match="needs stable_baselines3, which no extra installs: see"):
+        reinforcement.run(str(SMALL))
 
 
 def test_the_command_line_hands_the_program_its_options_alone(
