@@ -26,9 +26,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import controller_node.fast_path
-import pde_sim_node.fast_path
 from pdeloop.cli import DONE, FAILED, main, parser
+from pdeloop.training_run import resolve
 from tests.small import SMALL
 from tuner_node import run_store
 
@@ -147,8 +146,7 @@ def judged(out: Path, n: int, kind: str, policy: bytes) -> str | None:
 def run(folder: Path, kinds: tuple[str, ...]) -> dict[str, Any]:
     """Every failure, one after the other."""
     parser()  # imports what each training needs
-    controller_node.fast_path.load_compiled()
-    pde_sim_node.fast_path.load_compiled()
+    resolve(str(SMALL), {})  # loads what is compiled
     out = folder / "run"
     assert forked(folder / "log", training(out)) == 0, (folder / "log").read_text()
     policy = (out / "policy.npz").read_bytes()

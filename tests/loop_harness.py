@@ -1,21 +1,30 @@
-"""Real nodes in real processes on a ROS domain of their own, with a limit on every wait."""
+"""Real nodes in real processes on a ROS domain of their own, with a limit on every wait.
+
+Most of what it takes to start a node is imports and the loading of compiled code, a second of a
+core. So the nodes and trainings that a test starts itself are forked from a process that has done
+that (tests/preloaded.py). The nodes that a training starts are programs of their own, as always.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from loop_interfaces.isolation import loopback_environment
 from pdeloop.domain import DOMAINS, DOMAINS_FOLDER, own_domain
 
 ROOT = Path(__file__).resolve().parent.parent
+FORKING = multiprocessing.get_context("forkserver")
+FORKING.set_forkserver_preload(["tests.preloaded"])
 
 
 def until(condition: Callable[[], object], limit: float, what: str) -> None:
@@ -26,8 +35,64 @@ def until(condition: Callable[[], object], limit: float, what: str) -> None:
         time.sleep(0.02)
 
 
+class Forked:
+    """A node, or the command line, in a process that was forked, not executed; used like a Popen.
+
+    name: one of tests.preloaded.MAINS. Its output goes into the file `log`.
+    """
+
+    def __init__(
+        self, name: str, arguments: Sequence[str], log: Path, environment: Mapping[str, str]
+    ) -> None:
+        self.name, self.args, self.log = name, [name, *arguments], log
+        log.touch()
+        given = (name, list(arguments), log, dict(environment))
+        self._process = FORKING.Process(target=run_main, args=given)
+        self._process.start()
+        assert self._process.pid is not None
+        self.pid = self._process.pid
+
+    def poll(self) -> int | None:
+        return self._process.exitcode
+
+    def wait(self, timeout: float | None = None) -> int:
+        self._process.join(timeout)
+        code = self._process.exitcode
+        if code is None:
+            raise subprocess.TimeoutExpired(self.args, timeout or 0.0)
+        return code
+
+    def send_signal(self, number: int) -> None:
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        self.send_signal(signal.SIGKILL)
+
+
+def run_main(name: str, arguments: list[str], log: Path, environment: dict[str, str]) -> None:
+    """The main function called `name`, in a forked process."""
+    os.setsid()
+    with log.open("wb") as output, Path(os.devnull).open("rb") as nothing:
+        for file, number in ((nothing, 0), (output, 1), (output, 2)):
+            os.dup2(file.fileno(), number)
+    os.environ.clear()
+    os.environ.update(environment)
+    os.chdir(log.parent)
+    sys.argv = [name, *arguments]
+    from tests.preloaded import MAINS
+
+    sys.exit(MAINS[name]())
+
+
 class Processes:
-    """The processes of one test. All are gone when it is over."""
+    """The processes of one test. All are gone when it is over.
+
+    forks: whether its nodes and trainings are forked; set it to False where they need an interpreter
+    that was started in this test's environment.
+    """
+
+    forks = True
 
     def __init__(self, folder: Path, domain: int) -> None:
         self.folder = folder
@@ -38,13 +103,12 @@ class Processes:
             "ROS_LOG_DIR": str(folder / "ros_logs"),
             "PYTHONPATH": str(ROOT),
         }
-        self._alive: list[subprocess.Popen[bytes]] = []
+        self._alive: list[subprocess.Popen[bytes] | Forked] = []
         self._count = 0
 
     def start(self, *command: str, name: str = "") -> subprocess.Popen[bytes]:
         """Run `python COMMAND...` with its output in a file (see `output`)."""
-        self._count += 1
-        path = self.folder / f"{self._count:02d}-{name or Path(command[-1]).name}.log"
+        path = self._new_log(name or Path(command[-1]).name)
         with path.open("wb") as log:
             process = subprocess.Popen(
                 [sys.executable, *command],
@@ -59,12 +123,25 @@ class Processes:
         self._alive.append(process)
         return process
 
-    def node(self, name: str, *ros_arguments: str) -> subprocess.Popen[bytes]:
+    def _new_log(self, name: str) -> Path:
+        self._count += 1
+        return self.folder / f"{self._count:02d}-{name}.log"
+
+    def _fork(self, name: str, *arguments: str) -> Forked:
+        forked = Forked(name, arguments, self._new_log(name), self.environment)
+        self._alive.append(forked)
+        return forked
+
+    def node(self, name: str, *ros_arguments: str) -> Any:
         """Start one of our nodes."""
+        if self.forks:
+            return self._fork(name, "--ros-args", *ros_arguments)
         return self.start("-m", f"{name}.node", "--ros-args", *ros_arguments, name=name)
 
-    def pdeloop(self, *arguments: str) -> subprocess.Popen[bytes]:
+    def pdeloop(self, *arguments: str) -> Any:
         """Start the command line."""
+        if self.forks and arguments[0] == "train":
+            return self._fork("pdeloop", *arguments)
         return self.start("-m", "pdeloop.cli", *arguments, name="pdeloop")
 
     def output(self, process: subprocess.Popen[bytes]) -> str:
@@ -87,7 +164,7 @@ class Processes:
     def left_behind(self) -> list[int]:
         """Processes of this test that still run, also those its children started."""
         inside = f"ROS_LOG_DIR={self.folder}".encode()
-        found = []
+        found = [forked.pid for forked in self._forked()]
         for entry in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):
                 environment = (entry / "environ").read_bytes()
@@ -96,9 +173,13 @@ class Processes:
                     found.append(int(entry.name))
         return found
 
+    def _forked(self) -> list[Forked]:
+        """The forked ones that still run."""
+        return [p for p in self._alive if isinstance(p, Forked) and p.poll() is None]
+
     def pids(self, node: str) -> list[int]:
         """Processes of this test that run the module `node`.node, whoever started them."""
-        found = []
+        found = [forked.pid for forked in self._forked() if forked.name == node]
         for pid in self.left_behind():
             with contextlib.suppress(OSError):
                 words = Path(f"/proc/{pid}/cmdline").read_bytes().decode().split("\0")
