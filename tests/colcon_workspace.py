@@ -9,6 +9,9 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from pdeloop.training_run import resolve
+from tests.small import SMALL
+
 ROOT = Path(__file__).resolve().parent.parent
 _NOT_SOURCES = (".*", "__pycache__", "*.egg-info", "build", "install", "log", "runs", "tests")
 
@@ -31,6 +34,19 @@ class Workspace:
             text=True,
             timeout=300,
         )
+
+    def add_compiled(self) -> None:
+        """Put beside the installed files what Numba has compiled of the sources, which are the same.
+
+        Compiling it again would be most of what the tests of an installation do.
+        """
+        resolve(str(SMALL), {})  # compiles what is not
+        (library,) = self.prefix.glob("lib/python*/site-packages")
+        for installed in library.iterdir():
+            for path in (ROOT / installed.name).rglob("*.nb[ic]"):
+                target = library / path.relative_to(ROOT)
+                target.parent.mkdir(exist_ok=True)
+                shutil.copy2(path, target)
 
     def executable(self, name: str) -> Path:
         """The file that `ros2 run pdeloop NAME` and launch_ros look for."""

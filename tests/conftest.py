@@ -10,7 +10,8 @@ import pytest
 
 from tests.colcon_workspace import Workspace, build
 from tests.loop_harness import Processes, processes
-from tests.small import REPRODUCED
+from tests.made_once import made_once
+from tests.small import RECORDED, REPRODUCED, SMALL
 
 # Hundreds of processes import the same modules; each would compile them again.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -59,14 +60,37 @@ def loop(tmp_path: Path) -> Iterator[Processes]:
 
 @pytest.fixture(scope="session")
 def workspace(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
-    """The package as `colcon build` installs it."""
-    return build(tmp_path_factory.mktemp("colcon"))
+    """The package as `colcon build` installs it, with its compiled code."""
+
+    def make(folder: Path) -> Workspace:
+        workspace = build(folder)
+        workspace.add_compiled()
+        return workspace
+
+    return made_once(tmp_path_factory, "colcon", make)
 
 
 @pytest.fixture(scope="session")
 def reproduction(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """A small reproduction: its folder, and what it said."""
-    base = tmp_path_factory.mktemp("reproduction")
-    with processes(base) as running:
-        run = running.pdeloop("reproduce", *REPRODUCED, "--out", str(base / "out"))
-        return base / "out", running.wait(run, 600.0)
+
+    def make(folder: Path) -> tuple[Path, str]:
+        with processes(folder) as running:
+            run = running.pdeloop("reproduce", *REPRODUCED, "--out", str(folder / "out"))
+            return folder / "out", running.wait(run, 600.0)
+
+    return made_once(tmp_path_factory, "reproduction", make)
+
+
+@pytest.fixture(scope="session")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small run over topics, of RECORDED["iterations"] for two seeds, recorded as one MCAP bag."""
+
+    def make(folder: Path) -> Path:
+        with processes(folder) as running:
+            options = [word for name, value in RECORDED.items() for word in (f"--{name}", value)]
+            command = ("train", str(SMALL), *options, "--record", "--out", str(folder / "run"))
+            running.wait(running.pdeloop(*command), 600.0)
+        return folder / "run"
+
+    return made_once(tmp_path_factory, "recorded", make)

@@ -17,6 +17,8 @@ _OWN = ("optimizer", "seed", "seeds", "rollouts", "iterations", "start")
 SMALL = Path(__file__).parent / "data" / "small.yaml"
 REPRODUCED = (str(SMALL), "--seeds", "2", "--iterations", "12")
 """What a small reproduction is asked for."""
+RECORDED = {"iterations": "6", "seeds": "2"}
+"""What the small recorded run is asked for."""
 
 
 def parameters(**options: Any) -> dict[str, Any]:

@@ -13,22 +13,17 @@ from pdeloop.bags.mcap_messages import Message
 from pdeloop.bags.node import timed
 from pdeloop.bags.reader import Bag
 from tests.browser import browser
-from tests.loop_harness import Processes, processes, until, without_domain
+from tests.loop_harness import Processes, until, without_domain
 from tests.small import SMALL
 from tests.topics.test_monitor import FIELD, LIMIT, PAINTED, ROLLOUTS, STATE, address, card
 
 pytestmark = pytest.mark.topics
 
 
-@pytest.fixture(scope="module")
-def bag(tmp_path_factory) -> Path:
+@pytest.fixture
+def bag(recorded: Path) -> Path:
     """The folder of a small recorded run."""
-    folder = tmp_path_factory.mktemp("played")
-    with processes(folder) as loop:
-        options = ("--iterations", "3", "--optimizer", "two_point", "--record")
-        run = loop.pdeloop("train", str(SMALL), *options, "--out", str(folder / "run"))
-        loop.wait(run, LIMIT)
-    return folder / "run"
+    return recorded
 
 
 def by_topic(messages: list[Message]) -> dict[str, list[bytes]]:
@@ -111,13 +106,13 @@ def test_a_bag_that_is_none_is_told_in_one_line(loop: Processes, tmp_path):
     assert "--rate" in text
 
 
-def test_the_recorded_quality_of_service_is_that_of_the_loop(bag):
+def test_the_recorded_quality_of_service_is_that_of_the_loop(bag, tmp_path):
     found = {channel.topic: channel for channel in Bag(bag).channels()}
     assert found["/target"].latched and found["/episode/cost"].latched
     assert not found["/state"].latched and found["/state"].reliable
     assert found["/clock"].type == "rosgraph_msgs/msg/Clock"
     # Of an unfinished bag, which has no metadata, it is that of the loop's table.
-    unfinished = bag.parent / "unfinished"
+    unfinished = tmp_path / "unfinished"
     unfinished.mkdir()
     (source,) = (bag / "bag").glob("*.mcap")
     (unfinished / source.name).write_bytes(source.read_bytes())

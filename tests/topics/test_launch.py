@@ -42,22 +42,14 @@ sys.exit(service.run())
 """What `ros2 launch FILE ARGUMENTS...` does."""
 
 
-@pytest.fixture(scope="module")
-def compiled(workspace: Workspace, tmp_path_factory: pytest.TempPathFactory) -> Workspace:
-    """The workspace with its kernels compiled: once, not by every node at the same time."""
-    words = ("train", str(SMALL), "--in-process", "--iterations", "1")
-    done = workspace.run("pdeloop", *words, cwd=tmp_path_factory.mktemp("compile"))
-    assert done.returncode == 0, done.stderr
-    return workspace
-
-
 @pytest.fixture
-def installed(loop: Processes, compiled: Workspace) -> Processes:
+def installed(loop: Processes, workspace: Workspace) -> Processes:
     """Processes that run the installed code, not the sources."""
-    path = compiled.environment["PYTHONPATH"]
+    path = workspace.environment["PYTHONPATH"]
     given = os.environ.get("PYTHONPATH", "") if LAUNCH else str(STAND_IN)  # where launch comes from
     own = {"ROS_LOG_DIR": loop.environment["ROS_LOG_DIR"]}  # whose processes these are
-    loop.environment |= compiled.environment | own | {"PYTHONPATH": f"{path}{os.pathsep}{given}"}
+    loop.forks = False
+    loop.environment |= workspace.environment | own | {"PYTHONPATH": f"{path}{os.pathsep}{given}"}
     return loop
 
 

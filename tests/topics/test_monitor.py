@@ -218,11 +218,9 @@ def test_a_pair_in_a_namespace_and_an_environment_are_chosen_on_the_page(loop, p
 
 
 def test_a_run_that_is_over_opens_with_its_curve_its_seeds_and_its_recorded_episodes(
-    loop, page, tmp_path
+    loop, page, recorded
 ):
-    out = tmp_path / "run"
-    options = ("--rollouts", "30", "--seeds", "2", "--optimizer", "two_point", "--record")
-    loop.wait(loop.pdeloop("train", str(SMALL), *options, "--out", str(out)), LIMIT)
+    out = recorded
     page.go(address(loop, loop.pdeloop("monitor", str(out), "--port", "0")))
     page.until(f"{STATE} === 'finished'", LIMIT)
     result = json.loads((out / "result.json").read_text())

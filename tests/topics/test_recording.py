@@ -26,7 +26,7 @@ from pdeloop.bags.verify import verify
 from pdeloop.identification import Wanted, identify_bag
 from recorder_node.bag import BagWriter
 from tests.loop_harness import ROOT, Processes, until
-from tests.small import SMALL, same_bits
+from tests.small import RECORDED, SMALL, same_bits
 from tests.small_disk import read_only_folder, small_disk
 from tests.topics.test_loop import (
     LIMIT,
@@ -37,7 +37,7 @@ from tests.topics.test_loop import (
 )
 
 pytestmark = pytest.mark.topics
-STEPS, ITERATIONS = 30, 6
+STEPS, ITERATIONS = 30, int(RECORDED["iterations"])
 LAYOUTS = ("foxglove.json", "plotjuggler.xml")
 EPISODES = ITERATIONS + 3  # exploration, check, the iterations, evaluation
 
@@ -47,17 +47,6 @@ def trained(loop: Processes, folder: Path, *options: str, iterations: int = ITER
         "train", str(SMALL), "--iterations", str(iterations), "--out", str(folder), *options
     )
     return loop.wait(run, LIMIT)
-
-
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory, request) -> Path:
-    """A small run recorded by the command line, as one MCAP bag."""
-    from tests.loop_harness import processes
-
-    folder = tmp_path_factory.mktemp("recorded")
-    with processes(folder) as loop:
-        trained(loop, folder / "run", "--record", "--seeds", "2")
-    return folder / "run"
 
 
 def test_a_recorded_run_is_complete_and_everything_in_it_is_recomputed(loop, tmp_path):
