@@ -161,6 +161,15 @@ def parser() -> argparse.ArgumentParser:
         "--pairs", type=int, nargs="+", metavar="K", help="of plant and controller [1 15 30 60]"
     )
     participants.add_argument("--seconds", type=float, metavar="S", help="of a measurement [20]")
+    services = _add(
+        programs,
+        "services",
+        "how soon a recorded training answers its operator, and Ctrl-C",
+        "--calls 50",
+    )
+    services.add_argument("--problem", metavar="PROBLEM", help="[burgers]")
+    services.add_argument("--calls", type=int, metavar="N", help="of each service [20]")
+    services.add_argument("--queued", type=int, metavar="N", help="requests at once [20]")
     kernel = _add(
         programs, "kernel", "time of a step beside other implementations", "--batches 1 12 --json"
     )

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tomllib
 import xml.etree.ElementTree as ElementTree
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,9 @@ def test_the_manifest_says_what_the_project_says() -> None:
     assert manifest.get("format") == "3"
     for field in ("name", "version", "description"):
         assert manifest.findtext(field) == PROJECT["project"][field]
+    newest = re.search(r"^## \[(\d.*)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert newest and newest[1] == PROJECT["project"]["version"]
+    assert metadata.version("pdeloop") == newest[1], "make setup"  # what pdeloop --version tells
     assert manifest.findtext("export/build_type") == "ament_python"
     assert "Apache Software License" in " ".join(PROJECT["project"]["classifiers"])
     assert manifest.findtext("license") == "Apache-2.0"
