@@ -97,8 +97,10 @@ def run(
         failures = carry_out(own, place, partial(pool, processes), tasks=tasks)
         for failure in failures:
             print(f"failed: {failure.training}: {failure.reason}", file=sys.stderr)
-        rows += table(place / next(iter(study.problems)), budget)
-    result = {"problem": path.stem, "limit": limit(study), "rows": rows}
+        for name in study.problems:
+            rows += [{"problem": name, **row} for row in table(place / name, budget)]
+    limits = {name: limit(file, study.settings) for name, file in study.problems.items()}
+    result = {"limits": limits, "rows": rows}
     if figure is not None:
         plot(result, figure)
     return result
@@ -205,37 +207,37 @@ def table(folder: Path, budget: int) -> list[dict[str, Any]]:
     return sorted(rows, key=lambda row: row["cost"])
 
 
-def limit(study: Study) -> float | None:
+def limit(problem: str, settings: Mapping[str, Any]) -> float | None:
     """The cost of the best inputs for each field, below which no controller comes; None: unknown."""
-    (file,) = study.problems.values()
-    own = {**study.settings, "identification": "dmdc", "identification_attempts": 10}
+    own = {**settings, "identification": "dmdc", "identification_attempts": 10}
     # Fewer sensors or weaker actuators do not lower it.
-    known = find(load_parameters(file, {**own, "sensors": 0, "action_limit": 0.0}))
+    known = find(load_parameters(problem, {**own, "sensors": 0, "action_limit": 0.0}))
     return None if known is None else float(known.open_loop.mean())
 
 
 def text(result: Mapping[str, Any]) -> str:
-    """The rows as a Markdown table for each budget."""
-    bound, lines = result["limit"], []
-    for budget in dict.fromkeys(row["budget"] for row in result["rows"]):
-        lines += ["", f"**{result['problem']}, {budget} rollouts**", ""]
-        head = ["method", "rollouts", "seeds", "cost", f"{100 * CONFIDENCE:.0f} % interval", "mean"]
-        lines.append(f"| {' | '.join([*head, 'worst seed', 'over the limit', 'diverged'])} |")
-        lines.append("|---" * 9 + "|")
-        for row in (row for row in result["rows"] if row["budget"] == budget):
+    """The rows as a Markdown table for each problem and budget."""
+    lines: list[str] = []
+    head = ["method", "rollouts", "seeds", "cost", f"{100 * CONFIDENCE:.0f} % interval", "mean"]
+    head += ["worst seed", "over the limit", "diverged"]
+    for (problem, budget), rows in itertools.groupby(result["rows"], key=_table):
+        bound = result["limits"][problem]
+        lines += ["", f"**{problem}, {budget} rollouts**", "", f"| {' | '.join(head)} |"]
+        lines.append("|---" * len(head) + "|")
+        for row in rows:
             between = " to ".join(number(end) for end in row["interval"] or ()) or "-"
-            over = "-" if bound is None else f"{100 * (row['cost'] / bound - 1):.1f} %"
+            known = bound is not None and finished(row["cost"])
             shown = [row["method"], row["rollouts"], row["seeds"], number(row["cost"]), between]
-            shown += [
-                number(row["mean"]),
-                number(row["worst"]),
-                over if finished(row["cost"]) else "-",
-                row["diverged"],
-            ]
+            shown += [number(row["mean"]), number(row["worst"])]
+            shown += [f"{100 * (row['cost'] / bound - 1):.1f} %" if known else "-", row["diverged"]]
             lines.append(f"| {' | '.join(map(str, shown))} |")
         if bound is not None:
             lines.append(f"| any controller (limit) | | | {bound:.4g} | | | | 0.0 % | |")
     return "\n".join(lines[1:])
+
+
+def _table(row: Mapping[str, Any]) -> tuple[str, int]:
+    return row["problem"], row["budget"]
 
 
 def number(value: float) -> str:
@@ -249,30 +251,31 @@ def finished(cost: float) -> bool:
 
 
 def plot(result: Mapping[str, Any], path: Path) -> None:
-    """Cost against rollouts, with the intervals, as a picture; methods without adaptation are lines."""
+    """Cost against rollouts with the intervals, a panel a problem."""
     from matplotlib import rc_context
 
     from pdeloop.report.style import STYLE, panels, plain_log
 
+    shown = [row for row in result["rows"] if finished(row["cost"])]
+    methods = list(dict.fromkeys(row["method"] for row in shown))
     with rc_context(STYLE):
-        figure, (ax,) = panels(1, 3.4, 4.6, 4.6)
-        shown = [row for row in result["rows"] if finished(row["cost"])]
-        for number_, method in enumerate(dict.fromkeys(row["method"] for row in shown)):
-            own = [row for row in shown if row["method"] == method]
-            x, y = [row["budget"] for row in own], [row["cost"] for row in own]
-            ends = np.array([row["interval"] or (row["cost"],) * 2 for row in own]).T
-            marker = "osD^vPX*<>"[number_ % 10]
-            ax.plot(x, y, marker=marker, ms=4, lw=1, color=f"C{number_ % 10}", label=method)
-            ax.fill_between(x, *ends, color=f"C{number_ % 10}", alpha=0.15, lw=0)
-        if result["limit"] is not None:
-            ax.axhline(result["limit"], color="0.4", ls="--", lw=1, label="limit of any controller")
-        low, high = ax.get_ylim()
-        plain_log(ax, high / max(low, 1e-9))
-        ax.set_xscale("log", base=2)
-        ticks = sorted({row["budget"] for row in shown})
-        ax.set_xticks(ticks, [str(tick) for tick in ticks])
-        ax.set_xlabel("rollouts")
-        ax.set_ylabel("mean stage cost, test fields")
-        ax.set_title(result["problem"])
-        ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+        figure, axes = panels(len(result["limits"]), 3.2, 3.0, 4.6)
+        for ax, (problem, bound) in zip(axes, result["limits"].items(), strict=True):
+            for place, method in enumerate(methods):
+                own = [r for r in shown if (r["problem"], r["method"]) == (problem, method)]
+                ends = np.array([r["interval"] or (r["cost"],) * 2 for r in own]).reshape(-1, 2)
+                x, color = [r["budget"] for r in own], f"C{place % 10}"
+                ax.plot(x, [r["cost"] for r in own], "-o", ms=4, lw=1, color=color, label=method)
+                ax.fill_between(x, *ends.T, alpha=0.15, lw=0, color=color)
+            if bound is not None:
+                ax.axhline(bound, color="0.4", ls="--", lw=1, label="limit of any controller")
+            low, high = ax.get_ylim()
+            plain_log(ax, high / max(low, 1e-9))
+            ax.set_xscale("log", base=2)
+            ticks = sorted({row["budget"] for row in shown})
+            ax.set_xticks(ticks, [str(tick) for tick in ticks])
+            ax.set_xlabel("rollouts")
+            ax.set_title(problem)
+        axes[0].set_ylabel("mean stage cost, test fields")
+        axes[-1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
         figure.savefig(path, bbox_inches="tight")

@@ -159,7 +159,8 @@ def test_the_table_has_the_best_first_and_counts_what_diverges(tmp_path: Path) -
         ("better", 0, 2.5),
         ("worse", 1, 3.0),
     ]
-    lines = baselines.text({"problem": "p", "limit": 2.0, "rows": rows}).splitlines()
+    rows = [{"problem": "p", **row} for row in rows]
+    lines = baselines.text({"limits": {"p": 2.0}, "rows": rows}).splitlines()
     assert lines[0] == "**p, 20 rollouts**"
     assert lines[4].startswith("| better | 20 | 4 | 2.5 |") and "| 25.0 % | 0 |" in lines[4]
     assert lines[5].endswith("| diverged | diverged | 50.0 % | 1 |")
@@ -201,7 +202,7 @@ def test_a_comparison_is_a_study_that_is_continued(
         ("lqt-again", 2),
         ("two-point", 2),
     }
-    assert found["rows"][-1]["method"] == "no-control" and found["limit"] is None
+    assert found["rows"][-1]["method"] == "no-control" and found["limits"] == {"small": None}
     written = {path: path.stat().st_mtime_ns for path in folder.glob("9/*/*/*/result.json")}
     lost = folder / "9/small/lqt-again/1/result.json"
     lost.unlink()
