@@ -15,7 +15,6 @@ from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.topics import COMPLETED, COST, START, STATE, VOID
 from pdeloop.live import Live
 from pdeloop.monitor.finder import Finder, run_id
-from pdeloop.monitor.read_budget import ReadBudget
 from pdeloop.monitor.replay import replay
 from recorder_node.recording import Recording
 from recorder_node.sources import sources
@@ -159,45 +158,6 @@ def test_one_component_of_the_state_is_shown_at_a_time():
         header, numbers = parts["episode"]
         np.testing.assert_array_equal(numbers, values)
         assert header["rows"] == 2 and header["range"] == pytest.approx(span, abs=0.1)
-
-
-# When to read.
-
-
-def test_a_slow_loop_is_read_all_the_time():
-    budget = ReadBudget()
-    for tick in range(10_000):
-        assert budget.decide(0.03 * tick, page_open=True, complete=tick % 20 == 0)
-        budget.took(12)
-
-
-def test_a_fast_loop_is_read_an_episode_at_a_time_within_the_budget():
-    budget, read, seconds, pauses, before = ReadBudget(), 0, 60.0, 0, True
-    rate, tick = 10_000, 0.03
-    for i in range(int(seconds / tick)):
-        listening = budget.decide(i * tick, page_open=True, complete=i % 3 == 0)
-        pauses += before and not listening
-        before = listening
-        if listening:
-            budget.took(int(rate * tick))
-            read += int(rate * tick)
-    assert read / seconds < 1.2 * budget.rate
-    assert read / seconds > 0.5 * budget.rate
-    assert pauses > 10
-
-
-def test_nothing_is_read_while_nobody_looks():
-    budget = ReadBudget()
-    assert not budget.decide(0.0, page_open=False, complete=False)
-    assert budget.decide(0.1, page_open=True, complete=False)
-    assert not budget.decide(0.2, page_open=False, complete=False)
-
-
-def test_an_endless_episode_and_large_messages_do_not_escape_the_budget():
-    budget = ReadBudget()
-    assert budget.decide(0.0, page_open=True, complete=False)
-    budget.took(100, size=100_000_000)
-    assert not budget.decide(0.01, page_open=True, complete=False)
 
 
 # The curve.

@@ -66,8 +66,8 @@ class LoopReader:
         if self._samples is not None:
             self._samples.look()
 
-    def read(self) -> tuple[int, int]:
-        """Hand on what has come in; how many samples, and their bytes.
+    def read(self) -> None:
+        """Hand on what has come in.
 
         Taken in one order and handled in another: when a cost has come in, so have all samples of
         its episode, and its start.
@@ -75,18 +75,15 @@ class LoopReader:
         costs = self._costs.take()
         for topic in self._latched:
             topic.handle(topic.take())
-        count = size = 0
         now = time.monotonic()
         if self._samples is not None:
             with contextlib.suppress(ValueError):  # the loop's nodes report what they refuse
                 for kind, _, raw in self._samples.drain():
-                    count, size = count + 1, size + len(raw)
                     if kind in self._handlers:
                         decode, handle = self._handlers[kind]
                         with contextlib.suppress(ValueError):
                             handle(decode(raw), now)
         self._costs.handle(costs)
-        return count, size
 
     def close(self) -> None:
         """Stop reading."""

@@ -186,11 +186,6 @@ class LoopView:
         runs = current is not None and not current.ended and now - self._current_since > SLOW
         return current if runs or self.finished is None else self.finished
 
-    @property
-    def complete(self) -> bool:
-        """Whether the newest episode is over, and was seen from its beginning."""
-        return self.current is not None and self.current.ended and self.current.whole
-
     def numbers(self) -> dict[str, float]:
         """The numbers of VIEW_NUMBERS that are known by now."""
         found = dict(self._numbers)

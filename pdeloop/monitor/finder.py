@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Callable
 from pathlib import Path
 
+from loop_interfaces.files import read_json
 from pdeloop.live import Live, is_locked, running
-
-_MAX_TEXT = 1_000_000
 
 
 class Finder:
@@ -62,8 +60,6 @@ def worked_on(folder: Path) -> bool:
 
 def run_id(folder: Path) -> int | None:
     """The id of the run in `folder`, None if there is none."""
-    try:
-        with (folder / "run.json").open("rb") as file:
-            return int(json.loads(file.read(_MAX_TEXT))["run"])
-    except (OSError, ValueError, TypeError, KeyError, RecursionError):
-        return None
+    with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
+        return int(read_json(folder / "run.json")["run"])
+    return None

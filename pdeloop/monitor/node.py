@@ -1,8 +1,7 @@
 """The monitor as a ROS 2 node: reads the loop's topics now and then, calls its services when asked.
 
 Subscribes  episode/start, policy, model, episode/cost, episode/paused, target, /diagnostics;
-            samples (of a plant without them state and action) while a page is open, and no more of
-            them than pdeloop.monitor.read_budget allows
+            samples_throttled (of a plant without it state and action) while a page is open
 Calls       NODE/pause, resume, step, stop (std_srvs/Trigger) of the loop's nodes
 What it reads goes into the view core (viewer_node.loop_view), and to the page (viewer_node.web).
 """
@@ -28,7 +27,6 @@ from pdeloop.display import ProgressFile
 from pdeloop.live import Live
 from pdeloop.monitor.finder import Finder, run_id
 from pdeloop.monitor.names import component_names, short
-from pdeloop.monitor.read_budget import ReadBudget
 from pdeloop.monitor.replay import REFRESH, stop_event
 from pdeloop.monitor.service_call import ServiceCall
 from viewer_node.learning_curve import LearningCurve
@@ -84,7 +82,7 @@ class MonitorNode:
         """Show the loop in `namespace`."""
         if self._reader is not None:
             self._reader.close()
-        self._namespace, self._budget = namespace, ReadBudget()
+        self._namespace = namespace
         folder = self._live.folder
         self._progress = _progress(folder)
         from_topics = self._progress is None
@@ -103,10 +101,8 @@ class MonitorNode:
         if self._reader is None:
             return
         with self._page.lock:
-            self._budget.took(*self._reader.read())
-            complete = self._view.complete
-        now = self._loop.now()
-        self._reader.listen(self._budget.decide(now, page_open=self._page.open, complete=complete))
+            self._reader.read()
+        self._reader.listen(self._page.open)
 
     def _serve_requests(self) -> None:
         with contextlib.suppress(queue.Empty):
