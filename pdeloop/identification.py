@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from controller_node.identification import DesignSettings, design
 from controller_node.order import OrderStudy, study_orders
 from loop_interfaces.model_rows import ModelRows, pack
-from loop_interfaces.parameters import as_recorded
+from loop_interfaces.parameters import as_recorded, model_order, table
 from loop_interfaces.topics import COMPLETED, CostColumn
 from pdeloop.bags.reader import Bag
 from pdeloop.data_file import read_measurements
@@ -25,21 +25,6 @@ from recorder_node.episodes import RecordedEpisode
 
 Array = NDArray[np.float64]
 Trajectories = Sequence[tuple[Array, Array]]
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """What a user asks for; None: as the recorded run has it, or the default.
-
-    order: n_s, by default that of the recorded run or the suggested one; method: regression or dmdc;
-    rank: p of dmdc; state_weight, action_weight: q, r.
-    """
-
-    order: int | None = None
-    method: str | None = None
-    rank: int | None = None
-    state_weight: float | None = None
-    action_weight: float | None = None
 
 
 @dataclass(frozen=True)
@@ -98,20 +83,26 @@ class Identified:
         return "\n".join(lines)
 
 
-def identify_file(path: Path, wanted: Wanted) -> Identified:
-    """The model from measurements in a file; see `pdeloop.data_file`."""
+def identify_file(path: Path, given: Mapping[str, Any]) -> Identified:
+    """The model from measurements in a file; see `pdeloop.data_file`, and `given` as below."""
     found = read_measurements(path)
     sources = [{"trajectory": number} for number in range(len(found.trajectories))]
     known = {"sample_time": found.sample_time}
-    return _identified(found.trajectories, found.target, sources, wanted, known)
+    return _identified(found.trajectories, found.target, sources, {**known, **given})
 
 
 def identify_bag(
-    path: Path, wanted: Wanted, *, episode: int | None = None, environment: int | None = None
+    path: Path,
+    given: Mapping[str, Any],
+    *,
+    episode: int | None = None,
+    environment: int | None = None,
 ) -> Identified:
     """The model from the complete episodes of the bag at `path`.
 
-    episode, environment: only this one; otherwise the exploratory episodes, or all if there are none.
+    given: parameters (reduced_order, identification, dmdc_rank, state_weight, action_weight) that
+    replace those of the recorded run, which replace the defaults; episode, environment: only this
+    one; otherwise the exploratory episodes, or all if there are none.
     """
     bag = Bag(path)
     recorded = bag.episodes() if episode is None else bag.find(episode)
@@ -134,48 +125,28 @@ def identify_bag(
     if not trajectories:
         raise BagError(f"the chosen episodes have no environment {environment}")
     known = as_recorded(bag.parameters().get(chosen[-1].key[1], {}))
-    return _identified(trajectories, target, sources, wanted, known)
+    return _identified(trajectories, target, sources, {**known, **given})
 
 
 def _identified(
     trajectories: Trajectories,
     target: Array,
     sources: list[dict[str, int]],
-    wanted: Wanted,
-    known: Mapping[str, Any],
+    values: Mapping[str, Any],
 ) -> Identified:
     try:
         study = study_orders(trajectories)
     except ValueError:  # too few steps; the model itself may still be had
         study = None
-    suggested = None if study is None else study.suggested
-    settings = _settings(wanted, known, trajectories[0][1].shape[1], suggested)
+    defaults = {spec.name: spec.default for spec in table()} | {"reduced_order": 0}
+    order = model_order({**defaults, **values}) or (study and study.suggested)
+    if not order:
+        raise BagError("there are too few steps to suggest an order; give it with --order")
+    own = {"n_a": trajectories[0][1].shape[1], "reduced_order": order, "dmdc_order": order}
+    settings = DesignSettings.of({**defaults, **values, **own})
     model = design(trajectories, target, settings)
     steps = sum(len(actions) for _, actions in trajectories)
-    return Identified(model, sources, steps, study, known.get("sample_time"))
-
-
-def _settings(
-    wanted: Wanted, known: Mapping[str, Any], n_a: int, suggested: int | None
-) -> DesignSettings:
-    """What is wanted, else the recorded run's parameters, else the defaults."""
-
-    def pick(given: Any, *others: Any) -> Any:
-        return next((value for value in (given, *others) if value is not None), None)
-
-    method = pick(wanted.method, known.get("identification"), "regression")
-    dmdc_order = (method == "dmdc" and known.get("dmdc_order")) or None
-    order = pick(wanted.order, dmdc_order, known.get("reduced_order") or None, suggested)
-    if order is None:
-        raise BagError("there are too few steps to suggest an order; give it with --order")
-    return DesignSettings(
-        n_a=n_a,
-        reduced_order=order,
-        state_weight=pick(wanted.state_weight, known.get("state_weight"), 1.0),
-        action_weight=pick(wanted.action_weight, known.get("action_weight"), 1.0),
-        identification=method,
-        dmdc_rank=pick(wanted.rank, known.get("dmdc_rank"), 0),
-    )
+    return Identified(model, sources, steps, study, values.get("sample_time"))
 
 
 def save(found: Identified, path: Path) -> None:

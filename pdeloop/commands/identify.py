@@ -53,22 +53,24 @@ def add(commands: Commands) -> None:
 
 
 def _identify(options: argparse.Namespace) -> int:
-    from pdeloop.identification import Wanted, identify_bag, identify_file, save
+    from pdeloop.identification import identify_bag, identify_file, save
 
-    wanted = Wanted(
-        order=options.order,
-        method=options.identification,
-        rank=options.rank,
-        state_weight=options.state_weight,
-        action_weight=options.action_weight,
-    )
+    given = {
+        "reduced_order": options.order,
+        "dmdc_order": options.order,
+        "identification": options.identification,
+        "dmdc_rank": options.rank,
+        "state_weight": options.state_weight,
+        "action_weight": options.action_weight,
+    }
+    given = {name: value for name, value in given.items() if value is not None}
     if options.data is not None:
         if options.episode is not None or options.environment is not None:
             raise ParameterError("--episode and --environment choose from a bag; leave them out")
-        found = identify_file(options.data, wanted)
+        found = identify_file(options.data, given)
     else:
         found = identify_bag(
-            options.bag, wanted, episode=options.episode, environment=options.environment
+            options.bag, given, episode=options.episode, environment=options.environment
         )
     if options.out is not None:
         save(found, options.out)
