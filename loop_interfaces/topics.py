@@ -133,7 +133,7 @@ SAMPLES_THROTTLED = "samples_throttled"
 """The same of some episodes only: for people, who see a few pictures a second."""
 
 RECORDER_STATUS = "recorder/status"
-"""std_msgs/String, latched: a recorder that is matched with the whole loop says so here (JSON)."""
+"""std_msgs/String, latched: a recorder that is matched with the whole loop names its bag here."""
 
 # Not `episode/paused`, which says nothing about an episode's numbers.
 ARRAYS = (START, STATE, ACTION, POLICY, COST, MODEL_IDENTIFIED, MODEL, TARGET)

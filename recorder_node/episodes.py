@@ -67,8 +67,6 @@ class RecordedEpisode:
         Messages that were recorded twice with different content, in words.
     cost_at : int or None
         Arrival of its cost.
-    over : bool
-        Nothing more is expected of it.
     """
 
     key: Key
@@ -85,7 +83,6 @@ class RecordedEpisode:
     repeats: int = 0
     contradictions: list[str] = field(default_factory=list)
     cost_at: int | None = None
-    over: bool = False
 
     @property
     def number(self) -> int:
@@ -128,11 +125,6 @@ class RecordedEpisode:
             lost = sum(step not in samples for step in range(count))
             lacking += [f"{lost} of {count} {name}"] if lost else []
         return lacking
-
-    @property
-    def sampled(self) -> bool:
-        """Whether no more samples are awaited of it, now that its cost is there."""
-        return self.void or (len(self.states) > self.horizon and len(self.actions) >= self.horizon)
 
     def trajectory(self) -> tuple[Array, Array]:
         """States (T + 1, M, n_z) and actions (T, M, n_a) of a complete episode."""
@@ -230,7 +222,6 @@ class EpisodeIndex:
             if now is None or episode.settled(now) or episode.given_up(now, newest)
         ]
         for episode in done:
-            episode.over = True
             if episode.start is not None:
                 models = (*episode.key[:2], episode.start.step)
                 episode.bases = self._models.get(models)

@@ -9,7 +9,6 @@ topics. What is written: recorder_node.recording.
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from pathlib import Path
@@ -53,11 +52,6 @@ DEPTH = 1000
 """Messages of a topic that may wait: seconds of the fastest loop, if this process is held up."""
 LATCHED = DurabilityPolicy.TRANSIENT_LOCAL
 """A node that starts later gets the messages of before, too."""
-REPORT = 1.0
-"""Seconds between two messages on recorder/status."""
-SLICE, PAST = 200_000_000, 10_000_000_000
-"""Nanoseconds of arrivals that are recorded in one batch, so that a recorder that is behind writes at
-regular times, too; and by how much it can be behind: beyond that, the clock was set."""
 QUIET, END = 0.1, 1.0
 """At the end: seconds without a message after which the recording ends, and at the most."""
 
@@ -80,7 +74,7 @@ class RecorderNode:
         self._diagnostics = RecorderDiagnostics(self._recording)
         self._until = 0
         """Everything that arrived by then (ns since the epoch) was recorded."""
-        self._batch_at = self._index_at = self._report_at = 0.0
+        self._batch_at = self._index_at = 0.0
         self._wire(node, loop)
         self._log.info(f"recording to {self._recording.path}")
 
@@ -143,7 +137,7 @@ class RecorderNode:
             while recording.messages > known and time.monotonic() < end:
                 known = recording.messages
                 time.sleep(QUIET)
-                self._record(PAST)
+                self._record()
             recording.close()
         except BagError as error:
             print(f"recorder_node: {error}", file=sys.stderr)
@@ -154,28 +148,25 @@ class RecorderNode:
         )
         return 0
 
-    def _record(self, longest: int = SLICE) -> None:
-        """Record what has arrived since the last time, in the order of arrival; at most `longest` ns.
+    def _record(self) -> None:
+        """Record what has arrived since the last time, in the order of arrival.
 
         It takes all topics up to the same moment, so that what stands together in the bag belongs
         together, even if this process is held up between two topics and then killed.
         """
-        now = time.time_ns()
-        behind = longest < now - self._until < PAST
-        self._until = until = self._until + longest if behind else now
-        begin = time.monotonic()
-        if behind or begin - self._batch_at > HELD_UP:
+        self._until, begin = time.time_ns(), time.monotonic()
+        if begin - self._batch_at > HELD_UP:
             self._index_at = begin + CATCH_UP
         self._batch_at = begin
         taken: list[tuple[int, int, Source, bytes]] = []
         for samples, by_kind in self._samples:
             try:
-                for kind, when, raw in samples.drain(until):
+                for kind, when, raw in samples.drain(self._until):
                     taken.append((when, len(taken), by_kind[kind], raw))
             except FrameError as error:
                 self._log.warning(f"samples: {error}", throttle_duration_sec=1.0)
         for source, subscription in self._others:
-            for raw, info in subscription.take(until):
+            for raw, info in subscription.take(self._until):
                 taken.append((info["received_timestamp"], len(taken), source, raw))
         taken.sort()  # no two have the same number
         for when, _, source, raw in taken:
@@ -188,7 +179,7 @@ class RecorderNode:
             self._recording.index(self._until)
 
     def _look(self) -> None:
-        """Read the ROS graph, and publish how the recording is."""
+        """Read the ROS graph, and say when nothing can be missed any more."""
         now = time.monotonic()
         for samples, _ in self._samples:
             samples.look()
@@ -200,17 +191,8 @@ class RecorderNode:
             self._status = self._node.create_publisher(
                 String, RECORDER_STATUS, QoSProfile(depth=1, durability=LATCHED)
             )
+            self._status.publish(String(data=str(self._recording.path.resolve())))
             self._log.info("matched with all publishers of the loop")
-        if self._status is not None and now >= self._report_at:
-            self._report_at = now + REPORT
-            recording = self._recording
-            status = {
-                "bag": str(recording.path.resolve()),
-                "messages": recording.messages,
-                "episodes": recording.episodes,
-                "incomplete": recording.incomplete,
-            }
-            self._status.publish(String(data=json.dumps(status)))
 
 
 def _make(node: Node, loop: Observer) -> RecorderNode:

@@ -8,45 +8,22 @@ bag/parameters.json                the nodes' parameters by run, as far as they 
 from __future__ import annotations
 
 import json
-from collections import defaultdict, deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from loop_interfaces.topics import COST, POLICY
 from recorder_node.bag import BagError, BagWriter
-from recorder_node.episodes import SETTLING, EpisodeIndex, RecordedEpisode
+from recorder_node.episodes import EpisodeIndex
 from recorder_node.sources import Source
 
 INDEX = "episodes.jsonl"
 PARAMETERS = "parameters.json"
 
 
-class _Taken(NamedTuple):
-    """A message to be written; episode: the one it is about, if any."""
-
-    source: Source
-    when: int
-    raw: bytes
-    episode: RecordedEpisode | None
-
-    @property
-    def early(self) -> bool:
-        """Whether something should stand before it in the bag that has not come yet."""
-        if self.episode is None or self.episode.over:
-            return False
-        if self.source.array is POLICY:
-            return self.episode.start is None
-        return self.source.array is COST and not self.episode.sampled
-
-
 class Recording:
     """Writes the messages that `take` is given into the bag at `path`, a new folder.
 
-    A plant publishes the samples of an episode after its cost, and a tuner the policies before the
-    start. In the bag a cost comes after its samples and policies after the start: they are held back
-    until then, and so are later messages of the pair. So whenever this process is killed, all
-    episodes of a pair but the last are whole. Raises BagError when the bag cannot be written.
+    Raises BagError when the bag cannot be written.
     """
 
     def __init__(self, path: Path, what: Sequence[Source]) -> None:
@@ -59,8 +36,6 @@ class Recording:
         self._index = EpisodeIndex()
         self._notes: dict[str, Any] = {}
         self._bag = BagWriter(path, [source.channel for source in what])
-        self._waiting: defaultdict[str, deque[_Taken]] = defaultdict(deque)
-        """By namespace: one that came early, and what came after it."""
         self._append_index("")
 
     def take(self, source: Source, when: int, raw: bytes) -> None:
@@ -69,13 +44,7 @@ class Recording:
         episode = self._index.take(source, when, raw)
         if episode is not None:
             self.run = episode.key[1]
-        waiting = self._waiting[source.namespace]
-        if source.ordered:
-            waiting.append(_Taken(source, when, raw, episode))
-        else:
-            self._bag.write(source.channel.topic, when, raw)
-        if waiting:
-            self._write_waiting(waiting, when)
+        self._bag.write(source.channel.topic, when, raw)
 
     def note(self, run: int, parameters: Mapping[str, Any]) -> None:
         """Keep the parameters of a run, beside what is already known of them."""
@@ -99,8 +68,6 @@ class Recording:
         """Index the episodes that are over at time `now` (ns), None: all; nothing more is expected of
         them.
         """
-        for waiting in self._waiting.values():
-            self._write_waiting(waiting, now)
         rows = [episode.row() for episode in self._index.take_over(now)]
         self.episodes += len(rows)
         self.incomplete += sum(not row["complete"] for row in rows)
@@ -111,15 +78,6 @@ class Recording:
         """Finish the bag."""
         self.index(None)
         self._bag.close({"pdeloop.parameters": json.dumps(self._notes)} if self._notes else {})
-
-    def _write_waiting(self, waiting: deque[_Taken], now: int | None) -> None:
-        """Write what need not wait any more at time `now` (ns); None: all."""
-        while waiting:
-            first = waiting[0]
-            if now is not None and first.early and now - first.when <= SETTLING * 1e9:
-                return
-            waiting.popleft()
-            self._bag.write(first.source.channel.topic, first.when, first.raw)
 
     def _append_index(self, lines: str) -> None:
         try:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from loop_interfaces.frames import ArrayCodec
-from loop_interfaces.topics import ACTION, ARRAYS, MODEL_FAILED, STATE, VIEWS, Topic
+from loop_interfaces.topics import ARRAYS, MODEL_FAILED, VIEWS, Topic
 from recorder_node.bag import Channel
 
 ARRAY_TYPE = "std_msgs/msg/Float64MultiArray"
@@ -37,11 +37,6 @@ class Source:
         """Decodes its messages, if it has arrays."""
         assert self.array is not None
         return ArrayCodec(self.array.labels)
-
-    @cached_property
-    def ordered(self) -> bool:
-        """Whether it may have to wait for what belongs before it in the bag."""
-        return bool(self.namespace) and self.array not in (STATE, ACTION)
 
 
 CLOCK = Source(Channel("/clock", "rosgraph_msgs/msg/Clock"))

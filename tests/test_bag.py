@@ -28,10 +28,10 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability
 
 from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.topics import ACTION, COST, POLICY, START, STATE
+from loop_interfaces.topics import ACTION, COST, START, STATE
 from pdeloop.bags.reader import Bag
 from pdeloop.bags.verify import verify
-from pdeloop.identification import Wanted, identify_bag
+from pdeloop.identification import identify_bag
 from recorder_node.bag import BagError, definition
 from recorder_node.recording import Recording
 from recorder_node.sources import CLOCK, DIAGNOSTICS, ROSOUT, Source, sources
@@ -198,42 +198,6 @@ def test_what_was_flushed_is_readable_without_an_end(tmp_path):
     assert not bag.finished
     assert [episode.number for episode in bag.episodes()] == [7]
     assert len(list(bag.messages())) == 14
-
-
-@pytest.mark.parametrize("lost", [False, True])
-def test_a_cost_waits_for_the_samples_that_it_is_about(tmp_path, lost):
-    recording = Recording(tmp_path / "bag", WHAT)
-    early, samples = [], []
-
-    def take(topic, content: Frame, when: int) -> None:
-        recording.take(BY_TOPIC[topic], when, encode(topic, content))
-
-    for episode in (7, 8):
-        rows = np.array([(3.0, 4.0, 0.1, 0.0)])
-        early.append((POLICY, Frame(RUN, episode, 0, 0.0, np.ones((1, 2, 3)))))
-        early.append((START, Frame(RUN, episode, 0, 0.0, rows)))
-        early.append((COST, Frame(RUN, episode, 5, 0.0, np.array([(1.0, 5.0, -1.0)]), 99)))
-        for step in range(6):
-            samples.append((STATE, frame(step, 1, 16, episode=episode)))
-            samples.append((ACTION, frame(step, 1, 4, episode=episode)))
-    for topic, content in early:
-        take(topic, content, SECOND)
-        recording.flush()
-        began = (topic, content.episode) != (POLICY, 7)
-        assert len(list(Bag(tmp_path / "bag").episodes())) == began
-    for topic, content in samples:
-        recording.flush()  # as if it were killed now
-        whole = [not episode.missing for episode in Bag(tmp_path / "bag").episodes()]
-        assert lost or all(whole[:-1]), (topic, content.episode, content.step)
-        if not (lost and topic is STATE and content.step == 3):
-            take(topic, content, SECOND)
-    recording.index(SECOND + SECOND // 2)  # nothing more is waited for
-    recording.flush()
-    assert [not e.missing for e in Bag(tmp_path / "bag").episodes()] == [not lost] * 2
-    recording.close()
-    assert recording.messages == 6 + 24 - 2 * lost
-    with AnyReader([tmp_path / "bag"]) as reader:
-        assert reader.message_count == recording.messages
 
 
 def test_of_a_batch_all_survives_or_nothing(tmp_path):
@@ -512,7 +476,7 @@ def test_a_bag_of_the_version_before_is_read_verified_and_identified_from(tmp_pa
     for text in report.differences:  # on another machine than that which recorded it
         recorded, again = map(float, re.findall(r"re(?:corded|computed) (\S+?)(?:,|$)", text))
         assert again == pytest.approx(recorded, rel=1e-6), text
-    assert identify_bag(OLD, Wanted()).steps > 0
+    assert identify_bag(OLD, {}).steps > 0
     topics = {channel.topic: channel for channel in bag.channels()}
     assert topics["/target"].latched and not topics["/state"].latched
 

@@ -15,7 +15,6 @@ import numpy as np
 from geometry_msgs.msg import Point
 from numpy.typing import NDArray
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from sensor_msgs.msg import Image
 from std_msgs.msg import ColorRGBA, Float64
 from visualization_msgs.msg import Marker
@@ -23,10 +22,11 @@ from visualization_msgs.msg import Marker
 from loop_interfaces.affinity import lower_priority
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.parameters import VIEWER, taken_by
+from loop_interfaces.ros.message_types import message_class
 from loop_interfaces.ros.node_main import node_main
 from loop_interfaces.ros.observer import Observer
 from loop_interfaces.ros.parameters import declare, given_parameters, on_change
-from loop_interfaces.topics import VIEW_NUMBERS
+from loop_interfaces.topics import VIEWS
 from viewer_node.diagnostics import ViewerDiagnostics
 from viewer_node.loop_reader import PERIOD, LoopReader
 from viewer_node.loop_view import LoopView
@@ -67,10 +67,9 @@ class ViewerNode:
         self._node, self._loop = node, loop
         self._reader = LoopReader(node, "", self._view)
         self._reader.listen(True)
-        self._markers = {name: node.create_publisher(Marker, f"view/{name}", 1) for name in COLOURS}
-        self._image = node.create_publisher(Image, "view/spacetime", 1)
-        self._numbers = {
-            name: node.create_publisher(Float64, f"view/{name}", 1) for name in VIEW_NUMBERS
+        self._publishers = {
+            name.removeprefix("view/"): node.create_publisher(message_class(kind), name, 1)
+            for name, kind in VIEWS.items()
         }
         loop.every(PERIOD, self._read)
         loop.every(GRAPH_PERIOD, self._reader.poll_graph)
@@ -97,19 +96,17 @@ class ViewerNode:
 
     def _show(self, now: float) -> None:
         for name, value in self._view.numbers().items():
-            self._numbers[name].publish(Float64(data=value))
+            self._publishers[name].publish(Float64(data=value))
         profile = self._view.profile()
         if profile is None:
             return
         z, target = profile
         x = self._length / len(z) * np.arange(len(z), dtype=np.float64)
         for name, values in (("field", z), ("target", target)):
-            if values is not None and _wanted(self._markers[name]):
-                self._markers[name].publish(self._marker(name, x, values))
-        if _wanted(self._image):
-            fields = self._view.space_time(now)
-            if fields is not None:
-                self._image.publish(self._picture(diverging(fields)))
+            if values is not None and self._wanted(name):
+                self._publishers[name].publish(self._marker(name, x, values))
+        if self._wanted("spacetime") and (fields := self._view.space_time(now)) is not None:
+            self._publishers["spacetime"].publish(self._picture(diverging(fields)))
 
     def _marker(self, name: str, x: NDArray[np.float64], values: NDArray[np.float64]) -> Marker:
         marker = Marker(ns=name, id=list(COLOURS).index(name), type=Marker.LINE_STRIP)
@@ -131,13 +128,11 @@ class ViewerNode:
         image.data = colours.tobytes()
         return image
 
+    def _wanted(self, name: str) -> bool:
+        return bool(self._publishers[name].get_subscription_count())
+
     def _subscribers(self) -> int:
-        publishers = (*self._markers.values(), self._image, *self._numbers.values())
-        return sum(publisher.get_subscription_count() for publisher in publishers)
-
-
-def _wanted(publisher: Publisher) -> bool:
-    return bool(publisher.get_subscription_count())
+        return sum(p.get_subscription_count() for p in self._publishers.values())
 
 
 def main(args: list[str] | None = None) -> int:
