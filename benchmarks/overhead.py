@@ -83,7 +83,7 @@ def measure(
         try:
             cores = pair_cores(1)
             setting.others = [core for core in usable_cores() if core not in cores]
-            nodes = [start(node.package, *node.parameters) for node in pair_nodes(cores)]
+            nodes = [start(node.package, *node.assignments) for node in pair_nodes(cores)]
             start("tuner_node", f"out:={run}", "iterations:=100000", "optimizer:=two_point", *tuner)
             progress = run / "progress.jsonl"
 

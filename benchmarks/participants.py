@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.processes import BenchError, BenchProcess, bench, machine, markdown
-from pdeloop.pairs import PAIR, namespaces, tuner_parameter
+from pdeloop.pairs import PAIR, namespaces, ros_value
 
 NODE_MEMORY = 0.12
 """GB of a node, for the check that all of them fit."""
@@ -37,7 +37,7 @@ def run(pairs: Sequence[int] = (1, 15, 30, 60), seconds: float = 20.0) -> dict[s
         )
     rows = []
     with bench() as running:
-        waiting = ["recorder:=required", *tuner_parameter(len(names))]
+        waiting = ["recorder:=required", f"pairs:={ros_value(names)}"]
         tuner = running.start("tuner_node", *waiting, problem="burgers")
         nodes = [tuner]
         for count in sorted({0, *pairs}):

@@ -47,8 +47,8 @@ def _measure(
     chosen = [None] if cores == "any" else pair_cores(1, pinned)
     plant, controller = pair_nodes(chosen, solver_polls=pinned)
     pair = (
-        running.start(plant.package, horizon, *plant.parameters, problem=PROBLEM),
-        running.start(controller.package, *controller.parameters, problem=PROBLEM),
+        running.start(plant.package, horizon, *plant.assignments, problem=PROBLEM),
+        running.start(controller.package, *controller.assignments, problem=PROBLEM),
     )
     driver = running.start("benchmarks.driver", horizon, f"solver_pin:={one}", problem=PROBLEM)
     n_z = load_parameters(PROBLEM, {})["n_z"]

@@ -21,8 +21,9 @@ from pde_sim_node.plant import Plant
 from pdeloop.display import Display
 from pdeloop.finished_run import FinishedRun, load
 from pdeloop.in_process import LocalPair
+from pdeloop.interruption import Interruption
 from pdeloop.pairs import Transport
-from pdeloop.training_run import Interruption, begin, carry_out
+from pdeloop.training_run import begin, carry_out
 from tuner_node.build import build_training
 
 __all__ = ["Problem", "identify", "load_run", "problem", "train"]

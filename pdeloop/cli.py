@@ -12,6 +12,8 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 
+from pdeloop.interruption import Interruption
+
 DONE, FAILED, CRASHED, INTERRUPTED, NOBODY_READS = 0, 1, 70, 130, 141
 """Exit codes; 2, a command that is not understood, is argparse's."""
 _EXTRAS = {
@@ -60,8 +62,8 @@ def run(
         if extra is None:
             return _crashed()
         return _failed(f"needs {module}: pip install 'pdeloop[{extra}]'")
-    except KeyboardInterrupt:
-        print("pdeloop: interrupted", file=sys.stderr)
+    except (KeyboardInterrupt, Interruption) as reason:
+        print(f"pdeloop: stopped by {str(reason) or 'SIGINT'}", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
         with contextlib.suppress(OSError, ValueError):  # or the interpreter would try it again

@@ -6,8 +6,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +32,8 @@ class LoopNode:
     name : str
         Of its process.
     package : str
-    parameters : sequence of str
-        As NAME:=VALUE.
+    parameters : dict
+        Beside those of the problem.
     namespace : str
         Relative to that of the run; empty: the run's own.
     cores : sequence of int
@@ -42,15 +42,20 @@ class LoopNode:
 
     name: str
     package: str
-    parameters: Sequence[str] = ()
+    parameters: Mapping[str, Any] = field(default_factory=dict)
     namespace: str = ""
     cores: Sequence[int] = ()
+
+    @property
+    def assignments(self) -> list[str]:
+        """Its parameters as NAME:=VALUE."""
+        return [f"{name}:={ros_value(value)}" for name, value in self.parameters.items()]
 
     def ros_arguments(self, parameter_file: Path) -> list[str]:
         """All that follows `--ros-args` in its command."""
         words = ["--params-file", str(parameter_file)]
-        for value in self.parameters:
-            words += ["-p", value]
+        for assignment in self.assignments:
+            words += ["-p", assignment]
         return [*words, "-r", f"__ns:=/{self.namespace}"] if self.namespace else words
 
 
@@ -104,11 +109,10 @@ def pair_nodes(cores: Sequence[int | None], *, solver_polls: bool = False) -> li
     for number, (namespace, core) in enumerate(zip(namespaces(len(cores)), cores, strict=True)):
         for package in PAIR:
             own = core_parameters(package, core, solver_polls=solver_polls)
-            parameters = [f"{name}:={argument(value)}" for name, value in own.items()]
-            if number and package == "pde_sim_node":  # /clock is one topic for all
-                parameters.append("publish_clock:=false")
+            if number and package == "pde_sim_node":
+                own["publish_clock"] = False  # /clock is one topic for all
             name = f"{package}-{namespace}" if namespace else package
-            nodes.append(LoopNode(name, package, parameters, namespace))
+            nodes.append(LoopNode(name, package, own, namespace))
     return nodes
 
 
@@ -167,7 +171,7 @@ class Transport:
         The recorder, if any, comes first; it is told its bag when it is started. Recorder and viewer
         leave the cores of the pairs to them, if there are others.
         """
-        serving = tuner_parameter(self.pairs)
+        serving = {"pairs": namespaces(self.pairs)}
         cores = pair_cores(self.pairs, self.pin)
         nodes = pair_nodes(cores, solver_polls=self.pin)
         others = tuple(core for core in usable_cores() if core not in cores)
@@ -175,31 +179,22 @@ class Transport:
             first = namespaces(self.pairs)[0]
             nodes.append(LoopNode("viewer_node", "viewer_node", namespace=first, cores=others))
         if self.recorded:
-            own = [*serving, f"record_views:={argument(self.record_views)}"]
+            own = {**serving, "record_views": self.record_views}
             nodes.insert(0, LoopNode("recorder_node", "recorder_node", own, cores=others))
-        # resume: one that is started again goes on where it was.
-        tuner = [
-            f"out:={quoted(folder.resolve())}",
-            "resume:=true",
-            f"recorder:={self.recorder}",
-            *serving,
-        ]
-        tuner.append(f"plant:={fingerprint(RunFolder(folder).values())}")
+        tuner = {
+            **serving,
+            "out": str(folder.resolve()),
+            "resume": True,  # so that one that is started again goes on where it was
+            "recorder": self.recorder,
+            "plant": fingerprint(RunFolder(folder).values()),
+        }
         return [*nodes, LoopNode("tuner_node", "tuner_node", tuner)]
 
 
-def tuner_parameter(pairs: int) -> list[str]:
-    """What the tuner and the recorder have to know of the pairs."""
-    return [f"pairs:=[{', '.join(namespaces(pairs) if pairs > 1 else [quoted('')])}]"]
-
-
-def argument(value: object) -> str:
-    """A value as a ROS argument."""
+def ros_value(value: object) -> str:
+    """A value as a ROS argument; without quotes `5`, `no` or `a: b` would be something else."""
     if isinstance(value, bool):
         return str(value).lower()
-    return quoted(value) if isinstance(value, str) else str(value)
-
-
-def quoted(text: object) -> str:
-    """A text as a ROS argument: without quotes `5`, `no` or `a: b` would be something else."""
-    return "'" + str(text).replace("'", "''") + "'"
+    if isinstance(value, list):
+        return f"[{', '.join(map(ros_value, value))}]"
+    return "'" + value.replace("'", "''") + "'" if isinstance(value, str) else str(value)

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import importlib.util
 import itertools
-import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import asdict
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import controller_node.fast_path
@@ -24,9 +21,10 @@ from pde_sim_node.build import build_equation, build_plant
 from pdeloop.display import Display, ProgressFile
 from pdeloop.domain import own_domain
 from pdeloop.in_process import LocalPair, train
+from pdeloop.interruption import Interruption, interruptible
 from pdeloop.live import announced
 from pdeloop.output import print_json
-from pdeloop.pairs import LoopNode, Transport, quoted
+from pdeloop.pairs import LoopNode, Transport
 from pdeloop.supervisor import Child, NodeError, Supervisor, node_command
 from tuner_node import narration
 from tuner_node.build import build_training
@@ -37,10 +35,6 @@ BUILT_IN = {"nodes": [], "law": "affine"}
 """The controller of a training in this process, as result.json has it."""
 POLL = 0.05
 """Seconds between two looks at the nodes."""
-
-
-class Interruption(BaseException):
-    """SIGINT, SIGTERM or SIGHUP (a terminal that was closed) reached the command line."""
 
 
 def resolve(problem: str, options: Mapping[str, Any]) -> dict[str, Any]:
@@ -90,16 +84,10 @@ def run(folder: Path, values: dict[str, Any], transport: Transport, as_json: boo
     stream = sys.stderr if as_json else sys.stdout
     display = Display(values["seed"], values["seeds"], stream)
     started = time.monotonic()
+    again = f"pdeloop train --resume {folder}" + " --in-process" * transport.in_process
     try:
-        with interruptible() as check:
+        with interruptible(again) as check:
             carry_out(folder, values, transport, display, check)
-    except Interruption as signal_name:
-        display.close()
-        display.line(
-            f"stopped by {signal_name}; continue with: pdeloop train --resume {folder}"
-            + (" --in-process" if transport.in_process else "")
-        )
-        return 130
     finally:
         display.close()
     summary = RunFolder(folder).result()
@@ -165,13 +153,14 @@ def _train_over_topics(
     bags: list[Path] = []
 
     def command(node: LoopNode) -> list[str]:
-        words = node.ros_arguments(folder / "parameters.yaml")
+        changed: dict[str, Any] = {}
         if node.package == "recorder_node":  # started again, it leaves the unfinished bag alone
             bags.append(unused(folder / "bag"))
-            words += ["-p", f"bag:={quoted(bags[-1].resolve())}"]
+            changed = {"bag": str(bags[-1].resolve())}
         elif node.package == "tuner_node" and recorder is not None and recorder.ended:
-            words = [word.replace("recorder:=start", "recorder:=none") for word in words]
-        return node_command(node.package, *words)
+            changed = {"recorder": "none"}
+        node = replace(node, parameters={**node.parameters, **changed})
+        return node_command(node.package, *node.ros_arguments(folder / "parameters.yaml"))
 
     children = {
         node.name: Child(
@@ -224,32 +213,3 @@ def unused(path: Path) -> Path:
     """`path`, or the first of path-2, path-3, ... that does not exist."""
     numbered = (path.with_name(f"{path.name}-{n}") for n in itertools.count(2))
     return next(p for p in itertools.chain([path], numbered) if not p.exists())
-
-
-@contextmanager
-def interruptible() -> Iterator[Callable[[], None]]:
-    """SIGINT, SIGTERM and SIGHUP raise Interruption within the block, once.
-
-    Yields a function to be called now and then, which raises it, too: an exception that comes in the
-    middle of a finalizer or a callback of some library is lost.
-    """
-    caught: list[str] = []
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        if not caught:  # the way out is not interrupted again
-            caught.append(signal.Signals(number).name)
-            raise Interruption(caught[0])
-
-    def check() -> None:
-        if caught:
-            raise Interruption(caught[0])
-
-    numbers = [signal.SIGINT, signal.SIGTERM]
-    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # as nohup leaves it
-        numbers.append(signal.SIGHUP)
-    known = {n: signal.signal(n, interrupt) for n in numbers}
-    try:
-        yield check
-    finally:
-        for number, handler in known.items():
-            signal.signal(number, handler)

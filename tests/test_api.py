@@ -11,7 +11,7 @@ import pytest
 
 import pdeloop
 from pdeloop.cli import main
-from pdeloop.training_run import Interruption
+from pdeloop.interruption import Interruption
 from tests.small import SMALL, same_bits
 from tuner_node.seeds import Purpose, derive
 

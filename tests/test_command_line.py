@@ -171,7 +171,7 @@ def test_ctrl_c_during_imports_is_one_line(monkeypatch, capsys) -> None:
 
     monkeypatch.setattr(cli, "parser", interrupted)
     assert main(["problems"]) == cli.INTERRUPTED
-    assert capsys.readouterr().err == "pdeloop: interrupted\n"
+    assert capsys.readouterr().err == "pdeloop: stopped by SIGINT\n"
 
 
 def test_a_bug_is_a_traceback_and_a_code_of_its_own(monkeypatch, capsys) -> None:

@@ -27,16 +27,16 @@ def test_one_pair_has_no_namespace_and_several_share_one_clock() -> None:
     assert (plant.name, controller.name) == ("pde_sim_node", "controller_node")
     assert plant.namespace == controller.namespace == ""
     assert plant.ros_arguments(Path("f")) == ["--params-file", "f"]
-    assert pairs.tuner_parameter(1) == ["pairs:=['']"]
+    assert pairs.ros_value(pairs.namespaces(1)) == "['']"
     nodes = pairs.pair_nodes([None] * 3)
     assert len({node.name for node in nodes}) == 6
     with_clock = [
         node.name
         for node in nodes
-        if node.package == "pde_sim_node" and "publish_clock:=false" not in node.parameters
+        if node.package == "pde_sim_node" and "publish_clock:=false" not in node.assignments
     ]
     assert with_clock == ["pde_sim_node-pair0"]
-    assert pairs.tuner_parameter(3) == ["pairs:=[pair0, pair1, pair2]"]
+    assert pairs.ros_value(pairs.namespaces(3)) == "['pair0', 'pair1', 'pair2']"
 
 
 def test_pairs_get_the_least_busy_cores_and_pinning_one_each(
@@ -48,12 +48,11 @@ def test_pairs_get_the_least_busy_cores_and_pinning_one_each(
     cores = pairs.pair_cores(3, pin=True)
     assert cores == [6, 5, 7]
     nodes = pairs.pair_nodes(cores, solver_polls=True)
-    pins = [word for node in nodes for word in node.parameters if word.startswith("pin")]
-    assert pins == [f"pin:={core}" for core in (6, 6, 5, 5, 7, 7)]
-    helpers = [node.name for node in nodes if "solver_cores:='3,5,6,7'" in node.parameters]
+    assert [node.parameters["pin"] for node in nodes] == [6, 6, 5, 5, 7, 7]
+    helpers = [node.name for node in nodes if "solver_cores:='3,5,6,7'" in node.assignments]
     assert helpers == ["pde_sim_node-pair0", "pde_sim_node-pair1", "pde_sim_node-pair2"]
     assert all(
-        ("solver_polls:=true" in node.parameters) == (node.name in helpers) for node in nodes
+        ("solver_polls:=true" in node.assignments) == (node.name in helpers) for node in nodes
     )
     with pytest.raises(ParameterError, match="a core of its own, but there are 4"):
         pairs.pair_cores(5, pin=True)
@@ -82,8 +81,7 @@ def test_recorder_and_viewer_leave_the_core_of_the_pair_to_it(tmp_path: Path) ->
     RunFolder(folder).create(values)
     started = pairs.Transport(recorder="start", view=True).nodes(folder)
     nodes = {node.package: node for node in started}
-    (pin,) = (word for word in nodes["controller_node"].parameters if word.startswith("pin"))
-    others = os.sched_getaffinity(0) - {int(pin.removeprefix("pin:="))}
+    others = os.sched_getaffinity(0) - {nodes["controller_node"].parameters["pin"]}
     assert set(nodes["recorder_node"].cores) == set(nodes["viewer_node"].cores) == others
     assert nodes["tuner_node"].cores == ()
     process = subprocess.Popen(["sleep", "60"])

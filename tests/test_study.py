@@ -221,7 +221,9 @@ def test_an_interrupted_command_ends_its_processes_in_the_middle(tmp_path: Path)
     endless = {"rollouts": 2_000_000, "optimizer": "two_point"}
     file.write_text(json.dumps({"problems": [str(SMALL)], "seeds": 2, "settings": endless}))
     words = [sys.executable, "-m", "pdeloop.cli", "study", str(file), "--out", str(out)]
-    process = subprocess.Popen([*words, "--processes", "2"], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [*words, "--processes", "2"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
     assert process.stdout is not None
     try:
         assert "0 of 2 trainings" in process.stdout.readline()

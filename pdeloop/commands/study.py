@@ -80,10 +80,10 @@ def carry_out(
     """
     from rich.console import Console
 
+    from pdeloop.interruption import interruptible
     from pdeloop.progress import Progress
     from pdeloop.study.executors import cluster, processes
     from pdeloop.study.run import run
-    from pdeloop.training_run import Interruption, interruptible
     from tuner_node.results import timestamp
 
     if options.processes is not None and (options.processes < 1 or options.scheduler):
@@ -101,7 +101,7 @@ def carry_out(
         else partial(processes, options.processes)
     )
     try:
-        with interruptible():
+        with interruptible(f"pdeloop {name} --out {folder}"):
             failures = run(
                 study,
                 folder,
@@ -109,12 +109,6 @@ def carry_out(
                 any_environment=options.any_environment,
                 tell=progress.tell,
             )
-    except Interruption as signal_name:
-        progress.close()
-        console.print(
-            f"stopped by {signal_name}; continue with: pdeloop {name} --out {folder}", markup=False
-        )
-        return 130
     finally:
         progress.close()
     show(study, folder, failures, console)
