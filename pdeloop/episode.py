@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from controller_node.policy import ProjectedLaw
 from pde_sim_node.measurement import InstrumentedPlant
-from pde_sim_node.plant import EpisodeCosts, Plant
+from pde_sim_node.plant import MEAN_FIELD, EpisodeCosts, Plant
 
-__all__ = ["EpisodeRecord", "Law", "finite_array", "projected_law", "rollout"]
+__all__ = ["EpisodeRecord", "Law", "finite_array", "mean_field_cost", "projected_law", "rollout"]
 
 Array = NDArray[np.float64]
 Law: TypeAlias = Callable[[int, Array], Array]
@@ -103,6 +103,13 @@ def rollout(
             if keep:
                 actions[k] = a
     return EpisodeRecord(states, fields, actions, plant.episode_costs())
+
+
+def mean_field_cost(plant: Plant, law: Law | None = None) -> float:
+    """The mean stage cost from the mean initial field, under a law or without control."""
+    none = np.zeros((1, plant.n_a))
+    episode = rollout(plant, law or (lambda k, z: none), [MEAN_FIELD], np.arange(1), keep=False)
+    return float(episode.costs.mean[0])
 
 
 def projected_law(plant: Plant, U: ArrayLike, policy: ArrayLike) -> Law:

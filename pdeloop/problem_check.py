@@ -17,12 +17,11 @@ from scipy import linalg
 
 from controller_node.identification import DesignSettings, design
 from controller_node.order import study_orders
-from controller_node.policy import ProjectedLaw
 from loop_interfaces.parameters import INSTRUMENTS
 from pde_sim_node.build import build_plant
 from pde_sim_node.equations import LinearEquation
 from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD, Plant
-from pdeloop.episode import EpisodeRecord, rollout
+from pdeloop.episode import EpisodeRecord, mean_field_cost, projected_law, rollout
 from tuner_node.build import build_training
 
 __all__ = ["Finding", "Reach", "check", "draw", "reach"]
@@ -189,16 +188,15 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
         f"reduced_order {n_s}; one episode suggests {suggested}, and dmdc a rank of "
         f"{suggested + plant.n_a} or more",
     )
-    costs = {"no control": _cost(plant, None)}
+    costs = {"no control": mean_field_cost(plant)}
     for order in dict.fromkeys((n_s, suggested)):
         try:
             law = design(trajectories, plant.target, replace(settings, reduced_order=order))
         except ValueError as error:
             yield Finding("first law", False, f"of order {order}: {error}")
             return
-        own = ProjectedLaw([law.U], plant.target, settings.action_limit)
-        own.set(law.policy[np.newaxis], np.zeros(1, dtype=np.int64))
-        costs[f"order {order}"] = _cost(plant, own)
+        own = projected_law(plant, law.U, law.policy)
+        costs[f"order {order}"] = mean_field_cost(plant, own)
     told = ", ".join(
         f"{'diverges' if cost >= DIVERGED_COST else format(cost, '.4g')} with {name}"
         for name, cost in costs.items()
@@ -206,15 +204,6 @@ def _identification(values: Mapping[str, Any]) -> Iterator[Finding]:
     good = costs[f"order {n_s}"] < costs["no control"]
     hint = "" if good else ": a training would begin with no control; try another reduced_order"
     yield Finding("first law", good, f"mean stage cost from the mean field {told}{hint}")
-
-
-def _cost(plant: Plant, law: ProjectedLaw | None) -> float:
-    none = np.zeros((1, plant.n_a))
-
-    def answer(k: int, states: Array) -> Array:
-        return none if law is None else law.actions(states)
-
-    return float(rollout(plant, answer, [MEAN_FIELD], np.arange(1), keep=False).costs.mean[0])
 
 
 def draw(values: Mapping[str, Any], path: Path) -> None:

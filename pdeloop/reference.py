@@ -8,7 +8,6 @@ was computed for: all parameters of the problem must agree, and the plant must s
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,18 +16,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.files import read_json
 from loop_interfaces.parameters import PROBLEM, as_recorded, model_order
 from loop_interfaces.problem import config_folder
 from pde_sim_node.build import build_equation, build_plant
-from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD
-from pdeloop.episode import rollout
+from pde_sim_node.plant import DIVERGED_COST
+from pdeloop.episode import mean_field_cost
 from tuner_node.results import RunFolderError
 
 __all__ = ["FORMAT", "Reference", "bound_parameters", "find", "no_control_cost"]
 
 Array = NDArray[np.float64]
 FORMAT = 1
-MAX_BYTES = 10_000_000
 IGNORED = ("problem", "learning_rate", "learning_rate_from_zero", "smoothing_radius")
 """Parameters of a problem that neither the plant nor the basis U depends on."""
 AGREEMENT = 1e-6
@@ -93,9 +92,7 @@ def bound_parameters(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def no_control_cost(values: Mapping[str, Any]) -> float:
     """The mean stage cost from the mean initial field without control."""
-    plant = build_plant(values)
-    nothing = np.zeros((1, plant.n_a))
-    return float(rollout(plant, lambda k, z: nothing, [MEAN_FIELD], keep=False).costs.mean[0])
+    return mean_field_cost(build_plant(values))
 
 
 def find(
@@ -121,8 +118,7 @@ def find(
     if not path.is_file():
         return None
     try:
-        with path.open("rb") as file:
-            content = json.loads(file.read(MAX_BYTES + 1))
+        content = read_json(path)
         if content["format"] != FORMAT or not _fits(content, values, none_cost):
             return None
         for draw in content["evaluations"]:

@@ -93,46 +93,24 @@ EVERY_NODE_ANSWERS = (
 )
 
 
-def policy(namespace: str = "/", pairs: tuple[str, ...] = ("",)) -> str:
-    """The SROS2 policy of one loop in `namespace`, as XML.
-
-    pairs: namespaces of the plant and controller pairs relative to `namespace`, as the tuner's
-    parameter. The enclave of a node is /pdeloop, its pair, its name.
-    """
+def policy() -> str:
+    """The SROS2 policy of a loop, as XML. The enclave of a node is /pdeloop/NODE."""
     root = ET.Element("policy", version="0.2.0")
     enclaves = ET.SubElement(root, "enclaves")
     for role in ROLES:
-        serves_all = role.node in ("tuner_node", "recorder_node")
-        for own in ("",) if serves_all else pairs:
-            reached = pairs if serves_all else ("",)
-            _enclave(enclaves, role, _join(namespace, own), own, reached)
+        enclave = ET.SubElement(enclaves, "enclave", path=f"/pdeloop/{role.node}")
+        profiles = ET.SubElement(enclave, "profiles")
+        profile = ET.SubElement(profiles, "profile", ns="/", node=role.node)
+        services = ET.SubElement(profile, "services", reply="ALLOW")
+        for service in (*EVERY_NODE_ANSWERS, *role.services):
+            ET.SubElement(services, "service").text = f"~/{service}"
+        for verb, names in (
+            ("publish", (*EVERY_NODE_PUBLISHES, *role.publishes)),
+            ("subscribe", (*role.subscribes, *role.of_others)),
+        ):
+            rules = ET.SubElement(profile, "topics", {verb: "ALLOW"})
+            for name in names:
+                ET.SubElement(rules, "topic").text = name
     ET.indent(root)
     head = '<?xml version="1.0" encoding="UTF-8"?>\n'
     return head + ET.tostring(root, encoding="unicode") + "\n"
-
-
-def _enclave(
-    parent: ET.Element, role: Role, namespace: str, pair: str, reached: tuple[str, ...]
-) -> None:
-    path = "/".join(part for part in ("/pdeloop", pair.strip("/"), role.node) if part)
-    enclave = ET.SubElement(parent, "enclave", path=path)
-    profile = ET.SubElement(
-        ET.SubElement(enclave, "profiles"), "profile", ns=namespace, node=role.node
-    )
-    services = ET.SubElement(profile, "services", reply="ALLOW")
-    for service in (*EVERY_NODE_ANSWERS, *role.services):
-        ET.SubElement(services, "service").text = f"~/{service}"
-    for attribute, names in (
-        ("publish", (*EVERY_NODE_PUBLISHES, *role.publishes)),
-        ("subscribe", (*role.subscribes, *role.of_others)),
-    ):
-        rules = ET.SubElement(profile, "topics", {attribute: "ALLOW"})
-        for name in names:
-            absolute = name.startswith("/") or name == topics.RECORDER_STATUS
-            for place in ("",) if absolute else reached:
-                ET.SubElement(rules, "topic").text = "/".join(filter(None, (place, name)))
-
-
-def _join(namespace: str, pair: str) -> str:
-    parts = [part for part in (namespace.strip("/"), pair.strip("/")) if part]
-    return "/" + "/".join(parts)

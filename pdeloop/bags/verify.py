@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,24 +123,14 @@ def _complete(values: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
     return values if told else None
 
 
-@dataclass(frozen=True)
-class _Rollout:
+class _Rollout(NamedTuple):
     """What one environment of an episode gave."""
 
     episode: RecordedEpisode
     environment: int
+    cost: Array
+    model: Array | None
     trajectory: Trajectory | None
-
-    @property
-    def cost(self) -> Array:
-        assert self.episode.cost is not None
-        cost: Array = self.episode.cost.values[self.environment]
-        return cost
-
-    @property
-    def model(self) -> Array | None:
-        model = self.episode.model
-        return None if model is None else model.values[self.environment]
 
 
 class _Run:
@@ -257,7 +247,8 @@ class _Run:
         if self._values["optimizer"] in NEED_TRAJECTORIES and not episode.missing:
             seen = cut(*episode.trajectory(), episode.cost.values[:, CostColumn.ENDED])
         for i, key in enumerate(_keys(episode.start.values, policies, episode.start.step)):
-            found = _Rollout(episode, i, seen[i])
+            model = None if episode.model is None else episode.model.values[i]
+            found = _Rollout(episode, i, episode.cost.values[i], model, seen[i])
             known = self._rollouts.setdefault(key, found)
             if known is not found:
                 text = f"cost of {where}, repeating episode {known.episode.number}"

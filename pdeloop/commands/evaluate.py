@@ -45,20 +45,17 @@ def add(commands: Commands) -> None:
 
 def _evaluate(options: argparse.Namespace) -> int:
     from pdeloop.evaluation import all_diverged, another_plant, as_text, evaluate
-    from tuner_node.results import RunFolder
+    from pdeloop.finished_run import load
 
     allow_equation(options)
-    spec = DEFAULTS["evaluation_fields"]
-    spec.check(options.fields)
+    DEFAULTS["evaluation_fields"].check(options.fields)
     DEFAULTS["evaluation_seed"].check(options.seed)
-    costs = evaluate(
-        options.folder, fields=options.fields, seed=options.seed, mean_field=options.mean_field
-    )
-    run = RunFolder(options.folder)
-    if note := another_plant(run.values(), run.result()):
+    run = load(options.folder)
+    costs = evaluate(run, fields=options.fields, seed=options.seed, mean_field=options.mean_field)
+    if note := another_plant(run):
         print(f"WARNING: {note}; these are costs of the built-in one", file=sys.stderr)
     if options.json:
-        print_json(costs)
+        print_json({name: table.tolist() for name, table in costs.items()})
     else:
         print(as_text(costs))
     if lost := all_diverged(costs):

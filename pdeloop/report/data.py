@@ -244,7 +244,7 @@ def _problem(
         data.missing.append(
             "Training curves: LQT diverged, or every rollout of the adaptation did, or there was none."
         )
-    if note := another_plant(values, data.first.result):
+    if note := another_plant(data.first):
         data.missing.append(
             f"The run's own plant: {note}. The fields shown are of the built-in one."
         )

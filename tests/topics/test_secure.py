@@ -62,22 +62,13 @@ def test_the_policy_allows_each_running_node_what_it_does_and_no_more(loop: Proc
     assert json.loads(text.strip().splitlines()[-1]) == allowed
 
 
-def test_the_policy_has_the_form_of_sros2_and_an_enclave_for_every_node_of_every_pair():
-    root = ET.fromstring(policy("/lab", ("a", "b")))
+def test_the_policy_has_the_form_of_sros2_and_an_enclave_for_every_node():
+    root = ET.fromstring(policy())
     assert root.attrib == {"version": "0.2.0"}
     paths = [enclave.attrib["path"] for enclave in root.iter("enclave")]
-    assert paths == [
-        "/pdeloop/a/pde_sim_node",
-        "/pdeloop/b/pde_sim_node",
-        "/pdeloop/a/controller_node",
-        "/pdeloop/b/controller_node",
-        "/pdeloop/tuner_node",
-        "/pdeloop/recorder_node",
-        "/pdeloop/a/viewer_node",
-        "/pdeloop/b/viewer_node",
-    ]
+    assert paths == [f"/pdeloop/{role.node}" for role in ROLES]
     plant = next(root.iter("profile"))
-    assert plant.attrib == {"ns": "/lab/a", "node": "pde_sim_node"}
+    assert plant.attrib == {"ns": "/", "node": "pde_sim_node"}
     rules = {
         key: [topic.text for topic in topics.iter("topic")]
         for topics in plant.iter("topics")
@@ -85,11 +76,3 @@ def test_the_policy_has_the_form_of_sros2_and_an_enclave_for_every_node_of_every
     }
     assert "action" in rules["subscribe"]
     assert "action" not in rules["publish"]
-    tuner = next(p for p in root.iter("profile") if p.attrib["node"] == "tuner_node")
-    published = [
-        topic.text
-        for topics in tuner.iter("topics")
-        if "publish" in topics.attrib
-        for topic in topics.iter("topic")
-    ]
-    assert {"a/policy", "b/policy"} <= set(published)
