@@ -14,11 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.parameters import noisy
-from loop_interfaces.topics import CostColumn
+from pdeloop.evaluation import mean_costs
 from pdeloop.in_process import LocalPair
-from tuner_node.batch import Batch
-from tuner_node.seeds import Purpose, derive, evaluation_noise
 from tuner_node.training import Training
 
 Array = NDArray[np.float64]
@@ -65,12 +62,7 @@ class Curve:
 
     def _measured(self, policy: Array) -> Array:
         """Mean stage costs (fields,) of a policy, as in the closing evaluation."""
-        seed, count = self._values["evaluation_seed"], self._values["evaluation_fields"]
-        noise = evaluation_noise(seed, count) if noisy(self._values) else []
-        rows = [
-            (derive(seed, Purpose.EVALUATION_FIELD, i), -1, 0, 0, *noise[i : i + 1])
-            for i in range(count)
-        ]
-        batch = Batch(np.array(rows, dtype=np.float64), np.stack([policy] * count))
-        costs: Array = self._pair.run(batch, self._values["max_batch"]).costs[:, CostColumn.MEAN]
-        return costs.copy()
+        fields, seed = self._values["evaluation_fields"], self._values["evaluation_seed"]
+        laws = policy[np.newaxis]
+        (costs,) = mean_costs(self._pair, self._values, laws, [0], fields=fields, seed=seed)
+        return np.asarray(costs)
