@@ -1,4 +1,4 @@
-"""Many serialised messages in one: what the plant hands to those who record or watch the loop.
+"""Many serialised messages in one: what the plant publishes for recorders and viewers.
 
 A reader of its own for every state and action would cost the loop a packet and a wake-up per sample
 and reader. Instead the plant keeps the bytes of the states it sends and of the actions it receives,
@@ -37,7 +37,7 @@ AGE = 0.1
 MAX_TIME = 2.0**31
 """Simulated time in s up to which /clock, whose seconds are an int32, can tell it."""
 RATE, COUNTED = 600.0, 4096
-"""Samples a second of up to so many bytes that those who only look get."""
+"""Samples a second that viewers get, of up to so many bytes."""
 
 _MESSAGE = struct.Struct("<4sIIIQ")
 """CDR of an UInt8MultiArray without dims up to its data, and the first eight bytes of those."""
@@ -53,26 +53,26 @@ _WINDOW = 10_000_000_000
 """Nanoseconds of which the smallest delay counts: clocks of two hosts drift apart."""
 
 
-class Allowance:
-    """Which episodes go to those who only look: whole ones, about RATE samples a second.
+class TokenBucket:
+    """Which episodes go to viewers: whole ones, about RATE samples a second.
 
-    A sample of at most COUNTED bytes uses one up, a larger one more. Time gives them back, so after
-    an episode that used up more than there were the next ones are left out; never for longer than a
-    second, and in a loop that is slower none is.
+    A sample of at most COUNTED bytes takes one token, a larger one more; RATE tokens come back a
+    second. An episode may take more than there are: the next ones are then left out, for a second at
+    most. In a loop that is slower than RATE none is.
     """
 
     def __init__(self) -> None:
-        self._left, self._when = 0.0, -math.inf
+        self._tokens, self._when = 0.0, -math.inf
 
     def admits(self, now: float) -> bool:
         """Whether to show the episode that begins now (monotonic s)."""
-        self._left = max(-RATE, min(RATE, self._left + RATE * (now - self._when)))
+        self._tokens = max(-RATE, min(RATE, self._tokens + RATE * (now - self._when)))
         self._when = now
-        return self._left >= 0.0
+        return self._tokens >= 0.0
 
     def use(self, size: int, count: int = 1) -> None:
         """Samples of `size` bytes were shown."""
-        self._left -= count * max(1.0, size / COUNTED)
+        self._tokens -= count * max(1.0, size / COUNTED)
 
 
 class SampleBatch:
@@ -83,7 +83,7 @@ class SampleBatch:
         self.size = 0
 
     def add(self, kind: int, stamp: int, raw: bytes, time: float) -> bool:
-        """Keep a serialised message; whether the batch should be sent now."""
+        """Add a serialised message; whether the batch should be sent now."""
         at = _MESSAGE.size + self.size
         self._make_room(SAMPLE_HEADER + len(raw))
         _SAMPLE.pack_into(self._memory, at, kind, len(raw), stamp, time)
@@ -91,26 +91,22 @@ class SampleBatch:
         self.size += SAMPLE_HEADER + len(raw)
         return self.size >= LIMIT
 
-    def lend(self, record: np.void, room: int) -> None:
-        """Let compiled functions append, at most `room` bytes beyond the limit; then `settle`."""
+    def reserve(self, record: np.void, room: int) -> None:
+        """Let compiled code append, at most `room` bytes beyond the limit, until `commit`."""
         self._make_room(max(LIMIT - self.size, 0) + room)
         begin = np.frombuffer(self._memory, np.uint8).ctypes.data + _MESSAGE.size
         record["end"], record["limit"] = begin + self.size, begin + LIMIT
 
-    def settle(self, record: np.void) -> bool:
-        """They are done; whether the batch should be sent now."""
+    def commit(self, record: np.void) -> bool:
+        """Compiled code is done; whether the batch should be sent now."""
         self.size = int(record["end"] - record["limit"]) + LIMIT
         return self.size >= LIMIT
 
-    def take(self, sent: int) -> memoryview:
-        """CDR bytes of the message that holds them all, to be released before anything is added.
-
-        The batch is empty afterwards.
-        """
+    def take(self, sent: int) -> bytes:
+        """CDR bytes of the message that holds them all; the batch is empty afterwards."""
         _MESSAGE.pack_into(self._memory, 0, _ENCODING, 0, 0, 8 + self.size, sent)
-        whole = memoryview(self._memory)[: _MESSAGE.size + self.size]
-        self.size = 0
-        return whole
+        end, self.size = _MESSAGE.size + self.size, 0
+        return bytes(memoryview(self._memory)[:end])
 
     def _make_room(self, more: int) -> None:
         lacking = _MESSAGE.size + self.size + more - len(self._memory)
@@ -167,7 +163,7 @@ class ClockOffset:
     """Puts the plant's stamps on the reader's clock: the smallest delay of late counts as none.
 
     So the times of samples do not depend on how many came together, nor on the clocks of hosts, nor
-    on how long the reader was held up.
+    on how long the reader was delayed.
     """
 
     def __init__(self) -> None:

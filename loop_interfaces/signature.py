@@ -1,7 +1,7 @@
 """Signatures: with which policy, model and target an action was computed, and how a model was.
 
 Tuner, controller and plant compute the same numbers from what each of them knows, so the plant can
-tell whether an action comes from a controller that was told what the tuner published:
+tell whether an action comes from a controller that has what the tuner published:
 
     D = h(rows, action_limit, policy, h(model))    in the header of `episode/start`, as `plant`
     s = -h(D, z_r)                                 in the header of every `action`, as `time`
@@ -9,7 +9,7 @@ tell whether an action comes from a controller that was told what the tuner publ
 
 with h the first 53 bits of BLAKE2b over the numbers as little-endian float64. Where the controller
 explores there is neither policy nor model. A simulated time is never negative, so a controller that
-echoes the state's time, or sends 0, is told from one that signs. It is no protection from somebody
+echoes the state's time, or sends 0, differs from one that signs. It is no protection from somebody
 who reads the wire and copies the number.
 """
 
@@ -48,12 +48,12 @@ def design_digest(parameters: Mapping[str, Any]) -> int:
     return digest_of(*(list(v.encode()) if isinstance(v, str) else v for v in values))
 
 
-def signature(told: int, known: ArrayLike) -> float:
+def signature(digest: int, known: ArrayLike) -> float:
     """s for the D that a start carries; NOT_SIGNED where it carries none.
 
     known: z_r of an action, the design's digest of a model.
     """
-    return -float(digest_of(told, known)) if told else NOT_SIGNED
+    return -float(digest_of(digest, known)) if digest else NOT_SIGNED
 
 
 def signature_in(time: float) -> float:

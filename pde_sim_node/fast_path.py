@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from loop_interfaces.ros.endpoints import SampleBatcher
 
 PLAN = plan_type(
-    ("code", np.int64),  # of a step of the plant, see ParallelStep.lend
+    ("code", np.int64),  # of a step of the plant, see ParallelStep.begin_compiled
     ("context", np.int64),
     ("states", np.int64),  # addresses
     ("actions", np.int64),
@@ -130,7 +130,7 @@ class PlantFastPath(FastPath):
             return False
         if not self.expect(state, action, state.values.shape):
             return False
-        code = plant.parallel.lend()
+        code = plant.parallel.begin_compiled()
         if code is None:
             return False
         plan["code"], plan["context"] = code
@@ -144,15 +144,15 @@ class PlantFastPath(FastPath):
         plan["time"], plan["sample_time"] = lockstep.time, plant.sample_time
         plan["timed"] = self._batcher.timed
         plan["begin"], plan["length"] = self.answer.begin, len(self.answer.raw)
-        self._batcher.lend(plan["batches"], 2 * SAMPLE_HEADER + sum(self._lengths))
+        self._batcher.reserve(plan["batches"], 2 * SAMPLE_HEADER + sum(self._lengths))
         return True
 
     def synchronise(self, answers: int, last: float) -> None:
         plan = self.plan
-        self._plant.step_index = self._plant.parallel.take_back()
+        self._plant.step_index = self._plant.parallel.end_compiled()
         if answers:
             self._lockstep.advance_counters([digest(row) for row in self._log[:answers]], last)
-        self._batcher.settle(plan["batches"], self._lengths, answers)
+        self._batcher.commit(plan["batches"], self._lengths, answers)
 
     @property
     def _lengths(self) -> tuple[int, int]:

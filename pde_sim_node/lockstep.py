@@ -400,7 +400,7 @@ class Lockstep:
         """Do what is due: send the state that is ready, or again; give the episode up.
 
         With a pace, call it once right after `action`, too, so that a state which is ready too late is
-        told from one that is sent too late.
+        distinguished from one that is sent too late.
         """
         if self._phase is Phase.READY and self.pacer and not self.paused and self.pacer.ready(now):
             return self._send_state(now)

@@ -119,7 +119,7 @@ def carry_out(
 def _train_here(
     folder: Path, values: dict[str, Any], display: Display, check: Callable[[], None]
 ) -> None:
-    with RunFolder(folder).held():
+    with RunFolder(folder).locked():
         training = build_training(values)
         writer = RunWriter(folder, values, training, warn=display.line)
 

@@ -182,7 +182,7 @@ class RecorderNode:
         """Read the ROS graph, and say when nothing can be missed any more."""
         now = time.monotonic()
         for samples, _ in self._samples:
-            samples.look()
+            samples.poll()
         self._peers.look(now)
         run = self._recording.run
         if run and self._peers.changed(run):

@@ -119,9 +119,9 @@ def plant_on_topics(*, timed: bool = False, helped: bool = False, **overrides: o
             assert answer_for(path) is None
         assert plant.lockstep.step == plant.judge.step == 5
         parallel = plant.lockstep.plant.parallel
-        assert parallel.lend() is not None
+        assert parallel.begin_compiled() is not None
         assert bool(parallel._context["polling"]) == helped
-        assert parallel.take_back() == 5
+        assert parallel.end_compiled() == 5
         for _ in range(2):
             assert path.arm()
             peer.say(next_action())
@@ -161,7 +161,7 @@ def plant_on_topics(*, timed: bool = False, helped: bool = False, **overrides: o
         # For those who record.
         peer.watch()
         while not loop.batcher.wanted:
-            loop.batcher.look(loop.now())
+            loop.batcher.poll(loop.now())
         time.sleep(0.3)
         sent, told = [], []
         for _ in range(3):

@@ -187,7 +187,7 @@ def test_a_folder_that_another_process_works_on_is_left_alone(tmp_path, capsys):
     out = tmp_path / "run"
     assert train(out) == 0
     (out / "result.json").unlink()
-    with RunFolder(out).held():
+    with RunFolder(out).locked():
         line = error_of(capsys, "train", "--resume", str(out), "--in-process")
     assert "another process works on the run" in line
 

@@ -211,10 +211,10 @@ class NoSamples:
 
     timed = False
 
-    def lend(self, records: Any, room: int) -> None:
+    def reserve(self, records: Any, room: int) -> None:
         records["open"] = 0
 
-    def settle(self, records: Any, sizes: Any, count: int) -> None:
+    def commit(self, records: Any, sizes: Any, count: int) -> None:
         pass
 
 

@@ -49,7 +49,7 @@ def test_a_folder_in_a_given_domain_is_watched_while_a_process_works_on_it(tmp_p
     (tmp_path / "lock").touch()
     finder = Finder(tmp_path, 9, list)
     assert finder.find() is None  # nothing runs: what is there is shown as it was left
-    with RunFolder(tmp_path).held():
+    with RunFolder(tmp_path).locked():
         assert finder.find() == Live(9, tmp_path, 0.0)
 
 

@@ -35,44 +35,44 @@ def there(plants: int = 1, controllers: int = 1, tuners: int = 1, recorders: int
 
 def test_the_dispatcher_learns_which_nodes_of_each_pair_are_missing():
     company, dispatcher = participants(pairs=2)
-    company.look(Publishers([1, 0], [0, 1], {}, 0), 0.0)
+    company.update(Publishers([1, 0], [0, 1], {}, 0), 0.0)
     assert [sorted(pair.missing) for pair in dispatcher.pairs] == [["controller"], ["plant"]]
-    company.look(Publishers([1, 1], [1, 1], {}, 0), 1.0)
+    company.update(Publishers([1, 1], [1, 1], {}, 0), 1.0)
     assert dispatcher.missing() == []
 
 
 @pytest.mark.parametrize("recorder", ["start", "required"])
 def test_the_first_episode_waits_for_a_recorder(recorder: str):
     company, dispatcher = participants(recorder)
-    company.look(there(), 0.0)
+    company.update(there(), 0.0)
     assert dispatcher.missing() == ["recorder"]
-    company.look(there(recorders=1), 1.0)
+    company.update(there(recorders=1), 1.0)
     assert dispatcher.missing() == []
 
 
 def test_a_recorder_that_goes_ends_the_training_only_where_it_is_required():
     company, dispatcher = participants("start")
-    company.look(there(recorders=1), 0.0)
-    company.look(there(recorders=0), 1.0)
+    company.update(there(recorders=1), 0.0)
+    company.update(there(recorders=0), 1.0)
     assert dispatcher.missing() == []
     company, dispatcher = participants("required")
-    company.look(there(recorders=0), 0.0)
-    company.look(there(recorders=1), 1.0)
+    company.update(there(recorders=0), 0.0)
+    company.update(there(recorders=1), 1.0)
     with pytest.raises(DispatchError, match=r"the recorder is gone.*resume:=true"):
-        company.look(there(recorders=0), 2.0)
+        company.update(there(recorders=0), 2.0)
 
 
 def test_another_tuner_ends_this_one_unless_it_came_first_or_is_only_seen_for_a_while():
     company, _ = participants()
-    company.look(there(tuners=2), 0.0)
-    company.look(there(tuners=2), SECOND_TUNER_GRACE)
-    company.look(there(tuners=1), SECOND_TUNER_GRACE + 1)  # it was one that had been killed
-    company.look(there(tuners=2), 20.0)
+    company.update(there(tuners=2), 0.0)
+    company.update(there(tuners=2), SECOND_TUNER_GRACE)
+    company.update(there(tuners=1), SECOND_TUNER_GRACE + 1)  # it was one that had been killed
+    company.update(there(tuners=2), 20.0)
     with pytest.raises(DispatchError, match="another tuner publishes /episode/start; stop it"):
-        company.look(there(tuners=2), 20.1 + SECOND_TUNER_GRACE)
+        company.update(there(tuners=2), 20.1 + SECOND_TUNER_GRACE)
     company, _ = participants(established=True)
     for now in (0.0, 2 * SECOND_TUNER_GRACE):
-        company.look(there(tuners=2), now)
+        company.update(there(tuners=2), now)
 
 
 @pytest.mark.parametrize(("pairs", "which"), [(1, ""), (2, " of pair 1")])

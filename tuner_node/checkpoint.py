@@ -1,7 +1,7 @@
 """What must survive a crash: arrays in a file that is whole or not there.
 
 A checkpoint is one line `pdeloop-checkpoint 1 <sha256>` followed by an npz archive without pickled
-objects. It is written beside its place, flushed to the disk and renamed; the one before is kept, so
+objects. It is written under another name, flushed to the disk and renamed; the one before is kept, so
 that a file damaged later can be passed over. Where none is usable, a training begins again from its
 start, and comes to the same result.
 """
@@ -53,7 +53,7 @@ def save(path: Path, arrays: Arrays) -> None:
 
 
 def restore(path: Path, take: Callable[[dict[str, NDArray[Any]]], None]) -> tuple[bool, list[str]]:
-    """Hand the newest usable checkpoint to `take`.
+    """Call `take` with the newest usable checkpoint.
 
     Parameters
     ----------

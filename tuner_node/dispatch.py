@@ -1,4 +1,4 @@
-"""Hands the rollouts of a batch to plant and controller pairs as episodes. Pure: no ROS, no clock.
+"""Distributes the rollouts of a batch to pairs of nodes, as episodes. Pure: no ROS, no clock.
 
 A batch is cut into chunks of at most `max_batch` rows. Each becomes an episode of a pair that is free,
 and what a pair does not finish is started again with the same rows under a new episode number, on any
@@ -108,7 +108,7 @@ class Dispatcher:
         self.pairs = [Pair() for _ in range(pairs)]
         self.counters = Counters()
         self.notes: list[str] = []
-        """Why episodes were started again, for people."""
+        """Why episodes were started again, in words."""
         self.sim_time = 0.0
         self.paused = False
         """Whether an operator lets no new episode begin."""
@@ -264,7 +264,7 @@ class Dispatcher:
         Raises
         ------
         FrameError
-            They are of another shape or plant, or signed by a controller that was told something else.
+            They are of another shape or plant, or signed by a controller with other parameters.
         """
         signed = self.pairs[pair].signed.get(frame.episode, 0) if frame.run == self.run else 0
         expected = NOT_SIGNED, signature(signed, self.design)

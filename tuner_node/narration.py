@@ -1,4 +1,4 @@
-"""What a person is told of a training: its events, how far it is, and the closing words. Pure.
+"""A training in words: its events, how far it is, and its outcome. Pure.
 
 The tuner logs these lines, and `pdeloop train` shows them.
 """
@@ -16,7 +16,7 @@ _TOGETHER = ("designed", "checked", "evaluated")
 class Narration:
     """Sentences for the rows of progress.jsonl.
 
-    Of several seeds mean and range are told, in one line for all of them.
+    Of several seeds mean and range are shown, in one line for all of them.
 
     Parameters
     ----------
@@ -56,11 +56,11 @@ class Narration:
         event = row.get("event")
         if event in _TOGETHER and self._seeds > 1:
             lines = (
-                [] if not self._together or event == self._together[0]["event"] else self._told()
+                [] if not self._together or event == self._together[0]["event"] else self._flush()
             )
             self._together.append(row)
             return lines
-        lines = self._told()
+        lines = self._flush()
         if event == "phase":
             if self._phase == "adapt" and self._costs:
                 lines.append(f"  {self.done} rollouts: {self.status}")
@@ -76,11 +76,11 @@ class Narration:
             lines.append(f"  {row['reason']}")
         elif event in _TOGETHER:
             self._together.append(row)
-            lines += self._told()
+            lines += self._flush()
         return lines
 
-    def _told(self) -> list[str]:
-        """The line of the rows that are told together."""
+    def _flush(self) -> list[str]:
+        """The line of the rows that are shown together."""
         rows, self._together = self._together, []
         if not rows:
             return []

@@ -76,12 +76,12 @@ def declare_parameters(node: Node, changed: Mapping[str, Any] | None = None) -> 
 class TunerNode:
     """Moves messages between the topics and the session, and keeps the run folder."""
 
-    def __init__(self, node: Node, loop: NodeLoop, held: contextlib.ExitStack) -> None:
-        """`held` keeps the run folder from other processes, as long as this one lives."""
+    def __init__(self, node: Node, loop: NodeLoop, locks: contextlib.ExitStack) -> None:
+        """locks: the run folder is locked until it is closed."""
         values = declare_parameters(node)
         log = node.get_logger()
         training = build_training(values)
-        self._writer, identity = open_run(values, training, held, log.warning)
+        self._writer, identity = open_run(values, training, locks, log.warning)
         self._rows: deque[Mapping[str, Any]] = deque()
         self._problem, self._out = values["problem"], values["out"]
         self._narration = Narration(values["seed"], values["seeds"])
@@ -218,7 +218,7 @@ class TunerNode:
         except DispatchError as error:
             self._failure = self._failure or str(error)
             self._loop.stop("failure")
-        while self._rows:  # once everybody has been told what to do next, and before it is kept
+        while self._rows:  # after the messages, which others wait for, and before the checkpoint
             self._report(self._rows.popleft())
         if self._writer:
             with self._loop.introspection.working("writing the checkpoint"):
@@ -233,15 +233,15 @@ class TunerNode:
     def _housekeeping(self, now: float) -> None:
         if self._loop.stopped:  # by a service, in this round
             return
-        self._guarded(partial(self._participants.look, self._publishers()))
+        self._guarded(partial(self._participants.update, self._publishers()))
         missing, seconds = self._diagnostics.absent(now)
         if missing:
             self._log.warning(
                 f"waiting for {' and '.join(missing)} for {seconds:.0f} s",
                 throttle_duration_sec=ABSENCE_REPORT,
             )
-        if told := self._participants.newly_paused(now):
-            self._log.info(told)
+        if text := self._participants.newly_paused(now):
+            self._log.info(text)
 
     def _publishers(self) -> Publishers:
         count, resolve = self._node.count_publishers, self._node.resolve_topic_name
@@ -301,10 +301,10 @@ class TunerNode:
 def main(args: list[str] | None = None) -> int:
     """Console script."""
     keep_on_this_machine()
-    with contextlib.ExitStack() as held:
+    with contextlib.ExitStack() as locks:
 
         def make(node: Node, loop: NodeLoop) -> TunerNode:
-            return TunerNode(node, loop, held)
+            return TunerNode(node, loop, locks)
 
         return node_main("tuner_node", args, make)
 

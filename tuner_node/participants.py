@@ -34,7 +34,7 @@ class Publishers:
 
 
 class Participants:
-    """Tells a session's dispatcher who is missing, and who should not be there.
+    """Reports to a session's dispatcher who is missing, and refuses who should not be there.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ class Participants:
         self._second_tuner = ConditionTimer()
         self._paused: list[int] = []
 
-    def look(self, there: Publishers, now: float) -> list[PairPublication]:
+    def update(self, there: Publishers, now: float) -> list[PairPublication]:
         """What is to be sent, now that these publishers are there (now: monotonic s).
 
         Raises

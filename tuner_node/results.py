@@ -161,7 +161,7 @@ class RunFolder:
             )
 
     @contextlib.contextmanager
-    def held(self) -> Iterator[None]:
+    def locked(self) -> Iterator[None]:
         """Keep other processes from working on the run. RunFolderError if one does."""
         try:
             file = open_own(self.path / "lock", 0)

@@ -95,12 +95,12 @@ class RunWriter:
 def open_run(
     values: Mapping[str, Any],
     training: Training,
-    held: ExitStack,
+    locks: ExitStack,
     warn: Callable[[str], None],
 ) -> tuple[RunWriter | None, RunIdentity]:
     """Begin the run in the folder `out` of the tuner's parameters, or go on with it (`resume`).
 
-    held: keeps the folder from other processes until it is closed. Without a folder nothing is kept.
+    locks: the folder is locked until it is closed. Without a folder nothing is written.
     """
     if not values["out"]:
         return None, RunIdentity(1 + secrets.randbelow(MAX_ID - 1), 0)
@@ -109,6 +109,6 @@ def open_run(
         folder.parameters()
     else:
         folder.create(values)
-    held.enter_context(folder.held())
+    locks.enter_context(folder.locked())
     writer = RunWriter(folder.path, values, training, warn=warn)
     return writer, writer.identity

@@ -51,8 +51,8 @@ def rollout_noise(
     """A seed for every row.
 
     seeds: of the trainings; owners: the training of every row; counts: a number for every training
-    that is never the same again for this purpose: its attempts, or the batches that its optimiser
-    was told.
+    that is never the same again for this purpose: its attempts, or how many batches its optimiser has
+    had.
     """
     rows_of: Counter[int] = Counter()
     noise = []

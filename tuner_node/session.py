@@ -1,7 +1,7 @@
 """One training carried out by plant and controller pairs: Training and Dispatcher joined. Pure.
 
 Events of the pairs go to the dispatcher; `advance` takes what it answers, finishes a batch whose
-results are all there, and hands out the next one. What happens is given to `report` as JSON-able rows.
+results are all there, and assigns the next one. What happens is given to `report` as JSON-able rows.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Session:
         """
         if self._phase:
             return self.dispatcher.resend(now)
-        return self._hand_out_models() + self._next(now)
+        return self._new_models() + self._next(now)
 
     def baseline(self, name: str) -> float | None:
         """Mean cost of the controller `none` or `lqt` when the warm starts were checked, if known."""
@@ -87,12 +87,12 @@ class Session:
             if row["event"] == "checked":
                 self._checked[row["seed"]] = row
             self._report(row)
-        publications = publications + self._hand_out_models()
+        publications = publications + self._new_models()
         if self.stopping and training.phase != "done":
             return publications + self._end()
         return publications + self._next(now)
 
-    def _hand_out_models(self) -> list[PairPublication]:
+    def _new_models(self) -> list[PairPublication]:
         """The models, if they are others than before."""
         training = self.training
         if not training.ready or self._generation == training.generation:

@@ -56,7 +56,7 @@ class LoopReader:
         """Whether states and actions are read, too: each costs their sender something."""
         if yes and self._samples is None:
             self._samples = SampleSubscription(self._node, self._namespace, throttled=True)
-            self._samples.look()
+            self._samples.poll()
         elif not yes and self._samples is not None:
             self._samples.close()
             self._samples = None
@@ -64,7 +64,7 @@ class LoopReader:
     def poll_graph(self) -> None:
         """Subscribe to the samples where they are published; call it about once a second."""
         if self._samples is not None:
-            self._samples.look()
+            self._samples.poll()
 
     def read(self) -> None:
         """Hand on what has come in.

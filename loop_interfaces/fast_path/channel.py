@@ -53,7 +53,6 @@ from loop_interfaces.jit.native import (
     monotonic_ns,
 )
 from loop_interfaces.jit.simd import read_word
-from loop_interfaces.ros.rcl import Allocator, SerializedMessage
 
 CHANNEL = np.dtype(
     [
@@ -93,6 +92,26 @@ SLOT_BYTES, BUFFER, LENGTH = 64, 0, 1
 """Size of an rcl_serialized_message_t, and the two of its words that are used."""
 MUTEX_BYTES = 64
 """At least sizeof(pthread_mutex_t): 40 on x86-64, 48 on aarch64."""
+
+
+class Allocator(ctypes.Structure):
+    """rcutils_allocator_t."""
+
+    _fields_ = [
+        (name, ctypes.c_void_p)
+        for name in ("allocate", "deallocate", "reallocate", "zero_allocate", "state")
+    ]
+
+
+class SerializedMessage(ctypes.Structure):
+    """rcl_serialized_message_t."""
+
+    _fields_ = [
+        ("buffer", ctypes.c_void_p),
+        ("length", ctypes.c_size_t),
+        ("capacity", ctypes.c_size_t),
+        ("allocator", Allocator),
+    ]
 
 
 @jit

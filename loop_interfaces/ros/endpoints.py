@@ -19,8 +19,7 @@ from rclpy.subscription import Subscription
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
 from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.ros.rcl import publishes_where_it_is
-from loop_interfaces.samples import AGE, NO_TIME, STATE_KIND, Allowance, SampleBatch
+from loop_interfaces.samples import AGE, NO_TIME, STATE_KIND, SampleBatch, TokenBucket
 from loop_interfaces.topics import (
     READER_DEPTH,
     SAMPLES,
@@ -29,8 +28,8 @@ from loop_interfaces.topics import (
     Topic,
 )
 
-KEPT = 16
-"""Batches of samples that their writer keeps for a reader which lost one."""
+BATCH_HISTORY = 16
+"""Batches of samples that their publisher stores for a subscriber which lost one."""
 
 
 class NeverExecuted(CallbackGroup):
@@ -100,106 +99,102 @@ def scoped(namespace: str, name: str) -> str:
     return ("/" if namespace.startswith("/") else "") + (f"{inner}/{name}" if inner else name)
 
 
-class _Outlet:
-    """A topic of batches."""
+class _BatchPublisher:
+    """Publishes batches on one topic. open: whether it takes samples."""
 
     def __init__(self, node: Node, name: str) -> None:
-        self._publisher = node.create_publisher(UInt8MultiArray, name, samples_qos(KEPT))
-        self._publish = publishes_where_it_is(self._publisher)
+        self._publisher = node.create_publisher(UInt8MultiArray, name, samples_qos(BATCH_HISTORY))
         self.batch = SampleBatch()
-        self._began = 0.0
+        self.open = False
+        self._flushed = 0.0
+
+    def add(self, kind: int, stamp: int, raw: bytes, simulated: float) -> None:
+        if self.batch.add(kind, stamp, raw, simulated):
+            self.flush()
 
     def flush(self) -> None:
         if self.batch.size:
-            with self.batch.take(time.monotonic_ns()) as message:
-                self._publish(message)
-        self._began = time.monotonic()
+            self._publisher.publish(self.batch.take(time.monotonic_ns()))
+        self._flushed = time.monotonic()
 
-    def look(self, now: float) -> bool:
-        """Whether somebody listens; publishes what has waited for long."""
-        if now - self._began > AGE:
+    def poll(self, now: float) -> bool:
+        """Whether there are subscribers; publishes what has waited for long."""
+        if now - self._flushed > AGE:
             self.flush()
         return self._publisher.get_subscription_count() > 0
 
 
 class SampleBatcher:
-    """Publishes `samples` for those who record or learn, and some episodes on `samples_throttled`
-    for those who look; nothing is kept while there are none.
+    """Publishes all samples on `samples`, and those of some episodes on `samples_throttled`; nothing is
+    stored while there are no subscribers.
 
     Make it before the publisher of the states: who knows of the states then knows of the samples.
-    timed: whether the time of each state goes on /clock.
+    timed: whether the time of each state goes on /clock; wanted: whether `add` is to be called.
     """
 
     def __init__(self, node: Node) -> None:
-        self._all, self._some = _Outlet(node, SAMPLES), _Outlet(node, SAMPLES_THROTTLED)
-        self._allowance = Allowance()
-        self._read = self._looked_at = self._shown = False
+        self._full = _BatchPublisher(node, SAMPLES)
+        self._throttled = _BatchPublisher(node, SAMPLES_THROTTLED)
+        self._publishers = self._full, self._throttled
+        self._rate = TokenBucket()
+        self._viewers = False
+        """Whether `samples_throttled` has subscribers."""
         self.wanted = self.timed = False
 
     def begin(self, now: float) -> None:
-        """An episode begins: whether it is shown to those who look."""
-        self._shown = self._looked_at and self._allowance.admits(now)
-        self.wanted = self._read or self._shown
+        """An episode begins."""
+        self._throttled.open = self._viewers and self._rate.admits(now)
+        self._update()
 
     def show(self, raw: bytes | None) -> None:
-        """From now on show the episode in any case, beginning with the state `raw`."""
-        if raw is not None and self._looked_at and not self._shown:
-            self._some.batch.add(STATE_KIND, time.monotonic_ns(), raw, NO_TIME)
-        self._shown = self._looked_at
-        self.wanted = self._read or self._shown
+        """From now on give viewers this episode in any case, beginning with the state `raw`."""
+        if raw is not None and self._viewers and not self._throttled.open:
+            self._throttled.batch.add(STATE_KIND, time.monotonic_ns(), raw, NO_TIME)
+        self._throttled.open = self._viewers
+        self._update()
 
     def add(self, kind: int, raw: bytes, simulated: float = NO_TIME) -> None:
-        """Keep a message for the next batch. Call it only while `wanted`.
-
-        simulated: the time of a state in s.
-        """
+        """Add a message to the next batch; simulated: the time of a state in s."""
         stamp = time.monotonic_ns()
-        if self._read and self._all.batch.add(kind, stamp, raw, simulated):
-            self._all.flush()
-        if self._shown:
-            self._allowance.use(len(raw))
-            if self._some.batch.add(kind, stamp, raw, simulated):
-                self._some.flush()
+        if self._full.open:
+            self._full.add(kind, stamp, raw, simulated)
+        if self._throttled.open:
+            self._rate.use(len(raw))
+            self._throttled.add(kind, stamp, raw, simulated)
 
-    def lend(self, records: np.ndarray, room: int) -> None:
-        """Let compiled functions add to both batches, to be settled afterwards.
+    def reserve(self, records: np.ndarray, room: int) -> None:
+        """Let compiled code add to the batches, until `commit`.
 
-        records: two of messages.SAMPLE_BATCH; room: bytes that they may add when a batch should
-        be sent.
+        records: two of messages.SAMPLE_BATCH; room: bytes that it may add when a batch should be sent.
         """
-        for record, outlet, wanted in zip(records, self._outlets, self._open, strict=True):
-            record["open"] = wanted
-            if wanted:
-                outlet.batch.lend(record, room)
+        for record, publisher in zip(records, self._publishers, strict=True):
+            record["open"] = publisher.open
+            if publisher.open:
+                publisher.batch.reserve(record, room)
 
-    def settle(self, records: np.ndarray, sizes: Sequence[int], count: int) -> None:
-        """They are done, and have added `count` messages of each of the sizes."""
-        for record, outlet, wanted in zip(records, self._outlets, self._open, strict=True):
-            if wanted and outlet.batch.settle(record):
-                outlet.flush()
-        if self._shown:
+    def commit(self, records: np.ndarray, sizes: Sequence[int], count: int) -> None:
+        """Compiled code has added `count` messages of each of the sizes."""
+        for record, publisher in zip(records, self._publishers, strict=True):
+            if publisher.open and publisher.batch.commit(record):
+                publisher.flush()
+        if self._throttled.open:
             for size in sizes:
-                self._allowance.use(size, count)
-
-    @property
-    def _outlets(self) -> tuple[_Outlet, _Outlet]:
-        return self._all, self._some
-
-    @property
-    def _open(self) -> tuple[bool, bool]:
-        return self._read, self._shown
+                self._rate.use(size, count)
 
     def flush(self) -> None:
-        """Publish what has been kept."""
-        self._all.flush()
-        self._some.flush()
+        """Publish what waits."""
+        for publisher in self._publishers:
+            publisher.flush()
 
-    def look(self, now: float) -> None:
-        """Now and then: whether somebody listens, and whether a batch has waited for long."""
-        before = self._looked_at
-        self._read, self._looked_at = self._all.look(now), self._some.look(now)
-        self._shown = self._looked_at and (self._shown or not before)
-        self.wanted = self._read or self._shown
+    def poll(self, now: float) -> None:
+        """To be called now and then: looks for subscribers, and publishes what has waited for long."""
+        before = self._viewers
+        self._full.open, self._viewers = (publisher.poll(now) for publisher in self._publishers)
+        self._throttled.open = self._viewers and (self._throttled.open or not before)
+        self._update()
+
+    def _update(self) -> None:
+        self.wanted = self._full.open or self._throttled.open
 
 
 class Sender:
@@ -230,10 +225,7 @@ class Sender:
 
 
 class Receiver:
-    """Takes frames from one topic and hands them to a callback.
-
-    codec: decodes them.
-    """
+    """A subscription of one topic whose frames go to a callback."""
 
     def __init__(
         self,

@@ -27,7 +27,7 @@ from loop_interfaces.topics import Topic
 NAMELESS = "_NODE_NAME_UNKNOWN_"
 """What the graph says of an endpoint whose node it has not heard of yet."""
 WAITING_REQUESTS = 100
-"""Requests to a service that are kept until it answers."""
+"""Requests to a service that wait for an answer at the most."""
 DIAGNOSTICS = "/diagnostics"
 PERIOD = 1.0
 """Seconds between two reports, and between two inspections of the graph."""
@@ -65,7 +65,7 @@ class Introspection:
         """Publishers of a topic that were looked at."""
 
     def supervise(self, name: str, topic: Topic) -> None:
-        """Look at the publishers of a topic, by its full name: one other node should publish it."""
+        """Check the publishers of a topic, by its full name: one other node should publish it."""
         self._topics[name] = topic
 
     def refuse(self, topic: str, reason: object, count: int = 1) -> None:

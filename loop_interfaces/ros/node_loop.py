@@ -46,7 +46,7 @@ SERVING = 0.02
 
 @dataclass
 class _Watched:
-    """A pair that is watched: how its messages are decoded, and who is called with them."""
+    """A pair whose samples are read: how its messages are decoded, and who is called with them."""
 
     samples: SampleSubscription
     callbacks: dict[int, tuple[Callable[[bytes], Frame], Callable[[Frame], None]]] = field(
@@ -63,7 +63,7 @@ class _Fast(NamedTuple):
 
 
 class NodeLoop(EventLoop):
-    """Runs one node that answers messages until it is told to stop."""
+    """Runs one node that answers messages until `stop`."""
 
     def __init__(self, node: Node) -> None:
         super().__init__(node)
@@ -200,8 +200,8 @@ class NodeLoop(EventLoop):
                     return "suspended"
                 self._serve(now)
                 if self._batcher is not None:
-                    self._batcher.look(now)
-                changed = [watched.samples.look() for watched in self._watched.values()]
+                    self._batcher.poll(now)
+                changed = [watched.samples.poll() for watched in self._watched.values()]
                 if any(changed):
                     handles, take_from = self._sources(fast)
                 housekeeping(now)

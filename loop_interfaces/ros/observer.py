@@ -60,7 +60,7 @@ class EventLoop:
 
 
 class Observer(EventLoop):
-    """Runs one observing node until it is told to stop."""
+    """Runs one observing node until `stop`."""
 
     def __init__(self, node: Node) -> None:
         super().__init__(node)

@@ -76,9 +76,9 @@ class SampleSubscription:
     """The states and actions of one pair, as serialised messages with the time of their arrival.
 
     clock: also the times that go with the states of a batch; single_clock: also those on /clock
-    where nothing is bundled (once is enough for several pairs); throttled: of some episodes only, as
+    where there are no batches (once is enough for several pairs); throttled: of some episodes only, as
     many as people can see, where the plant offers that. `handles` are the subscriptions to wait for;
-    they may change with `look`.
+    they may change with `poll`.
     """
 
     def __init__(
@@ -100,10 +100,10 @@ class SampleSubscription:
         self._state_topic = node.resolve_topic_name(scoped(namespace, STATE.name))
         self.handles: list[Any] = [self._batches.subscription.handle]
 
-    def look(self) -> bool:
-        """Look at the graph, and read single samples if they are not bundled; whether that changed."""
-        bundled = self._node.count_publishers(self._batches.subscription.topic_name) > 0
-        wanted = not bundled and self._node.count_publishers(self._state_topic) > 0
+    def poll(self) -> bool:
+        """Inspect the graph, and read single samples if there are no batches; whether that changed."""
+        batched = self._node.count_publishers(self._batches.subscription.topic_name) > 0
+        wanted = not batched and self._node.count_publishers(self._state_topic) > 0
         if wanted == bool(self._singles):
             return False
         if wanted:
@@ -130,8 +130,8 @@ class SampleSubscription:
             offset = self._offset.update(sent, info["source_timestamp"], info["received_timestamp"])
             for sample in samples:
                 yield sample.kind, sample.stamp + offset, sample.raw
-                if self._clock and (told := clock_message(sample.time)) is not None:
-                    yield CLOCK_KIND, sample.stamp + offset, told
+                if self._clock and (clock := clock_message(sample.time)) is not None:
+                    yield CLOCK_KIND, sample.stamp + offset, clock
         for kind, intake in self._singles.items():
             for raw, info in intake.take(until):
                 yield kind, info["received_timestamp"], raw

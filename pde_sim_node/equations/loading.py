@@ -7,14 +7,12 @@ is not enough: either the code was installed under that name, as an entry point 
 
 import hashlib
 import importlib
-import importlib.machinery
-import importlib.util
 import os
 import sys
 from collections.abc import Mapping
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from types import CodeType, ModuleType
+from types import ModuleType
 from typing import Any
 
 from pde_sim_node.equations.base import Equation
@@ -131,35 +129,22 @@ def load_module(dotted: str) -> ModuleType:
         raise ValueError(f"the equation module {dotted!r} cannot be imported: {error}") from error
 
 
-class _FreshSource(importlib.machinery.SourceFileLoader):
-    """Compiles the source each time: compiled code kept beside it is told apart by time and size
-    only, and an edit within the same second can leave both.
-    """
-
-    def get_code(self, fullname: str) -> CodeType | None:
-        return self.source_to_code(self.get_data(self.path), self.path)
-
-
 def load_file(path: Path) -> ModuleType:
     """Execute a file as a module, once for each content: an edited file is a new module."""
     if not path.is_file():
         raise ValueError(f"the equation file {str(path)!r} does not exist")
-    path = path.resolve()
+    path, source = path.resolve(), path.read_bytes()
     # Numba keys its cache by the module's name: a name made of path and content is the same in the
     # next process, and another one after an edit.
-    digest = hashlib.sha256(str(path).encode() + b"\0" + path.read_bytes()).hexdigest()[:16]
-    module_name = f"equation_{path.stem}_{digest}"
-    if module_name in sys.modules:
-        return sys.modules[module_name]
-    loader = _FreshSource(module_name, str(path))
-    spec = importlib.util.spec_from_file_location(module_name, path, loader=loader)
-    if spec is None or spec.loader is None:
-        raise ValueError(f"the equation file {str(path)!r} cannot be read as Python")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[module_name] = module
+    digest = hashlib.sha256(str(path).encode() + b"\0" + source).hexdigest()[:16]
+    module = ModuleType(f"equation_{path.stem}_{digest}")
+    if module.__name__ in sys.modules:
+        return sys.modules[module.__name__]
+    module.__file__ = str(path)
+    sys.modules[module.__name__] = module
     try:
-        spec.loader.exec_module(module)
+        exec(compile(source, path, "exec"), vars(module))
     except Exception as error:
-        del sys.modules[module_name]
+        del sys.modules[module.__name__]
         raise ValueError(f"the equation file {str(path)!r} cannot be executed: {error}") from error
     return module

@@ -1,4 +1,4 @@
-"""What a compiled step is told: its settings, and how constants and scratch lie in memory."""
+"""The input of a compiled step: its settings, and the layout of constants and scratch in memory."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

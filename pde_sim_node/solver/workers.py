@@ -118,8 +118,8 @@ class ParallelStep:
         plan = self.plans.ctypes.data + thread * self.plans.itemsize
         take(self._contexts, plan)
 
-    def lend(self) -> tuple[int, int] | None:
-        """Let compiled code make the steps until `take_back`.
+    def begin_compiled(self) -> tuple[int, int] | None:
+        """Let compiled code make the steps until `end_compiled`.
 
         Returns
         -------
@@ -134,8 +134,8 @@ class ParallelStep:
             self._pool.call(self._help, self._slices - 1)
         return step_code(), self._contexts.ctypes.data
 
-    def take_back(self) -> int:
-        """Compiled code is done with its steps; the step k of the states now."""
+    def end_compiled(self) -> int:
+        """Python makes the steps again; the step k of the states now."""
         if self._context["polling"]:
             self._context["polling"] = 0
             self._pool.dismiss()
