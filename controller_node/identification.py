@@ -20,10 +20,19 @@ from loop_interfaces.model_rows import ModelRows
 class DesignSettings:
     """How to identify and what to design for.
 
-    identification: "regression" of order n_s = reduced_order (0: as `order.study_orders` suggests), or
-    "dmdc" of order dmdc_order (0: reduced_order) and rank p = dmdc_rank (0: n_s + n_a); the weights of
-    the stage cost. The gains are designed without the limit (action_limit, 0: none); only the actions
-    keep it.
+    Attributes
+    ----------
+    n_a : int
+        Actuators.
+    reduced_order : int
+        n_s of the identification "regression"; 0: as `order.study_orders` suggests.
+    state_weight, action_weight : float
+        Of the stage cost.
+    action_limit : float
+        Magnitude at which actions saturate; 0: none. The gains are designed without it.
+    identification : {"regression", "dmdc"}
+    dmdc_rank, dmdc_order : int
+        p and n_s of "dmdc"; 0: n_s + n_a, and reduced_order.
     """
 
     n_a: int
@@ -44,10 +53,23 @@ class DesignSettings:
 def identify(
     trajectories: Sequence[tuple[ArrayLike, ArrayLike]], *, method: str, n_s: int, p: int = 0
 ) -> ReducedModel:
-    """The reduced model from trajectories (states (N+1, n_z), actions (N, n_a)).
+    """The reduced model of one plant.
 
-    method: "regression" or "dmdc"; n_s: its order, 0: the suggested one (`study_orders`); p: rank of
-    dmdc, 0: n_s + n_a. Raises ValueError when the data allow no such model, or there is no such method.
+    Parameters
+    ----------
+    trajectories : sequence of (states (N + 1, n_z), actions (N, n_a))
+        a_k is held from z_k to z_{k+1}.
+    method : {"regression", "dmdc"}
+        Least squares in reduced coordinates, or truncated DMDc.
+    n_s : int
+        Its order; 0: the suggested one (`order.study_orders`).
+    p : int
+        Rank of "dmdc"; 0: n_s + n_a.
+
+    Raises
+    ------
+    ValueError
+        The data allow no such model, or there is no such method.
     """
     n_s = n_s or study_orders(trajectories).suggested
     if method == "regression":
@@ -65,8 +87,19 @@ def design(
 ) -> ModelRows:
     """Reduce and design: a model from the trajectories, then the LQ-tracking gains.
 
-    trajectories: states (N+1, n_z) and actions (N, n_a) of each; target (n_z,). Raises ValueError
-    with one sentence when the data allow no model of this order or the model no stabilising gains.
+    Parameters
+    ----------
+    trajectories : sequence of (states (N + 1, n_z), actions (N, n_a))
+        a_k is held from z_k to z_{k+1}.
+    target : (n_z,) array
+        z_r.
+    settings : DesignSettings
+        Method, order and weights.
+
+    Raises
+    ------
+    ValueError
+        The data allow no model of this order, or the model no stabilising gains.
     """
     own = settings.dmdc_order if settings.identification == "dmdc" else 0
     model = identify(

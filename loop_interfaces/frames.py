@@ -48,8 +48,14 @@ class Frame:
 
     (Not declared frozen, which makes a frame four times as slow to make, and every round makes four.)
 
-    run, episode, step, plant: whole numbers in [0, 2^53); time: simulated time (s);
-    values: float64, one axis per label of its topic.
+    Attributes
+    ----------
+    run, episode, step, plant : int
+        In [0, 2^53).
+    time : float
+        Simulated time in s, or a signature.
+    values : array
+        float64, one axis for each label of its topic.
     """
 
     run: int
@@ -79,7 +85,18 @@ class _Layout:
 class ArrayCodec:
     """Encodes and decodes the arrays of one topic.
 
-    labels: the names of the axes, in order (`layout.dim[i].label`).
+    Parameters
+    ----------
+    labels : tuple of str
+        The names of the axes, in order (`layout.dim[i].label`).
+
+    Examples
+    --------
+    >>> codec = ArrayCodec(("env", "actuator"))
+    >>> raw = codec.encode(Frame(run=7, episode=1, step=0, time=0.5, values=np.ones((1, 2))))
+    >>> frame = codec.decode(raw)
+    >>> frame.run, frame.time, frame.values
+    (7, 0.5, array([[1., 1.]]))
     """
 
     def __init__(self, labels: tuple[str, ...]) -> None:

@@ -27,7 +27,13 @@ Array = NDArray[np.float64]
 class ModelRows:
     """A reduced model, its warm-start gains and its target.
 
-    A (n_s, n_s), B (n_s, n_a), U (n_z, n_s), K_a (n_a, n_s), K_b (n_a, n_s), s_r (n_s,).
+    Attributes
+    ----------
+    A : (n_s, n_s) array
+    B : (n_s, n_a) array
+    U : (n_z, n_s) array
+    K_a, K_b : (n_a, n_s) arrays
+    s_r : (n_s,) array
     """
 
     A: Array
@@ -49,7 +55,20 @@ def pack(model: ModelRows) -> Array:
 
 
 def unpack(rows: Array, n_a: int) -> ModelRows:
-    """The model in `rows`; raises ValueError when the row count leaves no room for U."""
+    """The model in `rows`.
+
+    Raises
+    ------
+    ValueError
+        The number of rows leaves no room for U.
+
+    Examples
+    --------
+    >>> gains = np.ones((1, 2))
+    >>> model = ModelRows(np.eye(2), np.ones((2, 1)), np.eye(4)[:, :2], gains, gains, np.ones(2))
+    >>> pack(model).shape, unpack(pack(model), n_a=1).U.shape
+    ((10, 2), (4, 2))
+    """
     n_s = rows.shape[1]
     n_z = rows.shape[0] - n_s - 3 * n_a - 1
     if n_s < 1 or n_z < n_s:

@@ -19,8 +19,14 @@ from loop_interfaces.frames import Frame, FrameError
 class Topic:
     """One topic of arrays.
 
-    name: relative topic name; labels: names of the axes; latched: transient local, so that a node
-    which starts late or again receives the last one.
+    Attributes
+    ----------
+    name : str
+        Relative topic name.
+    labels : tuple of str
+        Names of the axes.
+    latched : bool
+        Transient local: a node that starts late or again receives the last message.
     """
 
     name: str

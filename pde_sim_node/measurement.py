@@ -80,7 +80,16 @@ def standard_normal(
 ) -> NDArray[np.float64]:
     """Independent numbers from N(0, 1): a pure function of the arguments.
 
-    noise_seed, step : not negative; field_seed : at least -1.
+    Parameters
+    ----------
+    noise_seed, step : int
+        Not negative.
+    field_seed : int
+        At least -1.
+    kind : Noise
+        What they are for.
+    size : int
+        How many.
     """
     key = np.array([noise_seed, field_seed + 1], dtype=np.uint64)
     # The draws of one call count in the low words: no two calls ever share a counter.

@@ -20,14 +20,19 @@ UNKNOWN_PLANT = -1
 class Batch:
     """Rollouts wanted together; any split into episodes gives the same results.
 
-    rows (R, 4), with noise (R, 5): the columns of `episode/start`; policies (R, n_a, 2 n_s), or
-    None for an exploratory batch, whose result is a model a row instead of a cost.
+    Attributes
+    ----------
+    rows : (R, 4) array, or (R, 5) with noise
+        The columns of `episode/start`.
+    policies : (R, n_a, 2 n_s) array, or None
+        None for an exploratory batch, whose result is a model for each row.
+    trajectories : bool
+        Whether the result must have the trajectories.
     """
 
     rows: Array
     policies: Array | None
     trajectories: bool = False
-    """Whether the result must carry the trajectories."""
 
     @property
     def exploratory(self) -> bool:
@@ -38,8 +43,16 @@ class Batch:
 class BatchResult:
     """Results of a batch.
 
-    costs (R, 3): mean, total, ended of each row; models (R, rows, n_s) after exploration;
-    plant: fingerprint of the plant; where the batch asked for trajectories: these, and the target.
+    Attributes
+    ----------
+    costs : (R, 3) array
+        As CostColumn says.
+    models : (R, rows, n_s) array, or None
+        After an exploration.
+    plant : int
+        Fingerprint of the plant.
+    trajectories, target
+        Where the batch asked for trajectories; target : (n_z,) array.
     """
 
     costs: Array

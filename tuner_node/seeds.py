@@ -48,11 +48,25 @@ NOISE = {
 def rollout_noise(
     purpose: Purpose, seeds: Sequence[int], owners: Sequence[int], counts: Sequence[int]
 ) -> list[int]:
-    """A seed for every row.
+    """The seed of the noise of every row of a batch.
 
-    seeds: of the trainings; owners: the training of every row; counts: a number for every training
-    that is never the same again for this purpose: its attempts, or how many batches its optimiser has
-    had.
+    Parameters
+    ----------
+    purpose : Purpose
+        One of NOISE.
+    seeds : sequence of int
+        Of the trainings.
+    owners : sequence of int
+        Index of the training of every row.
+    counts : sequence of int
+        For every training a number that is never the same again for this purpose: its attempts, or how
+        many batches its optimiser has had.
+
+    Examples
+    --------
+    >>> first, second, other = rollout_noise(Purpose.ADAPT_NOISE, [3, 4], [0, 0, 1], [0, 0])
+    >>> first == derive(3, Purpose.ADAPT_NOISE, 0) != second == derive(3, Purpose.ADAPT_NOISE, 1)
+    True
     """
     rows_of: Counter[int] = Counter()
     noise = []

@@ -8,6 +8,7 @@ that of the node's protocol, to the bit.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from types import ModuleType
@@ -21,7 +22,6 @@ from loop_interfaces.fast_path import messages
 from loop_interfaces.fast_path.channel import RclChannel
 from loop_interfaces.fast_path.messages import (
     EXPECTED,
-    ExpectedMessage,
     OwnMessage,
     expected_header,
 )
@@ -106,7 +106,6 @@ class FastPath(ABC):
         self.handle = handler()
         self.channel = RclChannel(self.handle, self.plans.ctypes.data)
         self._incoming, self._outgoing = incoming, ArrayCodec(outgoing.labels)
-        self._expected = ExpectedMessage(self.plan["expected"])
         self.answer = OwnMessage(self._outgoing, Frame(0, 0, 0, 0.0, np.zeros((0, 0))))
         self._prepared = False
 
@@ -134,8 +133,13 @@ class FastPath(ABC):
             False if nothing is expected, as the peer that was decoded last sends other messages.
         """
         prefix = self._incoming.prefix_of(shape)
-        if prefix is None or not self._expected.set(prefix, like, shape):
+        if prefix is None:
             return False
+        self._prefix = np.frombuffer(prefix, np.uint8)  # kept alive: the record has its address
+        expected = self.plan["expected"]
+        expected["prefix"], expected["start"] = self._prefix.ctypes.data, len(prefix)
+        expected["values"] = math.prod(shape)
+        expected["run"], expected["episode"], expected["plant"] = like.run, like.episode, like.plant
         if self.answer.shape != answer:
             self.answer = OwnMessage(self._outgoing, Frame(0, 0, 0, 0.0, np.zeros(answer)))
         self.answer.address_to(like)

@@ -114,27 +114,6 @@ def full(batch: Any) -> bool:
     return bool(batch.open and batch.end >= batch.limit)
 
 
-class ExpectedMessage:
-    """Fills in the record that `expected_header` compares with, an entry of EXPECTED."""
-
-    def __init__(self, record: np.void) -> None:
-        self._record = record
-        self._prefix = np.zeros(0, np.uint8)
-
-    def set(self, prefix: bytes, like: Frame, shape: tuple[int, ...]) -> bool:
-        """Expect messages with a prefix, the ids of `like` and values of a shape; False if the prefix
-        is none that `expected_header` can compare.
-        """
-        if len(prefix) < 8:
-            return False
-        self._prefix = np.frombuffer(prefix, np.uint8)
-        record = self._record
-        record["prefix"], record["start"] = self._prefix.ctypes.data, len(prefix)
-        record["values"] = math.prod(shape)
-        record["run"], record["episode"], record["plant"] = like.run, like.episode, like.plant
-        return True
-
-
 class OwnMessage:
     """A message in memory of its own, to be filled in by compiled code and sent again and again.
 

@@ -32,7 +32,7 @@ MIN_SLICES = 6
 MAX_SLICES_ALONE = 7
 """Steps of at most this many slices run on the calling thread alone, so that they are compiled code
 alone: to call workers takes the interpreter."""
-NAP = 50e-6
+POLL_PERIOD = 50e-6
 """Seconds to sleep while a thread that is waited for has lost its core to another process."""
 
 
@@ -110,7 +110,7 @@ class ParallelStep:
         self._pool.call(self._help, self._slices - 1)
         self._help(0)
         while not done(self._contexts):
-            time.sleep(NAP)
+            time.sleep(POLL_PERIOD)
         self._pool.dismiss()
         self._context["step"] += 1
 
