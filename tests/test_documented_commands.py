@@ -11,7 +11,8 @@ import pytest
 
 from benchmarks.__main__ import parser
 
-DOCS = Path(__file__).resolve().parent.parent / "docs"
+TESTS = Path(__file__).resolve().parent
+DOCS = TESTS.parent / "docs"
 COMMAND = re.compile(r"python -m benchmarks ([^`\n#]+)")
 BLANKS = {"PROBLEM": "burgers", "NAME": "two_point", "N": "4", "DIR": "limits"}
 
@@ -32,3 +33,31 @@ def test_a_table_of_costs_names_its_command(name):
     assert measured
     for text in measured:
         assert COMMAND.search(text) or "pdeloop train" in text, text.partition("\n")[0]
+
+
+NAMED = re.compile(r"`(?:tests/)?((?:topics/)?test_\w+\.py)`|`([a-z_0-9]{12,})`")
+"""A file of tests, or the distinctive part of a test's name."""
+
+
+def has_test(name: str, part: str) -> bool:
+    """Whether a file of tests, or of those over topics, has a test with this in its name."""
+    files = [path for path in (TESTS / name, TESTS / "topics" / name) if path.exists()]
+    return any(re.search(rf"def test_\w*{part}", file.read_text()) for file in files)
+
+
+def test_every_fault_that_is_survived_names_a_test_of_it():
+    rows = re.findall(r"^\|.*\|(.*)\|$", (DOCS / "reliability.md").read_text(), re.MULTILINE)[2:]
+    for row in rows:
+        file, parts = "topics/test_faults.py", 0
+        for name, part in NAMED.findall(row):
+            file, parts = name or file, parts + bool(part)
+            assert has_test(file, part), (file, part)
+        assert parts, row
+
+
+def test_every_test_that_the_page_on_security_names_exists():
+    text = (DOCS / "security.md").read_text()
+    files = re.findall(r"`tests/([\w/]+\.py)`", text)
+    named = re.findall(r"`(\w{12,})`\s+in\s+`tests/([\w/]+\.py)`", text)
+    assert len(files) > 10 and len(named) >= 5
+    assert all(has_test(file, part) for part, file in [*named, *(("", file) for file in files)])
