@@ -26,8 +26,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy  # which loads scipy.linalg when it is first used: a two-point training never does
 from numpy.typing import NDArray
+from scipy import linalg
 
 __all__ = ["ConvolutionModel", "fit_convolutions"]
 
@@ -161,7 +161,7 @@ def fit_convolutions(
             # (unknowns, to, wavenumbers)
             solution: NDArray[Any] = np.stack(
                 [
-                    scipy.linalg.solve(matrix, moment, assume_a="her", check_finite=False)
+                    linalg.solve(matrix, moment, assume_a="her", check_finite=False)
                     for matrix, moment in zip(matrices, moments[:, kept], strict=True)
                 ],
                 axis=2,

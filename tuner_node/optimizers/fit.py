@@ -24,8 +24,8 @@ from dataclasses import dataclass
 from itertools import combinations_with_replacement, permutations
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
+from scipy import linalg
 
 __all__ = ["LocalModel", "extended_basis", "fit"]
 
@@ -101,7 +101,7 @@ def extended_basis(U: Array, states: Sequence[Array], modes: int) -> Array:
     for z in states:
         covariance += z.T @ z
     outside = np.eye(n_z) - U @ U.T
-    values, vectors = scipy.linalg.eigh(outside @ covariance @ outside)
+    values, vectors = linalg.eigh(outside @ covariance @ outside)
     floor = (
         n_z * np.finfo(np.float64).eps * max(float(values[-1]), float(np.trace(covariance)) / n_z)
     )
@@ -109,7 +109,7 @@ def extended_basis(U: Array, states: Sequence[Array], modes: int) -> Array:
     if count <= 0:
         return U.copy()
     # Orthogonal to U already; the QR factor removes what rounding left.
-    basis, triangle = scipy.linalg.qr(np.hstack([U, vectors[:, ::-1][:, :count]]), mode="economic")
+    basis, triangle = linalg.qr(np.hstack([U, vectors[:, ::-1][:, :count]]), mode="economic")
     signed: Array = basis * np.where(np.diag(triangle) < 0.0, -1.0, 1.0)
     signed[:, :n_s] = U
     return signed
@@ -165,8 +165,8 @@ def fit(
             penalty[1 + r : affine] = _ACTION_RIDGE
             matrix = gram[:size, :size].copy()
             matrix[np.diag_indices(size)] += penalty
-            factor = scipy.linalg.cho_factor(matrix, overwrite_a=True, check_finite=False)
-            solution = scipy.linalg.cho_solve(factor, moment[:size], check_finite=False).T
+            factor = linalg.cho_factor(matrix, overwrite_a=True, check_finite=False)
+            solution = linalg.cho_solve(factor, moment[:size], check_finite=False).T
             models.append(
                 LocalModel(
                     centre=centre,

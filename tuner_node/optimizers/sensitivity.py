@@ -28,8 +28,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
+from scipy import linalg
 
 from tuner_node.optimizers.fit import LocalModel
 
@@ -235,7 +235,7 @@ def damped_step(
         if not (np.isfinite(g).all() and np.isfinite(matrix).all()):
             return nothing
         try:
-            d = -scipy.linalg.cho_solve(scipy.linalg.cho_factor(matrix), g)
-        except scipy.linalg.LinAlgError:
+            d = -linalg.cho_solve(linalg.cho_factor(matrix), g)
+        except linalg.LinAlgError:
             return nothing
         return d.reshape(n_a, n_f), float(-(g @ d + 0.5 * d @ H @ d))

@@ -22,7 +22,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
+from scipy import linalg
 
 from tuner_node.optimizers.base import Array
 from tuner_node.optimizers.convolution import ConvolutionModel
@@ -163,9 +163,7 @@ def improve(
         matrix[np.diag_indices(len(matrix))] += 1e-9 * np.trace(curvature) / len(matrix)
         if not (np.isfinite(matrix).all() and np.isfinite(gradient).all()):
             break
-        step = scipy.linalg.cho_solve(
-            scipy.linalg.cho_factor(matrix), -(gradient + pull.reshape(-1))
-        )
+        step = linalg.cho_solve(linalg.cho_factor(matrix), -(gradient + pull.reshape(-1)))
         candidate = theta + step.reshape(shape)
         simulation = loop.simulate(model, candidate, fields)
         lower = objective(simulation, candidate)
