@@ -229,6 +229,7 @@ def without_domain(loop: Processes) -> Iterator[None]:
     folder = loop.folder / DOMAINS_FOLDER.name
     folder.mkdir()
     loop.environment["TMPDIR"] = str(loop.folder)
+    loop.forks = False  # a program looks for its temporary folder when it starts
     with own_domain() as another, contextlib.ExitStack() as held:
         for domain in set(map(str, DOMAINS)) - {own, str(another)}:
             fcntl.flock(held.enter_context((folder / domain).open("w")), fcntl.LOCK_EX)
