@@ -18,9 +18,9 @@ setup: .venv/ready
 run: setup
 	$(BIN)/pdeloop train burgers
 
-# Two workers; each test over topics has a ROS domain of its own.
+# Four workers for two cores: tests over topics wait a part of their time. Each has a ROS domain of its own.
 test: setup packages
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+	$(BIN)/python -m pytest -n 4 --dist worksteal
 
 # Debian's packages that tests need: a real browser for the report's page, faketime to make a clock
 # jump, iproute2 for hosts made of network namespaces, zsh and fish for their

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from pdeloop.training_run import resolve
 from tests.colcon_workspace import Workspace, build
 from tests.loop_harness import Processes, processes
 from tests.made_once import made_once
@@ -15,6 +16,13 @@ from tests.small import RECORDED, REPRODUCED, SMALL
 
 # Hundreds of processes import the same modules; each would compile them again.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """What nearly all tests use is compiled by one of several workers, not by each of them."""
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        made_once(tmp_path_factory, "compiled", lambda folder: len(resolve(str(SMALL), {})))
 
 
 @pytest.fixture(autouse=True)

@@ -21,6 +21,16 @@ RECORDED = {"iterations": "6", "seeds": "2"}
 """What the small recorded run is asked for."""
 
 
+def paced(folder: Path, factor: float) -> Path:
+    """A file of the small problem in real time: its nodes wait most of the time.
+
+    factor: simulated seconds per second. An episode lasts 1.5 s.
+    """
+    path = folder / f"paced-{factor:g}.yaml"
+    path.write_text(f"{SMALL.read_text()}    real_time_factor: {factor}\n")
+    return path
+
+
 def parameters(**options: Any) -> dict[str, Any]:
     """The resolved parameters of a training of the small problem; any of them can be replaced."""
     tuner = {k: v for k, v in options.items() if k in _OWN}

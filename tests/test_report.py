@@ -16,6 +16,7 @@ from loop_interfaces.controllers import CONTROLLERS
 from pdeloop.report.data import gather
 from tests.browser import browser
 from tests.loop_harness import processes
+from tests.made_once import made_once
 from tests.small import SMALL
 
 LIMIT = 300.0
@@ -33,10 +34,16 @@ FIGURES = (
 @pytest.fixture(scope="module", params=["run", "reproduction"])
 def folder(request, tmp_path_factory) -> Path:
     """A small finished run with its limits, or a small reproduction without them."""
-    base = tmp_path_factory.mktemp(request.param)
-    out, report = base / "out", ()
+    given = request.getfixturevalue("reproduction")[0] if request.param == "reproduction" else None
+    name = f"report-{request.param}"
+    return made_once(tmp_path_factory, name, lambda base: reported(base, given))
+
+
+def reported(base: Path, reproduced: Path | None) -> Path:
+    """The folder of a run that is made here, or of a reproduction, with its report."""
+    out, report = reproduced or base / "out", ()
     with processes(base) as running:
-        if request.param == "run":
+        if not reproduced:
             options = ("--in-process", "--rollouts", "33", "--optimizer", "gauss_newton")
             words = ("train", str(SMALL), "--seeds", "2", *options, "--out", str(out))
             running.wait(running.pdeloop(*words), LIMIT)
@@ -46,8 +53,6 @@ def folder(request, tmp_path_factory) -> Path:
                 running.start("-m", "benchmarks", *limits, *words, name="benchmarks"), LIMIT
             )
             report = ("--limits", str(base / "limits"))
-        else:
-            out, _ = request.getfixturevalue("reproduction")
         running.wait(running.pdeloop("report", str(out), *report), LIMIT)
     return out
 

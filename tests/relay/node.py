@@ -23,7 +23,7 @@ from loop_interfaces.ros.node_main import node_main
 from loop_interfaces.ros.observer import Observer
 from loop_interfaces.ros.parameters import declare
 from loop_interfaces.spec import Spec
-from loop_interfaces.topics import ACTION, STATE
+from loop_interfaces.topics import ACTION, STATE, Topic
 
 PARAMETERS = (
     Spec("loss", 0.0, 0.0, 0.99).means("probability that a message is lost"),
@@ -82,14 +82,19 @@ class RelayNode:
 
     def join(self, node: Node, loop: Observer) -> None:
         self._node, self._loop = node, loop
+        self._publishers: dict[Topic, Publisher] = {}
         for topic, direction in self._directions.items():
             sent, qos = f"{topic.name}_sent", reader_qos(topic, 100)
             publisher = node.create_publisher(Float64MultiArray, topic.name, writer_qos(topic))
 
-            send = partial(self._send, direction, publisher)
             take = partial(self._take, direction, publisher)
             node.create_subscription(Float64MultiArray, sent, take, qos, raw=True)
-            loop.every(TICK, send)
+            self._publishers[topic] = publisher
+        loop.every(TICK, self._pass_on)
+
+    def _pass_on(self) -> None:
+        for topic, publisher in self._publishers.items():
+            self._send(self._directions[topic], publisher)
 
     def _take(self, direction: Direction, publisher: Publisher, message: bytes) -> None:
         direction.put(message)

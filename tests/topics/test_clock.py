@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 
 from tests.loop_harness import Processes, until
-from tests.small import SMALL
+from tests.operator_harness import operator
+from tests.topics.test_faults import start_pair, start_tuner
 from tests.topics.test_loop import (
     LIMIT,
     assert_same_training,
     in_process,
     iterations_done,
-    tuner_arguments,
 )
 
 pytestmark = pytest.mark.topics
@@ -65,23 +65,24 @@ def test_a_clock_that_jumps_forth_and_back_changes_nothing(loop: Processes, tmp_
     library = found[0]
     offset = tmp_path / "offset"
     offset.write_text("+0d\n")
-    loop.forks = False  # the library must be there when a program starts
-    loop.environment |= {
-        "LD_PRELOAD": str(library),
-        "FAKETIME_TIMESTAMP_FILE": str(offset),
-        "FAKETIME_CACHE_DURATION": "1",  # a jump is seen within so many seconds
-        "FAKETIME_DONT_FAKE_MONOTONIC": "1",
-        "FAKETIME_DONT_RESET": "1",
-    }
-    for name in ("pde_sim_node", "controller_node"):
-        loop.node(name, "--params-file", str(SMALL))
     out = tmp_path / "run"
-    tuner = loop.node(
-        "tuner_node", "--params-file", str(SMALL), *tuner_arguments(out, iterations=3000)
-    )
-    until(lambda: iterations_done(out) >= 20, LIMIT, "iteration 20")
-    for days in (2, -3, 0):
-        offset.write_text(f"{days:+d}d\n")
-        until(lambda d=days: abs(newest_time(out) - time.time() - 86400 * d) < 3600, LIMIT, "jump")
-    loop.wait(tuner, LIMIT)
-    assert_same_training(out, in_process(iterations=3000))
+    with operator(loop) as desk:
+        loop.forks = False  # the library must be there when a program starts
+        loop.environment |= {
+            "LD_PRELOAD": str(library),
+            "FAKETIME_TIMESTAMP_FILE": str(offset),
+            "FAKETIME_CACHE_DURATION": "1",  # a jump is seen within so many seconds
+            "FAKETIME_DONT_FAKE_MONOTONIC": "1",
+            "FAKETIME_DONT_RESET": "1",
+        }
+        # An episode lasts 0.15 s until all jumps were seen, then as short as it can.
+        start_pair(loop, real_time_factor=10.0)
+        tuner = start_tuner(loop, out, iterations=600)
+        until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
+        for days in (2, -3, 0):
+            offset.write_text(f"{days:+d}d\n")
+            wanted = 86400 * days
+            until(lambda d=wanted: abs(newest_time(out) - time.time() - d) < 3600, LIMIT, "jump")
+        assert desk.ask(set=["/pde_sim_node", "real_time_factor", 0.0])[0]
+        loop.wait(tuner, LIMIT)
+    assert_same_training(out, in_process(iterations=600))

@@ -115,10 +115,10 @@ def test_a_node_that_keeps_dying_is_given_up(loop, tmp_path):
 
 
 def test_a_second_tuner_is_refused_and_the_first_one_unharmed(loop, tmp_path):
-    start_pair(loop)
+    start_pair(loop, real_time_factor=100.0)
     out = tmp_path / "run"
     with operator(loop) as desk:
-        first = start_tuner(loop, out, iterations=1000)
+        first = start_tuner(loop, out, iterations=150)
         until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
         desk.call("/tuner_node/pause")  # so that it outlasts the other one's refusal
         second = start_tuner(loop, tmp_path / "second", seed=9)
@@ -126,19 +126,19 @@ def test_a_second_tuner_is_refused_and_the_first_one_unharmed(loop, tmp_path):
         desk.call("/tuner_node/resume")
     assert "another tuner publishes /episode/start" in text.strip().splitlines()[-1]
     loop.wait(first, LIMIT)
-    assert_same_training(out, in_process(iterations=1000))
+    assert_same_training(out, in_process(iterations=150))
     assert iterations_done(tmp_path / "second") == 0
 
 
 def test_a_second_plant_with_other_parameters_never_mixes_in(loop, tmp_path):
     start_pair(loop)
     out = tmp_path / "run"
-    tuner = start_tuner(loop, out, iterations=800)
+    tuner = start_tuner(loop, out, iterations=400)
     until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
     with held_training(loop, "/pde_sim_node"):
         loop.node("pde_sim_node", *PARAMETERS, "-p", "physical.viscosity:=0.02")
     text = loop.wait(tuner, LIMIT)
-    assert_same_training(out, in_process(iterations=800))
+    assert_same_training(out, in_process(iterations=400))
     assert "plant with other parameters" in text
 
 
@@ -156,12 +156,12 @@ def test_of_two_plants_there_from_the_start_the_one_that_was_asked_for_is_traine
 def test_a_second_plant_with_the_same_parameters_is_harmless(loop, tmp_path):
     start_pair(loop)
     out = tmp_path / "run"
-    tuner = start_tuner(loop, out, iterations=500)
+    tuner = start_tuner(loop, out, iterations=400)
     until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
     with held_training(loop, "/pde_sim_node"):
         loop.node("pde_sim_node", *PARAMETERS)
     loop.wait(tuner, LIMIT)
-    assert_same_training(out, in_process(iterations=500))
+    assert_same_training(out, in_process(iterations=400))
 
 
 def test_a_new_run_is_not_disturbed_by_what_an_earlier_one_left_latched(loop, tmp_path):
@@ -186,17 +186,17 @@ def fill(disk: Path) -> None:
 
 
 def test_a_full_disk_is_reported_and_the_training_goes_on(loop, tmp_path):
-    start_pair(loop)
+    start_pair(loop, real_time_factor=50.0)  # 30 ms an episode: it lasts longer than the full disk
     with small_disk(tmp_path / "disk", megabytes=8) as disk:
         out = disk / "run"
-        tuner = start_tuner(loop, out, iterations=1200)
+        tuner = start_tuner(loop, out, iterations=300)
         until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
         fill(disk)
         until(lambda: "cannot write the checkpoint" in loop.output(tuner), LIMIT, "warning")
         (disk / "filler").unlink()
         loop.wait(tuner, LIMIT)
         kept = shutil.copytree(out, tmp_path / "kept")
-    assert_same_training(kept, in_process(iterations=1200))
+    assert_same_training(kept, in_process(iterations=300))
 
 
 def test_a_full_disk_at_the_end_is_an_error_and_the_run_continues_later(loop, tmp_path):
@@ -274,7 +274,7 @@ print(sent, flush=True)
 def test_a_strange_publisher_is_reported_by_name_and_changes_nothing(loop, tmp_path):
     running = start_pair(loop)
     out = tmp_path / "run"
-    tuner = start_tuner(loop, out, iterations=600)
+    tuner = start_tuner(loop, out, iterations=400)
     until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
     with held_training(loop, "/stranger"):
         stranger = loop.start("-c", STRANGER, name="stranger")
@@ -284,7 +284,7 @@ def test_a_strange_publisher_is_reported_by_name_and_changes_nothing(loop, tmp_p
                 lambda node=node: "/stranger" in loop.output(node), LIMIT, "report of the stranger"
             )
     loop.wait(tuner, LIMIT)
-    assert_same_training(out, in_process(iterations=600))
+    assert_same_training(out, in_process(iterations=400))
     assert "2 nodes publish /action: /controller_node, /stranger" in loop.output(running["plant"])
     told = json.loads((out / "result.json").read_text())["several_publishers"]
     assert told == {"/action": ["/controller_node", "/stranger"]}

@@ -38,7 +38,7 @@ VALUES = {
 
 
 def test_every_node_reports_once_a_second_what_an_operator_asks(loop: Processes, tmp_path):
-    running = start_pair(loop)
+    running = start_pair(loop, real_time_factor=10.0)  # 200 steps a second
     loop.node("recorder_node", "-p", f"bag:={tmp_path / 'bag'}")
     out = tmp_path / "run"
     with operator(loop) as desk:
@@ -55,7 +55,7 @@ def test_every_node_reports_once_a_second_what_an_operator_asks(loop: Processes,
             assert set(values) == names | {"refused messages", "uptime"}, node
             # Never more often than once a second; how much less is the machine's business.
             assert count - before[node] <= seconds + 2, node
-            assert level == 0, (node, message)
+            assert level == 0 or "states too late for real time" in message, (node, message)
         plant, tuner = desk.values("pde_sim_node"), desk.values("tuner_node")
         assert plant["run"] == tuner["run"] == desk.values("controller_node")["run"]
         assert float(plant["steps/s"]) > 10
@@ -68,8 +68,9 @@ def test_every_node_reports_once_a_second_what_an_operator_asks(loop: Processes,
         assert int(desk.values("recorder_node")["messages"]) > 100
 
         running["controller"].send_signal(signal.SIGKILL)
-        until(lambda: desk.status("pde_sim_node")[1] == 1, LIMIT, "warning of the plant")
-        assert "is the controller running?" in desk.status("pde_sim_node")[2]
+        silent = "is the controller running?"
+        until(lambda: silent in desk.status("pde_sim_node")[2], LIMIT, "warning of the plant")
+        assert desk.status("pde_sim_node")[1] == 1
         until(lambda: desk.status("tuner_node")[1] == 1, LIMIT, "warning of the tuner")
         assert desk.status("tuner_node")[2] == "waiting for controller"
         before = desk.status("controller_node")[0]

@@ -25,9 +25,9 @@ def explorations(run: Path) -> list[int]:
 
 
 def recorded(loop: Processes, run: Path, problem: str, optimizer: str, *more: int) -> None:
-    """Record a training with the small budget of these tests, and verify its bag."""
-    seed, seeds = more
-    options = ("--optimizer", optimizer, "--rollouts", 26, "--seed", seed, "--seeds", seeds)
+    """Record a training with a small budget, and verify its bag."""
+    rollouts, seed, seeds = more
+    options = ("--optimizer", optimizer, "--rollouts", rollouts, "--seed", seed, "--seeds", seeds)
     text = pdeloop(loop, "train", problem, "--record", *options, "--out", run)
     assert f"recorded in {run / 'bag'}" in text
     text = pdeloop(loop, "bag", "verify", run)
@@ -45,7 +45,7 @@ def test_a_run_that_explored_again_is_verified_identified_from_evaluated_and_rep
     loop: Processes, tmp_path
 ):
     run, model = tmp_path / "run", tmp_path / "model.npz"
-    recorded(loop, run, "burgers", "two-point", 1, 2)
+    recorded(loop, run, "burgers", "two-point", 26, 1, 2)
     assert explorations(run) == [2, 1]
 
     text = pdeloop(loop, "identify", "--bag", run, "--environment", 0, "--out", model)
@@ -64,5 +64,5 @@ def test_a_run_that_explored_again_is_verified_identified_from_evaluated_and_rep
 
 @pytest.mark.parametrize(("problem", "seed"), [("allen-cahn", 0), ("kdv", 0)])
 def test_a_run_that_explored_once_is_verified(loop: Processes, tmp_path, problem, seed):
-    recorded(loop, tmp_path / "run", problem, "gauss-newton", seed, 1)
+    recorded(loop, tmp_path / "run", problem, "gauss-newton", 14, seed, 1)
     assert explorations(tmp_path / "run") == [1]

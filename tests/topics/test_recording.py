@@ -26,7 +26,7 @@ from pdeloop.bags.verify import verify
 from pdeloop.identification import identify_bag
 from recorder_node.bag import BagWriter
 from tests.loop_harness import ROOT, Processes, until
-from tests.small import RECORDED, SMALL, same_bits
+from tests.small import RECORDED, SMALL, paced, same_bits
 from tests.small_disk import read_only_folder, small_disk
 from tests.topics.test_loop import (
     LIMIT,
@@ -42,11 +42,15 @@ LAYOUTS = ("foxglove.json", "plotjuggler.xml")
 EPISODES = ITERATIONS + 3  # exploration, check, the iterations, evaluation
 
 
-def trained(loop: Processes, folder: Path, *options: str, iterations: int = ITERATIONS) -> str:
-    run = loop.pdeloop(
-        "train", str(SMALL), "--iterations", str(iterations), "--out", str(folder), *options
-    )
-    return loop.wait(run, LIMIT)
+def trained(
+    loop: Processes,
+    folder: Path,
+    *options: str,
+    problem: Path = SMALL,
+    iterations: int = ITERATIONS,
+) -> str:
+    command = ("train", str(problem), "--iterations", str(iterations), "--out", str(folder))
+    return loop.wait(loop.pdeloop(*command, *options), LIMIT)
 
 
 def test_a_recorded_run_is_complete_and_everything_in_it_is_recomputed(loop, tmp_path):
@@ -82,7 +86,7 @@ def layout_topics() -> set[str]:
 
 
 def test_the_layouts_find_every_topic_that_they_name_in_a_bag_with_views(loop, tmp_path):
-    trained(loop, tmp_path / "run", "--record-views", iterations=400)
+    trained(loop, tmp_path / "run", "--record-views", problem=paced(tmp_path, 50.0), iterations=100)
     named = layout_topics()
     assert len(named) > 10 and "/view/spacetime" in named
     counts = Counter(message.topic for message in Bag(tmp_path / "run").messages())
@@ -240,13 +244,13 @@ class Hand:
 
 
 def test_a_killed_recorder_loses_a_second_at_most_and_the_training_goes_on(loop, tmp_path):
-    hand = Hand(loop, tmp_path / "bag", tmp_path / "run", "start", 800)
+    hand = Hand(loop, tmp_path / "bag", tmp_path / "run", "start", 250, pace=100.0)
     until(lambda: iterations_done(hand.out) >= 20, LIMIT, "iteration 20")
     time.sleep(2.0)  # so that a second less leaves one
     hand.recorder.send_signal(signal.SIGKILL)
     killed = time.time()
     loop.wait(hand.tuner, LIMIT)
-    assert_same_training(hand.out, in_process(iterations=800))
+    assert_same_training(hand.out, in_process(iterations=250))
     content = describe(hand.bag)
     assert not content["finished"]
     assert content["last"] / 1e9 > killed - 1.0

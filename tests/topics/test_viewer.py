@@ -11,7 +11,7 @@ import pytest
 from loop_interfaces.topics import VIEW_NUMBERS
 from tests.loop_harness import Processes, until
 from tests.operator_harness import operator
-from tests.small import SMALL
+from tests.small import paced
 from tests.test_layouts import named_topics
 from tests.topics.test_faults import PARAMETERS, start_pair, start_tuner
 from tests.topics.test_loop import LIMIT, assert_same_training, in_process, iterations_done
@@ -113,7 +113,7 @@ def test_the_views_are_those_of_the_loop_and_the_policy_is_the_same(loop: Proces
 def test_a_viewer_is_throttled_and_shows_another_environment_when_told_to(
     loop: Processes, tmp_path
 ):
-    start_pair(loop)
+    start_pair(loop, real_time_factor=20.0)  # 400 steps a second
     loop.node("viewer_node", *PARAMETERS, "-p", "view_rate:=5.0")
     with operator(loop) as desk:
         tuner = start_tuner(loop, tmp_path / "run", iterations=100_000)
@@ -148,8 +148,8 @@ rclpy.shutdown()
 def test_the_command_line_starts_a_viewer_and_goes_on_when_it_dies(loop: Processes, tmp_path):
     out = tmp_path / "run"
     options = ("--iterations", "100000", "--optimizer", "two_point", "--out", str(out))
-    run = loop.pdeloop("train", str(SMALL), *options, "--view", "--pairs", "2")
-
+    problem = str(paced(tmp_path, 20.0))
+    run = loop.pdeloop("train", problem, *options, "--view", "--pairs", "2")
     with operator(loop) as desk:
         until(lambda: desk.values("pair0/viewer_node").get("samples", "0") != "0", LIMIT, "samples")
         (pid,) = loop.pids("viewer_node")
