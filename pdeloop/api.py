@@ -77,9 +77,10 @@ class Problem:
         Raises
         ------
         ValueError
-            The plant diverged.
+            The plant diverged, or the seed is out of range.
         """
-        training = build_training({**self.values, "seed": seed, "seeds": 1, "model": ""})
+        own = {"seed": seed, "seeds": 1, "model": ""}
+        training = build_training(load_parameters(self.source, {**self.given, **own}))
         batch = training.next_batch()
         assert batch is not None
         episode = LocalPair(self.values).roll_out(batch)
@@ -163,8 +164,8 @@ def identify(
     >>> model.A.shape, model.B.shape, model.U.shape
     ((4, 4), (4, 6), (128, 4))
     """
-    if not trajectories:
-        raise ValueError("identify needs one trajectory or more, each a pair (states, actions)")
+    if not trajectories or any(not isinstance(t, tuple) or len(t) != 2 for t in trajectories):
+        raise ValueError("identify needs one trajectory or more, each a tuple (states, actions)")
     return identification.identify(trajectories, method=method, n_s=n_s, p=p)
 
 
@@ -235,7 +236,7 @@ def train(
 
 
 def load_run(folder: str | Path) -> FinishedRun:
-    """A finished run from its folder: costs, policies and models as arrays.
+    """A finished run from its folder: costs, policies, models and trajectories as arrays.
 
     Raises
     ------

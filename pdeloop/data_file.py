@@ -41,7 +41,7 @@ class Measurements:
     sample_time: float
 
 
-def read_measurements(path: Path) -> Measurements:
+def read_measurements(path: str | Path) -> Measurements:
     """The measurements in a file.
 
     .npz : `states` (N + 1, n_z), `actions` (N, n_a), `target` (n_z,), `sample_time`; with one axis
@@ -55,6 +55,7 @@ def read_measurements(path: Path) -> Measurements:
     FileError
         It cannot be read, is too large, or is not that; one sentence.
     """
+    path = Path(path)
     read = {".npz": _npz, ".csv": _csv}.get(path.suffix.lower())
     if read is None:
         raise FileError(f"{path} must be a .npz or a .csv file (docs/identification.md)")

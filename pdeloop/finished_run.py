@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,9 @@ from scipy.stats import bootstrap
 
 from loop_interfaces import model_rows
 from loop_interfaces.model_rows import ModelRows
-from pde_sim_node.plant import DIVERGED_COST
+from loop_interfaces.topics import COMPLETED
+from pde_sim_node.plant import DIVERGED_COST, EpisodeCosts
+from pdeloop.episode import EpisodeRecord
 from tuner_node.results import RunFolder
 from tuner_node.training import CONTROLLERS
 
@@ -24,14 +26,29 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """What a report or a table needs of a run.
+    """A finished training of S seeds.
 
-    values: resolved parameters, with the present defaults; result: result.json; policies, warm: the
-    adapted gains and LQT's, (S, n_a, 2 n_s); models: of each seed; costs: by controller, (S, fields);
-    rollouts: what those of each seed were for (tuner_node.budget), empty where an older version did
-    not count them.
+    Attributes
+    ----------
+    folder : Path
+        Where it is.
+    values : dict
+        Resolved parameters, with the present defaults.
+    result : dict
+        result.json.
+    policies, warm : (S, n_a, 2 n_s) array
+        The adapted gains [K_a, K_b], and LQT's.
+    models : list of ModelRows
+        The reduced model of each seed: A (n_s, n_s), B (n_s, n_a), U (n_z, n_s), gains, and
+        U^T z_r (n_s,).
+    costs : dict of (S, fields) array
+        Mean stage costs of the closing evaluation, by controller: none, lqt, adapted.
+    rollouts : list of dict
+        What those of each seed were for (tuner_node.budget), empty where an older version did not
+        count them.
     """
 
+    folder: Path
     values: dict[str, Any]
     result: dict[str, Any]
     policies: Array
@@ -52,12 +69,41 @@ class FinishedRun:
         counted = [seed["exploration"] + seed["check"] for seed in self.rollouts]
         return counted or [0] * len(self.policies)
 
+    def trajectories(self) -> Iterator[EpisodeRecord]:
+        """The complete episodes in the run's bag, in their order, each when it is asked for.
+
+        The states (T + 1, M, state_size) are those that were published; so are the `fields`, as a bag
+        has no others.
+
+        Raises
+        ------
+        ValueError
+            The run was not recorded, or its bag cannot be read.
+        """
+        from pdeloop.bags.mcap_messages import files
+        from pdeloop.bags.reader import bags_of
+
+        if not any(map(files, self.folder.glob("bag*"))):
+            raise ValueError(
+                f"{self.folder} holds no trajectories, as its run was not recorded; record one with: "
+                "pdeloop train --record, or compute an episode with pdeloop.rollout"
+            )
+        for bag in bags_of(self.folder):
+            for episode in bag.episodes():
+                if episode.cost is None or episode.missing:
+                    continue
+                states, actions = episode.trajectory()
+                mean, total, ended = episode.cost.values.T[:3]
+                lost = np.where(ended == COMPLETED, -1, ended).astype(np.int64)
+                yield EpisodeRecord(states, states, actions, EpisodeCosts(mean, total, lost))
+
 
 def load(folder: Path) -> FinishedRun:
     """The run in `folder`. RunFolderError if there is none, or it is not finished."""
     run = RunFolder(folder)
     values, arrays, result = run.values(), run.policies(), run.result()
     return FinishedRun(
+        folder,
         values,
         result,
         policies=arrays["policy"],
@@ -73,6 +119,7 @@ def merged(runs: Sequence[FinishedRun]) -> FinishedRun:
     first = runs[0]
     history = [row for run in runs for row in run.result["history"]]
     return FinishedRun(
+        first.folder.parent,
         {**first.values, "seeds": len(runs)},
         {**first.result, "history": history},
         policies=np.concatenate([run.policies for run in runs]),

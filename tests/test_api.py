@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -133,3 +134,39 @@ def test_figures_show_what_the_arrays_hold(run, small) -> None:
     assert np.array_equal(actions.lines[0].get_ydata()[:-1], np.arange(plant.horizon))
     with pytest.raises(ValueError, match="environment is 2; expected one of the 2"):
         pdeloop.plot_episode(plant, episode, environment=2)
+
+
+def test_the_trajectories_of_a_recorded_run_are_the_plants_own(tmp_path: Path) -> None:
+    small, out = pdeloop.problem(SMALL), tmp_path / "run"
+    run = pdeloop.train(small, out=out, **TWO_POINT)
+    with pytest.raises(
+        ValueError, match="was not recorded; record one with: pdeloop train --record"
+    ):
+        next(run.trajectories())
+    shutil.copytree(Path(__file__).parent / "data" / "bag_0_1", out / "bag")
+    first, *others = pdeloop.load_run(out).trajectories()
+    plant, lengths = small.plant(), set()
+    for episode in (first, *others):
+        again = pdeloop.rollout(plant, lambda k, z, a=episode.actions: a[k], episode.states[0])
+        np.testing.assert_allclose(again.states, episode.states, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(again.costs.mean, episode.costs.mean, rtol=1e-9)
+        assert (episode.costs.diverged_step == -1).all()
+        lengths.add(len(episode.actions))
+    assert lengths == {small.values["horizon"]} and len(others) > 3
+    pdeloop.identify((first.states[:, 0], first.actions[:, 0]), n_s=2)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        (
+            lambda small: pdeloop.identify(*small.explore(0), n_s=2),
+            "each a tuple .states, actions.",
+        ),
+        (lambda small: small.explore(-1), "'seed' is -1; expected a whole number"),
+        (lambda small: pdeloop.read_measurements("nothing.csv"), "nothing.csv"),
+    ],
+)
+def test_what_does_not_fit_is_one_sentence(small, wrong, sentence) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        wrong(small)
