@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from pdeloop.cli import main
-from pdeloop.study import Failure, Study, StudyError, rows, run
+from pdeloop.study import Failure, Study, StudyError, executors, rows, run
 from pdeloop.study.executors import cluster, processes
 from pdeloop.study.table import text
 from pdeloop.study.training import FILES, train_one
@@ -212,7 +212,10 @@ def test_the_command_runs_continues_and_refuses_another_study(
     assert "holds another study" in capsys.readouterr().err
     assert main(["study", "--out", str(tmp_path / "none")]) == 1
     assert "no study in" in capsys.readouterr().err
-    assert main(["study", str(file), "--scheduler", "tcp://127.0.0.1:1"]) == 1
+    words = (str(file), "--out", str(tmp_path / "new"), "--scheduler")
+    assert main(["study", *words, "127.0.0.1"]) == 1
+    assert "expected one like tcp://localhost:8786" in capsys.readouterr().err
+    assert main(["study", *words, "tcp://127.0.0.1:1"]) == 1
     assert "no Dask scheduler answers" in capsys.readouterr().err
 
 
@@ -274,9 +277,14 @@ def dask_cluster(folder: Path, workers: int) -> Iterator[tuple[str, list[subproc
 
 
 @pytest.mark.filterwarnings("default")  # of the libraries below Dask, in threads of its own
-def test_a_dask_cluster_that_loses_a_worker_gives_the_same_bits(reference: Path, tmp_path: Path):
+def test_a_dask_cluster_that_loses_a_worker_gives_the_same_bits(
+    reference: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     out = tmp_path / "out"
     with dask_cluster(tmp_path, 2) as (address, workers):
+        with monkeypatch.context() as other, pytest.raises(StudyError, match=r"machine has 1\.0"):
+            other.setattr(executors.metadata, "version", lambda name: "1.0")
+            run(Study.of(CONTENT), tmp_path / "refused", partial(cluster, address))
 
         def kill_one(done: int, total: int, status: str) -> None:
             if done == 1 and workers[0].poll() is None:

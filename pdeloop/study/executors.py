@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import multiprocessing
 import signal
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
+from importlib import metadata
 from typing import Any
 
 from loop_interfaces.affinity import usable_cores
@@ -60,28 +63,67 @@ def cluster(address: str) -> Iterator[Executor]:
     Raises
     ------
     StudyError
-        No scheduler answers there, or it and its workers cannot be used with this version of Dask.
+        That is no address, no scheduler answers there, it or a worker has another version of Dask,
+        there are no workers, or one has no pdeloop.
     """
     from distributed import Client
+    from distributed.versions import VersionMismatchWarning
 
-    try:
+    own = metadata.version("distributed")
+    there = {"scheduler": _version_at(address)}  # first: a client fails in many ways at another one
+    _check_versions(there, own)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", VersionMismatchWarning)
         client = Client(address, timeout=CONNECTING, set_as_default=False)
-    except (OSError, ValueError) as error:
-        raise StudyError(
-            f"no Dask scheduler answers at {address} within {CONNECTING:.0f} s ({error}); "
-            "start one with: dask scheduler"
-        ) from error
     with client:
-        try:
-            client.get_versions(check=True)
-        except ValueError as error:
-            raise StudyError(
-                f"the scheduler at {address}, its workers and this machine have different versions "
-                "of Dask or of what it needs; install the same on all of them"
-            ) from error
-        if not client.scheduler_info()["workers"]:
+        found: Any = client.get_versions()
+        workers = found["workers"]
+        if not workers:
             raise StudyError(
                 f"the scheduler at {address} has no workers; start some with: "
                 f"dask worker {address} --nthreads 1"
             )
+        known = {f"worker at {at}": of["packages"]["distributed"] for at, of in workers.items()}
+        _check_versions(known, own)
+        # A worker would end at a task of a package that it has not.
+        installed = client.run(metadata.version, "pdeloop", on_error="return")
+        for at, version in installed.items():
+            if isinstance(version, Exception):
+                raise StudyError(
+                    f"the worker at {at} has no pdeloop; install pdeloop[cluster] there"
+                )
         yield client.get_executor(retries=RETRIES)
+
+
+def _check_versions(versions: Mapping[str, str], own: str) -> None:
+    for whose, version in versions.items():
+        if version != own:
+            raise StudyError(
+                f"the {whose} has Dask {version}, and this machine has {own}; install the same on all"
+            )
+
+
+def _version_at(address: str) -> str:
+    """The version of Dask of the scheduler there."""
+    from distributed.comm.addressing import get_address_host_port
+    from distributed.core import rpc
+    from distributed.security import Security
+
+    async def ask() -> str:
+        security = Security().get_connection_args("client")
+        async with rpc(address, connection_args=security, timeout=CONNECTING) as scheduler:
+            found = await asyncio.wait_for(scheduler.versions(), CONNECTING)
+            return str(found["packages"]["distributed"])
+
+    try:
+        get_address_host_port(address, strict=True)
+        return asyncio.run(ask())
+    except ValueError as error:
+        raise StudyError(
+            f"the scheduler's address is {address!r}; expected one like tcp://localhost:8786"
+        ) from error
+    except OSError as error:
+        raise StudyError(
+            f"no Dask scheduler answers at {address} within {CONNECTING:.0f} s; start one with: "
+            "dask scheduler"
+        ) from error
