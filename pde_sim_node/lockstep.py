@@ -16,14 +16,7 @@ state T advances nothing: it acknowledges the last state.
     AWAITING  an action that contradicts one taken  IDLE         cost(e), void
     any       end of the run, start of another run  IDLE         none; or as a start in IDLE
 
-Whoever is asked twice answers the same to the bit. So another answer to a state that was answered
-already comes from somebody else, or from a controller that cannot be relied on: which of the two was
-taken is chance, and the episode is void. When it comes after the end of one of the last episodes, the
-cost of that episode is sent again, void.
-
-Where the tuner asks for it (loop_interfaces.signature), the first action of a run says whether its
-controller signs. If so, only actions with the signature of their episode are taken; if not, a signed
-one comes from a second controller, and contradicts.
+Which actions contradict, and which are signed: pde_sim_node.taken_actions.
 
 A pause is independent of the phase: a paused plant takes the answer it waits for, and sends no further
 state. Nothing is sent again and nothing is given up meanwhile; `episode/paused` says so to those who
@@ -34,7 +27,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from enum import Enum, auto
 
 import numpy as np
@@ -42,16 +35,14 @@ import numpy as np
 from loop_interfaces.frames import MAX_VALUES, Frame, FrameError, digest
 from loop_interfaces.protocol import Counters, Publication
 from loop_interfaces.samples import MAX_TIME
-from loop_interfaces.signature import NOT_SIGNED, signature, signature_in
+from loop_interfaces.signature import signature
 from loop_interfaces.topics import (
     COMPLETED,
     COST,
     PAUSED,
-    START_COLUMNS,
     STATE,
     TARGET,
     VOID,
-    CostColumn,
     StartColumn,
     Topic,
     noise_seeds,
@@ -59,9 +50,8 @@ from loop_interfaces.topics import (
 )
 from pde_sim_node.plant import Plant
 from pde_sim_node.real_time import RealTimePacer
+from pde_sim_node.taken_actions import Episode, TakenActions
 
-REMEMBERED = 16
-"""Ended episodes whose actions can still be contradicted."""
 PAUSED_REPORT = 1.0
 """Seconds between two messages on `episode/paused` while the plant is paused."""
 
@@ -93,32 +83,6 @@ class Timing:
     max_repeats: int
     run_hold: float
     real_time_factor: float = 0.0
-
-
-@dataclass
-class Episode:
-    """What is remembered of an episode.
-
-    Attributes
-    ----------
-    rows : array
-        Of its start.
-    signature : float
-        What its actions carry if the controller signs.
-    taken : list of int
-        A digest of the action that was taken at each step.
-    cost : Frame or None
-        What it came to, once it has ended.
-    """
-
-    rows: np.ndarray
-    signature: float = NOT_SIGNED
-    taken: list[int] = field(default_factory=list)
-    cost: Frame | None = None
-
-    def contradicted_by(self, action: Frame) -> bool:
-        """Whether another action was taken at this step."""
-        return action.step < len(self.taken) and digest(action.values) != self.taken[action.step]
 
 
 class Lockstep:
@@ -165,13 +129,9 @@ class Lockstep:
         self._stepping = False
         """Whether a paused plant waits for the one action that it may still take."""
         self._phase = Phase.IDLE
-        self._current = Episode(np.empty((0, START_COLUMNS)))
-        self._ended: dict[int, Episode] = {}
-        """The last episodes of the run that came to a cost."""
+        self._actions = TakenActions()
         self._state = np.empty((0, 0))
         """What was measured last."""
-        self._signs: bool | None = None
-        """Whether the run's controller signs; None before its first action."""
         self.signed_run = signed_run
         """The last run whose controller signs."""
         self._repeats = 0
@@ -210,9 +170,7 @@ class Lockstep:
     @property
     def signature(self) -> float | None:
         """What the actions of the episode carry; None before the run's first one."""
-        if self._signs is None:
-            return None
-        return self._current.signature if self._signs else NOT_SIGNED
+        return self._actions.signature
 
     def overdue(self) -> bool:
         """Whether the awaited action has been missing for many repeats."""
@@ -306,7 +264,7 @@ class Lockstep:
             self.counters["starts of an earlier episode"] += 1
             return []
         if frame.episode == self.episode:
-            if not np.array_equal(rows, self._current.rows):
+            if not np.array_equal(rows, self._actions.episode.rows):
                 raise FrameError(
                     f"episode {frame.episode} was started with other seeds; "
                     "a new episode needs a new number"
@@ -316,7 +274,7 @@ class Lockstep:
         self._state = self.plant.reset(
             rows[:, StartColumn.SEED].astype(np.int64), noise_seeds(rows)
         )
-        self._current = Episode(rows.copy(), signature(frame.plant, self.plant.target))
+        self._actions.episode = Episode(rows.copy(), signature(frame.plant, self.plant.target))
         self.episode, self.contradiction, self._stepping = frame.episode, "", False
         self.time = max(self.time, frame.time) + self.plant.sample_time
         if self.pacer:
@@ -345,14 +303,14 @@ class Lockstep:
             raise FrameError(
                 f"expected an action of shape {expected} (env, actuator), got {frame.values.shape}"
             )
-        if not self._is_signed(frame):
-            if self._signs is False:
+        if not self._actions.is_signed(frame):
+            if self._actions.signs is False:
                 return [self._finish(now, void=True, contradiction=_TWO_CONTROLLERS)]
             raise FrameError(
                 f"the action for step {frame.step} was not computed from the policy, model and target "
                 "of its episode; expected one controller and one tuner"
             )
-        if self._current.contradicted_by(frame):
+        if self._actions.episode.contradicted_by(frame):
             return [self._finish(now, void=True, contradiction=_contradiction(frame))]
         if not awaited:
             return []
@@ -362,8 +320,8 @@ class Lockstep:
         if plant.step_index == plant.horizon:
             self._tuner_heard = now
             return [self._finish(now, void=False)]
-        self._signs = frame.time < 0.0
-        if self._signs:
+        self._actions.signs = frame.time < 0.0
+        if self._actions.signs:
             self.signed_run = self.run
         self._state = plant.step(frame.values)
         self.advance_counters([digest(frame.values)], now)
@@ -379,7 +337,7 @@ class Lockstep:
             self._phase is Phase.AWAITING
             and (frame.run, frame.episode, frame.step, frame.plant) == ids
             and frame.values.shape == (self.plant.batch, self.plant.n_a)
-            and self._is_signed(frame)
+            and self._actions.is_signed(frame)
         )
 
     def advance_counters(self, digests: Sequence[int], now: float) -> None:
@@ -388,7 +346,7 @@ class Lockstep:
         digests: of the values of the actions, see frames.digest.
         """
         self._tuner_heard = now
-        self._current.taken += digests
+        self._actions.episode.taken += digests
         self.steps_total += len(digests) * self.plant.batch
         self.rounds_total += len(digests)
         for _ in digests:  # rounded as often as they are counted one by one
@@ -426,43 +384,26 @@ class Lockstep:
     def _serve(self, run: int, now: float) -> None:
         """Belong to a run, 0: to none, and forget the one before."""
         self.run, self.episode = run, -1
-        self._ended, self._signs = {}, True if run == self.signed_run else None
+        self._actions = TakenActions(True if run == self.signed_run else None)
         self._end_episode(now)
 
     def _answer_again(self) -> list[Publication]:
         """The state that is not answered, or the cost."""
         if self._phase is Phase.AWAITING:
             return [self._stamped(STATE, self._state)]
-        cost = self._current.cost
+        cost = self._actions.episode.cost
         return [Publication(COST, cost)] if cost else []
-
-    def _is_signed(self, frame: Frame) -> bool:
-        """Whether an action of the episode is signed as the run's controller signs."""
-        found, expected = signature_in(frame.time), self.signature
-        return (
-            found in (NOT_SIGNED, self._current.signature)
-            if expected is None
-            else found == expected
-        )
 
     def _check_late_action(self, frame: Frame) -> list[Publication]:
         """Take the cost of an ended episode back, if this action contradicts one of its own."""
-        ended = self._ended.get(frame.episode)
-        if frame.run != self.run or frame.plant != self._fingerprint or ended is None:
+        if frame.run != self.run or frame.plant != self._fingerprint:
             return []
-        cost = ended.cost
-        if cost is None or frame.values.shape != (len(cost.values), self.plant.n_a):
+        cost = self._actions.retract(frame) if frame.values.shape[1] == self.plant.n_a else None
+        if cost is None:
             return []
-        if self._signs and signature_in(frame.time) != ended.signature:
-            return []  # it could never have been taken
-        if not ended.contradicted_by(frame):
-            return []
-        del self._ended[frame.episode]
         self.contradiction = _contradiction(frame)
         self.counters["costs taken back"] += 1
-        values = cost.values.copy()
-        values[:, CostColumn.ENDED] = VOID
-        return [Publication(COST, replace(cost, values=values))]
+        return [Publication(COST, cost)]
 
     def _send_unless_paused(self, now: float) -> list[Publication]:
         if not self.paused:
@@ -491,11 +432,7 @@ class Lockstep:
         values = np.column_stack([costs.mean, costs.total, ended.astype(np.float64)])
         self.last_cost = values
         publication = self._stamped(COST, values)
-        self._current.cost = publication.frame
-        if not void:
-            self._ended[self.episode] = self._current
-            if len(self._ended) > REMEMBERED:
-                del self._ended[min(self._ended)]
+        self._actions.end(publication.frame, void=void)
         self._end_episode(now)
         self.episodes_total += not void
         return publication

@@ -1,0 +1,96 @@
+"""Which actions a plant has taken in a run, and which further ones contradict them. Pure.
+
+Whoever is asked twice answers the same to the bit. So another answer to a state that was answered
+already comes from somebody else, or from a controller that cannot be relied on: which of the two was
+taken is chance, and the episode is void. When it comes after the end of one of the last episodes, the
+cost of that episode is sent again, void.
+
+Where the tuner asks for it (loop_interfaces.signature), the first action of a run says whether its
+controller signs. If so, only actions with the signature of their episode are taken; if not, a signed
+one comes from a second controller, and contradicts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from loop_interfaces.frames import Frame, digest
+from loop_interfaces.signature import NOT_SIGNED, signature_in
+from loop_interfaces.topics import START_COLUMNS, VOID, CostColumn
+
+REMEMBERED = 16
+"""Ended episodes whose actions can still be contradicted."""
+
+
+@dataclass
+class Episode:
+    """What is remembered of an episode.
+
+    Attributes
+    ----------
+    rows : array
+        Of its start.
+    signature : float
+        What its actions carry if the controller signs.
+    taken : list of int
+        A digest of the action that was taken at each step.
+    cost : Frame or None
+        What it came to, once it has ended.
+    """
+
+    rows: np.ndarray
+    signature: float = NOT_SIGNED
+    taken: list[int] = field(default_factory=list)
+    cost: Frame | None = None
+
+    def contradicted_by(self, action: Frame) -> bool:
+        """Whether another action was taken at this step."""
+        return action.step < len(self.taken) and digest(action.values) != self.taken[action.step]
+
+
+class TakenActions:
+    """The actions of a run's episodes. signs: whether its controller signs; None: not known yet."""
+
+    def __init__(self, signs: bool | None = None) -> None:
+        self.signs = signs
+        self.episode = Episode(np.empty((0, START_COLUMNS)))
+        """The present one, or the last."""
+        self._ended: dict[int, Episode] = {}
+
+    @property
+    def signature(self) -> float | None:
+        """What the actions of the episode carry; None before the run's first one."""
+        if self.signs is None:
+            return None
+        return self.episode.signature if self.signs else NOT_SIGNED
+
+    def is_signed(self, action: Frame) -> bool:
+        """Whether an action of the episode is signed as the run's controller signs."""
+        found, expected = signature_in(action.time), self.signature
+        return (
+            found in (NOT_SIGNED, self.episode.signature) if expected is None else found == expected
+        )
+
+    def end(self, cost: Frame, *, void: bool) -> None:
+        """The episode came to this cost."""
+        self.episode.cost = cost
+        if not void:
+            self._ended[cost.episode] = self.episode
+            if len(self._ended) > REMEMBERED:
+                del self._ended[min(self._ended)]
+
+    def retract(self, action: Frame) -> Frame | None:
+        """The cost of an ended episode, void, if this action contradicts one of its own; once."""
+        ended = self._ended.get(action.episode)
+        if ended is None or ended.cost is None or len(action.values) != len(ended.cost.values):
+            return None
+        if self.signs and signature_in(action.time) != ended.signature:
+            return None  # it could never have been taken
+        if not ended.contradicted_by(action):
+            return None
+        del self._ended[action.episode]
+        values = ended.cost.values.copy()
+        values[:, CostColumn.ENDED] = VOID
+        return replace(ended.cost, values=values)
