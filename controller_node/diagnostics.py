@@ -8,7 +8,7 @@ from loop_interfaces.diagnostics import ConditionTimer, Level, Rate, Status
 SILENT = 5.0
 """Seconds without a state, within an episode, after which what is known of the plant is old."""
 WAITING = 2.0
-"""Seconds that a state may wait for what its answer needs, before somebody should look."""
+"""Seconds that a state may wait for what its answer needs, before it is a warning."""
 
 
 class ControllerDiagnostics:

@@ -33,7 +33,7 @@ class Exploration:
     Attributes
     ----------
     outcomes : dict
-        What came out of it, by plant; for who fills it in.
+        What came out of it, by plant; filled in by the responder.
     nbytes : int
         Size of the states that are kept.
     """

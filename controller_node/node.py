@@ -55,7 +55,7 @@ class ControllerNode:
         responder = Responder(DesignSettings(**settings))
         self._responder = responder
         self._diagnostics = ControllerDiagnostics(responder)
-        load_compiled()  # before there is a publisher: who sees one expects answers
+        load_compiled()  # before there is a publisher: a peer that discovers one expects answers
         self._wire(node, loop)
         order = model_order(values) or "suggested by the data"
         node.get_logger().info(f"{values['problem']}: tracking law, order {order}")

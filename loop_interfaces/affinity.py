@@ -11,7 +11,7 @@ from collections.abc import Collection
 from pathlib import Path
 
 SAMPLE = 0.1
-"""Seconds over which `least_busy_cores` looks at how busy the cores are."""
+"""Seconds over which `least_busy_cores` measures how busy the cores are."""
 SOLVER = "solver"
 """Name, for the operating system, of the threads that help a plant with its step."""
 
@@ -48,7 +48,7 @@ def core_text(cores: Collection[int]) -> str:
 def join_solver(cores: Collection[int]) -> None:
     """Make this thread one of the solver's: it has their name, and their cores if it may.
 
-    The core that the process is kept on, if it is, it leaves to those who call for help.
+    If the process is pinned to one core, that one is left to the threads that share out the work.
     """
     with contextlib.suppress(OSError):  # other systems have no such file
         Path(f"/proc/self/task/{threading.get_native_id()}/comm").write_text(SOLVER)

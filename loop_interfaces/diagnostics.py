@@ -1,6 +1,6 @@
 """What a node reports on /diagnostics: a level, a sentence, named values. No ROS import.
 
-Levels as in diagnostic_msgs/DiagnosticStatus: OK; WARN, somebody should look (a message was
+Levels as in diagnostic_msgs/DiagnosticStatus: OK; WARN, needs attention (a message was
 refused, an operator holds the node, a neighbour is missing); ERROR, the node cannot do its work; STALE,
 what it shows is old, because nothing comes any more though something should.
 """

@@ -29,7 +29,7 @@ def keep_on_this_machine() -> None:
 
 
 def is_confined() -> bool:
-    """Whether this process was told to keep its traffic on this machine."""
+    """Whether this process is configured to keep its traffic on this machine."""
     return os.environ.get(PROFILE) == str(_loopback_profile())
 
 

@@ -123,7 +123,7 @@ MODEL = Topic("model", ("model", "row", "mode"), latched=True)
 MODEL_IDENTIFIED = Topic("model/identified", ("model", "row", "mode"), latched=True)
 TARGET = Topic("target", ("x",), latched=True)
 PAUSED = Topic("episode/paused", ("paused",), latched=True)
-"""One number: 1 while an operator holds the plant, 0 otherwise. Moves nothing: only for who waits."""
+"""One number: 1 while an operator has paused the plant, 0 otherwise. For information only."""
 
 # Volatile, depth 1: in lock-step only the newest sample has a meaning; the plant repeats what is lost.
 STATE = Topic("state", ("env", "x"), latched=False)
@@ -136,7 +136,7 @@ SAMPLES = "samples"
 """std_msgs/UInt8MultiArray: the plant's states and actions, many in one message (samples.py)."""
 
 SAMPLES_THROTTLED = "samples_throttled"
-"""The same of some episodes only: for people, who see a few pictures a second."""
+"""The same of some episodes only, for viewers."""
 
 RECORDER_STATUS = "recorder/status"
 """std_msgs/String, latched: a recorder that is matched with the whole loop names its bag here."""

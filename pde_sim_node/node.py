@@ -72,7 +72,7 @@ class PlantNode:
         if plant.compiled_in_seconds > 0.0:
             node.get_logger().info(f"compiled the kernel in {plant.compiled_in_seconds:.1f} s")
         if type(plant) is Plant:  # what instruments do to a step is not compiled
-            load_compiled()  # before there is a publisher: who sees one expects answers
+            load_compiled()  # before there is a publisher: a peer that discovers one expects answers
         domain = node.context.get_domain_id()
         self._run_record = RunRecord(node.get_fully_qualified_name(), domain)
         self._lockstep = Lockstep(
@@ -182,7 +182,7 @@ class PlantNode:
             self._send(self._lockstep.tick(self._loop.now()))
 
     def _report_pace(self) -> None:
-        """How well the wall clock was kept, at the end of a run or of this node."""
+        """Log how late the states were, at the end of a run or of this node."""
         pacer = self._lockstep.pacer
         if pacer and pacer.count:
             self._node.get_logger().info(f"real time: {pacer.summary()}")
@@ -199,7 +199,7 @@ class PlantNode:
                 )
             self._senders[send.topic].send(send.frame)
             if send.topic is COST:
-                self._batcher.flush()  # after it: most who wait for the cost need no samples
+                self._batcher.flush()  # after it: most readers of the cost need no samples
             if self._clock_wanted and send.topic is STATE:
                 self._publish_clock(send.frame.time)
 

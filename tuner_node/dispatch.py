@@ -160,7 +160,7 @@ class Dispatcher:
         known = self._answering(pair, frame, COST)
         if known is None or known.chunk is None or self._batch is None:
             return []
-        count = known.chunk.rows.stop - known.chunk.rows.start
+        count = known.chunk.size
         if frame.values.shape != (count, len(CostColumn)):
             raise FrameError(
                 f"expected costs of shape {(count, len(CostColumn))}, got {frame.values.shape}"
@@ -276,7 +276,7 @@ class Dispatcher:
         known = self._answering(pair, frame, MODEL_IDENTIFIED)
         if known is None or known.chunk is None or self._batch is None:
             return []
-        count = known.chunk.rows.stop - known.chunk.rows.start
+        count = known.chunk.size
         if len(frame.values) != count or not self._batch.exploratory:
             raise FrameError(f"expected {count} models, got {len(frame.values)}")
         if self.plant not in (UNKNOWN_PLANT, frame.plant):
@@ -401,7 +401,7 @@ class Dispatcher:
         """Whether this is a sample of the pair's episode; a FrameError if it has another shape."""
         if pair.chunk is None or (frame.run, frame.episode) != (self.run, pair.episode):
             return False
-        expected = (pair.chunk.rows.stop - pair.chunk.rows.start, width)
+        expected = (pair.chunk.size, width)
         if frame.values.shape != expected:
             raise FrameError(
                 f"expected a sample of shape {expected} for step {frame.step}, "

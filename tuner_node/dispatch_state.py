@@ -29,6 +29,12 @@ class Chunk:
     models: Array | None = None
     trajectories: list[Trajectory] | None = None
 
+    @property
+    def size(self) -> int:
+        """How many rows it has."""
+        size: int = self.rows.stop - self.rows.start
+        return size
+
     def done(self, batch: Batch) -> bool:
         """Whether all results are there that the batch asks for."""
         return (

@@ -25,7 +25,7 @@ class Session:
         self._phase = ""
         self.done = False
         self.established = False
-        """Whether a pair has served this session: then it is the newcomer who has to go."""
+        """Whether a pair has served this session: any other tuner then came later."""
         self.stopping = False
         """Whether an operator asked for the end after the rollouts under way."""
         self.stopped = False
@@ -50,7 +50,7 @@ class Session:
     def stop(self) -> list[PairPublication]:
         """End when the rollouts under way are over; at once in a pause, where none goes on.
 
-        What an unfinished batch of them has is dropped, and computed again by who continues,
+        What an unfinished batch of them has is dropped, and computed again when the run is continued,
         identically.
         """
         self.stopping = True

@@ -128,7 +128,8 @@ class SampleBatcher:
     """Publishes all samples on `samples`, and those of some episodes on `samples_throttled`; nothing is
     stored while there are no subscribers.
 
-    Make it before the publisher of the states: who knows of the states then knows of the samples.
+    Make it before the publisher of the states: a process that has discovered the states has
+    then discovered the samples.
     timed: whether the time of each state goes on /clock; wanted: whether `add` is to be called.
     """
 

@@ -25,7 +25,7 @@ from loop_interfaces.ros.endpoints import reader_qos
 from loop_interfaces.topics import Topic
 
 NAMELESS = "_NODE_NAME_UNKNOWN_"
-"""What the graph says of an endpoint whose node it has not heard of yet."""
+"""The graph's name for the node of an endpoint, before it has discovered the node."""
 WAITING_REQUESTS = 100
 """Requests to a service that wait for an answer at the most."""
 DIAGNOSTICS = "/diagnostics"
@@ -158,7 +158,7 @@ class Introspection:
             publisher.publish(message)
 
     def _look_at_publishers(self) -> None:
-        """Say who publishes what one other node should publish, or so that it does not arrive."""
+        """Warn of several publishers of one topic, and of one whose QoS is not compatible."""
         for topic, kind in self._topics.items():
             count = self._node.count_publishers(topic)
             if count < 2 and count == self._known.get(topic):

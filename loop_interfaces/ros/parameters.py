@@ -99,12 +99,11 @@ def descriptor(spec: Spec) -> ParameterDescriptor:
 class RemoteParameters:
     """Asks another node for its parameters, through the services that every ROS node has.
 
-    name: the node's full name; values: what it said, None before. Call `poll` from time to time. An
-    answer can be lost, if the other process has not heard yet of who reads it: it is asked again.
+    name: the node's full name; values: its answer, None before. Call `poll` from time to time. An
+    answer is lost if the other process has not discovered its reader yet: the request is repeated.
 
-    The answer also proves that the other process knows every endpoint this node had before: its
-    discovery hears of our endpoints in their order, and it cannot answer before it has heard of the
-    reader of the answer.
+    The answer also proves that the other process has discovered every endpoint this node had before:
+    it discovers our endpoints in their order, and the reader of the answer comes after them.
     """
 
     def __init__(self, node: Node, name: str) -> None:
