@@ -155,15 +155,3 @@ def test_a_model_that_is_known_to_be_too_far_off_is_not_simulated_further(
     assert len(simulated) == 1
     assert mismatch(closed, unstable, measured, 9.0) == 2.0
     assert len(simulated) == 1 + len(measured)
-
-
-def test_what_the_noise_of_the_measurement_adds_does_not_count() -> None:
-    model, closed = plant(), loop()
-    theta = np.zeros((N_A, 5))
-    states = closed.simulate(model, theta, episode(model, 11)[0][:1]).states[:, 0]
-    noise = 0.3
-    noisy = states + noise * np.random.default_rng(12).standard_normal(states.shape)
-    noisy[0] = states[0]
-    seen, corrected = (mismatch(closed, model, [(theta, noisy)], 9.0, s) for s in (0.0, noise))
-    # 960 squares of noise: a standard error of sqrt(2 / 960), 5 %, of what they add.
-    assert corrected < 0.2 * seen

@@ -8,7 +8,7 @@ method.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from tuner_node.optimizers.fit import LocalModel, extended_basis, fit
 from tuner_node.optimizers.selection import KAPPAS, LOCAL, RIDGES, Pair, choices, mismatches
 from tuner_node.optimizers.sensitivity import Path, damped_step
 from tuner_node.optimizers.simulation import FieldModel, Loop, improve, mismatch
-from tuner_node.optimizers.trajectories import Record
+from tuner_node.optimizers.trajectories import Record, denoised
 
 __all__ = ["Proposal", "Proposer"]
 
@@ -36,7 +36,9 @@ _DEGREES = (2, 3)
 _CONVOLUTION_RIDGES = (1e-7, 1e-6, 1e-5, 1e-4)
 _LEAST_WEIGHT = 0.05
 # A model of the whole field has to reproduce the last rollouts up to this share of their error energy.
+# With noise the local models are further from the plant, and so may these be.
 _REPRODUCED = 0.05
+_REPRODUCED_NOISY = 0.3
 _COMPARED = 8
 # Measured initial fields that a law is improved on, the newest, and how far from their mean further
 # ones are. Coordinates of the sensitivities of each component, at least.
@@ -129,13 +131,15 @@ class Proposer:
         self._horizon = context.horizon
         self._action_limit = context.action_limit
         self._noise = context.noise
-        self._before = [
+        self._reproduced = _REPRODUCED_NOISY if self._noise else _REPRODUCED
+        before = [
             Record(-1, np.zeros_like(policy), np.inf, states, actions),
             *(
                 Record(-1, m.policy, m.cost, m.trajectory.states, m.trajectory.actions)
                 for m in context.measured
             ),
         ]
+        self._before = [self._clean(record) for record in before]
         # U^T z_r, as a plain sum like the controller's.
         self._s_r: Array = np.sum(U * target[:, None], axis=0)
         self._s_r_square = float(np.sum(self._s_r * self._s_r))
@@ -179,6 +183,9 @@ class Proposer:
         accepted : bool
             Whether the last candidate was accepted.
         """
+        records = [self._clean(record) for record in records]
+        incumbents = [self._clean(record) for record in incumbents]
+        others = [other and self._clean(other) for other in others]
         data = [record for record in (*self._before, *records) if len(record.states) > 1]
         rejected = (
             [] if accepted else [(i, o) for i, o in zip(incumbents, others, strict=True) if o]
@@ -214,6 +221,12 @@ class Proposer:
             if fall >= least:
                 break
         return proposal
+
+    def _clean(self, record: Record) -> Record:
+        """The rollout without what of its noise can be told from the fields."""
+        if not self._noise:
+            return record
+        return replace(record, states=denoised(record.states, self._noise))
 
     def _simulated(
         self,
@@ -281,11 +294,11 @@ class Proposer:
         )
         for fitted in kinds if measured else ():
             judged: list[tuple[float, FieldModel | None]] = [
-                (mismatch(self._loop, model, measured, _REPRODUCED, self._noise), model)
+                (mismatch(self._loop, model, measured, self._reproduced), model)
                 for model in fitted()
             ]
             error, best = min(judged, key=lambda pair: pair[0], default=(np.inf, None))
-            if error <= _REPRODUCED:
+            if error <= self._reproduced:
                 return best, error
         return None, np.inf
 

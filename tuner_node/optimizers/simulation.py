@@ -99,13 +99,11 @@ def mismatch(
     model: FieldModel,
     measured: Sequence[tuple[Array, Array]],
     most: float,
-    noise: float = 0.0,
 ) -> float:
     """How far simulated rollouts are from the measured ones.
 
         E = mean over rollouts of min(2, sum_k |z_k^model - z_k|^2 / sum_k |z_k - z_r|^2)
 
-    where both sums are without what the noise adds to them in the mean, noise^2 for every number.
     measured: (theta, states (T, n_z)) of every rollout. Once E is known to be above `most`, the other
     rollouts are left out, and what is returned is a lower bound of E.
     """
@@ -113,8 +111,8 @@ def mismatch(
     for theta, states in measured:
         simulated = loop.simulate(model, theta, states[:1]).states[: len(states), 0]
         with np.errstate(over="ignore", invalid="ignore"):
-            error = max(float(np.sum((simulated - states) ** 2)) - noise**2 * states.size, 0.0)
-        size = max(float(np.sum((states - loop.target) ** 2)) - noise**2 * states.size, 1e-300)
+            error = float(np.sum((simulated - states) ** 2))
+        size = max(float(np.sum((states - loop.target) ** 2)), 1e-300)
         errors.append(min(_WORST, error / size) if np.isfinite(error) else _WORST)
         if sum(errors) > most * len(measured):
             return sum(errors) / len(measured)

@@ -6,11 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 
 from tuner_node.optimizers.base import Array, RolloutResult, State
 
-__all__ = ["Record", "Records"]
+__all__ = ["Record", "Records", "denoised"]
 
 
 GROWING = (
@@ -157,3 +158,31 @@ class Records:
         finite = np.isfinite(actions).all(axis=1)
         length = min(length, int(np.argmin(finite)) if not finite.all() else length)
         return states[:length], actions[: max(length - 1, 0)]
+
+
+def denoised(states: Array, noise: float) -> Array:
+    """A trajectory with the singular values that it would have without noise, nearest in the mean.
+
+    Measurement noise is white in space and time, while the fields of a trajectory have much in common:
+    few singular values are above 1 + sqrt(beta), in units of noise sqrt(n), which are those of the
+    noise alone; those that are shrink to sqrt((y^2 - beta - 1)^2 - 4 beta) / y.
+
+    Parameters
+    ----------
+    states : (T, n_z) array
+        n is the larger of T and n_z, beta the smaller over it.
+    noise : float
+        Standard deviation of the noise on every number.
+
+    References
+    ----------
+    Gavish, Donoho, "Optimal shrinkage of singular values", IEEE Trans. Inf. Theory 63, 2017.
+    """
+    if not states.size:
+        return states
+    left, values, right = scipy.linalg.svd(states, full_matrices=False)
+    beta, unit = min(states.shape) / max(states.shape), noise * np.sqrt(max(states.shape))
+    y = np.maximum(values / unit, 1.0 + np.sqrt(beta))
+    shrunk = unit * np.sqrt(np.maximum((y**2 - beta - 1.0) ** 2 - 4.0 * beta, 0.0)) / y
+    clean: Array = (left * shrunk) @ right
+    return clean
