@@ -141,7 +141,7 @@ class ProjectedLaw:
         self._scratch = np.zeros(4 * whole_lanes(self._n_s) + whole_lanes(gains.shape[1]))
         plan["scratch"] = self._scratch.ctypes.data
 
-    def actions(self, states: ArrayLike, out: Array | None = None) -> Array:
+    def actions(self, states: ArrayLike) -> Array:
         """The actions that answer the states.
 
         Parameters
@@ -149,8 +149,6 @@ class ProjectedLaw:
         states : (M, n_z) array
             The fields at t_k. An environment whose field is not finite gets an action that is not
             finite and does not disturb the others.
-        out : (M, n_a) C-contiguous float64 array, optional
-            Written and returned; without it every call allocates the result.
 
         Returns
         -------
@@ -166,15 +164,9 @@ class ProjectedLaw:
                 f"states must have shape ({shape[0]}, {self._n_z}), one field per policy, but the "
                 f"shape is {z.shape}."
             )
-        if out is None:
-            out = np.empty(shape)
-        elif out.shape != shape or out.dtype != np.float64 or not out.flags.c_contiguous:
-            raise ValueError(
-                f"out must be a C-contiguous float64 array of shape {shape}, but it is {out.dtype} "
-                f"of shape {out.shape}."
-            )
-        control(self._plan, z, out)
-        return out
+        actions: Array = np.empty(shape)
+        control(self._plan, z, actions)
+        return actions
 
 
 def excitation(seed: int, step: int, n_a: int, variance: float, action_limit: float = 0.0) -> Array:
