@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import importlib
 import os
 import sys
 import traceback
@@ -16,6 +17,11 @@ from pdeloop.interruption import Interruption
 
 DONE, FAILED, CRASHED, INTERRUPTED, NOBODY_READS = 0, 1, 70, 130, 141
 """Exit codes; 2, a command that is not understood, is argparse's."""
+COMMANDS = (
+    *("train", "evaluate", "identify", "bag", "monitor", "reproduce"),
+    *("study", "secure", "problems", "new", "check", "completion"),
+)
+"""The modules of `pdeloop.commands`, in the order of the help."""
 _EXTRAS = {
     "rosbags": "record",
     "mcap": "record",
@@ -89,22 +95,6 @@ def _crashed() -> int:
 
 def parser() -> argparse.ArgumentParser:
     """The parser of all commands."""
-    # Imported here, where `main` catches Ctrl-C: it takes most of a short command's time.
-    from pdeloop.commands import (
-        bag,
-        check,
-        completion,
-        evaluate,
-        identify,
-        monitor,
-        new,
-        problems,
-        reproduce,
-        secure,
-        study,
-        train,
-    )
-
     root = argparse.ArgumentParser(
         prog="pdeloop",
         description="Reduce, design and adapt controllers of PDEs over ROS 2 topics.",
@@ -112,21 +102,9 @@ def parser() -> argparse.ArgumentParser:
     )
     root.add_argument("--version", action="version", version=f"pdeloop {_version()}")
     commands = root.add_subparsers(required=True, metavar="COMMAND")
-    for module in (
-        train,
-        evaluate,
-        identify,
-        bag,
-        monitor,
-        reproduce,
-        study,
-        secure,
-        problems,
-        new,
-        check,
-        completion,
-    ):
-        module.add(commands)
+    for name in COMMANDS:
+        # Imported here, where `main` catches Ctrl-C: it takes most of a short command's time.
+        importlib.import_module(f"pdeloop.commands.{name}").add(commands)
     root.set_defaults(root=root)  # for what is made from the parser itself
     return root
 

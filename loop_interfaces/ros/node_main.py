@@ -24,7 +24,7 @@ CRASHED = 70
 """Exit code after a bug; 1 means that the node was asked for something it cannot do."""
 
 
-class ConfigurationError(Exception):
+class ConfigurationError(RuntimeError):
     """A node cannot start as it was asked to; the text is one sentence for the user."""
 
 

@@ -38,10 +38,6 @@ TICK = 0.005
 """Seconds between two looks at which messages are due."""
 
 
-class PlayerError(RuntimeError):
-    """The bag is not played; the text says why and what to do."""
-
-
 def timed(
     messages: Callable[[], Iterable[Message]], rate: float, again: bool = False
 ) -> Iterator[tuple[float, Message]]:
@@ -105,14 +101,14 @@ class PlayerNode:
             publisher = self._node.create_publisher(kind, channel.topic, _qos(channel))
             self._publishers[channel.topic] = publisher
         if not self._publishers:
-            raise PlayerError("the bag holds nothing that can be published here")
+            raise ConfigurationError("the bag holds nothing that can be published here")
 
     def _refuse_company(self) -> None:
         """A live loop must not be told what happened long ago."""
         everybodys = (DIAGNOSTICS.channel.topic, ROSOUT.channel.topic)
         for topic in {channel.topic for channel in self._channels}.difference(everybodys):
             for info in self._node.get_publishers_info_by_topic(topic):
-                raise PlayerError(
+                raise ConfigurationError(
                     f"{full_name(info)} publishes {topic} in this ROS "
                     "domain; a bag is not played beside a live loop, which would take its messages for "
                     "its own. Stop that loop (what was killed is seen for 3 s more), or play in "
@@ -139,13 +135,10 @@ def play(
     with own_domain() as domain, announced(domain, bag.path, network=network):
         os.environ["ROS_DOMAIN_ID"] = str(domain)
         tell(f"play {bag.path} (ROS_DOMAIN_ID={domain}{', on the network' * network})")
-        try:
-            arguments = ["--ros-args", "--disable-external-lib-logs"]
-            with ros_node(NAME, arguments, Observer) as (node, loop):
-                player = PlayerNode(node, loop, bag, rate, again)
-                reason: str = loop.run()
-        except ConfigurationError as error:
-            raise PlayerError(str(error)) from error
+        arguments = ["--ros-args", "--disable-external-lib-logs"]
+        with ros_node(NAME, arguments, Observer) as (node, loop):
+            player = PlayerNode(node, loop, bag, rate, again)
+            reason: str = loop.run()
     stopped = "" if reason == "end" else f", stopped by {reason}"
     tell(f"  {player.published} messages published{stopped}")
     return 0 if reason == "end" else 130

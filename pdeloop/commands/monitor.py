@@ -6,14 +6,9 @@ import argparse
 import os
 import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import Commands, command
-
-if TYPE_CHECKING:  # what the other commands do without
-    from pdeloop.monitor.finder import Finder
-    from viewer_node.web.page import Page
 
 PORT = 8420
 
@@ -82,20 +77,11 @@ def _monitor(options: argparse.Namespace) -> int:
         webbrowser.open(server.url)
     try:
         if folder is None or finder.find() is not None or replay(folder, finder, page):
-            _show_loops(options, finder, page)
+            from pdeloop.monitor.node import show_loops  # here, as it needs ROS
+
+            given = options.namespace
+            namespace = None if given is None else f"/{given.strip('/')}"
+            show_loops(page, finder, namespace=namespace, network=options.network)
     finally:
         server.stop()
     return 0
-
-
-def _show_loops(options: argparse.Namespace, finder: Finder, page: Page) -> None:
-    """Show loops that run; needs ROS."""
-    from pdeloop.monitor.node import ConfigurationError, show_loops
-
-    namespace = options.namespace
-    if namespace is not None:
-        namespace = "/" + namespace.strip("/")
-    try:
-        show_loops(page, finder, namespace=namespace, network=options.network)
-    except ConfigurationError as error:
-        raise RuntimeError(str(error)) from error

@@ -15,7 +15,7 @@ from std_msgs.msg import Float64MultiArray
 from loop_interfaces.frames import MAX_ID, ArrayCodec, Frame
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.ros.endpoints import Sender, reader_qos
-from loop_interfaces.ros.node_main import ConfigurationError, ros_node
+from loop_interfaces.ros.node_main import ros_node
 from loop_interfaces.topics import ARRAYS, Topic
 from pdeloop.conformance.checks import CHECKS
 from pdeloop.problem_check import Finding
@@ -71,16 +71,13 @@ def check_node(kind: str, *, n_a: int, patience: float, network: bool) -> Iterat
 
     Raises
     ------
-    ValueError
+    ConfigurationError
         There is no node to be made here.
     """
     if not network:
         keep_on_this_machine()
     check = CHECKS[kind]
-    try:
-        with ros_node("pdeloop_check", [], partial(RosWire, check.published)) as (_, wire):
-            run = 1 + secrets.randbelow(MAX_ID - 2)
-            yield from check(wire, n_a, patience=patience, run=run).all()
-            yield Finding("messages", not wire.refused, wire.refused or "all of them well formed")
-    except ConfigurationError as error:
-        raise ValueError(str(error)) from error
+    with ros_node("pdeloop_check", [], partial(RosWire, check.published)) as (_, wire):
+        run = 1 + secrets.randbelow(MAX_ID - 2)
+        yield from check(wire, n_a, patience=patience, run=run).all()
+        yield Finding("messages", not wire.refused, wire.refused or "all of them well formed")

@@ -20,7 +20,7 @@ from rclpy.node import Node
 
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.ros.introspection import NAMELESS, full_name
-from loop_interfaces.ros.node_main import ConfigurationError, ros_node
+from loop_interfaces.ros.node_main import ros_node
 from loop_interfaces.ros.observer import Observer
 from loop_interfaces.ros.parameters import RemoteParameters
 from pdeloop.display import ProgressFile
@@ -238,6 +238,3 @@ def show_loops(page: Page, finder: Finder, *, namespace: str | None, network: bo
             body = MonitorNode(node, loop, page, live, finder=finder, namespace=namespace)
             if body.run().startswith("SIG"):
                 return
-
-
-__all__ = ["ConfigurationError", "MonitorNode", "show_loops"]
