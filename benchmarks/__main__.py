@@ -208,6 +208,11 @@ def _add_baselines(programs: Commands) -> None:
     )
     add("--folder", type=Path, metavar="DIR", help="of the runs [runs/baselines-PROBLEM]")
     add("--processes", type=int, metavar="N", help="trainings at the same time [one a core]")
+    add(
+        "--any-environment",
+        action="store_true",
+        help="go on with results of other versions or another processor, as pdeloop study does",
+    )
     add("--figure", type=Path, metavar="FILE", help="draw the costs against the rollouts")
 
 

@@ -58,6 +58,7 @@ def run(
     tune: Sequence[str] = (),
     folder: Path | None = None,
     processes: int | None = None,
+    any_environment: bool = False,
     figure: Path | None = None,
 ) -> dict[str, Any]:
     """A row for each budget and method, the best first; the command line explains the parameters.
@@ -94,7 +95,9 @@ def run(
         own, tasks = with_methods(study, entries, budget)
         place = folder / str(budget)
         refuse_other_constants(place, tasks)
-        failures = carry_out(own, place, partial(pool, processes), tasks=tasks)
+        failures = carry_out(
+            own, place, partial(pool, processes), tasks=tasks, any_environment=any_environment
+        )
         for failure in failures:
             print(f"failed: {failure.training}: {failure.reason}", file=sys.stderr)
         for name in study.problems:
