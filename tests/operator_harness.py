@@ -83,17 +83,16 @@ class Operator:
 
 
 @contextlib.contextmanager
-def held_training(loop: Processes, newcomer: str) -> Iterator[None]:
+def held_training(desk: Operator, newcomer: str) -> Iterator[None]:
     """The training is paused until what the block starts, a node `newcomer`, is on the network.
 
     So what it does to the training does not depend on which of the two is faster.
     """
-    with operator(loop) as desk:
-        there = desk.ask(nodes=None).count(newcomer)
-        desk.call("/tuner_node/pause")
-        yield
-        until(lambda: desk.ask(nodes=None).count(newcomer) > there, LIMIT, newcomer)
-        desk.call("/tuner_node/resume")
+    there = desk.ask(nodes=None).count(newcomer)
+    desk.call("/tuner_node/pause")
+    yield
+    until(lambda: desk.ask(nodes=None).count(newcomer) > there, LIMIT, newcomer)
+    desk.call("/tuner_node/resume")
 
 
 @contextlib.contextmanager

@@ -133,10 +133,11 @@ def test_a_second_tuner_is_refused_and_the_first_one_unharmed(loop, tmp_path):
 def test_a_second_plant_with_other_parameters_never_mixes_in(loop, tmp_path):
     start_pair(loop)
     out = tmp_path / "run"
-    tuner = start_tuner(loop, out, iterations=400)
-    until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
-    with held_training(loop, "/pde_sim_node"):
-        loop.node("pde_sim_node", *PARAMETERS, "-p", "physical.viscosity:=0.02")
+    with operator(loop) as desk:
+        tuner = start_tuner(loop, out, iterations=400)
+        until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
+        with held_training(desk, "/pde_sim_node"):
+            loop.node("pde_sim_node", *PARAMETERS, "-p", "physical.viscosity:=0.02")
     text = loop.wait(tuner, LIMIT)
     assert_same_training(out, in_process(iterations=400))
     assert "plant with other parameters" in text
@@ -156,10 +157,11 @@ def test_of_two_plants_there_from_the_start_the_one_that_was_asked_for_is_traine
 def test_a_second_plant_with_the_same_parameters_is_harmless(loop, tmp_path):
     start_pair(loop)
     out = tmp_path / "run"
-    tuner = start_tuner(loop, out, iterations=400)
-    until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
-    with held_training(loop, "/pde_sim_node"):
-        loop.node("pde_sim_node", *PARAMETERS)
+    with operator(loop) as desk:
+        tuner = start_tuner(loop, out, iterations=400)
+        until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
+        with held_training(desk, "/pde_sim_node"):
+            loop.node("pde_sim_node", *PARAMETERS)
     loop.wait(tuner, LIMIT)
     assert_same_training(out, in_process(iterations=400))
 
@@ -274,15 +276,18 @@ print(sent, flush=True)
 def test_a_strange_publisher_is_reported_by_name_and_changes_nothing(loop, tmp_path):
     running = start_pair(loop)
     out = tmp_path / "run"
-    tuner = start_tuner(loop, out, iterations=400)
-    until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
-    with held_training(loop, "/stranger"):
-        stranger = loop.start("-c", STRANGER, name="stranger")
-        # Strangers are looked for from time to time, whether the training is paused or not.
-        for node in (running["plant"], tuner):
-            until(
-                lambda node=node: "/stranger" in loop.output(node), LIMIT, "report of the stranger"
-            )
+    with operator(loop) as desk:
+        tuner = start_tuner(loop, out, iterations=400)
+        until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
+        with held_training(desk, "/stranger"):
+            stranger = loop.start("-c", STRANGER, name="stranger")
+            # Strangers are looked for from time to time, whether the training is paused or not.
+            for node in (running["plant"], tuner):
+                until(
+                    lambda node=node: "/stranger" in loop.output(node),
+                    LIMIT,
+                    "report of the stranger",
+                )
     loop.wait(tuner, LIMIT)
     assert_same_training(out, in_process(iterations=400))
     assert "2 nodes publish /action: /controller_node, /stranger" in loop.output(running["plant"])
@@ -317,10 +322,11 @@ def test_a_second_controller_that_answers_otherwise_never_mixes_in(loop, tmp_pat
     """
     running = start_pair(loop, real_time_factor=10.0)
     out = tmp_path / "run"
-    tuner = start_tuner(loop, out, iterations=60)
-    until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
-    with held_training(loop, "/second_controller"):
-        second = loop.start("-c", SECOND_CONTROLLER, name="second")
+    with operator(loop) as desk:
+        tuner = start_tuner(loop, out, iterations=60)
+        until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
+        with held_training(desk, "/second_controller"):
+            second = loop.start("-c", SECOND_CONTROLLER, name="second")
     refused = "was not computed from the policy, model and target of its episode"
     until(lambda: refused in loop.output(running["plant"]), LIMIT, "refusal")
     loop.wait(tuner, LIMIT)
