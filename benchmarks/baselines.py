@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.stats import trim_mean
 
 from benchmarks.methods import LIBRARIES, METHODS, measure
 from loop_interfaces.files import read_json
@@ -182,7 +182,7 @@ def iqm(values: Array, axis: int = -1) -> Any:
     >>> float(iqm(np.array([0.0, 1.0, 3.0, 1e9])))
     2.0
     """
-    return trim_mean(values, 0.25, axis=axis)
+    return scipy.stats.trim_mean(values, 0.25, axis=axis)
 
 
 def table(folder: Path, budget: int) -> list[dict[str, Any]]:

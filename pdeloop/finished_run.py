@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy  # whose statistics, half a second of a core, load when they are used
 from numpy.typing import NDArray
-from scipy.stats import bootstrap
 
 from loop_interfaces import model_rows
 from loop_interfaces.model_rows import ModelRows
@@ -191,7 +191,7 @@ def interval(samples: tuple[Array, ...], statistic: Any) -> tuple[float, float] 
     """Percentile bootstrap of `statistic` over paired samples; None of fewer than two."""
     if len(samples[0]) < 2:
         return None
-    found = bootstrap(
+    found = scipy.stats.bootstrap(
         samples,
         statistic,
         paired=True,
