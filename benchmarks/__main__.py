@@ -151,6 +151,9 @@ def parser() -> argparse.ArgumentParser:
     environments.add_argument("--problem", metavar="PROBLEM", help="[burgers]")
     environments.add_argument("--num-envs", type=int, nargs="+", metavar="M", help="[1 4 16]")
     environments.add_argument("--turns", type=int, metavar="N", help="turns of each [3]")
+    environments.add_argument(
+        "--controlgym", metavar="PYTHON", help="interpreter with controlgym 1.0.0"
+    )
     participants = _add(
         programs,
         "participants",

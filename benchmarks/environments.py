@@ -1,30 +1,45 @@
 """`python -m benchmarks environments`: environment-steps a second of the Gymnasium environments.
 
 The batch of `VectorEnvironment` beside Gymnasium's own vector environments of as many single ones, in
-one process (sync) and in a process each (async), with the same random actions.
+one process (sync) and in a process each (async), and beside those of controlgym's environment of the
+same equation, grid, actuators and steps, under constant actions.
 """
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from statistics import median
 from typing import Any
 
 import gymnasium
 
+import pdeloop
+from benchmarks.kernel import KEEP_MEMORY
 from benchmarks.processes import machine, markdown
 from pdeloop.environments import environment_id
 
 MODES = {"vector_entry_point": "batch", "sync": "sync", "async": "async"}
+SECONDS = 0.5
+"""Of a measurement."""
 LIMIT = 1.0
 """Of the actions, so that no environment diverges."""
 
 
 def run(
-    problem: str = "burgers", num_envs: Sequence[int] = (1, 4, 16), turns: int = 3
+    problem: str = "burgers",
+    num_envs: Sequence[int] = (1, 4, 16),
+    turns: int = 3,
+    controlgym: str | None = None,
 ) -> dict[str, Any]:
-    """The rates for each number of environments; the modes take turns."""
+    """The rates for each number of environments; the modes take turns.
+
+    controlgym: an interpreter that can import controlgym 1.0.0; left out where not given.
+    """
     rows = []
     for count in num_envs:
         made = {
@@ -33,18 +48,20 @@ def run(
             )
             for mode in MODES
         }
-        rates: dict[str, list[float]] = {mode: [] for mode in MODES}
+        rates: dict[str, list[float]] = {name: [] for name in MODES.values()}
         try:
             for turn in range(-1, turns):  # the first one is to warm up
                 for mode, envs in made.items():
-                    rate = _rate(envs, 0.5)
+                    rate = _rate(envs, SECONDS)
                     if turn >= 0:
-                        rates[mode].append(rate)
+                        rates[MODES[mode]].append(rate)
+                if controlgym is not None and turn >= 0:
+                    for mode, rate in _rates_of_controlgym(controlgym, problem, count).items():
+                        rates.setdefault(f"controlgym {mode}", []).append(rate)
         finally:
             for envs in made.values():
                 envs.close()
-        found = {name: median(rates[mode]) for mode, name in MODES.items()}
-        rows.append({"num_envs": count, **found})
+        rows.append({"num_envs": count, **{name: median(own) for name, own in rates.items()}})
     return {"problem": problem, "machine": machine(), "rows": rows}
 
 
@@ -59,11 +76,42 @@ def _rate(envs: Any, seconds: float) -> float:
     return float(steps * envs.num_envs / passed)
 
 
+def _rates_of_controlgym(python: str, problem: str, count: int) -> dict[str, float]:
+    """By mode; CalledProcessError if the interpreter fails, its words on stderr."""
+    chosen = pdeloop.problem(problem)
+    values = chosen.values
+    parameters = {
+        "n_steps": 10**9,
+        "domain_length": chosen.plant().equation.length,
+        "integration_time": values["integration_time"],
+        # It counts steps by a floor division, which must not come out one short.
+        "sample_time": values["sample_time"] * (1 + 1e-12),
+        "n_state": values["n_z"],
+        "n_action": values["n_a"],
+        "control_sup_width": values["actuator_width"],
+        "sensor_noise_cov": 0.0,
+    }
+    program = Path(__file__).with_name("controlgym_rates.py")
+    name = {"kdv": "korteweg_de_vries"}.get(problem, problem.replace("-", "_"))
+    words = [python, str(program), name, json.dumps(parameters), str(count), str(SECONDS)]
+    done = subprocess.run(
+        words,
+        check=True,
+        stdout=subprocess.PIPE,
+        text=True,
+        timeout=600,
+        # It decomposes the noise's covariance each step; threads of several processes would collide.
+        env={**os.environ, **KEEP_MEMORY, "OPENBLAS_NUM_THREADS": "1"},
+    )
+    found: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+    return found
+
+
 def text(result: dict[str, Any]) -> str:
     """A table of the rates."""
-    head = ("environments", *(f"{name}, steps/s" for name in MODES.values()))
+    names = [name for name in result["rows"][0] if name != "num_envs"]
+    head = ("environments", *(f"{name}, steps/s" for name in names))
     rows = [
-        (str(row["num_envs"]), *(f"{row[name]:,.0f}" for name in MODES.values()))
-        for row in result["rows"]
+        (str(row["num_envs"]), *(f"{row[name]:,.0f}" for name in names)) for row in result["rows"]
     ]
     return f"{result['problem']}\n{markdown(head, rows)}"

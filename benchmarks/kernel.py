@@ -213,7 +213,7 @@ def measure(method: str, batches: Sequence[int]) -> list[Row]:
 
 def measure_with(python: str, method: str, batches: Sequence[int]) -> list[Row]:
     """`measure` by another interpreter; CalledProcessError if it fails, its words on stderr."""
-    root = Path(__file__).resolve().parent.parent.parent
+    root = Path(__file__).resolve().parent.parent
     command = [
         python,
         "-m",
