@@ -10,6 +10,7 @@ import sqlite3
 import struct
 import subprocess
 import sys
+from collections import Counter
 from functools import cache
 from pathlib import Path
 
@@ -17,6 +18,8 @@ import numpy as np
 import pytest
 import yaml
 import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from mcap.data_stream import RecordBuilder
 from mcap.reader import make_reader
 from mcap.records import Channel as McapChannel
@@ -459,6 +462,36 @@ def test_every_flipped_byte_is_noticed_or_harmless(tmp_path):
     path.write_bytes(content[:place] + b"\0" + content[place + 1 :])
     with pytest.raises(BagError, match=r"checksum|damaged"):
         list(Bag(path.parent).messages())
+
+
+@settings(derandomize=True, deadline=None, database=None, max_examples=150)
+@given(
+    places=st.lists(st.tuples(st.floats(0, 1), st.integers(1, 255)), max_size=3),
+    kept=st.floats(0, 1),
+)
+def test_a_damaged_bag_is_refused_in_a_sentence_or_gives_messages_that_were_recorded(
+    undamaged, places, kept
+):
+    path, whole, content = undamaged
+    damaged = bytearray(content)
+    for place, flipped in places:
+        damaged[int(place * (len(content) - 1))] ^= flipped
+    path.write_bytes(damaged[: int(len(content) * (kept if kept > 0.5 else 1))])
+    try:
+        found = Counter((m.when, m.data) for m in Bag(path.parent).messages())
+        list(Bag(path.parent).episodes())
+    except BagError as error:
+        assert "\n" not in str(error)
+    else:
+        assert found <= whole
+
+
+@pytest.fixture(scope="module")
+def undamaged(tmp_path_factory):
+    """A bag's file, its messages and its content."""
+    path = written(tmp_path_factory.mktemp("bag")) / "bag.mcap"
+    messages = Counter((m.when, m.data) for m in Bag(path.parent).messages())
+    return path, messages, path.read_bytes()
 
 
 OLD = Path(__file__).parent / "data" / "bag_0_1"
