@@ -220,6 +220,22 @@ def test_an_archive_is_refused_before_it_is_unpacked(tmp_path, monkeypatch):
         array_files.read_arrays(path)
 
 
+def test_a_checkpoint_of_any_size_is_read_but_none_that_unpacks_to_more_than_it_is(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(array_files, "MAX_ARRAY_BYTES", 100)  # of policies and models
+    path, found = tmp_path / "checkpoint", []
+    checkpoint.save(path, {"states": np.zeros(2**16)})
+    assert checkpoint.restore(path, found.append) == (True, [])
+    assert found[0]["states"].shape == (2**16,)
+    bomb = io.BytesIO()
+    np.savez_compressed(bomb, states=np.zeros(2**16))
+    digest = hashlib.sha256(bomb.getvalue()).hexdigest().encode()
+    path.write_bytes(checkpoint.MAGIC + digest + b"\n" + bomb.getvalue())
+    usable, (sentence,) = checkpoint.restore(path, found.append)
+    assert not usable and "bytes of arrays; expected at most" in sentence
+
+
 def test_a_pipe_in_place_of_a_file_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "policy.npz")
     with pytest.raises(FileError, match="no ordinary file"):
