@@ -103,9 +103,9 @@ def optimise_law(job: LawJob) -> dict[str, Any]:
         warm = np.column_stack([policy[:, :n_s], policy[:, n_s:] @ (U.T @ target)])
         fields = evaluation_seeds(TRAINING_SEED, job.fields)
         theta = np.zeros_like(warm) if job.from_zero else warm
-        while not (path := gradients.law(U, theta, fields)).whole:
+        while not (episode := gradients.law(U, theta, fields)).whole:
             theta = 0.5 * theta
-        rows = features(U, target, path.states).reshape(-1, n_s + 1)
+        rows = features(U, target, episode.states[:-1]).reshape(-1, n_s + 1)
         moments = rows.T @ rows / len(rows)
         moments += RIDGE * np.trace(moments) / (n_s + 1) * np.eye(n_s + 1)
         scale: Array = np.kron(
@@ -136,7 +136,7 @@ def optimise_law(job: LawJob) -> dict[str, Any]:
             seed: {
                 name: gradients.law(
                     U, law, evaluation_seeds(seed, job.evaluation_fields)
-                ).costs.tolist()
+                ).costs.mean.tolist()
                 for name, law in (("lqt", warm), ("optimum", best))
             }
             for seed in job.evaluations
@@ -167,8 +167,8 @@ def optimise_inputs(job: InputJob) -> dict[str, Any]:
         plant = gradients.plant
         inputs = np.zeros((plant.horizon, 1, plant.n_a))
         if job.U is not None and job.theta is not None:
-            path = gradients.law(job.U, job.theta, [job.field_seed])
-            inputs = path.actions if path.whole else inputs
+            episode = gradients.law(job.U, job.theta, [job.field_seed])
+            inputs = episode.actions if episode.whole else inputs
 
         found = descend(
             lambda given: gradients.of_actions(given, [job.field_seed])[:2],

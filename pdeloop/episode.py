@@ -42,6 +42,11 @@ class EpisodeRecord:
     actions: Array
     costs: EpisodeCosts
 
+    @property
+    def whole(self) -> bool:
+        """Whether no environment diverged."""
+        return bool((self.costs.diverged_step < 0).all())
+
 
 def rollout(
     plant: Plant,

@@ -12,16 +12,15 @@ dJ/dtheta = sum_k g_k [s_k; 1]^T for the law a = K_a s + b = theta [s; 1], s = U
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pde_sim_node.measurement import InstrumentedPlant
-from pde_sim_node.plant import Plant
+from pde_sim_node.plant import EpisodeCosts, Plant
 from pde_sim_node.solver.adjoint import adjoint_of
-from pdeloop.episode import Law, finite_array, rollout
+from pdeloop.episode import EpisodeRecord, Law, finite_array, rollout
 
 __all__ = ["CostGradient", "Gradients", "features"]
 
@@ -44,20 +43,6 @@ class CostGradient(NamedTuple):
     cost: float
     gradient: Array
     of_fields: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Path:
-    """Trajectories of M environments.
-
-    states (T, M, n_z): z_0 .. z_{T-1}; actions (T, M, n_a); costs (M,): mean stage costs; whole:
-    none diverged.
-    """
-
-    states: Array
-    actions: Array
-    costs: Array
-    whole: bool
 
 
 def features(U: Array, target: Array, states: Array) -> Array:
@@ -117,8 +102,7 @@ class Gradients:
         """
         shape = self.plant.horizon, len(np.asarray(fields)), self.plant.n_a
         given = finite_array("actions", actions, shape)
-        path = self._roll(fields, lambda k, _: given[k])
-        return self._gradient(path, given)
+        return self._gradient(self._roll(fields, lambda k, _: given[k]), given)
 
     def of_policy(self, U: ArrayLike, policy: ArrayLike, fields: ArrayLike) -> CostGradient:
         """J and dJ/dpolicy of the law a = K_a U^T z + K_b U^T z_r.
@@ -147,37 +131,40 @@ class Gradients:
         """J and dJ/dtheta of the law a = theta [U^T z; 1], theta (n_a, n_s + 1)."""
         return self._gradient(self.law(U, theta, fields), theta, U)
 
-    def law(self, U: Array, theta: Array, fields: ArrayLike) -> Path:
-        """The trajectories under a law."""
+    def law(self, U: Array, theta: Array, fields: ArrayLike) -> EpisodeRecord:
+        """An episode under a law; infinite costs where it makes the actions overflow."""
         return self._roll(
             fields, lambda _, states: features(U, self.plant.target, states) @ theta.T
         )
 
-    def _roll(self, fields: ArrayLike, law: Law) -> Path:
+    def _roll(self, fields: ArrayLike, law: Law) -> EpisodeRecord:
         def finite(k: int, z: Array) -> Array:
             a = law(k, z)
             if not np.isfinite(a).all():
                 raise FloatingPointError
             return a
 
-        plant = self.plant
         try:
-            episode = rollout(plant, finite, fields)
+            return rollout(self.plant, finite, fields)
         except FloatingPointError:  # gains so large that the actions overflow
-            nothing = np.empty((plant.horizon, plant.batch, 0))
-            return Path(nothing, nothing, np.full(plant.batch, np.inf), False)
-        whole = not (episode.costs.diverged_step >= 0).any()
-        return Path(episode.states[:-1], episode.actions, episode.costs.mean, whole)
+            M = self.plant.batch
+            none, infinite = np.empty((0, M, 0)), np.full(M, np.inf)
+            return EpisodeRecord(
+                none, none, none, EpisodeCosts(infinite, infinite, np.zeros(M, int))
+            )
 
-    def _gradient(self, path: Path, argument: Array, U: Array | None = None) -> CostGradient:
-        """Of the path's cost, by its actions or, with U, by the law theta."""
-        plant, (T, M, _) = self.plant, path.states.shape
+    def _gradient(
+        self, episode: EpisodeRecord, argument: Array, U: Array | None = None
+    ) -> CostGradient:
+        """Of the episode's cost, by its actions or, with U, by the law theta."""
+        plant = self.plant
+        T, M = plant.horizon, len(episode.costs.mean)
         gradient, eta = np.zeros_like(argument), np.zeros((M, plant.n_z))
-        if not path.whole:
+        if not episode.whole:
             return CostGradient(np.inf, gradient, eta)
         q, r = 2 * plant.state_weight / (M * T), 2 * plant.action_weight / (M * T)
         for k in range(T - 1, -1, -1):
-            z, a = path.states[k], path.actions[k]
+            z, a = episode.states[k], episode.actions[k]
             eta, g = self._adjoint.pull_back(z, a, eta)
             g += r * a
             eta += q * (z - plant.target)
@@ -186,4 +173,4 @@ class Gradients:
             else:
                 eta += g @ argument[:, :-1] @ U.T
                 gradient += g.T @ features(U, plant.target, z)
-        return CostGradient(float(path.costs.mean()), gradient, eta)
+        return CostGradient(float(episode.costs.mean.mean()), gradient, eta)
