@@ -13,7 +13,7 @@ state T advances nothing: it acknowledges the last state.
     AWAITING  action(e, T)                          IDLE         cost(e)
     AWAITING  no answer for `action_timeout`        AWAITING     state(e, k) again
     AWAITING  no answer after `max_repeats`         IDLE         cost(e), void: not a cost
-    AWAITING  an action that contradicts one taken  IDLE         cost(e), void
+    active    an action that contradicts one taken  IDLE         cost(e), void; active: not IDLE
     any       end of the run, start of another run  IDLE         none; or as a start in IDLE
 
 Which actions contradict, and which are signed: pde_sim_node.taken_actions.
