@@ -238,7 +238,10 @@ class KalmanLaw:
             spread = self._first - mean
             prior = spread.T @ spread / len(spread) + 1e-3 * (mean @ mean) * np.eye(n_s)
             self._s, self._P = np.tile(mean, (len(states), 1)), prior
-        gain = linalg.solve(C @ self._P @ C.T + self._V, C @ self._P, assume_a="pos").T
+        try:
+            gain = linalg.solve(C @ self._P @ C.T + self._V, C @ self._P, assume_a="pos").T
+        except linalg.LinAlgError as error:
+            raise ValueError(f"the Kalman filter's covariance is singular in step {k}") from error
         s = self._s + (states[:, : self._n_y] - self._s @ C.T) @ gain.T
         P = (np.eye(n_s) - gain @ C) @ self._P
         actions: Array = s @ self._known.gains.K_a.T + self._known.gains.K_b @ self._known.s_r
