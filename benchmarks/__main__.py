@@ -154,6 +154,16 @@ def parser() -> argparse.ArgumentParser:
     environments.add_argument(
         "--controlgym", metavar="PYTHON", help="interpreter with controlgym 1.0.0"
     )
+    workers = _add(
+        programs,
+        "workers",
+        "wall time of a study against the number of its worker processes",
+        "--seeds 8 --workers 1 2 4",
+    )
+    workers.add_argument("--problem", metavar="PROBLEM", help="[burgers]")
+    workers.add_argument("--seeds", type=int, metavar="N", help="trainings [8]")
+    workers.add_argument("--rollouts", type=int, metavar="N", help="of a training [20]")
+    workers.add_argument("--workers", type=int, nargs="+", metavar="N", help="[1 2]")
     participants = _add(
         programs,
         "participants",
