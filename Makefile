@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 SHELL := /bin/bash
 
-.PHONY: setup run test packages lint types docs check clean
+.PHONY: setup run test coverage packages lint types docs check clean
 
 setup: .venv/ready
 
@@ -21,6 +21,10 @@ run: setup
 # Four workers for two cores: tests over topics wait a part of their time. Each has a ROS domain of its own.
 test: setup packages
 	$(BIN)/python -m pytest -n 4 --dist worksteal
+
+# The same, with the branch coverage of the pure modules (pyproject.toml).
+coverage: setup packages
+	$(BIN)/python -m pytest -n 4 --dist worksteal -p pytest_cov --cov
 
 # Debian's packages that tests need: a real browser for the report's page, faketime to make a clock
 # jump, iproute2 for hosts made of network namespaces, zsh and fish for their
