@@ -1,7 +1,7 @@
 """Real nodes in real processes on a ROS domain of their own, with a limit on every wait.
 
 Most of what it takes to start a node is imports and the loading of compiled code, a second of a
-core. So the nodes and trainings that a test starts itself are forked from a process that has done
+core. So the nodes and commands that a test starts itself are forked from a process that has done
 that (tests/preloaded.py). The nodes that a training starts are programs of their own, as always.
 """
 
@@ -88,7 +88,7 @@ def run_main(name: str, arguments: list[str], log: Path, environment: dict[str, 
 class Processes:
     """The processes of one test. All are gone when it is over.
 
-    forks: whether its nodes and trainings are forked; set it to False where they need an interpreter
+    forks: whether its nodes and commands are forked; set it to False where they need an interpreter
     that was started in this test's environment.
     """
 
@@ -140,7 +140,7 @@ class Processes:
 
     def pdeloop(self, *arguments: str) -> Any:
         """Start the command line."""
-        if self.forks and arguments[0] == "train":
+        if self.forks and arguments[0] not in ("reproduce", "study"):  # they have their own workers
             return self._fork("pdeloop", *arguments)
         return self.start("-m", "pdeloop.cli", *arguments, name="pdeloop")
 

@@ -1,4 +1,4 @@
-"""What nodes and trainings import and load, done once by the process that they are forked from.
+"""What nodes and commands import and load, done once by the process that they are forked from.
 
 `tests.loop_harness` starts that process with this module.
 """

@@ -38,6 +38,7 @@ def recorded(loop: Processes, run: Path, problem: str, optimizer: str, *more: in
 
 
 def pdeloop(loop: Processes, *words: object) -> str:
+    loop.forks = False  # as a user starts them: the libraries they load, and when, decide on bits
     return loop.wait(loop.pdeloop(*map(str, words)), LIMIT)
 
 
