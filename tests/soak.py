@@ -323,7 +323,8 @@ def text(result: dict[str, Any]) -> str:
         f"nodes restarted: {result['restarts']}, trainings resumed: {result['resumes']}",
         "faults:",
         *(f"  {count:5d}  {kind}" for kind, count in sorted(result["faults"].items())),
-        f"  and on the line between plant and controller: {', '.join(FAULTS)}",
+        "  and on the line between plant and controller: "
+        + ", ".join(f"{name} {value}" for name, value in FAULTS.items()),
         "memory in MB, after the start and last, of the process that grew most:",
         *(f"  {n:<16} {a:8.1f} {b:8.1f}" for n, (a, b) in sorted(result["memory_mb"].items())),
     ]

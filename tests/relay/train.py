@@ -12,7 +12,7 @@ from pdeloop import pairs
 from pdeloop.cli import main
 from pdeloop.pairs import LoopNode
 
-FAULTS = ("loss:=0.01", "duplicate:=0.02", "delay:=0.002")
+FAULTS = {"loss": 0.01, "duplicate": 0.02, "delay": 0.002}
 REMAPS = {"pde_sim_node": "state:=state_sent", "controller_node": "action:=action_sent"}
 
 
@@ -29,7 +29,7 @@ class RelayNode(LoopNode):
     """The relay, which has nothing of the problem."""
 
     def ros_arguments(self, parameter_file: Path) -> list[str]:
-        return [word for value in self.parameters for word in ("-p", value)]
+        return [word for assignment in self.assignments for word in ("-p", assignment)]
 
 
 class TransportWithRelay(pairs.Transport):
