@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +50,14 @@ class LoopNode:
     def assignments(self) -> list[str]:
         """Its parameters as NAME:=VALUE."""
         return [f"{name}:={ros_value(value)}" for name, value in self.parameters.items()]
+
+    def having(self, **parameters: Any) -> LoopNode:
+        """The same node with these parameters."""
+        return replace(self, parameters={**self.parameters, **parameters})
+
+    def without_recorder(self) -> LoopNode:
+        """The same node where the recorder has ended: only a tuner that requires one waits for it."""
+        return self.having(recorder="none") if self.parameters.get("recorder") == "start" else self
 
     def ros_arguments(self, parameter_file: Path) -> list[str]:
         """All that follows `--ros-args` in its command."""

@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -153,13 +153,11 @@ def _train_over_topics(
     bags: list[Path] = []
 
     def command(node: LoopNode) -> list[str]:
-        changed: dict[str, Any] = {}
         if node.package == "recorder_node":  # started again, it leaves the unfinished bag alone
             bags.append(unused(folder / "bag"))
-            changed = {"bag": str(bags[-1].resolve())}
-        elif node.package == "tuner_node" and recorder is not None and recorder.ended:
-            changed = {"recorder": "none"}
-        node = replace(node, parameters={**node.parameters, **changed})
+            node = node.having(bag=str(bags[-1].resolve()))
+        elif recorder is not None and recorder.ended:
+            node = node.without_recorder()
         return node_command(node.package, *node.ros_arguments(folder / "parameters.yaml"))
 
     children = {

@@ -75,6 +75,17 @@ def test_the_busy_time_of_a_core_is_what_it_neither_idled_nor_waited(tmp_path: P
     assert affinity._busy_ticks(tmp_path / "none") == {}
 
 
+@pytest.mark.parametrize(("asked", "then"), [("start", "none"), ("required", "required")])
+def test_a_tuner_started_again_after_its_recorder_ended_waits_only_if_it_requires_one(
+    asked: str, then: str, tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    RunFolder(folder).create(resolve(str(SMALL), {}))
+    tuner = pairs.Transport(recorder=asked).nodes(folder)[-1]
+    assert tuner.parameters["recorder"] == asked
+    assert f"recorder:='{then}'" in tuner.without_recorder().assignments
+
+
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
 def test_recorder_and_viewer_leave_the_core_of_the_pair_to_it(tmp_path: Path) -> None:
     folder, values = tmp_path / "run", resolve(str(SMALL), {})
