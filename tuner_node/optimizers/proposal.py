@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -132,6 +133,7 @@ class Proposer:
         self._action_limit = context.action_limit
         self._noise = context.noise
         self._reproduced = _REPRODUCED_NOISY if self._noise else _REPRODUCED
+        self._cleaned: WeakKeyDictionary[Record, Record] = WeakKeyDictionary()
         before = [
             Record(-1, np.zeros_like(policy), np.inf, states, actions),
             *(
@@ -226,7 +228,10 @@ class Proposer:
         """The rollout without what of its noise can be told from the fields."""
         if not self._noise:
             return record
-        return replace(record, states=denoised(record.states, self._noise))
+        if record not in self._cleaned:  # every proposal asks for all remembered rollouts
+            states = denoised(record.states, self._noise)
+            self._cleaned[record] = replace(record, states=states)
+        return self._cleaned[record]
 
     def _simulated(
         self,
