@@ -6,7 +6,7 @@ import asyncio
 import multiprocessing
 import signal
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from importlib import metadata
@@ -24,19 +24,14 @@ RETRIES = 3
 
 
 @contextmanager
-def processes(
-    count: int | None = None, prepare: Callable[..., None] | None = None, *arguments: Any
-) -> Iterator[Executor]:
+def processes(count: int | None = None) -> Iterator[Executor]:
     """So many processes of this machine, a core each; as many as cores by default.
 
-    An exception in the block ends them at once, in the middle of what they do. prepare(*arguments) is
-    called in each before its first task.
+    An exception in the block ends them at once, in the middle of what they do.
     """
     context = multiprocessing.get_context("spawn")
     others = {process.pid for process in multiprocessing.active_children()}
-    with ProcessPoolExecutor(
-        count or len(usable_cores()), context, _begin, (prepare, arguments)
-    ) as pool:
+    with ProcessPoolExecutor(count or len(usable_cores()), context, _begin) as pool:
         try:
             yield pool
         except BaseException:
@@ -46,14 +41,12 @@ def processes(
             raise
 
 
-def _begin(prepare: Callable[..., None] | None, arguments: tuple[Any, ...]) -> None:
+def _begin() -> None:
     """In a process that is about to train. Ctrl-C is for its parent, which then ends it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     die_with_parent()
     use_cores(usable_cores()[:1])  # the others have trainings of their own
-    if prepare is not None:
-        prepare(*arguments)
 
 
 @contextmanager
