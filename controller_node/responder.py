@@ -199,11 +199,11 @@ class Responder:
         return run.signatures[state.plant]
 
     def _digest(self, run: _Run, start: Frame) -> int:
-        """D: what the tuner published of an episode; 0 if it asks for no signature."""
+        """D: what the tuner published of an episode."""
         published: list[Any] = [start.values, self._settings.action_limit]
         if run.exploration is None and run.policy is not None:
             published += [run.policy.values, run.models_digest]
-        return digest_of(*published) if start.plant else 0
+        return digest_of(*published)
 
     def law_for(self, state: Frame) -> ProjectedLaw | None:
         """The law that answers the states of an episode, like one that was answered before.

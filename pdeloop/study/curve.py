@@ -39,7 +39,7 @@ class Curve:
         self._costs: list[Array] = []
         self._rollouts: list[int] = []
 
-    def look(self) -> None:
+    def update(self) -> None:
         """Add the present policy; its cost is measured where it is another one than before."""
         if not self._training.optimizers or self._training.phase == "done":
             return

@@ -87,7 +87,7 @@ def train_one(
             pair,
             lambda row: None,
             max_batch=parameters["max_batch"],
-            after_batch=curve.look if curves else lambda: None,
+            after_batch=curve.update if curves else lambda: None,
         )
         extra = {"transport": "in-process", "controller": BUILT_IN, "environment": here}
         folder.finish(training, extra)
