@@ -35,7 +35,7 @@ LOOK_FOR = 2.5
 SETTLE = 1.0
 """Seconds in which publishers are found before the first message, and the last one arrives."""
 TICK = 0.005
-"""Seconds between two looks at which messages are due."""
+"""Seconds between two rounds in which the messages that are due are published."""
 
 
 def timed(
@@ -79,7 +79,7 @@ class PlayerNode:
     def _play(self) -> None:
         elapsed = self._loop.now() - self._begin
         if not self._publishers and elapsed > -SETTLE:
-            self._refuse_company()
+            self._refuse_beside_a_loop()
             self._create()
         while self._next is not None and self._next[0] <= elapsed:
             message = self._next[1]
@@ -103,10 +103,10 @@ class PlayerNode:
         if not self._publishers:
             raise ConfigurationError("the bag holds nothing that can be published here")
 
-    def _refuse_company(self) -> None:
-        """A live loop must not be told what happened long ago."""
-        everybodys = (DIAGNOSTICS.channel.topic, ROSOUT.channel.topic)
-        for topic in {channel.topic for channel in self._channels}.difference(everybodys):
+    def _refuse_beside_a_loop(self) -> None:
+        """A live loop would take the recorded messages for its own."""
+        of_every_node = (DIAGNOSTICS.channel.topic, ROSOUT.channel.topic)
+        for topic in {channel.topic for channel in self._channels}.difference(of_every_node):
             for info in self._node.get_publishers_info_by_topic(topic):
                 raise ConfigurationError(
                     f"{full_name(info)} publishes {topic} in this ROS "
