@@ -1,4 +1,4 @@
-"""Which loops run on this machine: `pdeloop train` and `bag play` say so here, `monitor` asks.
+"""Which loops run on this machine: `pdeloop train` says so here, `monitor` asks.
 
 Each puts a file into a folder of this user's under the temporary one and holds a lock on it. The
 lock ends with its process, however that ends, so what is found here does run.
@@ -25,7 +25,7 @@ _MAX_TEXT = 10_000
 
 @dataclass(frozen=True)
 class Live:
-    """A loop that runs: its ROS domain, the folder of its run (or bag), since when (epoch s).
+    """A loop that runs: its ROS domain, the folder of its run, since when (epoch s).
 
     network: whether its messages may leave the machine.
     """

@@ -348,7 +348,6 @@ def test_bags_of_other_writers_are_read(tmp_path, finished):
         assert [(m.topic, m.when, m.data) for m in again] == [
             (m.topic, m.when, m.data) for m in original
         ]
-        assert {channel.topic for channel in Bag(folder).channels()} == set(channels)
 
 
 def record_bytes(record: McapRecord) -> bytes:
@@ -510,8 +509,6 @@ def test_a_bag_of_the_version_before_is_read_verified_and_identified_from(tmp_pa
         recorded, again = map(float, re.findall(r"re(?:corded|computed) (\S+?)(?:,|$)", text))
         assert again == pytest.approx(recorded, rel=1e-6), text
     assert identify_bag(OLD, {}).steps > 0
-    topics = {channel.topic: channel for channel in bag.channels()}
-    assert topics["/target"].latched and not topics["/state"].latched
 
 
 def test_a_bag_is_written_without_ros(tmp_path):

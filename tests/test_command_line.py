@@ -350,7 +350,7 @@ from pdeloop.cli import main
 run = {str(tmp_path / "run")!r}
 assert main(["train", {str(SMALL)!r}, "--in-process", "--rollouts", "11", "--out", run]) == 0
 for words in (["monitor"], ["report", run], ["completion", "bash"], ["bag", "info", run],
-              ["bag", "play", run], ["identify", "--bag", run],
+              ["identify", "--bag", run],
               ["train", {str(SMALL)!r}, "--record", "--out", run + "2"],
               ["train", {str(SMALL)!r}, "--out", run + "3"]):
     said = io.StringIO()
@@ -368,7 +368,7 @@ for words in (["monitor"], ["report", run], ["completion", "bash"], ["bag", "inf
     )
     assert done.returncode == 0, done.stderr
     lines = [line for line in done.stdout.splitlines() if line.startswith("@")]
-    assert len(lines) == 8, done.stdout
+    assert len(lines) == 7, done.stdout
     said = r"@ 1 .*\| pdeloop: needs \w+: .*pip install 'pdeloop\[\w+\]'[^|]*\|"
     for line in lines:
         assert re.fullmatch(said, line), line

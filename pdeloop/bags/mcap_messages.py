@@ -1,8 +1,7 @@
 """The messages of MCAP files, whether or not the files were finished. No ROS import.
 
 A file is read with the library `mcap`, record by record up to its last whole one and without its
-summary: the file of a recorder that was killed has none. Chunks outside the wanted time are not
-decompressed.
+summary: the file of a recorder that was killed has none.
 
 What a file may make its reader do is bounded: it may decompress to RATIO times its size and SLACK
 bytes more.
@@ -13,23 +12,20 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import IO, cast
 
 import lz4.frame
-import yaml
 import zstandard
 from mcap.exceptions import EndOfFile, McapError, RecordLengthLimitExceeded
-from mcap.records import Channel as McapChannel
-from mcap.records import Chunk, Footer, McapRecord, Schema
+from mcap.records import Channel, Chunk, McapRecord, Schema
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
-from recorder_node.bag import METADATA, QOS, BagError, Channel
+from recorder_node.bag import METADATA, BagError
 
 RATIO, SLACK = 100, 64 * 2**20
 """A file of n bytes may decompress to RATIO n + SLACK bytes."""
@@ -47,73 +43,60 @@ class Message:
     data: bytes
 
 
-class McapMessages:
-    """The messages of the MCAP file at `path`.
+def read(path: Path) -> Iterator[Message]:
+    """The messages of the file at `path` in the order in which they were written.
 
-    channels: its topics by their numbers; finished: whether its recorder came to its end. Raises
-    BagError for a file that is none or is damaged.
+    Raises
+    ------
+    BagError
+        It cannot be read, is none or is damaged; one sentence.
     """
+    types: dict[int, str] = {}
+    channels: dict[int, Channel] = {}
+    try:
+        for record in _records(path):
+            if isinstance(record, Schema):
+                types[record.id] = record.name
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, McapMessage):
+                if (channel := channels.get(record.channel_id)) is None:
+                    raise ValueError(
+                        f"a message of channel {record.channel_id}, which it does not declare"
+                    )
+                kind = types.get(channel.schema_id, "")
+                yield Message(channel.topic, kind, record.log_time, record.data)
+    except (McapError, ValueError) as error:
+        text = f"{type(error).__name__} {error}" if isinstance(error, McapError) else error
+        raise BagError(f"{path} cannot be read, it is damaged: {text}") from error
+    except OSError as error:
+        raise BagError(f"{path} cannot be read: {error.strerror}") from error
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._types: dict[int, str] = {}
-        self.channels: dict[int, Channel] = {}
-        outside = self._records(lambda chunk: False)
-        self.finished = any(isinstance(record, Footer) for record in outside)
-        if not self.channels:  # an unfinished file declares them within its chunks alone
-            for _ in self._records(lambda chunk: True):
-                pass
 
-    def messages(self, start: int | None = None, stop: int | None = None) -> Iterator[Message]:
-        """Those in [start, stop) ns, in the order in which they were written."""
-        low, high = start or 0, 2**64 if stop is None else stop
-        for record in self._records(
-            lambda chunk: chunk.message_end_time >= low and chunk.message_start_time < high
-        ):
-            if isinstance(record, McapMessage) and low <= record.log_time < high:
-                channel = self.channels[record.channel_id]
-                yield Message(channel.topic, channel.type, record.log_time, record.data)
+def finished(path: Path) -> bool:
+    """Whether the recorder of the file at `path` came to its end, which repeats the magic bytes."""
+    with path.open("rb") as file:
+        file.seek(-min(len(MAGIC), path.stat().st_size), os.SEEK_END)
+        return file.read() == MAGIC
 
-    def _records(self, wanted: Callable[[Chunk], bool]) -> Iterator[McapRecord]:
-        """The records outside chunks, and those in the chunks that are `wanted`."""
-        try:
-            with self._path.open("rb") as file:
-                size = os.fstat(file.fileno()).st_size
-                left = RATIO * size + SLACK
-                for record in _whole_records(file, size):
-                    inner = [record]
-                    if isinstance(record, Chunk):
-                        if not wanted(record):
-                            continue
-                        left -= record.uncompressed_size
-                        if left < 0:
-                            raise self._too_large(size)
-                        inner = breakup_chunk(_decompressed(record), validate_crc=True)
-                    for one in inner:
-                        self._note(one)
-                        yield one
-        except (McapError, ValueError) as error:
-            text = f"{type(error).__name__} {error}" if isinstance(error, McapError) else error
-            raise BagError(f"{self._path} cannot be read, it is damaged: {text}") from error
-        except OSError as error:
-            raise BagError(f"{self._path} cannot be read: {error.strerror}") from error
 
-    def _note(self, record: McapRecord) -> None:
-        """Keep what declares a topic; refuse a message of a topic that is not declared."""
-        if isinstance(record, Schema):
-            self._types[record.id] = record.name
-        elif isinstance(record, McapChannel):
-            kind = self._types.get(record.schema_id, "")
-            self.channels[record.id] = _channel(record, kind)
-        elif isinstance(record, McapMessage) and record.channel_id not in self.channels:
-            raise ValueError(f"a message of channel {record.channel_id}, which it does not declare")
-
-    def _too_large(self, size: int) -> BagError:
-        return BagError(
-            f"{self._path} ({size} bytes) decompresses to more than {RATIO} times its size "
-            f"and {SLACK} bytes; expected less of a recording. If it is one, convert it to an "
-            "uncompressed bag (ros2 bag convert)"
-        )
+def _records(path: Path) -> Iterator[McapRecord]:
+    """The records of a file, those in its chunks, too."""
+    with path.open("rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        left = RATIO * size + SLACK
+        for record in _whole_records(file, size):
+            if not isinstance(record, Chunk):
+                yield record
+                continue
+            left -= record.uncompressed_size
+            if left < 0:
+                raise BagError(
+                    f"{path} ({size} bytes) decompresses to more than {RATIO} times its size "
+                    f"and {SLACK} bytes; expected less of a recording. If it is one, convert it "
+                    "to an uncompressed bag (ros2 bag convert)"
+                )
+            yield from breakup_chunk(_decompressed(record), validate_crc=True)
 
 
 class _WholeReads:
@@ -158,33 +141,6 @@ def _decompressed(chunk: Chunk) -> Chunk:
     if len(data) != size:
         raise ValueError("the content of a chunk is not of the size that it says")
     return replace(chunk, compression="", data=data)
-
-
-def _channel(found: McapChannel, kind: str) -> Channel:
-    """A topic with what its publishers offered; the strictest offer serves every reader."""
-    offers = _offers(found.metadata.get(QOS, ""))
-
-    def any_offers(name: str, *values: object) -> bool:
-        return any(offer.get(name) in values for offer in offers)
-
-    return Channel(
-        found.topic,
-        kind,
-        # As numbers in bags of ROS 2 before Jazzy (rmw_qos_*_policy_t).
-        latched=any_offers("durability", "transient_local", 1),
-        reliable=any_offers("reliability", "reliable", 1) or not offers,
-        depth=max((offer["depth"] for offer in offers), default=1),
-    )
-
-
-@lru_cache
-def _offers(text: str) -> list[dict[str, Any]]:
-    """The offered quality of service of a topic's publishers; empty if it is not told."""
-    try:
-        offers = [dict(offer) for offer in yaml.safe_load(text) or []]
-        return [{**offer, "depth": max(1, int(offer.get("depth", 1)))} for offer in offers]
-    except (yaml.YAMLError, TypeError, ValueError, RecursionError):
-        return []
 
 
 def files(folder: Path) -> list[Path]:

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.topics import TARGET
-from pdeloop.bags.mcap_messages import McapMessages, Message, files, text_of
-from recorder_node.bag import METADATA, BagError, Channel
+from pdeloop.bags.mcap_messages import Message, files, finished, read, text_of
+from recorder_node.bag import METADATA, BagError
 from recorder_node.episodes import EpisodeIndex, RecordedEpisode
 from recorder_node.recording import INDEX, PARAMETERS
 from recorder_node.sources import source_of
@@ -47,21 +47,14 @@ class Bag:
     @property
     def finished(self) -> bool:
         """Whether it was closed properly."""
-        complete = all(McapMessages(file).finished for file in self.files)
-        return complete and (self.path / METADATA).exists()
-
-    def channels(self) -> list[Channel]:
-        """Its topics, by name."""
-        found = [channel for file in self.files for channel in McapMessages(file).channels.values()]
-        return sorted(
-            {channel.topic: channel for channel in found}.values(),
-            key=lambda channel: channel.topic,
-        )
+        return all(map(finished, self.files)) and (self.path / METADATA).exists()
 
     def messages(self, start: int | None = None, stop: int | None = None) -> Iterator[Message]:
         """The messages in the order in which they were written, those in [start, stop) ns if given."""
         for file in self.files:
-            yield from McapMessages(file).messages(start, stop)
+            for message in read(file):
+                if (start or 0) <= message.when and (stop is None or message.when < stop):
+                    yield message
 
     def find(self, episode: int) -> Iterator[RecordedEpisode]:
         """The episodes of this number: through the index, without a scan, if the bag has one."""

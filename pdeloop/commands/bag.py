@@ -6,7 +6,6 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
-from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import Commands, add_equation, add_json, allow_equation, command
 from pdeloop.output import print_json
 
@@ -17,8 +16,8 @@ def add(commands: Commands) -> None:
         commands,
         "bag",
         None,
-        help="look into a recorded bag, verify it, play it",
-        description="Look into a bag that --record or recorder_node wrote, verify it, or play it "
+        help="look into a recorded bag, verify it",
+        description="Look into a bag that --record or recorder_node wrote, or verify it "
         "(docs/recording.md).",
         example="pdeloop bag info runs/burgers-20260101-120000-1",
     )
@@ -53,28 +52,6 @@ def add(commands: Commands) -> None:
     add_equation(verify)
     for action in (info, verify):
         add_json(action)
-    _add_play(actions)
-
-
-def _add_play(actions: Commands) -> None:
-    play = command(
-        actions,
-        "play",
-        _bag_play,
-        help="publish a bag's messages over topics",
-        description="Publish a bag's messages again: the recorded bytes under the recorded names and "
-        "quality of service, in the recorded time. In a ROS domain of its own (pdeloop monitor finds "
-        "it), or in ROS_DOMAIN_ID if that is set; not beside a live loop.",
-        example="pdeloop bag play runs/lab/bag --rate 0.1",
-    )
-    play.add_argument("bag", type=Path, metavar="BAG", help="folder of a bag or of a run")
-    play.add_argument("--rate", type=float, default=1.0, metavar="R", help="times as fast [1]")
-    play.add_argument("--loop", action="store_true", help="begin again at the end, until Ctrl-C")
-    play.add_argument(
-        "--network",
-        action="store_true",
-        help="let messages leave this machine (default: loopback interface only)",
-    )
 
 
 def _bag_info(options: argparse.Namespace) -> int:
@@ -98,17 +75,3 @@ def _bag_verify(options: argparse.Namespace) -> int:
     else:
         print(report.text())
     return 1 if report.count else 0
-
-
-def _bag_play(options: argparse.Namespace) -> int:
-    from pdeloop.bags.node import play
-
-    if not 1e-6 <= options.rate <= 1e6:
-        raise ParameterError(f"--rate is {options.rate:g}; expected a number from 1e-6 to 1e6")
-    return play(
-        options.bag,
-        rate=options.rate,
-        again=options.loop,
-        network=options.network,
-        tell=lambda text: print(text, flush=True),
-    )

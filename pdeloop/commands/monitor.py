@@ -22,7 +22,7 @@ def add(commands: Commands) -> None:
         help="a page that shows a loop as it runs, or a run that is over",
         description="Serve a page on 127.0.0.1 that shows a loop as it runs: the field, the actions, "
         "the profile against the target, the training curve, the nodes, and buttons to pause. "
-        "Without DIR and ROS_DOMAIN_ID it shows the newest training (or played bag) on this machine, "
+        "Without DIR and ROS_DOMAIN_ID it shows the newest training on this machine, "
         "and the next one when that has ended. Of a run in DIR that is over it shows the curve, the "
         "seeds and the recorded episodes. Ctrl-C ends it; the loop never waits for it.",
         example="pdeloop monitor runs/burgers-20260101-120000-1 --environment 3",

@@ -13,7 +13,7 @@ from pdeloop.live import Live, is_locked, running
 class Finder:
     """Finds the loop to show.
 
-    folder: of a run (or a bag that is played), to show this one only; domain: show this ROS
+    folder: of a run, to show this one only; domain: show this ROS
     domain, whatever runs there. With neither, the newest loop on this machine that runs, and the
     next one when it has ended.
     """

@@ -24,7 +24,7 @@ from pdeloop.bags.info import describe
 from pdeloop.bags.reader import Bag
 from pdeloop.bags.verify import verify
 from pdeloop.identification import identify_bag
-from recorder_node.bag import BagWriter
+from recorder_node.bag import BagWriter, Channel
 from tests.loop_harness import ROOT, Processes, until
 from tests.small import RECORDED, SMALL, paced, same_bits
 from tests.small_disk import read_only_folder, small_disk
@@ -134,9 +134,10 @@ def test_two_libraries_read_the_same_numbers(recorded):
 
 def rewrite(bag: Path, frame: Frame) -> None:
     """Change the last bit of the first number of `frame` where it is in the bag."""
-    messages, channels = list(Bag(bag).messages()), Bag(bag).channels()
+    messages = list(Bag(bag).messages())
     (bag / "bag.mcap").rename(bag / "old")
-    writer = BagWriter(bag / "again", channels)
+    topics = {message.topic: message.type for message in messages}
+    writer = BagWriter(bag / "again", [Channel(*topic) for topic in topics.items()])
     ids, values = struct.pack("<3d", frame.run, frame.episode, frame.step), frame.values.tobytes()
     changed = 0
     for message in messages:
