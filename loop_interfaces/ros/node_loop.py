@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from rclpy.executors import ShutdownException, TimeoutException
+from rclpy.executors import Executor, ShutdownException, TimeoutException
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
@@ -25,7 +25,7 @@ from std_msgs.msg import Float64MultiArray
 from loop_interfaces.affinity import pin_process
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.ros.endpoints import Receiver, SampleBatcher, Sender, reader_qos, scoped
-from loop_interfaces.ros.observer import STUCK, SUSPENDED, EventLoop
+from loop_interfaces.ros.observer import STUCK, SUSPENDED, WAIT, EventLoop
 from loop_interfaces.ros.sample_subscription import SampleSubscription
 from loop_interfaces.ros.suspend_watchdog import SuspendWatchdog
 from loop_interfaces.samples import ACTION_KIND, STATE_KIND
@@ -36,6 +36,10 @@ if TYPE_CHECKING:  # not every node needs the compiler
 
 HOUSEKEEPING = 0.05
 """Seconds between two rounds of the executor and of the node's slow duties."""
+IDLE_HOUSEKEEPING = 0.5
+"""The same, at most, in a node that has waited for long; whatever comes in begins a round at once."""
+IMPATIENCE = 0.05
+"""Share of the time it has waited after which a node looks around again."""
 BUSY_HOUSEKEEPING = 0.15
 """The same while messages stream through: a round of the executor costs as much as ten of them."""
 BUSY = 20
@@ -60,6 +64,47 @@ class _Fast(NamedTuple):
     receiver: Receiver
     sender: Sender
     path: FastPath
+
+
+class _Sources:
+    """What a node waits for: subscriptions, of which `takes` says how their messages are handled.
+
+    executor: whose services and subscriptions end a wait, too; they are many, so only of an idle node.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        guard: Any,
+        takes: dict[Any, Callable[[], int]],
+        executor: Executor | None = None,
+    ) -> None:
+        self.idle = executor is not None
+        self._guard, self._handles, self._services = guard, list(takes), []
+        self._takes = {handle.pointer: take for handle, take in takes.items()}
+        if executor is not None:
+            self._handles += [s.handle for s in node.subscriptions if executor.can_execute(s)]
+            self._services = [s.handle for s in node.services if executor.can_execute(s)]
+        self._set = _rclpy.WaitSet(
+            len(self._handles), 1, 0, 0, len(self._services), 0, node.context.handle
+        )
+
+    def wait(self, seconds: float) -> list[int]:
+        """Wait for so long at most; pointers of those that have something."""
+        wait_set = self._set
+        wait_set.clear_entities()
+        wait_set.add_guard_condition(self._guard)
+        for handle in self._handles:
+            wait_set.add_subscription(handle)
+        for service in self._services:
+            wait_set.add_service(service)
+        wait_set.wait(int(seconds * 1e9))
+        ready: list[int] = wait_set.get_ready_entities("subscription")
+        return ready + wait_set.get_ready_entities("service") if self.idle else ready
+
+    def handle(self, ready: list[int]) -> int:
+        """Handle messages of those subscriptions; how many."""
+        return sum(self._takes[pointer]() for pointer in ready)
 
 
 class NodeLoop(EventLoop):
@@ -149,7 +194,7 @@ class NodeLoop(EventLoop):
         """Handle events until `stop` or a signal; returns the reason.
 
         tick(now) is called when `deadline()` (monotonic s, or None) has passed; housekeeping(now)
-        every HOUSEKEEPING seconds, or BUSY_HOUSEKEEPING.
+        every HOUSEKEEPING seconds, BUSY_HOUSEKEEPING, or less often while nothing happens.
         """
         self._turned = self.now()
         with SuspendWatchdog(self._look_after) as watchdog, self._fast_path_open() as fast:
@@ -182,13 +227,9 @@ class NodeLoop(EventLoop):
     ) -> str:
         context = self.node.context
         clock = time.monotonic
-        handles, take_from = self._sources(fast)
-        wait_set = _rclpy.WaitSet(
-            len(handles) + 2 * len(self._watched), 1, 0, 0, 0, 0, context.handle
-        )
-        clear, add = wait_set.clear_entities, wait_set.add_subscription
-        wait, ready = wait_set.wait, wait_set.get_ready_entities
-        next_round = clock()
+        takes = self._takes(fast)
+        sources = _Sources(self.node, self._guard, takes)
+        next_round = active = clock()
         handled = 0
         while self._stop_reason is None:
             self._turned = now = clock()
@@ -198,41 +239,45 @@ class NodeLoop(EventLoop):
                 if watchdog.longest() > SUSPENDED:
                     self.suspended = True
                     return "suspended"
-                self._serve(now)
+                if self._serve(now) or handled:
+                    active = now
                 if self._batcher is not None:
                     self._batcher.poll(now)
                 changed = [watched.samples.poll() for watched in self._watched.values()]
                 if any(changed):
-                    handles, take_from = self._sources(fast)
+                    takes = self._takes(fast)
                 housekeeping(now)
                 self.introspection.round(now)
-                next_round = now + (BUSY_HOUSEKEEPING if handled > BUSY else HOUSEKEEPING)
+                period = BUSY_HOUSEKEEPING if handled > BUSY else HOUSEKEEPING
+                idle = min(IMPATIENCE * (now - active), IDLE_HOUSEKEEPING)
+                next_round = now + max(period, idle)
+                executor = self._executor if idle > period else None
+                sources = _Sources(self.node, self._guard, takes, executor)
                 handled = 0
                 continue
             due = deadline()
             if due is not None and now >= due:
                 tick(now)
                 continue
-            # Never longer than HOUSEKEEPING: a wait does not end by a signal.
-            wake = min(next_round, now + HOUSEKEEPING)
+            wake = min(next_round, now + WAIT)
             if due is not None:
                 wake = min(wake, due)
             if fast is not None and not fast.path.arm():
                 handled += self._take_waiting(fast)
                 continue
-            clear()
-            wait_set.add_guard_condition(self._guard)
-            for handle in handles:
-                add(handle)
-            wait(int((wake - now) * 1e9))
+            ready = sources.wait(wake - now)
             if fast is not None:
                 handled += fast.path.disarm()
-            handled += sum(take_from[pointer]() for pointer in ready("subscription"))
+            if sources.idle:  # first a round: who is there may have changed
+                if ready or handled:
+                    active = next_round = now
+                continue
+            handled += sources.handle(ready)
         return self._stop_reason or "shutdown"
 
-    def _serve(self, now: float) -> None:
-        """Call the executor's callbacks that are ready."""
-        served = True
+    def _serve(self, now: float) -> bool:
+        """Call the executor's callbacks that are ready; whether there were any."""
+        served, any_served = True, False
         while served and not self.stopped and self.now() < now + SERVING:
             served = False
             with suppress(TimeoutException, ShutdownException):
@@ -240,7 +285,8 @@ class NodeLoop(EventLoop):
                     callback, _, _ = self._executor.wait_for_ready_callbacks(timeout_sec=0)
                     callback()
                     callback.result()
-                    served = True
+                    served = any_served = True
+        return any_served
 
     def _look_after(self) -> None:
         """In another thread: report a long computation, and end a wait that takes too long.
@@ -253,20 +299,18 @@ class NodeLoop(EventLoop):
             self.introspection.round_while_working(now)
             self._guard.trigger_guard_condition()
 
-    def _sources(self, fast: _Fast | None) -> tuple[list[Any], dict[int, Callable[[], int]]]:
+    def _takes(self, fast: _Fast | None) -> dict[Any, Callable[[], int]]:
         """What to wait for, and what takes from it; the watched ones first: a cost comes after
         the samples of its episode, and is to be handled after them.
         """
-        found: dict[int, tuple[Any, Callable[[], int]]] = {}
+        found: dict[Any, Callable[[], int]] = {}
         for watched in self._watched.values():
             for handle in watched.samples.handles:
-                found[handle.pointer] = (handle, partial(self._drain, watched))
+                found[handle] = partial(self._drain, watched)
         for receiver in self._receivers:
-            if fast is not None and receiver is fast.receiver:
-                continue
-            found[receiver.handle.pointer] = (receiver.handle, partial(self._take, receiver))
-        handles = [handle for handle, _ in found.values()]
-        return handles, {pointer: take for pointer, (_, take) in found.items()}
+            if fast is None or receiver is not fast.receiver:
+                found[receiver.handle] = partial(self._take, receiver)
+        return found
 
     def _take(self, receiver: Receiver) -> int:
         """Handle the next message of `receiver`; how many there were."""

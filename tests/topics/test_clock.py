@@ -26,7 +26,7 @@ import rclpy, threading, time
 from loop_interfaces.ros import node_loop
 from loop_interfaces.topics import ACTION, STATE
 from tests.test_fast_path import Controller
-node_loop.HOUSEKEEPING = 60.0  # as long as a wait until a moment that was set back
+node_loop.HOUSEKEEPING = node_loop.WAIT = 60.0  # as long as a wait until a moment that was set back
 rclpy.init()
 loop = node_loop.NodeLoop(rclpy.create_node("stuck"))
 turns = []

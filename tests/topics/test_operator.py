@@ -168,7 +168,7 @@ def test_the_command_line_ends_with_a_stopped_tuner_and_continues(loop: Processe
 
 
 QUEUED = """
-import rclpy
+import rclpy, threading
 from std_srvs.srv import Trigger
 from loop_interfaces.ros import node_loop
 rclpy.init()
@@ -185,14 +185,25 @@ def count(now):
     if len(answered) == 20:
         loop.stop("answered")
 loop.run(tick=lambda now: None, deadline=lambda: None, housekeeping=count)
-print(len({*rounds}), flush=True)
+groups = len({*rounds})
+# Idle as one that has waited for long, but for a minute.
+node_loop.IMPATIENCE, node_loop.IDLE_HOUSEKEEPING = 1e9, 60.0
+answered.clear(), rounds.clear(), loop.resume()
+threading.Timer(1.0, client.call_async, [Trigger.Request()]).start()
+def look(now):
+    rounds.append(now)
+    if answered:
+        loop.stop("answered")
+loop.run(tick=lambda now: None, deadline=lambda: None, housekeeping=look)
+print(groups, len(rounds), flush=True)
 """
 
 
-def test_requests_that_wait_are_answered_together(loop: Processes):
+def test_requests_that_wait_are_answered_together_and_one_wakes_an_idle_node(loop: Processes):
     """Not one a round; they may come in a few groups."""
-    groups = loop.wait(loop.start("-c", QUEUED, name="queued"), LIMIT)
-    assert int(groups.split()[-1]) < 10
+    said = loop.wait(loop.start("-c", QUEUED, name="queued"), LIMIT)
+    groups, rounds = map(int, said.split()[-2:])
+    assert groups < 10 and rounds < 10
 
 
 def test_services_that_do_not_fit_the_moment_say_why(loop: Processes):
