@@ -17,7 +17,6 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args, try_shutdown
 
 from loop_interfaces.isolation import PROFILE, is_confined, outside_sockets
-from loop_interfaces.memory import release_compiler
 from loop_interfaces.ros.node_loop import NodeLoop
 
 CRASHED = 70
@@ -92,7 +91,6 @@ def node_main(
     """
     try:
         _refuse_other_words(name, args)
-        release_compiler()  # of what importing it has touched; loading needs little of that
         body: NodeBody | None = None
         while True:
             with ros_node(name, args, make_loop) as (node, loop):
@@ -104,7 +102,6 @@ def node_main(
                         node.get_logger().warning("was suspended; joined the network again")
                 except ValueError as error:
                     raise ConfigurationError(str(error)) from error
-                release_compiler()
                 code = body.run()
                 if not loop.suspended:
                     return code
