@@ -81,7 +81,7 @@ class ControllerNode:
         loop.answer_fast(states, self._senders[ACTION], self._fast_path)
         for topic, handler in handlers.items():
             loop.receive(topic, partial(self._on_other, handler))
-        loop.listen(PAUSED, self._on_paused)
+        loop.receive(PAUSED, self._on_paused)
         loop.introspection.report("responder", self._report)
 
     def _on_state(self, frame: Frame) -> None:

@@ -155,7 +155,7 @@ class TunerNode:
                 partial(self._on_failure, number),
                 reader_qos(MODEL),
             )
-            loop.listen(PAUSED, self._handler(dispatcher.plant_paused, number), namespace)
+            loop.receive(PAUSED, self._handler(dispatcher.plant_paused, number), namespace)
             for topic in ARRAYS:
                 name = scoped(namespace, topic.name)
                 loop.introspection.supervise(node.resolve_topic_name(name), topic)

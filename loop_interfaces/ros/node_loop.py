@@ -24,7 +24,7 @@ from std_msgs.msg import Float64MultiArray
 
 from loop_interfaces.affinity import pin_process
 from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.ros.endpoints import Receiver, SampleBatcher, Sender, reader_qos, scoped
+from loop_interfaces.ros.endpoints import Receiver, SampleBatcher, Sender
 from loop_interfaces.ros.observer import STUCK, SUSPENDED, WAIT, EventLoop
 from loop_interfaces.ros.sample_subscription import SampleSubscription
 from loop_interfaces.ros.suspend_watchdog import SuspendWatchdog
@@ -158,22 +158,6 @@ class NodeLoop(EventLoop):
         if self._batcher is None:
             self._batcher = SampleBatcher(self.node)
         return self._batcher
-
-    def listen(self, topic: Topic, callback: Callable[[Frame], None], namespace: str = "") -> None:
-        """Like `receive`, for what is rare and not urgent: served with the housekeeping.
-
-        It costs the hot path nothing, not even a place in its WaitSet.
-        """
-        decode = ArrayCodec(topic.labels).decode
-        name = scoped(namespace, topic.name)
-
-        def take(raw: bytes) -> None:
-            try:
-                callback(decode(raw))
-            except ValueError as error:
-                self.introspection.refuse(name, error)
-
-        self.node.create_subscription(Float64MultiArray, name, take, reader_qos(topic), raw=True)
 
     def pin(self, core: int) -> None:
         """Stay on one core; -1: on any. ValueError for a core not allowed."""
