@@ -12,7 +12,6 @@ import yaml
 from loop_interfaces.controllers import CONTROLLERS
 from loop_interfaces.problem import config_folder
 from loop_interfaces.topics import VIEW_NUMBERS
-from pdeloop.secure import ROLES
 from viewer_node.loop_view import COSTS
 
 VIEWS = config_folder() / "views"
@@ -143,7 +142,13 @@ def test_the_foxglove_layout_places_every_panel_once_and_calls_services_that_the
     }
     placed = list(panels(layout["layout"]))
     assert sorted(placed) == sorted(layout["configById"])
-    services = {f"/{role.node}/{name}" for role in ROLES for name in role.services}
+    policy = ET.parse(config_folder() / "sros2_policy.xml")
+    services = {
+        service.text.replace("~", f"/{profile.attrib['node']}")
+        for profile in policy.iter("profile")
+        for service in profile.iter("service")
+        if service.text
+    }
     called = {
         config["serviceName"]
         for name, config in layout["configById"].items()

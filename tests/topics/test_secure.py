@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable
 
 import pytest
 
-from pdeloop.secure import EVERY_NODE_ANSWERS, EVERY_NODE_PUBLISHES, ROLES, policy
+from loop_interfaces.problem import config_folder
 from tests.loop_harness import Processes
 from tests.topics.test_loop import LIMIT
 
@@ -39,40 +38,41 @@ print(json.dumps(seen))
 """
 
 
-def absolute(names: Iterable[str]) -> set[str]:
-    return {name if name.startswith("/") else f"/{name}" for name in names}
+POLICY = ET.parse(config_folder() / "sros2_policy.xml").getroot()
+WITHOUT_SAMPLES = {"tuner_node", "recorder_node", "viewer_node"}
+"""They subscribe to state, action and /clock only where a plant publishes no `samples`."""
+
+
+def allowed(profile: ET.Element, verb: str) -> list[str]:
+    """Full names of the topics that a node may publish or subscribe, as far as it does here."""
+    found = profile.findall(f"topics[@{verb}='ALLOW']/topic")
+    names = {f"/{(topic.text or '').lstrip('/')}" for topic in found} - {"/parameter_events"}
+    if verb == "subscribe" and profile.attrib["node"] in WITHOUT_SAMPLES:
+        names -= {"/state", "/action", "/clock"}
+    return sorted(names)
 
 
 def test_the_policy_allows_each_running_node_what_it_does_and_no_more(loop: Processes):
-    for role in ROLES:
-        own = {
-            "recorder_node": ["-p", "bag:=recorded"],
-            "tuner_node": ["-p", "optimizer:=gauss_newton"],
-        }.get(role.node, [])
-        loop.node(role.node, *own)
-    allowed = {
-        role.node: [
-            sorted(absolute({*role.publishes, *EVERY_NODE_PUBLISHES}) - {"/parameter_events"}),
-            sorted(absolute(role.subscribes)),
-            sorted(f"/{role.node}/{name}" for name in {*EVERY_NODE_ANSWERS, *role.services}),
-        ]
-        for role in ROLES
+    own = {
+        "recorder_node": ["-p", "bag:=recorded"],
+        "tuner_node": ["-p", "optimizer:=gauss_newton"],
     }
-    text = loop.wait(loop.start("-c", GRAPH, json.dumps(allowed), name="graph"), LIMIT)
-    assert json.loads(text.strip().splitlines()[-1]) == allowed
+    expected = {}
+    for profile in POLICY.iter("profile"):
+        name = profile.attrib["node"]
+        loop.node(name, *own.get(name, []))
+        services = sorted((s.text or "").replace("~", f"/{name}") for s in profile.iter("service"))
+        topics = (allowed(profile, verb) for verb in ("publish", "subscribe"))
+        expected[name] = [*topics, services]
+    text = loop.wait(loop.start("-c", GRAPH, json.dumps(expected), name="graph"), LIMIT)
+    assert json.loads(text.strip().splitlines()[-1]) == expected
 
 
 def test_the_policy_has_the_form_of_sros2_and_an_enclave_for_every_node():
-    root = ET.fromstring(policy())
-    assert root.attrib == {"version": "0.2.0"}
-    paths = [enclave.attrib["path"] for enclave in root.iter("enclave")]
-    assert paths == [f"/pdeloop/{role.node}" for role in ROLES]
-    plant = next(root.iter("profile"))
-    assert plant.attrib == {"ns": "/", "node": "pde_sim_node"}
-    rules = {
-        key: [topic.text for topic in topics.iter("topic")]
-        for topics in plant.iter("topics")
-        for key in topics.attrib
+    assert POLICY.attrib == {"version": "0.2.0"}
+    enclaves = {
+        enclave.attrib["path"]: next(enclave.iter("profile")).attrib
+        for enclave in POLICY.iter("enclave")
     }
-    assert "action" in rules["subscribe"]
-    assert "action" not in rules["publish"]
+    nodes = "pde_sim_node", "controller_node", "tuner_node", "recorder_node", "viewer_node"
+    assert enclaves == {f"/pdeloop/{node}": {"ns": "/", "node": node} for node in nodes}
