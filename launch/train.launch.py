@@ -67,7 +67,6 @@ def generate_launch_description() -> LaunchDescription:
                 for name, description in (
                     ("record", "record all topics to a rosbag2 bag in the folder"),
                     ("record_or_stop", "as record, and end if the recording fails"),
-                    ("record_views", "as record, with the topics of a viewer_node"),
                     ("view", "a viewer_node, for RViz, Foxglove and PlotJuggler"),
                 )
             ),
@@ -112,8 +111,8 @@ def training(context: LaunchContext) -> list[Any]:
             **options,
         )
 
-    required, views = given["record_or_stop"] == "true", given["record_views"] == "true"
-    recorded = required or views or given["record"] == "true"
+    required = given["record_or_stop"] == "true"
+    recorded = required or given["record"] == "true"
     serving = {"pairs": namespaces(pairs)}
     tuner = node(
         "tuner_node",
@@ -135,12 +134,12 @@ def training(context: LaunchContext) -> list[Any]:
     ]
     if recorded:
         grace = str(RECORDER_GRACE)  # it has a bag to finish
-        bag = {"bag": str(unused(folder / "bag")), "record_views": views, **serving}
+        bag = {"bag": str(unused(folder / "bag")), **serving}
         recorder = node(
             "recorder_node", parameters=bag, sigterm_timeout=grace, sigkill_timeout=grace
         )
         actions.insert(1, recorder)
-    if views or given["view"] == "true":
+    if given["view"] == "true":
         actions.append(node("viewer_node", namespaces(pairs)[0], respawn=True))
     return actions
 

@@ -216,7 +216,6 @@ RECORDER = _section(
     "R",
     Spec("bag", "").means("new folder of the bag; empty: bags/ and the time"),
     Spec("record_clock", True).means("record /clock, too"),
-    Spec("record_views", False).means("record the topics of a viewer_node, too"),
 )
 
 VIEWER = _section(

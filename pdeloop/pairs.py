@@ -134,8 +134,6 @@ class Transport:
         Without ROS.
     recorder : {"none", "start", "required"}
         Whether it is recorded, as the tuner's parameter says it.
-    record_views : bool
-        Record a viewer's topics, too.
     network : bool
         Let the messages leave this machine.
     pairs : int
@@ -148,7 +146,6 @@ class Transport:
 
     in_process: bool = False
     recorder: str = "none"
-    record_views: bool = False
     network: bool = False
     pairs: int = 1
     pin: bool = False
@@ -183,12 +180,11 @@ class Transport:
         cores = pair_cores(self.pairs, self.pin)
         nodes = pair_nodes(cores, solver_polls=self.pin)
         others = tuple(core for core in usable_cores() if core not in cores)
-        if self.view or self.record_views:
+        if self.view:
             first = namespaces(self.pairs)[0]
             nodes.append(LoopNode("viewer_node", "viewer_node", namespace=first, cores=others))
         if self.recorded:
-            own = {**serving, "record_views": self.record_views}
-            nodes.insert(0, LoopNode("recorder_node", "recorder_node", own, cores=others))
+            nodes.insert(0, LoopNode("recorder_node", "recorder_node", serving, cores=others))
         tuner = {
             **serving,
             "out": str(folder.resolve()),

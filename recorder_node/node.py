@@ -1,7 +1,6 @@
 """recorder_node: writes the loop's topics to a rosbag2 bag, as a ROS 2 node.
 
-Subscribes  every topic of the loop in its namespace (and of `pairs`), /clock, /diagnostics, /rosout;
-            with record_views those below view/, too
+Subscribes  every topic of the loop in its namespace (and of `pairs`), /clock, /diagnostics, /rosout
 Publishes   recorder/status (std_msgs/String, latched; from when nothing can be missed any more)
 A timer takes the serialised messages that have come in, in the order of their arrival over all
 topics. What is written: recorder_node.recording.
@@ -35,7 +34,7 @@ from recorder_node.bag import BagError
 from recorder_node.diagnostics import RecorderDiagnostics
 from recorder_node.peers import Peers
 from recorder_node.recording import Recording
-from recorder_node.sources import CLOCK, DIAGNOSTICS, ROSOUT, Source, sources, views
+from recorder_node.sources import CLOCK, DIAGNOSTICS, ROSOUT, Source, sources
 
 RECORDING_FAILED = 3
 """Exit code when writing fails later on; 1 is a recording that cannot begin."""
@@ -67,8 +66,6 @@ class RecorderNode:
         ]
         self._sources = [source for name in self._namespaces for source in sources(name)]
         self._sources += [DIAGNOSTICS, ROSOUT, *([CLOCK] if values["record_clock"] else [])]
-        if values["record_views"]:
-            self._sources += [source for name in self._namespaces for source in views(name)]
         folder = str(values["bag"]) or time.strftime("bags/%Y%m%d-%H%M%S")
         self._recording = Recording(Path(folder), self._sources)
         self._diagnostics = RecorderDiagnostics(self._recording)

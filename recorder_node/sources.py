@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from loop_interfaces.frames import ArrayCodec
-from loop_interfaces.topics import ARRAYS, MODEL_FAILED, VIEWS, Topic
+from loop_interfaces.topics import ARRAYS, MODEL_FAILED, Topic
 from recorder_node.bag import Channel
 
 ARRAY_TYPE = "std_msgs/msg/Float64MultiArray"
@@ -53,12 +53,6 @@ def sources(namespace: str) -> list[Source]:
         for topic in ARRAYS
     ]
     return [*found, Source(Channel(f"{base}/{MODEL_FAILED}", TEXT_TYPE, True), None, base or "/")]
-
-
-def views(namespace: str) -> list[Source]:
-    """What a viewer in the absolute `namespace` publishes."""
-    base = namespace.rstrip("/")
-    return [Source(Channel(f"{base}/{name}", kind)) for name, kind in VIEWS.items()]
 
 
 def source_of(name: str) -> Source | None:

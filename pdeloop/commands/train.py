@@ -67,11 +67,6 @@ def add(commands: Commands) -> None:
         help="as --record, and stop the training if the recording fails",
     )
     add(
-        "--record-views",
-        action="store_true",
-        help="as --record, with the topics of the viewer (--view), for Foxglove and PlotJuggler",
-    )
-    add(
         "--view",
         action="store_true",
         help="a viewer_node beside the others, for RViz, Foxglove and PlotJuggler (docs/views.md)",
@@ -95,13 +90,12 @@ def _train(options: argparse.Namespace) -> int:
     from pdeloop.pairs import Transport
     from pdeloop.training_run import begin, reopen, run
 
-    recorded = options.record or options.record_or_stop or options.record_views
+    recorded = options.record or options.record_or_stop
     if recorded:
         import recorder_node.bag  # noqa: F401  # the recorder would only say so in its log
     transport = Transport(
         options.in_process,
         recorder="required" if options.record_or_stop else "start" if recorded else "none",
-        record_views=options.record_views,
         network=options.network,
         pairs=options.pairs,
         pin=options.pin,

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import signal
 import struct
 import time
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +23,8 @@ from pdeloop.bags.reader import Bag
 from pdeloop.bags.verify import verify
 from pdeloop.identification import identify_bag
 from recorder_node.bag import BagWriter, Channel
-from tests.loop_harness import ROOT, Processes, until
-from tests.small import RECORDED, SMALL, paced, same_bits
+from tests.loop_harness import Processes, until
+from tests.small import RECORDED, SMALL, same_bits
 from tests.small_disk import read_only_folder, small_disk
 from tests.topics.test_loop import (
     LIMIT,
@@ -38,7 +36,6 @@ from tests.topics.test_loop import (
 
 pytestmark = pytest.mark.topics
 STEPS, ITERATIONS = 30, int(RECORDED["iterations"])
-LAYOUTS = ("foxglove.json", "plotjuggler.xml")
 EPISODES = ITERATIONS + 3  # exploration, check, the iterations, evaluation
 
 
@@ -76,28 +73,6 @@ def test_a_recorded_run_is_complete_and_everything_in_it_is_recomputed(loop, tmp
     names = {status.name for m in messages if hasattr(m, "status") for status in m.status}
     assert names >= {"pde_sim_node: lock-step", "recorder_node: recording"}
     assert {"pde_sim_node", "tuner_node"} <= {m.name for m in messages if hasattr(m, "msg")}
-
-
-def layout_topics() -> set[str]:
-    """Every topic that the shipped layouts of Foxglove and PlotJuggler name."""
-    text = "".join((ROOT / "config" / "views" / name).read_text() for name in LAYOUTS)
-    named = set(re.findall(r'"(/(?:view|diagnostics|rosout)[\w/]*)', text))
-    return {name.removesuffix("/data") for name in named}
-
-
-def test_the_layouts_find_every_topic_that_they_name_in_a_bag_with_views(loop, tmp_path):
-    trained(loop, tmp_path / "run", "--record-views", problem=paced(tmp_path, 50.0), iterations=100)
-    named = layout_topics()
-    assert len(named) > 10 and "/view/spacetime" in named
-    counts = Counter(message.topic for message in Bag(tmp_path / "run").messages())
-    assert {topic for topic in named if not counts[topic]} == set()
-    with AnyReader([tmp_path / "run" / "bag"]) as reader:
-        pictures = [c for c in reader.connections if c.topic == "/view/spacetime"]
-        assert pictures[0].msgtype == "sensor_msgs/msg/Image"
-        *_, (connection, _, raw) = reader.messages(pictures)
-        image = reader.deserialize(raw, connection.msgtype)
-        assert len(image.data) == image.height * image.step > 0
-    assert verify(tmp_path / "run").count == 0
 
 
 def test_the_policies_of_an_optimiser_that_uses_trajectories_are_recomputed_from_them(
