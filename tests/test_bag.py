@@ -11,7 +11,6 @@ import struct
 import subprocess
 import sys
 from collections import Counter
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -375,47 +374,44 @@ def crafted(folder: Path, *records: bytes) -> Path:
     return folder
 
 
-@cache
-def zeros(gigabytes: int) -> bytes:
-    """So many, compressed."""
+def zeros() -> bytes:
+    """2 GiB of them, compressed."""
     compressor = zstandard.ZstdCompressor(level=1).compressobj()
-    return (
-        b"".join(compressor.compress(bytes(2**20)) for _ in range(1024 * gigabytes))
-        + compressor.flush()
-    )
+    parts = [compressor.compress(bytes(2**24)) for _ in range(128)]
+    return b"".join(parts) + compressor.flush()
 
 
 MEMORY = """
 import resource, sys
-from pathlib import Path
 from pdeloop.cli import main
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-code = main(sys.argv[1:])
-print(code, (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024, file=sys.stderr)
+for bag in sys.argv[1:]:
+    for command in (("bag", "info"), ("bag", "verify"), ("identify", "--bag")):
+        assert main([*command, bag]) == 1
+print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024)
 """
 
 
-@pytest.mark.parametrize(
-    ("told", "words"),
-    [(2 * 2**30, "decompresses to more than 100 times"), (1000, "a chunk is not")],
-)
-@pytest.mark.parametrize("command", [("bag", "info"), ("bag", "verify"), ("identify", "--bag")])
-def test_a_small_file_that_becomes_gigabytes_is_refused_in_one_sentence(
-    tmp_path, told, words, command
-):
-    bag = crafted(tmp_path / "bomb", record_bytes(chunk(zeros(2), told)))
-    assert (bag / "x.mcap").stat().st_size < 2**20
+def test_a_small_file_that_becomes_gigabytes_is_refused_in_one_sentence(tmp_path):
+    """Whether the file says how large it becomes, or not."""
+    content = zeros()
+    told = [
+        crafted(tmp_path / str(size), record_bytes(chunk(content, size))) for size in (2**31, 1000)
+    ]
+    assert all((bag / "x.mcap").stat().st_size < 2**20 for bag in told)
     ended = subprocess.run(
-        [sys.executable, "-c", MEMORY, *command, str(bag)],
+        [sys.executable, "-c", MEMORY, *map(str, told)],
         capture_output=True,
         text=True,
         timeout=600,
         cwd=ROOT,
     )
-    *lines, last = ended.stderr.strip().splitlines()
-    code, megabytes = map(int, last.split())
-    assert code == 1 and len(lines) == 1 and words in lines[0], ended.stderr
-    assert megabytes < 300
+    assert ended.returncode == 0, ended.stderr
+    lines = ended.stderr.splitlines()
+    assert len(lines) == 6
+    assert all("decompresses to more than 100 times" in line for line in lines[:3])
+    assert all("a chunk is not" in line for line in lines[3:])
+    assert int(ended.stdout) < 300
 
 
 def test_many_chunks_are_bounded_together(tmp_path):
@@ -431,14 +427,14 @@ def test_many_chunks_are_bounded_together(tmp_path):
         list(bag.messages())
 
 
-@pytest.mark.parametrize("opcode", range(1, 16))
 @pytest.mark.parametrize("length", [0, 1, 5, 23, 2**40, 2**64 - 1])
-def test_hostile_records_are_one_sentence_or_no_messages(tmp_path, opcode, length):
-    record = struct.pack("<BQ", opcode, length) + b"\xff" * min(length, 100)
-    try:
-        assert list(Bag(crafted(tmp_path / "bag", record)).messages()) == []
-    except BagError as error:
-        assert "cannot be read, it is damaged" in str(error) and "\n" not in str(error)
+def test_hostile_records_are_one_sentence_or_no_messages(tmp_path, length):
+    for opcode in range(1, 16):
+        record = struct.pack("<BQ", opcode, length) + b"\xff" * min(length, 100)
+        try:
+            assert list(Bag(crafted(tmp_path / f"{opcode}", record)).messages()) == []
+        except BagError as error:
+            assert "cannot be read, it is damaged" in str(error) and "\n" not in str(error)
 
 
 def test_every_flipped_byte_is_noticed_or_harmless(tmp_path):

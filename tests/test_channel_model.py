@@ -8,9 +8,10 @@ alone. The same exploration finds what is wrong with each of several broken prot
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from graphlib import TopologicalSorter
 from itertools import product
+from typing import NamedTuple
 
 import pytest
 
@@ -18,8 +19,7 @@ MESSAGES, WAKES = 3, 2
 """Messages that arrive, and times that the node's thread wakes up for another reason."""
 
 
-@dataclass(frozen=True)
-class State:
+class State(NamedTuple):
     """Both threads between two steps; the messages are numbered from 0."""
 
     arrived: int = 0
@@ -62,31 +62,31 @@ class Model:
     def steps(self, s: State) -> Iterator[State]:
         """All states that one step of anybody leads to."""
         if s.arrived < MESSAGES:
-            yield replace(s, arrived=s.arrived + 1, queue=(*s.queue, s.arrived))
+            yield s._replace(arrived=s.arrived + 1, queue=(*s.queue, s.arrived))
         yield from self.middleware(s)
         yield from self.node(s)
 
     def middleware(self, s: State) -> Iterator[State]:
         match s.middleware:
             case "idle" if s.queue:
-                yield replace(s, middleware="lock", seen_armed=s.armed)
+                yield s._replace(middleware="lock", seen_armed=s.armed)
             case "lock" if not s.lock:
-                yield replace(s, middleware="take", lock="middleware")
+                yield s._replace(middleware="take", lock="middleware")
             case "take" if not s.queue:
-                yield replace(s, middleware="idle", lock="")
+                yield s._replace(middleware="idle", lock="")
             case "take":
-                yield replace(s, middleware="decide", taken=s.queue[0], queue=s.queue[1:])
+                yield s._replace(middleware="decide", taken=s.queue[0], queue=s.queue[1:])
             case "decide":
                 early = self.broken == "it looks whether it is armed before it has the lock"
                 armed = s.seen_armed if early else s.armed
                 if armed and self.fast[s.taken]:
                     lock = "" if self.broken == "it answers without the lock" else s.lock
-                    yield replace(s, middleware="answer", answering=True, lock=lock)
+                    yield s._replace(middleware="answer", answering=True, lock=lock)
                 else:
-                    yield replace(s, middleware="mail")
+                    yield s._replace(middleware="mail")
             case "answer":
                 handled = (*s.handled, s.taken)
-                yield replace(s, middleware="unlock", answering=False, handled=handled)
+                yield s._replace(middleware="unlock", answering=False, handled=handled)
             case "mail":
                 armed = s.armed and self.broken == "it stays armed while a message waits"
                 room = len(s.mailbox) < self.capacity
@@ -95,8 +95,7 @@ class Model:
                 # A guard condition keeps it; an event would be lost where nobody waits for it.
                 heard = s.node == "wait" or self.broken != "the guard condition forgets"
                 triggered = heard and self.broken != "nobody is told of a message that waits"
-                yield replace(
-                    s,
+                yield s._replace(
                     middleware="unlock",
                     armed=armed,
                     mailbox=mailbox,
@@ -105,45 +104,45 @@ class Model:
                 )
             case "unlock":
                 lock = "" if s.lock == "middleware" else s.lock
-                yield replace(s, middleware="lock", lock=lock, seen_armed=s.armed)
+                yield s._replace(middleware="lock", lock=lock, seen_armed=s.armed)
 
     def node(self, s: State) -> Iterator[State]:
         match s.node:
             case "arm":
                 if not s.lock:  # without an episode under way there is nothing to arm
-                    yield replace(s, node="pop" if s.mailbox else "go to sleep")
+                    yield s._replace(node="pop" if s.mailbox else "go to sleep")
                 if self.broken == "it arms without the lock":
-                    yield replace(s, node="answer waiting" if s.mailbox else "armed")
+                    yield s._replace(node="answer waiting" if s.mailbox else "armed")
                 elif not s.lock:
-                    yield replace(s, node="answer waiting", lock="node")
+                    yield s._replace(node="answer waiting", lock="node")
             case "answer waiting":
                 lock = "" if s.lock == "node" else s.lock
                 if s.mailbox and self.fast[s.mailbox[0]]:
                     handled = (*s.handled, s.mailbox[0])
-                    yield replace(s, mailbox=s.mailbox[1:], handled=handled)
+                    yield s._replace(mailbox=s.mailbox[1:], handled=handled)
                 elif s.mailbox and self.broken != "it arms while a message waits":
-                    yield replace(s, node="pop", lock=lock)
+                    yield s._replace(node="pop", lock=lock)
                 else:
-                    yield replace(s, node="go to sleep", lock=lock, armed=True, owns=False)
+                    yield s._replace(node="go to sleep", lock=lock, armed=True, owns=False)
             case "armed":
-                yield replace(s, node="go to sleep", armed=True, owns=False)
+                yield s._replace(node="go to sleep", armed=True, owns=False)
             case "go to sleep":
-                yield replace(s, node="wait")
+                yield s._replace(node="wait")
             case "wait":
                 if s.triggered:
-                    yield replace(s, node="disarm", triggered=False)
+                    yield s._replace(node="disarm", triggered=False)
                 if s.wakes:
-                    yield replace(s, node="disarm", wakes=s.wakes - 1)
+                    yield s._replace(node="disarm", wakes=s.wakes - 1)
             case "disarm":
-                yield replace(s, node="disarmed", armed=False)
+                yield s._replace(node="disarmed", armed=False)
             case "disarmed" if not s.lock or self.broken == "it does not wait for the answer":
-                yield replace(s, node="work", owns=True)
+                yield s._replace(node="work", owns=True)
             case "work":  # messages of other topics
-                yield replace(s, node="arm")
+                yield s._replace(node="arm")
             case "pop" if not s.lock:
-                yield replace(s, node="handle", popped=s.mailbox[0], mailbox=s.mailbox[1:])
+                yield s._replace(node="handle", popped=s.mailbox[0], mailbox=s.mailbox[1:])
             case "handle":
-                yield replace(s, node="arm", handled=(*s.handled, s.popped))
+                yield s._replace(node="arm", handled=(*s.handled, s.popped))
 
     def check(self) -> int:
         """Explore everything; how many states there are. AssertionError says what is wrong."""
