@@ -119,20 +119,6 @@ def parser() -> argparse.ArgumentParser:
     monitor.add_argument(
         "--browser", action="store_true", help="with the page drawn by a headless chromium"
     )
-    robustness = _add(
-        programs,
-        "robustness",
-        "trainings with noise, action limits and few sensors",
-        "--problems burgers --parts limit",
-    )
-    robustness.add_argument("--problems", nargs="+", metavar="PROBLEM", help="[all three]")
-    robustness.add_argument(
-        "--parts", nargs="+", metavar="PART", help="[ideal measurement process limit sensors both]"
-    )
-    robustness.add_argument("--seeds", type=int, default=3, metavar="N", help="[3]")
-    robustness.add_argument(
-        "--rollouts", type=int, default=20, metavar="N", help="of a seed, in all [20]"
-    )
     linearised = _add(
         programs,
         "linearised",

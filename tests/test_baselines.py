@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import baselines, reinforcement, robustness
+from benchmarks import baselines, reinforcement
 from benchmarks.__main__ import parser
 from benchmarks.baselines import TEST, TUNING_SEEDS, VALIDATION, iqm, refuse_other_constants, run
 from benchmarks.methods import (
@@ -245,20 +245,3 @@ def test_a_comparison_that_cannot_be_is_refused_in_one_sentence(
 ) -> None:
     with pytest.raises(ValueError, match=why):
         run(**words)
-
-
-def test_the_table_of_other_settings_says_what_diverged_and_where_there_was_no_model():
-    common = {"problem": "p", "none": [4.0, 4.0], "lqt": [2.0, 3.0], "attempts": [1, 5]}
-    noisy = {**common, "options": {"measurement_noise": 0.1}, "accepted": [3, 7]}
-    rows = [
-        {**noisy, "adapted": [1.0, 2.0]},
-        {**noisy, "lqt": [2.0, 5.0], "adapted": [1.0, 0.1 * DIVERGED_COST]},
-        {"problem": "p", "options": {"sensors": 2}, "failed": "why"},
-    ]
-    lines = robustness.text(rows).splitlines()
-    assert lines[0] == "**p**"
-    assert lines[-3:] == [
-        "| measurement_noise 0.1 | 1/5 | 4 | 2.5 (3) | 0 of 2 | 1.5 (2) | 3/7 |",
-        "| measurement_noise 0.1 | 1/5 | 4 | 3.5 (5) | 1 of 2 | diverges (1 of 2) | 3/7 |",
-        "| sensors 2 | no reduced model | | | | | |",
-    ]
