@@ -22,8 +22,8 @@ PROBLEM = "allen-cahn"
 BATCHES = (2, 64)
 CORES = ("any", "shared", "pinned")
 """Where plant and controller are: wherever the scheduler puts them (nodes started by hand), on one
-core for both (as `pdeloop train` does it), the same with the plant's helpers looking for work on the
-others all the time (`--pin`). The ping-pong is on any two, and with `pinned` on one each, polling."""
+core for both (as `pdeloop train` does it), the same on a core that no other pair has (`--pin`). The
+ping-pong is on any two, and with `pinned` on one each, polling."""
 PAYLOAD = 256
 """Numbers in a request of the bare ping-pong."""
 
@@ -45,7 +45,7 @@ def _measure(
     horizon = "horizon:=1000"
     pinned = cores == "pinned"
     chosen = [None] if cores == "any" else pair_cores(1, pinned)
-    plant, controller = pair_nodes(chosen, solver_polls=pinned)
+    plant, controller = pair_nodes(chosen)
     pair = (
         running.start(plant.package, horizon, *plant.assignments, problem=PROBLEM),
         running.start(controller.package, *controller.assignments, problem=PROBLEM),

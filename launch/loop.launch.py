@@ -45,7 +45,7 @@ def generate_launch_description() -> LaunchDescription:
                 "pin",
                 default_value="false",
                 choices=["true", "false"],
-                description="a core of its own for each pair, the plant's helpers polling on others",
+                description="a core of its own for each pair",
             ),
             DeclareLaunchArgument(
                 "equation",
@@ -99,7 +99,7 @@ def pairs_of_nodes(context: LaunchContext) -> list[Any]:
     cores = pair_cores(PAIRS.parse(given["pairs"]), pinned)
     for number, (pair, core) in enumerate(zip(namespaces(len(cores)), cores, strict=True)):
         for executable in ("pde_sim_node", "controller_node"):
-            parameters = {**own, **core_parameters(executable, core, solver_polls=pinned)}
+            parameters = {**own, **core_parameters(executable, core)}
             if executable == "pde_sim_node":
                 parameters["publish_clock"] = number == 0  # /clock is one topic for all
             actions.append(

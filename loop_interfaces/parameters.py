@@ -135,9 +135,6 @@ PLANT = _section(
         "cores of the threads that share a step of many environments, like 0-3,6; empty: those of "
         "the node"
     ),
-    Spec("solver_polls", False).means(
-        "those threads look for work all the time within an episode, instead of sleeping"
-    ),
 )
 
 EXECUTION = _section(

@@ -67,7 +67,7 @@ class PlantNode:
         values = declare_parameters(node)
         loop.pin(values["pin"])  # before the plant counts the cores it has
         if values["solver_cores"]:
-            use_cores(core_list(values["solver_cores"]), polling=values["solver_polls"])
+            use_cores(core_list(values["solver_cores"]))
         plant = build_plant(values)
         if plant.compiled_in_seconds > 0.0:
             node.get_logger().info(f"compiled the kernel in {plant.compiled_in_seconds:.1f} s")

@@ -100,23 +100,20 @@ def pair_cores(pairs: int, pin: bool = False) -> list[int | None]:
     return list(least_busy_cores(pairs))
 
 
-def core_parameters(package: str, core: int | None, *, solver_polls: bool) -> dict[str, Any]:
+def core_parameters(package: str, core: int | None) -> dict[str, Any]:
     """What keeps a node of a pair on its core, and the plant's helpers on all."""
     if core is None:
         return {}
-    solver = {"solver_cores": core_text(usable_cores()), "solver_polls": solver_polls}
+    solver = {"solver_cores": core_text(usable_cores())}
     return {"pin": core, **(solver if package == "pde_sim_node" else {})}
 
 
-def pair_nodes(cores: Sequence[int | None], *, solver_polls: bool = False) -> list[LoopNode]:
-    """The nodes of as many pairs as there are `cores` (see `pair_cores`).
-
-    solver_polls: the plant's helpers look for work all the time.
-    """
+def pair_nodes(cores: Sequence[int | None]) -> list[LoopNode]:
+    """The nodes of as many pairs as there are `cores` (see `pair_cores`)."""
     nodes = []
     for number, (namespace, core) in enumerate(zip(namespaces(len(cores)), cores, strict=True)):
         for package in PAIR:
-            own = core_parameters(package, core, solver_polls=solver_polls)
+            own = core_parameters(package, core)
             if number and package == "pde_sim_node":
                 own["publish_clock"] = False  # /clock is one topic for all
             name = f"{package}-{namespace}" if namespace else package
@@ -139,7 +136,7 @@ class Transport:
     pairs : int
         Of plant and controller.
     pin : bool
-        Keep each pair on a core of its own, and its solver's helpers polling.
+        Keep each pair on a core of its own.
     view : bool
         With a viewer_node of the first pair.
     """
@@ -178,7 +175,7 @@ class Transport:
         """
         serving = {"pairs": namespaces(self.pairs)}
         cores = pair_cores(self.pairs, self.pin)
-        nodes = pair_nodes(cores, solver_polls=self.pin)
+        nodes = pair_nodes(cores)
         others = tuple(core for core in usable_cores() if core not in cores)
         if self.view:
             first = namespaces(self.pairs)[0]

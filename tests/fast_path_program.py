@@ -18,7 +18,6 @@ from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.sample_subscription import SerializedSubscription
 from loop_interfaces.samples import ACTION_KIND, NO_TIME, STATE_KIND, unpack
 from loop_interfaces.topics import ACTION, COST, STATE, VOID, CostColumn
-from pde_sim_node.solver import workers
 from tests.test_fast_path import Controller, Plant, with_number
 
 
@@ -89,11 +88,11 @@ def answer_for(path: Any, seconds: float = 0.0, messages: int = 0) -> bytes | No
     return waiting
 
 
-def plant_on_topics(*, timed: bool = False, helped: bool = False, **overrides: object) -> None:
+def plant_on_topics(*, timed: bool = False) -> None:
     node = rclpy.create_node("plant")
     loop, peer = NodeLoop(node), Peer("action", "state")
     loop.batcher.timed = timed
-    plant = Plant(loop.batcher, horizon=14, **overrides)
+    plant = Plant(loop.batcher, horizon=14)
     path = plant.path
     receiver = loop.receive(ACTION, lambda frame: None)
     sender = loop.sender(STATE, sampled=True)
@@ -120,7 +119,6 @@ def plant_on_topics(*, timed: bool = False, helped: bool = False, **overrides: o
         assert plant.lockstep.step == plant.judge.step == 5
         parallel = plant.lockstep.plant.parallel
         assert parallel.begin_compiled() is not None
-        assert bool(parallel._context["polling"]) == helped
         assert parallel.end_compiled() == 5
         for _ in range(2):
             assert path.arm()
@@ -259,7 +257,5 @@ if __name__ == "__main__":
     controller_on_topics()
     plant_on_topics()
     plant_on_topics(timed=True)
-    workers.use_cores(range(2), polling=True)
-    plant_on_topics(helped=True, integration_time=0.0005)
     rclpy.shutdown()
     print("done")

@@ -191,8 +191,9 @@ def test_batch_place_and_threads_change_no_bit(
         assert all(alone[s] == bits for s, bits in rollout(plant, seeds[:batch]).items())
     shuffled = [int(s) for s in np.random.default_rng(0).permutation(seeds)]
     assert rollout(plant, shuffled) == alone
-    monkeypatch.setattr(workers, "_POOL", [workers.ThreadPool(range(3))])
-    monkeypatch.setattr(workers, "POINTS_PER_SLICE", 1)
+    monkeypatch.setattr(workers, "solver_threads", workers.SolverThreads())
+    workers.use_cores(range(3))
+    monkeypatch.setattr(workers, "SHARED_POINTS", 1)
     threaded = make(equation, **grid)
     for batch in (3, 7, 64):
         assert all(alone[s] == bits for s, bits in rollout(threaded, shuffled[:batch]).items())

@@ -16,17 +16,7 @@ from loop_interfaces.affinity import core_list, core_text, helps_solver
 from pde_sim_node.equations import Burgers
 from pde_sim_node.plant import Plant
 from pde_sim_node.solver import workers
-from pde_sim_node.solver.memory import aligned
-from pde_sim_node.solver.work_queue import (
-    QUEUE_WORDS,
-    begin_turn,
-    claim,
-    close,
-    current_turn,
-    finish,
-    wait_until_done,
-)
-from pde_sim_node.solver.workers import ThreadPool
+from pde_sim_node.solver.workers import SolverThreads, use_cores
 
 several = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
 P1 = {
@@ -43,10 +33,11 @@ def rollout(plant: Plant, seeds: range, steps: int = 20) -> bytes:
 
 
 def test_plants_in_several_threads_share_the_helpers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workers, "_POOL", [ThreadPool(range(1))])
+    monkeypatch.setattr(workers, "solver_threads", SolverThreads())
+    use_cores(range(1))
     alone = Plant(Burgers(), **P1)
     expected = [rollout(alone, range(first, first + 12)) for first in (0, 50, 100)]
-    monkeypatch.setattr(workers, "_POOL", [ThreadPool(range(4))])
+    use_cores(range(4))
     plants = [Plant(Burgers(), **P1) for _ in expected]
     found: list[list[bytes]] = [[] for _ in expected]
 
@@ -62,39 +53,9 @@ def test_plants_in_several_threads_share_the_helpers(monkeypatch: pytest.MonkeyP
     assert found == [[bits] * 10 for bits in expected]
 
 
-def test_who_comes_late_takes_nothing_of_the_next_step() -> None:
-    words = aligned(QUEUE_WORDS)
-    queue = words.ctypes.data
-    begin_turn(queue)
-    late = current_turn(queue)
-    assert [claim(queue, late, 3) for _ in range(4)] == [0, 1, 2, -1]
-    for _ in range(3):
-        assert not wait_until_done(queue, 3, 10)
-        finish(queue)
-    assert wait_until_done(queue, 3, 10)
-    close(queue)
-    assert claim(queue, late, 6) == -1  # a larger batch has more slices
-    begin_turn(queue)
-    assert claim(queue, late, 6) == -1
-    assert claim(queue, current_turn(queue), 6) == 0
-
-
-def test_a_worker_that_comes_late_does_not_touch_what_a_plant_evaluates() -> None:
-    plant = Plant(Burgers(), **P1)
-    plant.reset(np.arange(12))
-    plant.step(np.zeros((12, 6)))
-    before = plant.states.copy()
-    new, _ = plant.evaluate(before, np.ones((12, 6)))
-    for _ in range(2):
-        plant.parallel._help(0)
-    assert np.array_equal(plant.states, before)
-    assert (new != before).any(axis=1).all()
-    assert np.array_equal(plant.step(np.ones((12, 6))), new)
-
-
-def test_helpers_exist_from_the_first_large_batch_on_and_hold_no_plant() -> None:
+def test_a_small_step_is_compiled_code_alone_and_a_large_one_is_shared() -> None:
     program = """
-import gc, sys, threading, weakref
+import os, threading
 import numpy as np
 from pde_sim_node.solver import workers
 from pde_sim_node.equations import Burgers
@@ -102,24 +63,23 @@ from pde_sim_node.plant import Plant
 from tests.test_workers import P1, rollout
 workers.use_cores(range(3))
 plant = Plant(Burgers(), **P1)
-rollout(plant, range(2))
+few = rollout(plant, range(2))
+assert plant.parallel.begin_compiled() is not None
 assert threading.active_count() == 1
-rollout(plant, range(12))
+many = rollout(plant, range(16))
+assert plant.parallel.begin_compiled() is None
 assert threading.active_count() == 3
-gone = weakref.ref(plant.parallel)
-del plant
-gc.collect()
-for _ in range(100):
-    if gone() is None: break
-    import time; time.sleep(0.05)
-print(gone())
+if child := os.fork():
+    print(os.waitpid(child, 0)[1])
+else:  # a fork has none of the threads, and starts others
+    os._exit(rollout(plant, range(16)) != many)
 """
     root = Path(__file__).parent.parent
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=600, cwd=root,
         env={**os.environ, "PYTHONPATH": str(root)},
     )  # fmt: skip
-    assert done.stdout.strip() == "None", done.stderr
+    assert done.stdout.strip() == "0", done.stderr
 
 
 @several
@@ -136,7 +96,7 @@ from tests.test_workers import P1, rollout
 pin_process({cores[0]})
 workers.use_cores({cores})
 plant = Plant(Burgers(), **P1)
-rollout(plant, range(12))
+rollout(plant, range(16))
 print("there", flush=True)
 sys.stdin.readline()
 """

@@ -1,4 +1,4 @@
-"""Words of memory that several threads change, inside compiled functions."""
+"""Words of memory that several threads share, inside compiled functions."""
 
 from typing import Any
 
@@ -33,25 +33,3 @@ def store_release(typing_context: Any, address: Any, word: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(types.intp, types.intp), build
-
-
-@intrinsic
-def compare_exchange(typing_context: Any, address: Any, old: Any, new: Any) -> Any:
-    """Write `new` if the word is `old`; whether it was."""
-
-    def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        address, old, new = args
-        found = builder.cmpxchg(place(builder, address), old, new, "acq_rel", "acquire")
-        return builder.extract_value(found, 1)
-
-    return types.boolean(types.intp, types.intp, types.intp), build
-
-
-@intrinsic
-def fetch_add(typing_context: Any, address: Any, number: Any) -> Any:
-    """Add to the word at an address; what it was before."""
-
-    def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.atomic_rmw("add", place(builder, args[0]), args[1], "seq_cst")
-
-    return types.intp(types.intp, types.intp), build

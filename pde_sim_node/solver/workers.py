@@ -1,39 +1,36 @@
 """The compiled step of a batch of environments, shared out to the threads of a pool."""
 
 import os
-import time
-from _thread import LockType
-from collections.abc import Callable, Collection
-from contextlib import suppress
-from threading import Lock, Thread
+from collections.abc import Collection
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.affinity import join_solver, usable_cores
-from loop_interfaces.jit import atomics, native
+from loop_interfaces.jit import native
 from loop_interfaces.jit.cache import cached_njit, fingerprint
-from pde_sim_node.solver import step_context, work_queue
+from pde_sim_node.solver import step_context
 from pde_sim_node.solver.memory import Constants, aligned
-from pde_sim_node.solver.step_context import (
-    SPINS,
-    STEP_CONTEXT,
-    step_code,
-    step_environments,
-    take_slices,
-)
-from pde_sim_node.solver.work_queue import QUEUE_WORDS, begin_turn, close, wait_until_done
+from pde_sim_node.solver.step_context import STEP_CONTEXT, advance, step_code
 
-POINTS_PER_SLICE = 15_000
-"""Grid points, in all stages, of a slice: 30 to 40 microseconds of one thread."""
-MIN_SLICES = 6
-"""Below this many slices, waking another thread takes longer than it helps."""
-MAX_SLICES_ALONE = 7
-"""Steps of at most this many slices run on the calling thread alone, so that they are compiled code
-alone: to call workers takes the interpreter."""
-POLL_PERIOD = 50e-6
-"""Seconds to sleep while a thread that is waited for has lost its core to another process."""
+SHARED_POINTS = 120_000
+"""Grid points, in all stages, from which on a step is shared: some 250 microseconds of one thread. A
+smaller one is done before another thread has woken up, and is compiled code alone."""
+
+
+def compile_part(sources: str) -> Any:
+    @cached_njit
+    def advance_part(contexts: NDArray[np.void], plan: int, first: int, last: int) -> None:
+        """Advance the environments first, ..., last - 1 of the STEP_CONTEXT in an array."""
+        sources  # noqa: B018  # closed over to be part of the key on disk
+        advance(contexts[0], plan, first, last)
+
+    return advance_part
+
+
+advance_part = compile_part(fingerprint(step_context, native))
 
 
 class ParallelStep:
@@ -64,21 +61,15 @@ class ParallelStep:
         self.constants = constants.planes()
         plan["constants"] = self.constants.ctypes.data
         plan["constants_apart"] = self.constants.size // 2
-        self._pool = thread_pool()
-        threads = 1 + self._pool.size
+        threads = len(solver_threads.cores)
         self._scratch = [aligned(2 * scratch) for _ in range(threads)]
         self.plans = np.repeat(plan, threads)
         self.plans["scratch"] = [area.ctypes.data for area in self._scratch]
         self._points_per_step = points_per_step
-        self._queue = aligned(QUEUE_WORDS)  # of words as long as a number
         self._contexts = np.zeros(1, STEP_CONTEXT)
         self._context = self._contexts[0]
         self._context["code"], self._context["plan"] = code, self.plans.ctypes.data
-        self._context["queue"] = self._queue.ctypes.data
-        if self._pool.size:  # load or compile what the first large batch would wait for
-            start(self._contexts)
-            done(self._contexts)
-            self._help(0)
+        advance_part(self._contexts, self.plans.ctypes.data, 0, 0)  # load or compile it
 
     def bind(
         self,
@@ -89,152 +80,74 @@ class ParallelStep:
         k: int,
     ) -> None:
         """Work on these arrays from now on, contiguous and writable; k: step of the states."""
-        context, batch = self._context, len(states)
-        if self._pool.size:
-            shut(self._contexts)  # for a worker that wakes up late
         self._arrays = states, actions, totals, diverged_step  # kept alive
+        context, batch = self._context, len(states)
         names = "states", "actions", "totals", "diverged_step"
         for name, array in zip(names, self._arrays, strict=True):
             context[name] = array.ctypes.data
-        self._slices = min(batch, batch * self._points_per_step // POINTS_PER_SLICE)
-        self._shared = self._pool.size > 0 and self._slices >= MIN_SLICES
-        context["batch"], context["slices"], context["step"] = batch, self._slices, k
-        context["shared"] = self._shared
+        context["batch"], context["step"] = batch, k
+        shared = batch * self._points_per_step >= SHARED_POINTS
+        parts = min(len(self.plans), batch) if shared else 1
+        edges = [batch * part // parts for part in range(parts + 1)]
+        addresses = (self.plans[part : part + 1].ctypes.data for part in range(parts))
+        self._parts = list(zip(addresses, edges[:-1], edges[1:], strict=True))
 
     def step(self) -> None:
         """Advance all environments in place."""
-        if not self._shared:
-            step(self._contexts)
-            return
-        start(self._contexts)
-        self._pool.call(self._help, self._slices - 1)
-        self._help(0)
-        while not done(self._contexts):
-            time.sleep(POLL_PERIOD)
-        self._pool.dismiss()
+        own, *others = self._parts
+        begun = [solver_threads.pool().submit(advance_part, self._contexts, *it) for it in others]
+        advance_part(self._contexts, *own)
+        for part in begun:
+            part.result()
         self._context["step"] += 1
-
-    def _help(self, thread: int) -> None:
-        plan = self.plans.ctypes.data + thread * self.plans.itemsize
-        take(self._contexts, plan)
 
     def begin_compiled(self) -> tuple[int, int] | None:
         """Let compiled code make the steps until `end_compiled`.
 
         Returns
         -------
-        Addresses of a C function that makes one, and of what it is called with; None where workers
-        are better that have to be called from Python.
+        Addresses of a C function that makes one, and of what it is called with; None where several
+        threads are better, which have to be called from Python.
         """
-        polled = self._pool.size > 0 and self._pool.polling and self._slices > 1
-        if self._pool.size and not polled and self._slices > MAX_SLICES_ALONE:
+        if len(self._parts) > 1:
             return None
-        self._context["shared"] = self._context["polling"] = polled
-        if polled:
-            self._pool.call(self._help, self._slices - 1)
         return step_code(), self._contexts.ctypes.data
 
     def end_compiled(self) -> int:
         """Python makes the steps again; the step k of the states now."""
-        if self._context["polling"]:
-            self._context["polling"] = 0
-            self._pool.dismiss()
-        self._context["shared"] = self._shared
         return int(self._context["step"])
 
 
-class ThreadPool:
-    """Worker threads, started on first use and never stopped.
+class SolverThreads:
+    """The threads that share the steps of this process's plants, started on first use.
 
-    Nobody waits for one that has not begun, so a busy machine costs little. polling: whether they
-    may poll for work while they are called.
+    Attributes
+    ----------
+    cores : collection of int
+        Where they may be. There are as many threads, with the one that asks for a step.
     """
 
-    def __init__(self, cores: Collection[int], polling: bool = False) -> None:
-        self.size = len(cores) - 1
-        self.polling = polling
-        self._cores = cores
-        self._process = 0
-        self._gates: list[LockType] = []
-        self._work: Callable[[int], None] | None = None
+    def __init__(self) -> None:
+        self.cores: Collection[int] = usable_cores()
+        self._pool: ThreadPoolExecutor | None = None
+        os.register_at_fork(after_in_child=self.forget)
 
-    def call(self, work: Callable[[int], None], workers: int) -> None:
-        """work(thread) in at most so many threads, numbered from 1."""
-        if self._process != os.getpid():  # a fork has the gates, not the threads
-            self._begin()
-        self._work = work
-        for gate in self._gates[:workers]:
-            with suppress(RuntimeError):  # it is open still: that thread has not woken up yet
-                gate.release()
+    def pool(self) -> ThreadPoolExecutor:
+        """Those beside the thread that asks for a step."""
+        if self._pool is None:
+            helpers = len(self.cores) - 1
+            self._pool = ThreadPoolExecutor(helpers, "solver", join_solver, (self.cores,))
+        return self._pool
 
-    def _begin(self) -> None:
-        self._process = os.getpid()
-        self._gates = [Lock() for _ in range(self.size)]
-        for number, gate in enumerate(self._gates, 1):
-            gate.acquire()
-            Thread(target=self._run_worker, args=(number, gate), daemon=True).start()
-
-    def dismiss(self) -> None:
-        """The work is done."""
-        self._work = None
-
-    def _run_worker(self, number: int, gate: LockType) -> None:
-        join_solver(self._cores)
-        while gate.acquire():
-            work = self._work
-            if work is not None:
-                work(number)
-            del work  # it holds a plant
+    def forget(self) -> None:
+        """Start others with the next step: a fork has none of them."""
+        self._pool = None
 
 
-_POOL: list[ThreadPool] = []
+solver_threads = SolverThreads()
 
 
-def thread_pool() -> ThreadPool:
-    """The one of this process; on the cores that it may use when the first plant is made."""
-    if not _POOL:
-        _POOL.append(ThreadPool(usable_cores()))
-    return _POOL[0]
-
-
-def use_cores(cores: Collection[int], *, polling: bool = False) -> None:
-    """Where the threads of the plants that are made from now on may be.
-
-    polling: they poll for work within an episode, where a step is worth it.
-    """
-    _POOL[:] = [ThreadPool(cores, polling)]
-
-
-def compile_for_threads() -> tuple[Any, ...]:
-    """What the threads call, with a STEP_CONTEXT in an array."""
-    sources = fingerprint(step_context, work_queue, atomics, native)
-
-    @cached_njit
-    def step(contexts: NDArray[np.void]) -> None:
-        sources  # noqa: B018  # closed over to be part of the key on disk
-        step_environments(contexts[0])
-
-    @cached_njit
-    def start(contexts: NDArray[np.void]) -> None:
-        sources  # noqa: B018
-        begin_turn(contexts[0].queue)
-
-    @cached_njit
-    def take(contexts: NDArray[np.void], plan: int) -> None:
-        sources  # noqa: B018
-        take_slices(contexts[0], plan)
-
-    @cached_njit
-    def done(contexts: NDArray[np.void]) -> bool:
-        sources  # noqa: B018
-        return wait_until_done(contexts[0].queue, contexts[0].slices, SPINS)
-
-    @cached_njit
-    def shut(contexts: NDArray[np.void]) -> None:
-        sources  # noqa: B018
-        close(contexts[0].queue)
-
-    return step, start, take, done, shut
-
-
-COMPILED = step, start, take, done, shut = compile_for_threads()
+def use_cores(cores: Collection[int]) -> None:
+    """Where the threads of the plants that are made from now on may be."""
+    solver_threads.cores = cores
+    solver_threads.forget()
