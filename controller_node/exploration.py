@@ -34,10 +34,13 @@ class Exploration:
     ----------
     outcomes : dict
         What came out of it, by plant; filled in by the responder.
+    nbytes : int
+        Size of the states that are kept.
     """
 
     def __init__(self, start: Frame, settings: DesignSettings) -> None:
         self.outcomes: dict[int, Publication | ModelFailure] = {}
+        self.nbytes = 0
         self._start, self._settings = start, settings
         seeds, variances = start.values[:, [StartColumn.EXCITATION, StartColumn.VARIANCE]].T
         self._draws = list(zip(seeds.astype(int).tolist(), variances.tolist(), strict=True))
@@ -57,16 +60,25 @@ class Exploration:
             self._actions = {k: np.stack([self._draw(*d, k) for d in self._draws]) for k in steps}
         return self._actions[step]
 
-    def keep(self, state: Frame) -> None:
-        """Keep a state for the identification; two different ones of a step allow none."""
+    def lacks(self, state: Frame) -> bool:
+        """Whether the state is to be kept. Two different ones of a step make the episode unusable."""
         known = self._states.get((state.plant, state.step))
-        if known is None:
-            self._states[state.plant, state.step] = state.values.copy()
-        elif not np.array_equal(known, state.values):
-            self._unusable = self._failure(
-                f"two different states came for step {state.step} of the exploratory episode",
-                retry=True,
-            )
+        if known is None or self._unusable is not None:
+            return self._unusable is None
+        if not np.array_equal(known, state.values):
+            reason = f"two different states came for step {state.step} of the exploratory episode"
+            self.give_up(reason, retry=True)
+        return False
+
+    def keep(self, state: Frame) -> None:
+        """Keep a state for the identification."""
+        self._states[state.plant, state.step] = state.values.copy()
+        self.nbytes += state.values.nbytes
+
+    def give_up(self, reason: str, *, retry: bool) -> None:
+        """No model can come out of the episode, whatever its cost is."""
+        self._unusable = self._failure(reason, retry=retry)
+        self._states, self.nbytes = {}, 0
 
     def identify(self, cost: Frame, target: Array | None) -> Publication | ModelFailure:
         """The models of all environments, or why there are none, once the episode has its cost.

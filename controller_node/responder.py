@@ -34,6 +34,9 @@ from loop_interfaces.topics import (
 MAX_RUNS = 8
 """Runs, and plants, that are remembered. The longest unheard one is forgotten first, but never the one
 that was answered last: a flood of strangers cannot push it out."""
+MAX_BYTES = 2**29
+"""Bytes that are kept of all runs together. Runs that were heard longer ago are forgotten for a newer
+one; a run that has no room alone is refused, and an exploratory episode without room gives no model."""
 
 
 @dataclass
@@ -54,6 +57,14 @@ class _Run:
     """The law for each plant, and the episode it is set for."""
     signatures: dict[int, float] = field(default_factory=dict)
     """What the actions of the episode carry, by plant."""
+
+    @property
+    def nbytes(self) -> int:
+        frames = [frame.values.nbytes for frame in (self.start, self.policy) if frame is not None]
+        models = [a.nbytes for model in self.models for a in (model.U, model.A, model.B)]
+        laws = len(self.laws) * sum(model.U.nbytes for model in self.models)
+        samples = self.exploration.nbytes if self.exploration else 0
+        return sum(frames) + sum(models) + laws + samples
 
     def episode_start(self, frame: Frame) -> Frame | None:
         """The start of the frame's episode, if it is the one this run is in."""
@@ -115,7 +126,7 @@ class Responder:
         if not len(rows):
             self._runs.pop(frame.run, None)
             return []
-        run = self._run(frame.run)
+        run = self._run(frame.run, rows.nbytes)
         if run.episode_start(frame) is None:
             run.start, run.signatures = replace(frame, values=rows.copy()), {}
             explores = rows[0, StartColumn.EXCITATION] >= 0
@@ -132,7 +143,7 @@ class Responder:
             raise FrameError(f"expected gains of {n_a} actuators, got {frame.values.shape[1]}")
         if frame.values.size and np.abs(frame.values).max() > MAX_GAIN:
             raise FrameError(f"expected gains of at most {MAX_GAIN:g} in magnitude")
-        run = self._run(frame.run)
+        run = self._run(frame.run, frame.values.nbytes)
         known = run.policy
         shape = frame.values.shape
         # One of another shape could never have been used: it puts nothing in doubt.
@@ -150,7 +161,7 @@ class Responder:
 
     def model(self, frame: Frame) -> list[Publication]:
         """Take a run's reduced models."""
-        run = self._run(frame.run)
+        run = self._run(frame.run, 2 * frame.values.nbytes)
         run.models = [model_rows.unpack(rows.copy(), self._settings.n_a) for rows in frame.values]
         run.models_digest = digest_of(frame.values)
         run.generation, run.laws, run.signatures = frame.step, {}, {}
@@ -249,11 +260,35 @@ class Responder:
                 lacking.append("policy (two different ones came)")
         return lacking
 
-    def _run(self, number: int) -> _Run:
-        """What is known of a run."""
+    def _run(self, number: int, more: int) -> _Run:
+        """What is known of a run, of which `more` bytes come. FrameError if there is no room."""
         run = self._runs.setdefault(number, _Run())
         _forget(self._runs, number, self._served[0])
+        if not self._has_room(number, more):
+            raise FrameError(f"expected less than {MAX_BYTES} bytes of all runs together")
         return run
+
+    def _has_room(self, number: int, more: int) -> bool:
+        """Forget runs that were heard longer ago than this one, until `more` bytes have room."""
+        others = [key for key in self._runs if key not in (number, self._served[0])]
+        while sum(run.nbytes for run in self._runs.values()) + more > MAX_BYTES:
+            if not others:
+                return False
+            del self._runs[others.pop(0)]
+        return True
+
+    def _keep_sample(self, exploration: Exploration, state: Frame) -> None:
+        """Keep a state of an exploratory episode for its identification."""
+        if not exploration.lacks(state):
+            return
+        if self._has_room(state.run, state.values.nbytes):
+            exploration.keep(state)
+            return
+        reason = (
+            f"the states of the exploratory episode take more than {MAX_BYTES} bytes; "
+            "explore fewer seeds at once (max_batch)"
+        )
+        exploration.give_up(reason, retry=False)
 
     def _actions(self, frame: Frame) -> np.ndarray | None:
         run = self._runs.get(frame.run)
@@ -268,7 +303,7 @@ class Responder:
         if target is None:
             return None
         if run.exploration:
-            run.exploration.keep(frame)
+            self._keep_sample(run.exploration, frame)
             return run.exploration.actions(frame.step)
         law, episode = run.laws.get(frame.plant, (None, -1))
         if law is None or episode != frame.episode:

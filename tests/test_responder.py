@@ -216,6 +216,26 @@ def test_a_policy_that_does_not_fit_the_episode_is_refused_and_a_good_one_serves
     assert len(responder.state(state)) == 1
 
 
+def test_a_run_of_a_stranger_fills_no_memory(monkeypatch):
+    monkeypatch.setattr("controller_node.responder.MAX_BYTES", 100_000)
+    responder = Responder(SETTINGS)
+    responder.target(TARGET)
+    states = PLANT.reset(np.array([1]))
+    for run in range(100, 120):
+        responder.start(start(1, (1, 2, 0.1, 0), run=run))
+        for k in range(2000):
+            assert len(responder.state(Frame(run, 1, k, 0.0, states + k))) == 1
+        assert sum(known.nbytes for known in responder._runs.values()) <= 100_000
+    costs = np.array([[1.0, 30.0, COMPLETED]])
+    (failure,) = responder.cost(Frame(119, 1, 1999, 1.0, costs))
+    assert isinstance(failure, ModelFailure) and not failure.retry
+    assert "more than 100000 bytes; explore fewer seeds at once" in failure.reason
+    with pytest.raises(FrameError, match="expected less than 100000 bytes of all runs"):
+        responder.policy(Frame(7, 1, 0, 0.0, np.ones((50, 4, 80))))
+    (model,) = explore(responder, 5)  # the run with room is served as before
+    assert model.topic is MODEL_IDENTIFIED
+
+
 def test_two_different_states_of_one_step_give_no_model_and_ask_for_the_episode_again():
     responder = Responder(SETTINGS)
     responder.target(TARGET)
