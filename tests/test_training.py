@@ -44,31 +44,6 @@ def test_training_moves_the_policy_and_zero_starts_from_zero():
     assert np.isclose(np.linalg.norm(plus), 0.1)
 
 
-@pytest.mark.parametrize("stop_after", [0, 1, 2, 3, 5, 6])
-def test_a_checkpoint_at_any_batch_continues_to_the_same_policy(tmp_path, stop_after):
-    values = parameters(seeds=2, iterations=4)
-    undisturbed = train_here(values)
-    first, pair = build_training(values), LocalPair(values)
-    for _ in range(stop_after):
-        result = pair.run(first.next_batch())
-        first.finish(result)
-        if result.models is not None:
-            pair.use_models(first.models)
-    checkpoint.save(tmp_path / "checkpoint", first.state())
-    second = build_training(values)
-    assert checkpoint.restore(tmp_path / "checkpoint", second.restore) == (True, [])
-    fresh_pair = LocalPair(values)
-    if second.models is not None:
-        fresh_pair.use_models(second.models)
-    while (batch := second.next_batch()) is not None:
-        result = fresh_pair.run(batch)
-        second.finish(result)
-        if result.models is not None:
-            fresh_pair.use_models(second.models)
-    assert same_bits(second.policies(), undisturbed.policies())
-    assert second.history == undisturbed.history
-
-
 def test_a_bad_warm_start_is_identified_again_and_only_that_one():
     values = parameters(seeds=2, iterations=1)
     training, pair = build_training(values), LocalPair(values)
@@ -218,24 +193,6 @@ def test_a_model_of_another_plant_is_refused(tmp_path):
     for optimizer in ("two_point", "gauss_newton"):
         with pytest.raises(ValueError, match=r"state"):
             train_here(parameters(model=path, optimizer=optimizer))
-
-
-@pytest.mark.parametrize("told", [5, 9])
-def test_gauss_newton_continues_from_a_checkpoint_in_the_middle_to_the_same_bits(tmp_path, told):
-    values = parameters(rollouts=25, optimizer="gauss_newton")
-    undisturbed = train_here(values)
-    first, pair = build_training(values), LocalPair(values)
-    for _ in range(told):
-        result = pair.run(first.next_batch())
-        first.finish(result)
-        pair.follow(first)
-    assert first.phase == "adapt"
-    checkpoint.save(tmp_path / "checkpoint", first.state())
-    second = build_training(values)
-    assert checkpoint.restore(tmp_path / "checkpoint", second.restore) == (True, [])
-    train(second, LocalPair(values), lambda row: None)
-    assert same_bits(second.policies(), undisturbed.policies())
-    assert same_bits(second.evaluation, undisturbed.evaluation)
 
 
 @pytest.mark.parametrize("limit", [0.0, 0.05])
