@@ -6,7 +6,7 @@ n until a training comes to its end, it lets the n-th call fail in each of these
 kill     SIGKILL before the call; the training that continues is killed once more
 torn     SIGKILL in fsync, when half of the file's content is on the disk
 EIO      fsync and rename are refused
-ENOSPC   open and fsync are refused
+ENOSPC   open is refused
 
 and the training is continued until it is done. It prints a line of JSON: how many failures of each way
 there were, and a sentence for each training that did not come to the same policy.
@@ -36,7 +36,7 @@ KINDS = {
     "kill": CHANGING,
     "torn": ("fsync",),
     "EIO": ("fsync", "replace", "rename"),
-    "ENOSPC": ("open", "fsync"),
+    "ENOSPC": ("open",),
 }
 """Ways to fail, and the calls that can fail so."""
 

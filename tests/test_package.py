@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tomllib
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Iterator
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from tests.colcon_workspace import ROOT, Workspace, build
 from tests.small import SMALL
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+TRAIN = "train.launch.py"
 NODES = ("pde_sim_node", "controller_node", "tuner_node", "recorder_node")
 
 
@@ -107,50 +109,65 @@ def test_installed_executables_run_with_the_installed_code_and_configuration(
         assert "Traceback" not in refused.stderr
 
 
-@pytest.mark.parametrize("option", ["--merge-install", "--symlink-install"])
-def test_merged_and_linked_installations_work_too(option: str, tmp_path: Path) -> None:
-    workspace = build(tmp_path, option)
-    merged = option == "--merge-install"
-    assert workspace.prefix == tmp_path / "install" / ("" if merged else "pdeloop")
+def test_a_merged_and_linked_installation_works_too(tmp_path: Path) -> None:
+    workspace = build(tmp_path, "--merge-install", "--symlink-install")
+    assert workspace.prefix == tmp_path / "install"
     done = workspace.run("pdeloop", "problems", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     # A linked installation runs the workspace's sources, so that an edit needs no build.
-    used = workspace.prefix / "share/pdeloop" if merged else tmp_path / "src/pdeloop"
-    assert str(used / "config/problems/burgers.yaml") in done.stdout
+    assert str(tmp_path / "src/pdeloop/config/problems/burgers.yaml") in done.stdout
 
 
-def launched(file: str, **texts: object) -> list[dict[str, Any]]:
-    """The nodes that a launch file starts with these arguments, as the stand-in for launch says."""
-    program = (
-        "import sys\n"
-        "from launch import LaunchDescription, LaunchService\n"
-        "from launch.actions import IncludeLaunchDescription\n"
-        "from launch.launch_description_sources import PythonLaunchDescriptionSource\n"
-        "arguments = [tuple(word.split(':=', 1)) for word in sys.argv[2:]]\n"
-        "source = PythonLaunchDescriptionSource(sys.argv[1])\n"
-        "service = LaunchService()\n"
-        "included = IncludeLaunchDescription(source, launch_arguments=arguments)\n"
-        "service.include_launch_description(LaunchDescription([included]))\n"
-        "sys.exit(service.run())\n"
-    )
+@pytest.fixture(scope="module")
+def launched(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., list[Any]]]:
+    """A function to the nodes that a launch file starts, as the stand-in for launch says.
+
+    In a process of its own, which has no other `launch`, and is asked more than once.
+    """
     path = os.pathsep.join([str(ROOT / "tests" / "launch_stand_in"), str(ROOT)])
-    words = [f"{name}:={text}" for name, text in texts.items()]
-    done = subprocess.run(
-        [sys.executable, "-c", program, str(ROOT / "launch" / file), *words],
-        env={**os.environ, "PYTHONPATH": path, "LAUNCH_DRY_RUN": "1"},
-        capture_output=True,
-        text=True,
-        timeout=600,
-    )
-    assert "Traceback" not in done.stderr, done.stderr
-    said = done.stdout.splitlines()
-    if done.returncode:
-        raise ValueError(said[0])
-    return [json.loads(line) for line in said if line.startswith("{")]
+    with (tmp_path_factory.mktemp("launched") / "errors").open("w+") as errors:
+        asked = subprocess.Popen(
+            [sys.executable, "-c", LAUNCHED],
+            env={**os.environ, "PYTHONPATH": path, "LAUNCH_DRY_RUN": "1"},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
+        )
+        assert asked.stdin and asked.stdout
+
+        def launch(file: str, **texts: object) -> list[dict[str, Any]]:
+            words = {name: str(text) for name, text in texts.items()}
+            print(json.dumps([str(ROOT / "launch" / file), words]), file=asked.stdin, flush=True)
+            answer = asked.stdout.readline()
+            assert answer, Path(errors.name).read_text()
+            code, said = json.loads(answer)
+            if code:
+                raise ValueError(said[0])
+            return [json.loads(line) for line in said if line.startswith("{")]
+
+        with asked:
+            yield launch
+            asked.stdin.close()
 
 
-def train(**texts: object) -> list[dict[str, Any]]:
-    return launched("train.launch.py", problem=SMALL, **texts)
+LAUNCHED = """
+import contextlib, io, json, os, sys
+from launch import LaunchDescription, LaunchService
+from launch.actions import IncludeLaunchDescription
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+environment = dict(os.environ)
+for line in sys.stdin:
+    path, texts = json.loads(line)
+    source, service = PythonLaunchDescriptionSource(path), LaunchService()
+    included = IncludeLaunchDescription(source, launch_arguments=texts.items())
+    service.include_launch_description(LaunchDescription([included]))
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        code = service.run()
+    print(json.dumps([code, said.getvalue().splitlines()]), flush=True)
+    os.environ.clear()
+    os.environ.update(environment)
+"""
 
 
 def given_to(node: dict[str, Any]) -> dict[str, Any]:
@@ -159,9 +176,18 @@ def given_to(node: dict[str, Any]) -> dict[str, Any]:
     return own
 
 
-def test_a_launched_training_has_the_nodes_and_parameters_that_exist(tmp_path: Path) -> None:
+def test_a_launched_training_has_the_nodes_and_parameters_that_exist(launched, tmp_path) -> None:
     run = tmp_path / "run"
-    nodes = train(out=run, pairs=2, record="true", iterations=3, real_time_factor=50, view="true")
+    nodes = launched(
+        TRAIN,
+        problem=SMALL,
+        out=run,
+        pairs=2,
+        record="true",
+        iterations=3,
+        real_time_factor=50,
+        view="true",
+    )
     assert [(node["executable"], node["namespace"]) for node in nodes] == [
         ("recorder_node", ""),
         *(("pde_sim_node", "pair0"), ("controller_node", "pair0")),
@@ -184,17 +210,19 @@ def test_a_launched_training_has_the_nodes_and_parameters_that_exist(tmp_path: P
     assert [given_to(node)["publish_clock"] for node in nodes[1:5:2]] == [True, False]
 
 
-def test_an_interrupted_launched_training_is_continued_with_its_own_parameters(tmp_path) -> None:
-    train(out=tmp_path / "run", iterations=3)
-    again = launched("train.launch.py", resume=tmp_path / "run", record_or_stop="true")
+def test_an_interrupted_launched_training_is_continued_with_its_own_parameters(
+    launched, tmp_path
+) -> None:
+    launched(TRAIN, problem=SMALL, out=tmp_path / "run", iterations=3)
+    again = launched(TRAIN, resume=tmp_path / "run", record_or_stop="true")
     assert again[0]["parameters"][0] == str(tmp_path / "run" / "parameters.yaml")
     assert given_to(again[-1])["recorder"] == "required"
     with pytest.raises(ValueError, match="leave out seed"):
-        launched("train.launch.py", resume=tmp_path / "run", seed=1)
+        launched(TRAIN, resume=tmp_path / "run", seed=1)
     with pytest.raises(ValueError, match="no run in"):
-        launched("train.launch.py", resume=tmp_path)
+        launched(TRAIN, resume=tmp_path)
     with pytest.raises(ValueError, match="already holds a run"):
-        train(out=tmp_path / "run")
+        launched(TRAIN, problem=SMALL, out=tmp_path / "run")
 
 
 @pytest.mark.parametrize(
@@ -210,10 +238,10 @@ def test_an_interrupted_launched_training_is_continued_with_its_own_parameters(t
     ],
 )
 def test_a_bad_argument_is_refused_before_anything_is_made(
-    texts: dict[str, str], said: str, tmp_path: Path
+    launched, texts: dict[str, str], said: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ValueError, match=said):
-        launched("train.launch.py", **{"problem": SMALL, "out": tmp_path / "run", **texts})
+        launched(TRAIN, **{"problem": SMALL, "out": tmp_path / "run", **texts})
     assert list(tmp_path.iterdir()) == []
 
 
@@ -228,15 +256,17 @@ def own_equation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "own.yaml"
 
 
-def test_code_that_only_a_problems_file_names_is_not_run(own_equation: Path) -> None:
+def test_code_that_only_a_problems_file_names_is_not_run(launched, own_equation: Path) -> None:
     out, own = own_equation.parent / "run", f"{own_equation.parent}/own.py:Own"
     with pytest.raises(ValueError, match="is code, which is not run because a file names it"):
-        launched("train.launch.py", problem=own_equation, out=out)
-    nodes = launched("train.launch.py", problem=own_equation, out=out, equation=own)
+        launched(TRAIN, problem=own_equation, out=out)
+    nodes = launched(TRAIN, problem=own_equation, out=out, equation=own)
     assert all(own in node["environment"][ALLOWED].split(",") for node in nodes)
 
 
-def test_a_loop_without_a_tuner_finds_an_equation_beside_its_file(own_equation: Path) -> None:
+def test_a_loop_without_a_tuner_finds_an_equation_beside_its_file(
+    launched, own_equation: Path
+) -> None:
     nodes = launched("loop.launch.py", problem=own_equation, namespace="lab", process_noise=0.1)
     assert [node["executable"] for node in nodes] == ["pde_sim_node", "controller_node"]
     for node in nodes:

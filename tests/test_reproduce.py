@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import json
-import signal
+import shutil
 
 import numpy as np
 import pytest
 
 from loop_interfaces.topics import CostColumn
+from pdeloop.cli import main
 from pdeloop.finished_run import reduction
 from pdeloop.in_process import LocalPair
 from pdeloop.reproduce.experiment import LEARNED, command_of, reproduction_in, study_of
 from pdeloop.reproduce.table import beside_the_paper, rows_of, runs_of
 from pdeloop.study import StudyError
-from tests.loop_harness import until
-from tests.small import REPRODUCED, parameters, same_bits, train_here
+from tests.small import parameters, same_bits, train_here
 from tuner_node.batch import Batch
 from tuner_node.seeds import Purpose, derive
-
-LIMIT = 300.0
 
 
 def test_every_number_is_that_of_the_trainings(reproduction):
@@ -112,29 +110,27 @@ def test_the_table_says_where_the_papers_figure_lies(ratio, mean, words):
     assert words in beside_the_paper(row)
 
 
-def test_an_interrupted_reproduction_continues_to_the_same_bits(loop, tmp_path, reproduction):
-    run = loop.pdeloop("reproduce", *REPRODUCED, "--out", str(tmp_path / "a"))
-    until(lambda: list((tmp_path / "a").glob("small/*/*/result.json")), LIMIT, "first training")
-    run.send_signal(signal.SIGINT)
-    text = loop.wait(run, LIMIT, code=130)
-    assert f"continue with: pdeloop reproduce --out {tmp_path / 'a'}" in text
-    until(lambda: loop.left_behind() == [], LIMIT, "end of all processes")
-    assert not (tmp_path / "a" / "table.json").exists()
-    loop.wait(loop.pdeloop("reproduce", "--out", str(tmp_path / "a")), LIMIT)
+def test_an_interrupted_reproduction_continues_to_the_same_bits(reproduction, tmp_path):
     whole, _ = reproduction
-    for path in whole.glob("small/*/*/*"):
-        assert (tmp_path / "a" / path.relative_to(whole)).read_bytes() == path.read_bytes()
+    out = tmp_path / "out"
+    shutil.copytree(whole, out, ignore=shutil.ignore_patterns("report"))
+    (out / "table.json").unlink()
+    shutil.rmtree(out / "small" / "lqt_po" / "1")
+    assert main(["reproduce", "--out", str(out), "--processes", "1"]) == 0
+    for path in (whole / "table.json", *whole.glob("small/*/*/*")):
+        assert (out / path.relative_to(whole)).read_bytes() == path.read_bytes()
 
 
-def test_what_cannot_be_done_is_one_line(loop, tmp_path, reproduction):
+def test_what_cannot_be_done_is_one_line(reproduction, tmp_path, capsys):
     out, _ = reproduction
-    other = loop.pdeloop("reproduce", "--seeds", "3", "--out", str(out))
-    text = loop.wait(other, LIMIT, code=1)
-    assert f"{out} holds another study" in text
-    text = loop.wait(loop.pdeloop("reproduce", "nothing"), LIMIT, code=1)
-    assert text.startswith("pdeloop: unknown problem 'nothing'")
-    text = loop.wait(loop.pdeloop("report", str(tmp_path)), LIMIT, code=1)
-    assert "holds neither a run nor a reproduction" in text
+    for words, said in (
+        (["reproduce", "--seeds", "3", "--out", str(out)], f"{out} holds another study"),
+        (["reproduce", "nothing"], "unknown problem 'nothing'"),
+        (["report", str(tmp_path)], "holds neither a run nor a reproduction"),
+    ):
+        assert main(words) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("pdeloop: ") and said in line
 
 
 def test_the_command_of_a_reproduction_gives_it_again(reproduction):
