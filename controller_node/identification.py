@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from threadpoolctl import threadpool_limits
 
 from controller_node import dmdc, lqt, regression
+from controller_node.field_law import field_law
 from controller_node.order import study_orders
 from controller_node.policy import ProjectedLaw
 from controller_node.reduced_model import ReducedModel
@@ -25,12 +27,13 @@ class DesignSettings:
     n_a : int
         Actuators.
     reduced_order : int
-        n_s of the identification "regression"; 0: as `order.study_orders` suggests.
+        n_s of "field" and "regression"; 0: as `order.study_orders` suggests.
     state_weight, action_weight : float
         Of the stage cost.
     action_limit : float
         Magnitude at which actions saturate; 0: none. The gains are designed without it.
-    identification : {"regression", "dmdc"}
+    identification : {"field", "regression", "dmdc"}
+        "field": the regression, or a law from a model of the whole field (`field_law`) that is better.
     dmdc_rank, dmdc_order : int
         p and n_s of "dmdc"; 0: n_s + n_a, and reduced_order.
     """
@@ -72,7 +75,7 @@ def identify(
         The data allow no such model, or there is no such method.
     """
     n_s = n_s or study_orders(trajectories).suggested
-    if method == "regression":
+    if method in ("field", "regression"):
         return regression.identify(trajectories, n_s=n_s)
     if method == "dmdc":
         n_a = np.shape(trajectories[0][1])[-1]
@@ -112,4 +115,9 @@ def design(
         model, state_weight=settings.state_weight, action_weight=settings.action_weight
     )
     s_r = ProjectedLaw([model.U], target).reduced_targets[0]
-    return ModelRows(A=model.A, B=model.B, U=model.U, K_a=gains.K_a, K_b=gains.K_b, s_r=s_r)
+    rows = ModelRows(A=model.A, B=model.B, U=model.U, K_a=gains.K_a, K_b=gains.K_b, s_r=s_r)
+    if settings.identification != "field":
+        return rows
+    weights = {"state_weight": settings.state_weight, "action_weight": settings.action_weight}
+    with threadpool_limits(limits=1):  # as in the identification itself
+        return field_law(trajectories, target, rows, **weights) or rows

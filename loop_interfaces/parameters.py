@@ -88,10 +88,10 @@ PROBLEM = _section(
     Spec("reduced_order", 4, 0, 1024, nodes="CT", group="budget and method").means(
         "n_s, order of the reduced model; 0: as the exploratory episode suggests, of one seed"
     ),
-    Spec("identification", "regression", choices=("regression", "dmdc"), nodes="CT").means(
+    Spec("identification", "regression", choices=("field", "regression", "dmdc"), nodes="CT").means(
         "how the reduced model is identified: least squares in reduced coordinates with the inputs "
-        "whole, or the paper's truncated DMDc, which the optimizers that learn from costs begin "
-        "with"
+        "whole; field: or a linearised model of the whole field, where its law is better; or the "
+        "paper's truncated DMDc, which the optimizers that learn from costs begin with"
     ),
     Spec("dmdc_rank", 0, 0, 4096, nodes="CT").means(
         "p of the identification dmdc, rank of [Z; Y]; 0: n_s + n_a"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tuner_node.optimizers.convolution import ConvolutionModel, fit_convolutions
+from loop_interfaces.field_models.convolution import ConvolutionModel, fit_convolutions
 from tuner_node.optimizers.simulation import Loop, improve, mismatch
 
 Array = np.ndarray

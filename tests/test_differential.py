@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from benchmarks.warm_start import warm_start
+from loop_interfaces.field_models.differential import DifferentialModel, fit_differential
 from loop_interfaces.problem import load_parameters
 from pdeloop.in_process import LocalPair
-from tuner_node.optimizers.differential import DifferentialModel, fit_differential
 from tuner_node.optimizers.proposal import Proposer
 from tuner_node.optimizers.simulation import Loop, mismatch
 

@@ -40,8 +40,9 @@ def add(commands: Commands) -> None:
     )
     add(
         "--identification",
-        choices=("regression", "dmdc"),
-        help="least squares with the inputs whole, or truncated DMDc [that of the run, or regression]",
+        choices=("field", "regression", "dmdc"),
+        help="a model of the whole field where its law is better, least squares with the inputs whole, "
+        "or truncated DMDc [that of the run, or regression]",
     )
     add("--rank", type=int, metavar="P", help="p of the identification dmdc [that of the run]")
     add("--episode", type=int, metavar="N", help="only this episode of the bag")

@@ -13,13 +13,14 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from loop_interfaces.field_models import FieldModel
+from loop_interfaces.field_models.convolution import fit_convolutions
+from loop_interfaces.field_models.differential import fit_differential
 from tuner_node.optimizers.base import Array, Context, Row
-from tuner_node.optimizers.convolution import fit_convolutions
-from tuner_node.optimizers.differential import fit_differential
 from tuner_node.optimizers.fit import LocalModel, extended_basis, fit
 from tuner_node.optimizers.selection import KAPPAS, LOCAL, RIDGES, Pair, choices, mismatches
 from tuner_node.optimizers.sensitivity import Path, damped_step
-from tuner_node.optimizers.simulation import FieldModel, Loop, improve, mismatch
+from tuner_node.optimizers.simulation import Loop, improve, mismatch
 from tuner_node.optimizers.trajectories import Record, denoised
 
 __all__ = ["Proposal", "Proposer"]

@@ -1,6 +1,6 @@
 """Improve a law on a model that reproduces the measured rollouts.
 
-With a model of the whole field (`convolution`, `differential`) the closed loop can be simulated from
+With a model of the whole field (`loop_interfaces.field_models`) the closed loop can be simulated from
 every initial field that was measured, and the Gauss-Newton step repeated on the simulated trajectories
 until it gains nothing more:
 
@@ -24,12 +24,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
+from loop_interfaces.field_models import FieldModel
 from tuner_node.optimizers.base import Array
-from tuner_node.optimizers.convolution import ConvolutionModel
-from tuner_node.optimizers.differential import DifferentialModel
 from tuner_node.optimizers.sensitivity import ISOTROPY, Path, expand
 
-__all__ = ["FieldModel", "Improvement", "Loop", "Simulation", "improve", "mismatch"]
+__all__ = ["Improvement", "Loop", "Simulation", "improve", "mismatch"]
 
 # Inner steps, and the share of the objective below which a further one is not worth its time.
 _STEPS = 10
@@ -37,10 +36,6 @@ _LEAST_GAIN = 1e-3
 # Damping of the inner steps: first, factor after a fall and after a rise, largest.
 _INNER = (1.0, 0.1, 10.0, 1e4)
 _WORST = 2.0
-
-
-FieldModel = ConvolutionModel | DifferentialModel
-"""A model of the whole field."""
 
 
 @dataclass(frozen=True, eq=False)

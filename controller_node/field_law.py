@@ -1,0 +1,182 @@
+"""A first law from a model of the whole field, linearised at the target.
+
+POD modes of an exploratory episode are the directions in which the fields are large, and a law needs
+those that it senses: for an unstable plant these differ, as by the end of the episode the field is
+saturated. A model of the whole field (`loop_interfaces.field_models`) that reproduces the episode is
+linearised at the target, with e = z - z_r,
+
+    e_{k+1} = A e_k + B a_k + d,        d = f(z_r, 0) - z_r,
+
+and the law a = K e + b that minimises the cost over the horizon senses no more than the n_a rows of K.
+They come first in U, and POD modes of what is left fill the other columns.
+
+References
+----------
+Anderson, Moore, "Optimal Control: Linear Quadratic Methods", chapter 4; "Optimal Filtering",
+section 6.7 (doubling).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from controller_node.reduced_model import leading_modes, steps_of
+from loop_interfaces.field_models import FieldModel
+from loop_interfaces.field_models.convolution import fit_convolutions
+from loop_interfaces.field_models.differential import fit_differential
+from loop_interfaces.model_rows import ModelRows
+
+Array = NDArray[np.float64]
+Trajectory = tuple[Array, Array]
+
+LARGEST = 512
+"""Points of a field, at most: the work grows with their third power."""
+REPRODUCED = 0.05
+"""A model reproduces trajectories up to this share of their squared distance from the target."""
+DEGREE, RIDGE = 3, 1e-5
+"""Of the convolution model."""
+
+
+def reproducing(trajectories: Sequence[Trajectory], target: Array) -> FieldModel | None:
+    """The simplest model of the whole field that reproduces the trajectories, if one does.
+
+    Each step counts relative to how much changes in it: saturated fields say little about the plant
+    near its target.
+    """
+    data = steps_of(trajectories)
+    z, a, after = data.before, data.inputs, data.after
+    change = np.sum((after - z) ** 2, axis=1)
+    weights = 1.0 / np.maximum(change, 1e-12 * change.max())
+
+    def convolution(degree: int, components: int) -> FieldModel:
+        return fit_convolutions(
+            *(z, a, after, weights), degrees=[degree], ridges=[RIDGE], components=components
+        )[0]
+
+    kinds: list[Callable[[], FieldModel]] = [
+        lambda: convolution(DEGREE, 1),
+        lambda: fit_differential(z, a, after),
+    ]
+    if not len(target) % 2:
+        kinds.append(lambda: convolution(1, 2))
+    for kind in kinds:
+        model = kind()
+        error = size = 0.0
+        for states, actions in trajectories:
+            error += float(np.sum((simulated(model, states[0], actions) - states) ** 2))
+            size += float(np.sum((states - target) ** 2))
+        if error <= REPRODUCED * size:  # not where it overflows
+            return model
+    return None
+
+
+def simulated(model: FieldModel, z: Array, actions: Array) -> Array:
+    """z_0 .. z_N under given actions."""
+    states = [z]
+    with np.errstate(over="ignore", invalid="ignore"):
+        for a in actions:
+            states.append(model.step(states[-1], a))
+    return np.array(states)
+
+
+def field_law(
+    trajectories: Sequence[Trajectory],
+    target: Array,
+    other: ModelRows,
+    *,
+    state_weight: float,
+    action_weight: float,
+) -> ModelRows | None:
+    """A law from a model of the whole field, with as many modes as another has, if it is better.
+
+    Parameters
+    ----------
+    trajectories : sequence of (states (N + 1, n_z), actions (N, n_a))
+        a_k is held from z_k to z_{k+1}.
+    target : (n_z,) array
+        z_r.
+    other : ModelRows
+        The law to compare with.
+    state_weight, action_weight : float
+        q and r.
+
+    Returns
+    -------
+    ModelRows or None
+        With the linearised model on U. None where no model reproduces the trajectories, or where on the
+        one that does the other law costs no more, simulated from their initial fields.
+    """
+    n_z, n_s = other.U.shape
+    model = reproducing(trajectories, target) if n_z <= LARGEST else None
+    if model is None:
+        return None
+    A = model.jacobians(target[None], np.eye(n_z))[0]
+    B = model.B
+    drift = model.step(target, np.zeros(B.shape[1])) - target
+    horizon = max(len(actions) for _, actions in trajectories)
+    K, b = finite_horizon(A, B, drift, state_weight, action_weight, horizon)
+    sensed = linalg.svd(K, full_matrices=False)[2][:n_s].T
+    U = sensed
+    if (rest := n_s - sensed.shape[1]) > 0:
+        after = steps_of(trajectories).after
+        U = np.hstack([sensed, leading_modes(after - after @ sensed @ sensed.T, rest)[0]])
+    K_a, s_r = K @ U, U.T @ target
+    # Of the K_b with the wanted constant part the least; none where the target is outside of U.
+    size = float(s_r @ s_r)
+    constant = b - K_a @ s_r
+    K_b = np.outer(constant, s_r) / size if size > 0.0 else np.zeros_like(K_a)
+    law = ModelRows(A=U.T @ A @ U, B=U.T @ B, U=U, K_a=K_a, K_b=K_b, s_r=s_r)
+
+    def cost(rows: ModelRows) -> float:
+        total = 0.0
+        with np.errstate(over="ignore", invalid="ignore"):
+            for states, actions in trajectories:
+                z = states[0]
+                for _ in actions:
+                    a = rows.K_a @ (z @ rows.U) + rows.K_b @ rows.s_r
+                    total += state_weight * np.sum((z - target) ** 2)
+                    total += action_weight * np.sum(a**2)
+                    z = model.step(z, a)
+        return float(total)
+
+    return law if cost(law) < np.nan_to_num(cost(other), nan=np.inf) else None
+
+
+def finite_horizon(
+    A: Array, B: Array, drift: Array, state_weight: float, action_weight: float, horizon: int
+) -> tuple[Array, Array]:
+    """The law a = K e + b that is optimal over a horizon, in its first step.
+
+        e_{k+1} = A e_k + B a_k + d,        J = sum_k q |e_k|^2 + r |a_k|^2
+
+    The Riccati recursion of [e; 1] is doubled until it covers the horizon (`horizon` rounded up to a
+    power of two). Unlike the algebraic equation it needs no stabilisable model.
+
+    Returns
+    -------
+    K (n_a, n), b (n_a,)
+
+    Examples
+    --------
+    >>> K, b = finite_horizon(np.eye(1), np.eye(1), np.zeros(1), 1.0, 1.0, 64)
+    >>> K.round(6), b
+    (array([[-0.618034]]), array([-0.]))
+    """
+    n, n_a = B.shape
+    whole = np.block([[A, drift[:, None]], [np.zeros((1, n)), np.ones((1, 1))]])
+    inputs = np.vstack([B, np.zeros((1, n_a))])
+    P = np.diag(np.append(np.full(n, state_weight), 0.0))
+    G, power, eye = inputs @ inputs.T / action_weight, whole, np.eye(n + 1)
+    for _ in range(int(np.ceil(np.log2(horizon)))):
+        solved = linalg.solve(eye + G @ P, np.hstack([power, G]))
+        own, reach = solved[:, : n + 1], solved[:, n + 1 :]
+        G, P = G + power @ reach @ power.T, P + power.T @ P @ own
+        power = power @ own
+    gains = -linalg.solve(
+        action_weight * np.eye(n_a) + inputs.T @ P @ inputs, inputs.T @ P @ whole, assume_a="pos"
+    )
+    return gains[:, :n], gains[:, n]
