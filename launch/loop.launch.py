@@ -99,7 +99,7 @@ def pairs_of_nodes(context: LaunchContext) -> list[Any]:
     cores = pair_cores(PAIRS.parse(given["pairs"]), pinned)
     for number, (pair, core) in enumerate(zip(namespaces(len(cores)), cores, strict=True)):
         for executable in ("pde_sim_node", "controller_node"):
-            parameters = {**own, **core_parameters(executable, core)}
+            parameters = {**own, **core_parameters(core)}
             if executable == "pde_sim_node":
                 parameters["publish_clock"] = number == 0  # /clock is one topic for all
             actions.append(

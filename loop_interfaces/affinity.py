@@ -23,28 +23,6 @@ def usable_cores() -> list[int]:
     return list(range(os.cpu_count() or 1))
 
 
-def core_list(text: str) -> list[int]:
-    """Cores as `taskset -c` takes them, like 0-3,6. ValueError, one sentence, for anything else."""
-    present, cores = os.cpu_count() or 1, set()
-    try:
-        for part in text.split(","):
-            first, _, last = part.partition("-")
-            span = range(int(first), int(last or first) + 1)
-            if not span or span[-1] >= present:
-                raise ValueError
-            cores |= set(span)
-    except ValueError:
-        raise ValueError(
-            f"cores are {text!r}; expected some of 0-{present - 1}, in a list like 0-3,6"
-        ) from None
-    return sorted(cores)
-
-
-def core_text(cores: Collection[int]) -> str:
-    """The list that `core_list` takes."""
-    return ",".join(map(str, sorted(cores)))
-
-
 def join_solver(cores: Collection[int]) -> None:
     """Make this thread one of the solver's: it has their name, and their cores if it may.
 

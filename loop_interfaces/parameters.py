@@ -131,16 +131,13 @@ PLANT = _section(
     Spec("real_time_factor", 0.0, 0.0, 1e6, live=True, group="problem").means(
         "simulated seconds per second of the wall clock; 0: as fast as possible"
     ),
-    Spec("solver_cores", "").means(
-        "cores of the threads that share a step of many environments, like 0-3,6; empty: those of "
-        "the node"
-    ),
 )
 
 EXECUTION = _section(
     "PC",
     Spec("pin", -1, -1, 4095).means(
-        "core on which every thread of the node stays, but those of solver_cores; -1: any core"
+        "core on which the node stays, but for the threads that help a plant with a step of many "
+        "environments; -1: any core"
     ),
 )
 """How plant and controller use the machine."""

@@ -16,7 +16,6 @@ from typing import Any
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
-from loop_interfaces.affinity import core_list
 from loop_interfaces.files import FileError
 from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
@@ -35,7 +34,6 @@ from pde_sim_node.fast_path import PlantFastPath, load_compiled
 from pde_sim_node.lockstep import Lockstep, Timing
 from pde_sim_node.plant import Plant
 from pde_sim_node.run_record import RunRecord
-from pde_sim_node.solver.workers import use_cores
 
 
 def declare_parameters(node: Node, changed: Mapping[str, Any] | None = None) -> dict[str, Any]:
@@ -65,9 +63,7 @@ class PlantNode:
 
     def __init__(self, node: Node, loop: NodeLoop) -> None:
         values = declare_parameters(node)
-        loop.pin(values["pin"])  # before the plant counts the cores it has
-        if values["solver_cores"]:
-            use_cores(core_list(values["solver_cores"]))
+        loop.pin(values["pin"])
         plant = build_plant(values)
         if plant.compiled_in_seconds > 0.0:
             node.get_logger().info(f"compiled the kernel in {plant.compiled_in_seconds:.1f} s")

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from loop_interfaces.affinity import core_text, least_busy_cores, usable_cores
+from loop_interfaces.affinity import least_busy_cores, usable_cores
 from loop_interfaces.isolation import PROFILE
 from loop_interfaces.spec import ParameterError, Spec
 from pde_sim_node.build import fingerprint
@@ -100,12 +100,9 @@ def pair_cores(pairs: int, pin: bool = False) -> list[int | None]:
     return list(least_busy_cores(pairs))
 
 
-def core_parameters(package: str, core: int | None) -> dict[str, Any]:
-    """What keeps a node of a pair on its core, and the plant's helpers on all."""
-    if core is None:
-        return {}
-    solver = {"solver_cores": core_text(usable_cores())}
-    return {"pin": core, **(solver if package == "pde_sim_node" else {})}
+def core_parameters(core: int | None) -> dict[str, Any]:
+    """What keeps a node of a pair on its core."""
+    return {} if core is None else {"pin": core}
 
 
 def pair_nodes(cores: Sequence[int | None]) -> list[LoopNode]:
@@ -113,7 +110,7 @@ def pair_nodes(cores: Sequence[int | None]) -> list[LoopNode]:
     nodes = []
     for number, (namespace, core) in enumerate(zip(namespaces(len(cores)), cores, strict=True)):
         for package in PAIR:
-            own = core_parameters(package, core)
+            own = core_parameters(core)
             if number and package == "pde_sim_node":
                 own["publish_clock"] = False  # /clock is one topic for all
             name = f"{package}-{namespace}" if namespace else package

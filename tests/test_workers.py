@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loop_interfaces.affinity import core_list, core_text, helps_solver
+from loop_interfaces.affinity import helps_solver
 from pde_sim_node.equations import Burgers
 from pde_sim_node.plant import Plant
 from pde_sim_node.solver import workers
@@ -94,7 +94,6 @@ from pde_sim_node.equations import Burgers
 from pde_sim_node.plant import Plant
 from tests.test_workers import P1, rollout
 pin_process({cores[0]})
-workers.use_cores({cores})
 plant = Plant(Burgers(), **P1)
 rollout(plant, range(16))
 print("there", flush=True)
@@ -122,13 +121,3 @@ sys.stdin.readline()
         while places() != {True: set(cores[1:]), False: {cores[0]}}:
             assert time.monotonic() < limit, places()
             time.sleep(0.05)
-
-
-def test_lists_of_cores() -> None:
-    present = os.cpu_count() or 1
-    assert core_list("0") == [0]
-    assert core_list(f"0-{present - 1}") == list(range(present))
-    assert core_list(core_text(range(present))) == list(range(present))
-    for wrong in ("", "a", "-1", f"{present}", "1-0", "0,,0", "0-99999"):
-        with pytest.raises(ValueError, match="expected some of 0-"):
-            core_list(wrong)

@@ -11,7 +11,6 @@ line on stdin and answers with one on stdout:
 from __future__ import annotations
 
 import json
-import os
 import sys
 import time
 from typing import Any
@@ -20,7 +19,6 @@ import numpy as np
 from rclpy.node import Node
 
 from loop_interfaces import model_rows
-from loop_interfaces.affinity import pin_process
 from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.parameters import PROBLEM
@@ -30,6 +28,7 @@ from loop_interfaces.ros.parameters import declare
 from loop_interfaces.spec import Spec
 from loop_interfaces.topics import COST, MODEL, POLICY, START, CostColumn
 from pde_sim_node.build import build_plant
+from pde_sim_node.solver.workers import use_cores
 
 PARAMETERS = (
     Spec("solver_pin", -1, -1, 4095).means("core to measure the solver on; -1: all cores"),
@@ -51,12 +50,8 @@ class DriverNode:
         physical = {k: v for k, v in given.items() if k.startswith("physical.")}
         self._values = {**values, **physical}
         if values["solver_pin"] >= 0:
-            cores = os.sched_getaffinity(0)
-            pin_process(values["solver_pin"])
-            self._plant = build_plant(self._values)
-            os.sched_setaffinity(0, cores)
-        else:
-            self._plant = build_plant(self._values)
+            use_cores([values["solver_pin"]])
+        self._plant = build_plant(self._values)
         self._run = 1 + time.time_ns() % 2**52
         self._episode = 0
         self.join(node, loop)
