@@ -37,7 +37,7 @@ def test_the_auditor_finds_a_plant_that_takes_any_action_and_the_smallest_plan(
     monkeypatch: pytest.MonkeyPatch,
 ):
     rival = Fault(0.02, "second controller", "does not sign", 0.5)
-    others = Fault(0.01, "pause plant", duration=0.01), Fault(0.04, "cut", "tuner>plant", 0.01)
+    others = Fault(0.01, "pause plant", "plant", 0.01), Fault(0.04, "cut", "tuner>plant", 0.01)
     bad = Plan(1, duplicates=0.02, faults=(others[0], rival, others[1]))
     assert not failure(bad)
     monkeypatch.setattr(TakenActions, "is_signed", lambda self, frame: True)

@@ -12,6 +12,7 @@ from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.topics import COMPLETED
 from tests.test_dispatch import RUN, batch, costs_of, dispatcher, starts
 from tuner_node.batch import Batch
+from tuner_node.dispatch import DispatchError
 from tuner_node.trajectory_collector import TrajectoryCollector
 
 STEPS = 30
@@ -78,9 +79,8 @@ def test_a_late_sample_is_waited_for_and_a_lost_one_repeats_the_episode():
 
 
 def test_samples_of_other_runs_episodes_and_plants_are_not_mixed_in():
-    observer = TrajectoryCollector()
+    observer = TrajectoryCollector(RUN, 5)
     start = Frame(RUN, 5, 0, 0.0, np.zeros((1, 4)))
-    observer.begin(RUN, 5)
     for frame, actions in samples(start, plant=1):
         for stranger in (
             replace(frame, run=RUN + 1),
@@ -142,3 +142,21 @@ def test_two_different_samples_of_one_step_repeat_the_episode(kind, first):
     feed(served, 0, again)
     served.cost(0, costs_of(again), 0.0)
     assert served.result() is not None
+
+
+@pytest.mark.parametrize("kind", ["state", "action"])
+@pytest.mark.parametrize("episodes_later", [0, 1])
+def test_a_late_sample_that_contradicts_one_that_was_used_ends_the_run(kind, episodes_later):
+    served = dispatcher()
+    served.target(0, Frame(0, 0, 0, 0.0, np.ones(2)), 0.0)
+    ((_, start),) = starts(served.assign(observed(1), 0.0))
+    feed(served, 0, start)
+    served.cost(0, costs_of(start), 0.0)
+    assert served.result() is not None
+    if episodes_later:
+        served.assign(observed(1), 0.0)
+    feed(served, 0, start)  # again the same: no harm
+    served.tick(0.0)
+    getattr(served, kind)(0, Frame(RUN, start.episode, 3, 0.0, np.ones((1, 2))))
+    with pytest.raises(DispatchError, match=f"two different {kind}s .* one of which was used"):
+        served.tick(0.0)

@@ -43,6 +43,7 @@ from loop_interfaces.topics import (
 )
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult
 from tuner_node.dispatch_state import Chunk, Pair
+from tuner_node.trajectory_collector import TrajectoryCollector
 
 Array = NDArray[np.float64]
 PairPublication = tuple[int, Publication]
@@ -248,6 +249,8 @@ class Dispatcher:
         then `tick`, they come in their order. Raises FrameError for one of another shape.
         """
         known = self.pairs[pair]
+        for late in known.used_samples():
+            late.state(frame)
         target = self._targets.get(frame.plant)
         if self._is_sample(known, frame, frame.values.shape[1] if target is None else len(target)):
             known.samples.state(frame)
@@ -255,8 +258,11 @@ class Dispatcher:
 
     def action(self, pair: int, frame: Frame) -> None:
         """Take a sample a_k of a pair's episode. Raises FrameError for one of another shape."""
-        if self._is_sample(self.pairs[pair], frame, self.n_a):
-            self.pairs[pair].samples.action(frame)
+        known = self.pairs[pair]
+        for late in known.used_samples():
+            late.action(frame)
+        if self._is_sample(known, frame, self.n_a):
+            known.samples.action(frame)
 
     def model(self, pair: int, frame: Frame, now: float) -> list[PairPublication]:
         """Take the reduced models of an exploratory episode.
@@ -440,6 +446,12 @@ class Dispatcher:
         self._waiting.append(chunk)
 
     def _begin_episodes(self, now: float) -> list[PairPublication]:
+        for samples in (used for pair in self.pairs for used in pair.used_samples()):
+            if samples.contradiction:
+                raise DispatchError(
+                    f"{samples.contradiction}, one of which was used: stop who else publishes them "
+                    "and start a new run"
+                )
         publications: list[PairPublication] = []
         if self.paused:
             return publications
@@ -471,7 +483,8 @@ class Dispatcher:
         self._issued += 1
         pair.chunk, pair.last_heard = chunk, now
         pair.episode = self.incarnation * EPISODES_PER_INCARNATION + self._issued
-        pair.samples.begin(self.run, pair.episode)
+        pair.former_samples = pair.samples
+        pair.samples = TrajectoryCollector(self.run, pair.episode)
         return self._request(number, pair, now, again=False)
 
     def _request(

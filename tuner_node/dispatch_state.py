@@ -58,6 +58,8 @@ class Pair:
     last_heard: float = 0.0
     last_sent: float = 0.0
     samples: TrajectoryCollector = field(default_factory=TrajectoryCollector)
+    former_samples: TrajectoryCollector = field(default_factory=TrajectoryCollector)
+    """Of the episode before: one that comes late can still contradict them."""
     pending_cost: Frame | None = None
     """The cost of the episode, while the last samples of its trajectories are missing."""
     pending_since: float = 0.0
@@ -77,6 +79,10 @@ class Pair:
         known = self.answers.setdefault(topic, {})
         known[answer.episode] = digest(answer.values)
         _forget(known)
+
+    def used_samples(self) -> list[TrajectoryCollector]:
+        """Of the last two episodes, if they were used."""
+        return [known for known in (self.samples, self.former_samples) if known.used]
 
     def begin(self, start: Publication) -> None:
         """A start is published."""

@@ -26,13 +26,10 @@ class TrajectoryCollector:
     episode: int = -1
     contradiction: str = ""
     """Why the episode cannot be used, if two different samples came for one step."""
+    used: bool = False
+    """Whether the trajectories were taken: what comes now is only compared."""
     _states: dict[tuple[int, int], Array] = field(default_factory=dict)
     _actions: dict[tuple[int, int], Array] = field(default_factory=dict)
-
-    def begin(self, run: int, episode: int) -> None:
-        """Forget the last episode and listen to this one."""
-        self.run, self.episode, self.contradiction = run, episode, ""
-        self._states, self._actions = {}, {}
 
     def state(self, frame: Frame) -> None:
         """Take z_k; repeated ones are equal."""
@@ -47,7 +44,8 @@ class TrajectoryCollector:
             return
         key = frame.plant, frame.step
         if key not in known:
-            known[key] = frame.values.copy()
+            if not self.used:
+                known[key] = frame.values.copy()
         elif not np.array_equal(known[key], frame.values):
             self.contradiction = (
                 f"two different {what} came for step {frame.step} of episode {frame.episode}"
@@ -67,6 +65,7 @@ class TrajectoryCollector:
 
         ended (M,): as in CostColumn.ENDED. Only when `lost` says that nothing is missing.
         """
+        self.used = True
         states = np.stack([self._states[plant, k] for k in range(steps + 1)])
         actions = np.stack([self._actions[plant, k] for k in range(steps)])
         return cut(states, actions, ended)

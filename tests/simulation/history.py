@@ -5,10 +5,13 @@ from __future__ import annotations
 import heapq
 import itertools
 import random
+from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
-from loop_interfaces.frames import ArrayCodec, Frame, FrameError
+from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.protocol import ModelFailure, Publication
 from loop_interfaces.topics import (
     ACTION,
@@ -25,6 +28,7 @@ from loop_interfaces.topics import (
 from tests.simulation.disk import Disk
 from tests.simulation.plan import MAIN, Fault, Plan
 from tests.simulation.processes import (
+    EVERY_PAIR,
     RUN,
     ControllerProcess,
     PlantProcess,
@@ -64,20 +68,22 @@ class History:
         self.time = 0.0
         self.rows: list[Any] = []
         self.refused: list[str] = []
-        self.record = 0, 0
-        """The plant's record of the runs with a pause and a signing controller, which outlives it."""
+        self.records: dict[str, tuple[int, int]] = {}
+        """Each plant's record of the runs with a pause and a signing controller, which outlives it."""
         self._disk = Disk(random.Random(plan.seed + 2))
         self._starts = 0
         self._events: list[tuple[float, int, Callable[[], None]]] = []
         self._numbers = itertools.count()
         self._codecs = {topic: ArrayCodec(topic.labels) for topic in READERS}
-        self._latched: dict[tuple[str, Topic], bytes] = {}
-        self._sent: list[tuple[Topic, bytes]] = []
+        self._latched: dict[tuple[str, int, Topic], bytes] = {}
+        self._sent: deque[tuple[Topic, bytes, int]] = deque(maxlen=RECALLED)
+        self._forged: dict[str, float] = {}
+        """Topics on which messages are forged, and until when."""
         self._cut: set[tuple[str, str]] = set()
         self._gone: dict[str, float] = {}
         self._rates = dict(zip(MAIN, plan.rates, strict=True))
         self._processes: dict[str, Process] = {}
-        for name in MAIN:
+        for name in plan.names:
             self._at(0.0, lambda name=name: self._start(name))
         for fault in plan.faults:
             self._at(fault.time, lambda fault=fault: self._happen(fault))
@@ -98,8 +104,10 @@ class History:
                     self._end("tuner", self.rng.expovariate(1.0))
         raise TimeoutError(f"no end within {LIMIT:g} virtual seconds")
 
-    def send(self, writer: Process, sent: Publication | ModelFailure) -> None:
-        """Bring a message to who reads its topic, as the network at that moment does."""
+    def send(self, writer: Process, sent: Publication | ModelFailure, pair: int) -> None:
+        """Bring a message to who reads its topic in the namespace of a pair, as the network at that
+        moment does.
+        """
         if isinstance(sent, ModelFailure):
             text = sent.to_json()
             self._later(lambda: self._tell(writer, ModelFailure.from_json(text)))
@@ -107,35 +115,61 @@ class History:
         topic, plan = sent.topic, self.plan
         raw = self._codecs[topic].encode(sent.frame)
         if topic.latched:
-            self._latched[writer.name, topic] = raw
-        self._sent = [*self._sent[1 - RECALLED :], (topic, raw)]
-        for process in self._reading(topic):
+            self._latched[writer.name, pair, topic] = raw
+        self._sent.append((topic, raw, pair))
+        if self.time < self._forged.get(topic.name, 0.0):
+            forgery = self._codecs[topic].encode(self._forgery(sent.frame))
+            for process in self._reading(topic, pair):
+                self._carry("stranger", process, topic, forgery, pair)
+        for process in self._reading(topic, pair):
             copies = 1
             if not topic.latched:  # the others are reliable
                 copies = (self.rng.random() >= plan.loss) + (self.rng.random() < plan.duplicates)
             for _ in range(copies):
-                self._carry(writer.name, process, topic, self._damaged(raw, sent.frame))
+                self._carry(writer.name, process, topic, self._damaged(raw, sent.frame), pair)
 
     def show(self, plant: Process, samples: list[tuple[Topic, Frame]]) -> None:
         """Bring the samples of an episode to the tuners, if they read them."""
         if self.plan.iterations or self.rng.random() < self.plan.loss:
             return
+        shown = [samples]
+        if self.time < self._forged.get("samples", 0.0):
+            shown.append([(topic, self._forgery(frame)) for topic, frame in samples])
         for tuner in self._processes.values():
             if isinstance(tuner, TunerProcess) and (plant.name, tuner.name) not in self._cut:
-                self._later(lambda tuner=tuner: self._handing(tuner, lambda: tuner.see(samples)))
+                for batch in shown:
+                    see = partial(tuner.see, batch, plant.pair)
+                    self._later(partial(self._handing, tuner, see))
 
-    def present(self, role: str) -> bool:
-        """Whether the tuner finds the plant or controller on the network."""
-        return role in self._processes or self.time - self._gone.get(role, -LEASE) < LEASE
+    def missing(self, pair: int) -> list[str]:
+        """Which nodes of a pair the tuner does not find on the network."""
+        names = {role: f"{role} {pair}" if pair else role for role in MAIN[:2]}
+        return [
+            role
+            for role, name in names.items()
+            if name not in self._processes and self.time - self._gone.get(name, -LEASE) >= LEASE
+        ]
 
     def _tell(self, writer: Process, failure: ModelFailure) -> None:
         for tuner in list(self._processes.values()):
             if isinstance(tuner, TunerProcess) and (writer.name, tuner.name) not in self._cut:
-                self._handing(tuner, lambda tuner=tuner: tuner.fail(failure))
+                self._handing(tuner, lambda tuner=tuner: tuner.fail(failure, writer.pair))
 
-    def _reading(self, topic: Topic) -> list[Process]:
-        roles = READERS[topic]
-        return [process for process in self._processes.values() if process.role in roles]
+    def _reading(self, topic: Topic, pair: int) -> list[Process]:
+        return [
+            process for process in self._processes.values() if self._reads(process, topic, pair)
+        ]
+
+    @staticmethod
+    def _reads(process: Process, topic: Topic, pair: int) -> bool:
+        return process.role in READERS[topic] and process.pair in (pair, EVERY_PAIR)
+
+    def _forgery(self, frame: Frame) -> Frame:
+        """The same header with other values."""
+        values = frame.values.copy()
+        if values.size:
+            values.flat[self.rng.randrange(values.size)] += 1.0
+        return replace(frame, values=values)
 
     def _damaged(self, raw: bytes, frame: Frame) -> bytes:
         """The message, or with a changed bit in what is in front of its values."""
@@ -145,7 +179,7 @@ class History:
         changed[self.rng.randrange(len(raw) - frame.values.nbytes)] ^= 1 << self.rng.randrange(8)
         return bytes(changed)
 
-    def _carry(self, writer: str, process: Process, topic: Topic, raw: bytes) -> None:
+    def _carry(self, writer: str, process: Process, topic: Topic, raw: bytes, pair: int) -> None:
         """Bring a message to a process; where the line is cut, a reliable one waits for it."""
 
         def arrive() -> None:
@@ -154,7 +188,7 @@ class History:
                     self._at(self.time + 0.1, arrive)
                 return
             self._handing(
-                process, lambda: process.take(topic, self._codecs[topic].decode(bytes(raw)))
+                process, lambda: process.take(topic, self._codecs[topic].decode(bytes(raw)), pair)
             )
 
         self._later(arrive)
@@ -168,7 +202,7 @@ class History:
             return
         try:
             hand()
-        except FrameError as error:
+        except ValueError as error:
             self.refused.append(str(error))
         except DispatchError as error:
             if process.name == "tuner":
@@ -177,11 +211,12 @@ class History:
             self.refused.append(str(error))
 
     def _start(self, name: str, *, power: bool = False, rot: bool = False) -> None:
-        rate = self._rates[name]
-        if name == "plant":
-            self._join(PlantProcess(self, rate))
-        elif name == "controller":
-            self._join(ControllerProcess(self, name, rate))
+        role, _, number = name.partition(" ")
+        rate, pair = self._rates[role], int(number or 0)
+        if role == "plant":
+            self._join(PlantProcess(self, name, rate, pair))
+        elif role == "controller":
+            self._join(ControllerProcess(self, name, rate, pair))
         else:
             how: dict[str, Any] = {"incarnation": self._starts, "power": power, "rot": rot}
             self._starts += 1
@@ -191,9 +226,9 @@ class History:
         self._processes[process.name] = process
         self._gone.pop(process.name, None)
         process.begin()
-        for (writer, topic), raw in self._latched.items():
-            if process.role in READERS[topic] and writer != process.name:
-                self._carry(writer, process, topic, raw)
+        for (writer, pair, topic), raw in self._latched.items():
+            if self._reads(process, topic, pair) and writer != process.name:
+                self._carry(writer, process, topic, raw, pair)
         self._tick(process)
 
     def _tick(self, process: Process) -> None:
@@ -222,7 +257,7 @@ class History:
         if kind == "crash":
             self._end(who, duration)
         elif kind in ("power cut", "bit rot"):
-            for name in MAIN:
+            for name in self.plan.names:
                 tuner = name == "tuner"
                 how = {"power": True, "rot": kind == "bit rot"} if tuner else {}
                 self._end(name, duration * self.rng.random(), **how)
@@ -234,23 +269,25 @@ class History:
             if who in self._processes:
                 self._processes[who].stalled = end
         elif kind in ("pause plant", "step plant"):
-            self._call("plant", "pause")
+            self._call(who, "pause")
             if kind == "step plant":
                 for _ in range(3):
                     self._at(
                         self.time + duration * self.rng.random(),
-                        lambda: self._call("plant", "step"),
+                        lambda: self._call(who, "step"),
                     )
-            self._at(end, lambda: self._call("plant", "resume", until_done=True))
+            self._at(end, lambda: self._call(who, "resume", until_done=True))
         elif kind == "pause tuner":
             self._call("tuner", "pause")
             self._at(end, lambda: self._call("tuner", "resume", until_done=True))
         elif kind == "stop tuner":
             self._call("tuner", "stop")
         elif kind == "replay" and self._sent:
-            topic, raw = self.rng.choice(self._sent)
-            for process in self._reading(topic):
-                self._carry("", process, topic, raw)
+            topic, raw, pair = self.rng.choice(self._sent)
+            for process in self._reading(topic, pair):
+                self._carry("", process, topic, raw, pair)
+        elif kind == "forgery":
+            self._forged[who] = end
         elif kind == "second controller":
             if who == "signs":  # with another limit of the actions
                 self._join(ControllerProcess(self, "rival", action_limit=0.1))

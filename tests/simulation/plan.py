@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 MAIN = ("plant", "controller", "tuner")
-"""The processes of the loop."""
+"""The processes of a loop; those of a second pair have its number behind their name."""
 KINDS = {
     "crash": 30,  # of one process, at any moment, also within a write to its disk
     "power cut": 6,  # of all of them; what was not synced is lost
@@ -21,9 +21,15 @@ KINDS = {
     "replay": 6,  # a message from before is delivered again
     "second controller": 14,  # that was told something else, or answers anything and does not sign
     "second tuner": 5,  # of a training of its own, on the same plant and controller
+    "forgery": 8,  # beside each message on a topic comes one with the same header and other values
 }
 """Faults, and how often each is drawn."""
-HOSTILE = ("second controller", "second tuner")
+FORGED = (
+    *("policy", "target", "model", "episode/start", "state", "action", "episode/cost"),
+    *("model/identified", "samples"),
+)
+"""Topics on which messages are forged."""
+HOSTILE = ("second controller", "second tuner", "forgery")
 """Faults after which a training may also end with an error that names the cause."""
 
 
@@ -44,7 +50,7 @@ class Plan:
     loss, duplicates, damage: probabilities that a message on a topic that is not reliable is lost,
     comes twice, or has a bit changed in what is in front of its values; delay: mean (s); rates: of
     the clocks of the processes; iterations: of the two-point method, 0 for Gauss-Newton, for which
-    the tuner reads states and actions.
+    the tuner reads states and actions; pairs: of plant and controller.
     """
 
     seed: int
@@ -54,18 +60,24 @@ class Plan:
     delay: float = 1e-3
     rates: tuple[float, ...] = (1.0, 1.0, 1.0)
     iterations: int = 1
+    pairs: int = 1
     faults: tuple[Fault, ...] = ()
 
     @property
     def hostile(self) -> bool:
         return self.damage > 0.0 or any(fault.kind in HOSTILE for fault in self.faults)
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The processes."""
+        return MAIN if self.pairs == 1 else (*MAIN, "plant 1", "controller 1")
+
     def smaller(self) -> Iterator[Plan]:
         """Plans with one thing less, to find the smallest that still fails."""
         for i in range(len(self.faults)):
             yield replace(self, faults=self.faults[:i] + self.faults[i + 1 :])
         quiet = Plan(self.seed)
-        for name in ("loss", "duplicates", "damage", "delay", "rates", "iterations"):
+        for name in ("loss", "duplicates", "damage", "delay", "rates", "iterations", "pairs"):
             if getattr(self, name) != getattr(quiet, name):
                 yield replace(self, **{name: getattr(quiet, name)})
 
@@ -75,15 +87,21 @@ def draw(seed: int) -> Plan:
     rng = random.Random(seed)
     delay = rng.choice([1e-4, 1e-3, 2e-2])
     iterations = rng.choice([0, 0, 0, 1, 1, 1, 4])
+    pairs = rng.choice([1, 1, 1, 2])
+    names = Plan(seed, pairs=pairs).names
     length = 0.1 + (70 + 20 * iterations) * delay  # of the training, if nothing happens
     faults = []
     for _ in range(rng.randrange(6)):
         (kind,) = rng.choices(list(KINDS), KINDS.values())
         who = ""
         if kind in ("crash", "stall"):
-            who = rng.choice(MAIN)
+            who = rng.choice(names)
         elif kind == "cut":
-            who = ">".join(rng.sample(MAIN, 2))
+            who = ">".join(rng.sample(names, 2))
+        elif kind in ("pause plant", "step plant"):
+            who = rng.choice([name for name in names if name.startswith("plant")])
+        elif kind == "forgery":
+            who = rng.choice(FORGED)
         elif kind == "second controller":
             who = rng.choice(["signs", "does not sign"])
         duration = rng.expovariate(1.0 / rng.choice([length / 4, 2.0]))
@@ -96,5 +114,6 @@ def draw(seed: int) -> Plan:
         delay=delay,
         rates=tuple(rng.choices([1.0, 0.5, 2.0], k=len(MAIN))),
         iterations=iterations,
+        pairs=pairs,
         faults=tuple(sorted(faults, key=lambda fault: fault.time)),
     )

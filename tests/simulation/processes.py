@@ -44,6 +44,8 @@ if TYPE_CHECKING:
     from tests.simulation.history import History
 
 RUN = 7
+EVERY_PAIR = -1
+"""In place of the pair of a process that gets the messages of all."""
 
 
 @cache
@@ -100,7 +102,7 @@ def _once(compute: Callable[[], Any], of: Any) -> Any:
 
 
 @cache
-def _plant(iterations: int) -> tuple[Plant, int]:
+def _plant(iterations: int, name: str) -> tuple[Plant, int]:
     given = values(iterations)
     return plant_build.build_plant(given), plant_build.fingerprint(given)
 
@@ -108,11 +110,13 @@ def _plant(iterations: int) -> tuple[Plant, int]:
 class Process:
     """What a process is handed, and what it publishes. Dead once `alive` is False.
 
-    name: of the process; role: whose messages it gets.
+    name: of the process; role: whose messages it gets; pair: of which pair, unless it is a tuner.
     """
 
-    def __init__(self, history: History, name: str, role: str, rate: float = 1.0) -> None:
-        self.history, self.name, self.role = history, name, role
+    def __init__(
+        self, history: History, name: str, role: str, rate: float = 1.0, pair: int = 0
+    ) -> None:
+        self.history, self.name, self.role, self.pair = history, name, role, pair
         self.alive, self.stalled = True, 0.0
         self._offset, self._rate = history.rng.uniform(0.0, 1e4), rate
 
@@ -123,7 +127,7 @@ class Process:
 
     def publish(self, publications: Iterable[Publication | ModelFailure]) -> None:
         for sent in publications:
-            self.history.send(self, sent)
+            self.history.send(self, sent, self.pair)
 
     def begin(self) -> None:
         """Say what is said at the start."""
@@ -132,27 +136,28 @@ class Process:
         """Look at the deadlines; seconds until it wants to do so again."""
         return np.inf
 
-    def take(self, topic: Topic, frame: Frame) -> None:
-        """Handle a message; a FrameError refuses it."""
+    def take(self, topic: Topic, frame: Frame, pair: int) -> None:
+        """Handle a message in the namespace of a pair; a ValueError refuses it."""
 
 
 class PlantProcess(Process):
-    def __init__(self, history: History, rate: float) -> None:
-        super().__init__(history, "plant", "plant", rate)
-        plant, fingerprint = _plant(history.plan.iterations)
+    def __init__(self, history: History, name: str, rate: float, pair: int) -> None:
+        super().__init__(history, name, "plant", rate, pair)
+        plant, fingerprint = _plant(history.plan.iterations, name)
+        paused_run, signed_run = history.records.get(name, (0, 0))
         self.lockstep = Lockstep(
             copy.copy(plant),
             Timing(action_timeout=0.05, max_repeats=100, run_hold=5.0),
             fingerprint=fingerprint,
-            paused_run=history.record[0],
-            signed_run=history.record[1],
+            paused_run=paused_run,
+            signed_run=signed_run,
         )
         self._samples: list[tuple[Topic, Frame]] = []
 
     def begin(self) -> None:
         self._send([self.lockstep.announcement(), self.lockstep.paused_report()])
 
-    def take(self, topic: Topic, frame: Frame) -> None:
+    def take(self, topic: Topic, frame: Frame, pair: int) -> None:
         if topic is START:
             self._send(self.lockstep.start(frame, self.now))
         else:
@@ -181,7 +186,7 @@ class PlantProcess(Process):
 
     def _record(self) -> None:
         run = self.lockstep.run if self.lockstep.paused else 0
-        self.history.record = run, self.lockstep.signed_run
+        self.history.records[self.name] = run, self.lockstep.signed_run
 
     def _send(self, publications: Iterable[Publication]) -> None:
         """Samples go in one message, before the cost."""
@@ -196,8 +201,10 @@ class PlantProcess(Process):
 
 
 class ControllerProcess(Process):
-    def __init__(self, history: History, name: str, rate: float = 1.0, **changed: Any) -> None:
-        super().__init__(history, name, "controller", rate)
+    def __init__(
+        self, history: History, name: str, rate: float = 1.0, pair: int = 0, **changed: Any
+    ) -> None:
+        super().__init__(history, name, "controller", rate, pair)
         made = Responder(DesignSettings.of({**history.values, **changed}))
         self._handlers: dict[Topic, Callable[[Frame], Any]] = {
             TARGET: made.target,
@@ -208,14 +215,14 @@ class ControllerProcess(Process):
             STATE: made.state,
         }
 
-    def take(self, topic: Topic, frame: Frame) -> None:
+    def take(self, topic: Topic, frame: Frame, pair: int) -> None:
         self.publish(self._handlers[topic](frame))
 
 
 class Stranger(Process):
     """Answers every state with zeros and, as stand-ins may, without a signature."""
 
-    def take(self, topic: Topic, frame: Frame) -> None:
+    def take(self, topic: Topic, frame: Frame, pair: int) -> None:
         if topic is STATE:
             zeros = np.zeros((len(frame.values), self.history.values["n_a"]))
             answer = Frame(frame.run, frame.episode, frame.step, frame.time, zeros, frame.plant)
@@ -240,8 +247,8 @@ class TunerProcess(Process):
         power: bool = False,
         rot: bool = False,
     ) -> None:
-        super().__init__(history, name, "tuner", rate)
-        given = history.values
+        super().__init__(history, name, "tuner", rate, EVERY_PAIR)
+        given = {**history.values, "pairs": [""] * history.plan.pairs}
         training = build_training(given)
         disk.restart(training.restore, power=power, rot=rot)
         self._disk = disk
@@ -252,7 +259,7 @@ class TunerProcess(Process):
     def begin(self) -> None:
         self._guarded(self.session.begin)
 
-    def take(self, topic: Topic, frame: Frame) -> None:
+    def take(self, topic: Topic, frame: Frame, pair: int) -> None:
         handler = {
             COST: self.dispatcher.cost,
             MODEL_IDENTIFIED: self.dispatcher.model,
@@ -260,22 +267,23 @@ class TunerProcess(Process):
             PAUSED: self.dispatcher.plant_paused,
         }[topic]
         if topic is not TARGET or self.session.training.settings.trajectories:
-            self._guarded(lambda now: handler(0, frame, now))
+            self._guarded(lambda now: handler(pair, frame, now))
 
-    def see(self, samples: list[tuple[Topic, Frame]]) -> None:
+    def see(self, samples: list[tuple[Topic, Frame]], pair: int) -> None:
         """Take samples of an episode."""
         for topic, frame in samples:
             if topic is ACTION:
-                self.dispatcher.action(0, frame)
-            elif self.dispatcher.state(0, frame):
+                self.dispatcher.action(pair, frame)
+            elif self.dispatcher.state(pair, frame):
                 self._guarded(self.dispatcher.tick)
 
-    def fail(self, failure: ModelFailure) -> None:
-        self._guarded(lambda now: self.dispatcher.failure(0, failure, now))
+    def fail(self, failure: ModelFailure, pair: int) -> None:
+        self._guarded(lambda now: self.dispatcher.failure(pair, failure, now))
 
     def tick(self) -> float:
-        missing = [role for role in ("plant", "controller") if not self.history.present(role)]
-        self._guarded(lambda now: self.dispatcher.presence(0, missing, now))
+        for pair in range(self.history.plan.pairs):
+            missing = self.history.missing(pair)
+            self._guarded(lambda now, p=pair, m=missing: self.dispatcher.presence(p, m, now))
         self._guarded(self.dispatcher.tick)
         return 0.1
 
@@ -294,7 +302,8 @@ class TunerProcess(Process):
         if session.done or session.stopped:
             return
         sent = session.advance(event(self.now), self.now)
-        self.publish(publication for _, publication in sent)
+        for pair, publication in sent:
+            self.history.send(self, publication, pair)
         if self._changed and (session.stopped or self.history.rng.random() < 0.5):
             self._disk.save(session.training.state())
             self._changed = False
