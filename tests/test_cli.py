@@ -168,6 +168,19 @@ def test_a_run_without_a_usable_checkpoint_begins_again_and_comes_to_the_same_po
     assert (out / "policy.npz").read_bytes() == policy
 
 
+def test_a_truncated_checkpoint_falls_back_to_the_one_before(tmp_path, capsys):
+    out = tmp_path / "run"
+    assert train(out) == 0
+    policy = (out / "policy.npz").read_bytes()
+    (out / "result.json").unlink()
+    path = out / "checkpoint"
+    path.write_bytes(path.read_bytes()[:-7])
+    assert main(["train", "--resume", str(out), "--in-process"]) == 0
+    text = capsys.readouterr().out
+    assert "is damaged: its checksum does not match; using an older checkpoint" in text
+    assert (out / "policy.npz").read_bytes() == policy
+
+
 def test_a_checkpoint_of_another_run_is_not_taken(tmp_path, capsys):
     for name in ("a", "b"):
         assert train(tmp_path / name, "--seed", str("ab".index(name))) == 0

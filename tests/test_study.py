@@ -229,7 +229,8 @@ def test_an_interrupted_command_ends_its_processes_in_the_middle(tmp_path: Path)
     )
     assert process.stdout is not None
     try:
-        assert "0 of 2 trainings" in process.stdout.readline()
+        # A busy machine may say first that it compiles.
+        assert any("0 of 2 trainings" in line for line in process.stdout)
         process.send_signal(signal.SIGINT)
         told, _ = process.communicate(timeout=LIMIT)
     finally:
@@ -287,7 +288,7 @@ def test_a_dask_cluster_that_loses_a_worker_gives_the_same_bits(
             run(Study.of(CONTENT), tmp_path / "refused", partial(cluster, address))
 
         def kill_one(done: int, total: int, status: str) -> None:
-            if done == 1 and workers[0].poll() is None:
+            if done and workers[0].poll() is None:
                 os.kill(workers[0].pid, signal.SIGKILL)
 
         assert run(Study.of(CONTENT), out, partial(cluster, address), tell=kill_one) == []
