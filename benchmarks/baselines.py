@@ -1,6 +1,6 @@
-"""Methods at equal rollouts, one table a problem: `python -m benchmarks baselines PROBLEM`.
+"""Methods at equal rollouts, one table a problem: `python -m benchmarks baselines STUDY ...`.
 
-benchmarks/studies/PROBLEM.yaml is a study of the project's optimisers, and names the methods of others
+benchmarks/studies/STUDY.yaml is a study of the project's optimisers, and names the methods of others
 (benchmarks/methods.py), which are further tasks of that study: it runs on all cores, and is interrupted
 and continued. A budget counts every rollout before the closing evaluation, explorations and checks
 among them.
@@ -32,7 +32,7 @@ from loop_interfaces.parameters import table as parameters
 from loop_interfaces.problem import load_parameters
 from loop_interfaces.spec import read_document
 from pde_sim_node.plant import DIVERGED_COST
-from pdeloop.finished_run import CONFIDENCE, interval
+from pdeloop.finished_run import interval
 from pdeloop.reference import find
 from pdeloop.study import Study
 from pdeloop.study import run as carry_out
@@ -49,7 +49,7 @@ BUDGETS = (20, 40, 80)
 
 
 def run(
-    problem: str = "burgers",
+    studies: Sequence[str] = ("burgers",),
     *,
     rollouts: Sequence[int] = BUDGETS,
     seeds: int | None = None,
@@ -61,14 +61,47 @@ def run(
     any_environment: bool = False,
     figure: Path | None = None,
 ) -> dict[str, Any]:
-    """A row for each budget and method, the best first; the command line explains the parameters.
+    """A row for each problem, budget and method; the command line explains the parameters.
 
     Raises
     ------
     ValueError
         There is no such study or method, or a setting is not NAME=JSON.
     """
-    path = Path(problem) if problem.endswith(".yaml") else STUDIES / f"{problem}.yaml"
+    folder = folder or Path("runs") / f"baselines{'-tuning' if tune else ''}"
+    result: dict[str, Any] = {"limits": {}, "rows": []}
+    for name in studies:
+        study, entries = chosen(name, seeds, methods, settings, tune)
+        place = folder / Path(name).stem
+        for budget in rollouts:
+            print(f"{name}, {budget} rollouts ...", file=sys.stderr, flush=True)
+            own, tasks = with_methods(study, entries, budget)
+            refuse_other_constants(place / str(budget), tasks)
+            executor = partial(pool, processes)
+            failures = carry_out(
+                own, place / str(budget), executor, tasks=tasks, any_environment=any_environment
+            )
+            for failure in failures:
+                print(f"failed: {failure.training}: {failure.reason}", file=sys.stderr)
+        for problem, file in study.problems.items():
+            result["limits"][problem] = limit(file, study.settings)
+            for budget in rollouts:
+                found = table(place / str(budget) / problem, budget)
+                result["rows"] += [{"problem": problem, **row} for row in found]
+    if figure is not None:
+        plot(result, figure)
+    return result
+
+
+def chosen(
+    name: str,
+    seeds: int | None,
+    methods: Sequence[str],
+    settings: Sequence[str],
+    tune: Sequence[str],
+) -> tuple[Study, dict[str, dict[str, Any]]]:
+    """The study of that name, and the methods with their constants, as the words change them."""
+    path = Path(name) if name.endswith(".yaml") else STUDIES / f"{name}.yaml"
     if not path.is_file():
         known = ", ".join(sorted(each.stem for each in STUDIES.glob("*.yaml")))
         raise ValueError(f"no study {path}; expected one of {known}, or a YAML file like theirs")
@@ -88,25 +121,7 @@ def run(
         entries = candidates(entries, pairs(tune))
         settings_ = {**study.settings, "evaluation_seed": VALIDATION}
         study = replace(study, seeds=TUNING_SEEDS, settings=settings_)
-    folder = folder or Path("runs") / f"baselines-{path.stem}{'-tuning' if tune else ''}"
-    rows: list[dict[str, Any]] = []
-    for budget in rollouts:
-        print(f"{budget} rollouts ...", file=sys.stderr, flush=True)
-        own, tasks = with_methods(study, entries, budget)
-        place = folder / str(budget)
-        refuse_other_constants(place, tasks)
-        failures = carry_out(
-            own, place, partial(pool, processes), tasks=tasks, any_environment=any_environment
-        )
-        for failure in failures:
-            print(f"failed: {failure.training}: {failure.reason}", file=sys.stderr)
-        for name in study.problems:
-            rows += [{"problem": name, **row} for row in table(place / name, budget)]
-    limits = {name: limit(file, study.settings) for name, file in study.problems.items()}
-    result = {"limits": limits, "rows": rows}
-    if figure is not None:
-        plot(result, figure)
-    return result
+    return study, entries
 
 
 def pairs(words: Sequence[str]) -> dict[str, Any]:
@@ -219,28 +234,31 @@ def limit(problem: str, settings: Mapping[str, Any]) -> float | None:
 
 
 def text(result: Mapping[str, Any]) -> str:
-    """The rows as a Markdown table for each problem and budget."""
+    """A Markdown table for each problem, the method first that is the best after the last budget."""
     lines: list[str] = []
-    head = ["method", "rollouts", "seeds", "cost", f"{100 * CONFIDENCE:.0f} % interval", "mean"]
-    head += ["worst seed", "over the limit", "diverged"]
-    for (problem, budget), rows in itertools.groupby(result["rows"], key=_table):
-        bound = result["limits"][problem]
-        lines += ["", f"**{problem}, {budget} rollouts**", "", f"| {' | '.join(head)} |"]
-        lines.append("|---" * len(head) + "|")
-        for row in rows:
-            between = " to ".join(number(end) for end in row["interval"] or ()) or "-"
-            known = bound is not None and finished(row["cost"])
-            shown = [row["method"], row["rollouts"], row["seeds"], number(row["cost"]), between]
-            shown += [number(row["mean"]), number(row["worst"])]
-            shown += [f"{100 * (row['cost'] / bound - 1):.1f} %" if known else "-", row["diverged"]]
-            lines.append(f"| {' | '.join(map(str, shown))} |")
+    for problem, bound in result["limits"].items():
+        rows = [row for row in result["rows"] if row["problem"] == problem]
+        budgets = list(dict.fromkeys(row["budget"] for row in rows))
+        cells = {(row["method"], row["budget"]): cell(row) for row in rows}
+        last = {row["method"]: row["cost"] for row in rows}
+        head = [problem, *(f"{budget} rollouts" for budget in budgets), "over the limit"]
+        lines += ["", f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+        for method in sorted(last, key=lambda name: last[name]):
+            shown = [method, *(cells.get((method, budget), "") for budget in budgets)]
+            known = bound is not None and finished(last[method])
+            shown.append(f"{100 * (last[method] / bound - 1):.1f} %" if known else "-")
+            lines.append(f"| {' | '.join(shown)} |")
         if bound is not None:
-            lines.append(f"| any controller (limit) | | | {bound:.4g} | | | | 0.0 % | |")
+            lines.append(f"| any controller | {' | '.join([f'{bound:.4g}'] * len(budgets))} | 0 |")
     return "\n".join(lines[1:])
 
 
-def _table(row: Mapping[str, Any]) -> tuple[str, int]:
-    return row["problem"], row["budget"]
+def cell(row: Mapping[str, Any]) -> str:
+    """A cost with its interval, or how many of the seeds diverged."""
+    if not finished(row["cost"]):
+        return f"diverged ({row['diverged']} of {row['seeds']})"
+    between = " to ".join(number(end) for end in row["interval"] or ())
+    return f"{number(row['cost'])} ({between})" if between else number(row["cost"])
 
 
 def number(value: float) -> str:

@@ -6,13 +6,12 @@ jitted; controlgym for the library that the paper used. The last two run in Pyth
 their own, named by the path of their interpreter.
 """
 
-import argparse
 import json
 import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -23,8 +22,6 @@ from numpy.typing import NDArray
 from pde_sim_node.equations import EQUATIONS, Equation
 from pde_sim_node.solver.reference import ReferenceStep
 from pde_sim_node.supports import indicator_supports
-
-__all__ = ["BATCHES", "GRIDS", "Grid", "Row", "run"]
 
 BATCHES = (1, 2, 12, 64)
 SECONDS = 0.25
@@ -54,16 +51,6 @@ GRIDS = {
     "allen-cahn": Grid(256, 12, 0.05, 0.01, 0.01),
     "kdv": Grid(256, 10, 0.05, 0.01, 0.001),
 }
-
-
-@dataclass(frozen=True)
-class Row:
-    """Least time that a sampling time of one environment took."""
-
-    problem: str
-    batch: int
-    method: str
-    microseconds: float
 
 
 def reference(equation: Equation, grid: Grid) -> ReferenceStep:
@@ -99,18 +86,8 @@ def time_pdeloop(problem: str, batch: int) -> float:
     from pde_sim_node.plant import Plant
 
     equation, _, actions = start(problem, batch)
-    grid = GRIDS[problem]
-    plant = Plant(
-        equation,
-        n_z=grid.n_z,
-        n_a=grid.n_a,
-        width=grid.width,
-        sample_time=grid.sample_time,
-        integration_time=grid.integration_time,
-        horizon=10**9,
-        state_weight=1.0,
-        action_weight=1.0,
-    )
+    settings = {**asdict(GRIDS[problem]), "state_weight": 1.0, "action_weight": 1.0}
+    plant = Plant(equation, **settings, horizon=10**9)
     plant.reset(np.arange(batch))
 
     def step() -> None:
@@ -202,93 +179,68 @@ METHODS = {
 }
 
 
-def measure(method: str, batches: Sequence[int]) -> list[Row]:
-    time_one = METHODS[method]
+def measure(method: str, batches: Sequence[int]) -> list[dict[str, Any]]:
+    """Least time that a sampling time of one environment took, for each problem and batch."""
     return [
-        Row(problem, batch, method, time_one(problem, batch))
+        {
+            **{"problem": problem, "batch": batch, "method": method},
+            "microseconds": METHODS[method](problem, batch),
+        }
         for problem in GRIDS
         for batch in batches
     ]
 
 
-def measure_with(python: str, method: str, batches: Sequence[int]) -> list[Row]:
+def measure_with(python: str, method: str, batches: Sequence[int]) -> list[dict[str, Any]]:
     """`measure` by another interpreter; CalledProcessError if it fails, its words on stderr."""
     root = Path(__file__).resolve().parent.parent
-    command = [
-        python,
-        "-m",
-        "benchmarks.kernel",
-        "--only",
-        method,
-        "--batches",
-        *map(str, batches),
-    ]
     done = subprocess.run(
-        command,
+        [python, "-m", "benchmarks.kernel", method, *map(str, batches)],
         check=True,
         stdout=subprocess.PIPE,
         text=True,
         timeout=600,
         env={**os.environ, **KEEP_MEMORY, "PYTHONPATH": str(root)},
     )
-    return [Row(**row) for row in json.loads(done.stdout.splitlines()[-1])]
+    rows: list[dict[str, Any]] = json.loads(done.stdout.splitlines()[-1])
+    return rows
 
 
 def run(
     batches: Sequence[int] = BATCHES,
     *,
-    jax_python: str | None = None,
-    controlgym_python: str | None = None,
-) -> list[Row]:
+    jax: str | None = None,
+    controlgym: str | None = None,
+) -> list[dict[str, Any]]:
     """Measure the plant and its references, one after the other.
 
     Parameters
     ----------
     batches
         Numbers of environments.
-    jax_python, controlgym_python
+    jax, controlgym
         Interpreters that can import JAX, and controlgym 1.0.0; left out where not given.
     """
     rows = measure("pdeloop", batches) + measure_with(sys.executable, "numpy", batches)
-    if jax_python:
-        rows += measure_with(jax_python, "jax", batches)
-    if controlgym_python:
-        rows += measure_with(controlgym_python, "controlgym", batches)
+    for method, python in (("jax", jax), ("controlgym", controlgym)):
+        rows += measure_with(python, method, batches) if python else []
     return rows
 
 
-def table(rows: Sequence[Row]) -> str:
+def text(rows: Sequence[Mapping[str, Any]]) -> str:
     """Times, and in brackets how many times slower than the plant, as Markdown."""
-    methods = list(dict.fromkeys(row.method for row in rows))
-    times = {(row.problem, row.batch, row.method): row.microseconds for row in rows}
-    lines = ["| problem | batch | " + " | ".join(methods) + " |", "|---" * (2 + len(methods)) + "|"]
-    for problem, batch in dict.fromkeys((row.problem, row.batch) for row in rows):
-        own = times[problem, batch, methods[0]]
-        cells = [
-            f"{times[problem, batch, method]:.1f} ({times[problem, batch, method] / own:.1f})"
-            for method in methods
-        ]
-        lines.append(f"| {problem} | {batch} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+    from benchmarks.processes import markdown  # what the other interpreters lack
 
-
-def main() -> None:
-    """Print the table, in microseconds for a sampling time of one environment."""
-    parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("--batches", type=int, nargs="+", default=BATCHES)
-    parser.add_argument("--jax", metavar="PYTHON", help="interpreter that can import JAX")
-    parser.add_argument("--controlgym", metavar="PYTHON", help="interpreter with controlgym 1.0.0")
-    parser.add_argument("--only", choices=METHODS, help="measure one, print its rows as JSON")
-    options = parser.parse_args()
-    if options.only:
-        json.dump([asdict(row) for row in measure(options.only, options.batches)], sys.stdout)
-    else:
-        print(
-            table(
-                run(options.batches, jax_python=options.jax, controlgym_python=options.controlgym)
-            )
-        )
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    times = {
+        (row["problem"], row["batch"], row["method"]): float(row["microseconds"]) for row in rows
+    }
+    table = []
+    for problem, batch in dict.fromkeys((row["problem"], row["batch"]) for row in rows):
+        own = [times[problem, batch, method] for method in methods]
+        table.append((problem, batch, *(f"{time:.1f} ({time / own[0]:.1f})" for time in own)))
+    return markdown(("problem", "batch", *methods), table)
 
 
 if __name__ == "__main__":
-    main()
+    print(json.dumps(measure(sys.argv[1], [int(batch) for batch in sys.argv[2:]])))

@@ -314,7 +314,7 @@ def lqg(values: Values, *, whole: bool) -> tuple[LocalPair, Law, int]:
         return KalmanLaw(known, plant.positions.size, values["action_limit"])
 
     if not values["sensors"]:
-        raise ValueError("lqg is for plants with few sensors: give --set sensors=16")
+        raise ValueError("lqg is for plants with few sensors: give --settings sensors=16")
     return identified_again(values, controller, whole)
 
 

@@ -194,7 +194,7 @@ def run(
     tolerance: float = 2e-4,
     iterations: int = 1000,
     jobs: int | None = None,
-    checks: bool = True,
+    no_checks: bool = False,
     save: Path | None = None,
 ) -> list[dict[str, Any]]:
     """The limits of each problem, as JSON-able numbers.
@@ -213,8 +213,8 @@ def run(
         See `descend`.
     jobs
         Processes; none: one a core.
-    checks
-        For the first seed and field also from zero, and with twice the fields: what the result
+    no_checks
+        Leave out the first seed and field from zero, and with twice the fields: what the result
         depends on.
     save
         Folder for PROBLEM.json, which reports read (`pdeloop.reference`).
@@ -248,7 +248,7 @@ def run(
             laws: dict[Any, LawJob] = {
                 seed: law(problem, seed, fields) for seed in range(first_seed, first_seed + seeds)
             }
-            if checks:
+            if not no_checks:
                 laws["from zero"] = law(problem, first_seed, fields, from_zero=True)
                 laws["twice the fields"] = law(problem, first_seed, 2 * fields)
             name = str(values["problem"])
@@ -261,7 +261,7 @@ def run(
                 for seed in evaluation_seed
                 for i, field in enumerate(evaluation_seeds(seed, evaluation_fields))
             }
-            if checks:
+            if not no_checks:
                 field = evaluation_seeds(evaluation_seed[0], 1)[0]
                 given["from zero"] = InputJob(problem, field, None, None, tolerance, iterations)
             inputs = _all(pool, optimise_inputs, given, f"{name}, inputs of field")

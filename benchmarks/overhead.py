@@ -1,24 +1,29 @@
-"""How much something beside a loop slows it: one training, that something beside it now and then.
+"""`python -m benchmarks overhead WHAT`: how much a recorder, a viewer or the live page slows a loop.
 
-The same three nodes run all the time and only the other process comes and goes, so that what else
-the machine does weighs on both sides alike.
+The same three nodes train all the time and only the other process comes and goes, so that what else
+the machine does weighs on both sides alike. A viewer is looked at by somebody who reads all of its
+topics, the live page by a client that takes all that a browser would (benchmarks.reader).
 """
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import os
+import re
+import signal
 import statistics
 import subprocess
+import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from benchmarks.processes import BenchError
 from loop_interfaces.affinity import usable_cores
 from loop_interfaces.isolation import loopback_environment
 from loop_interfaces.problem import find_problem
@@ -26,18 +31,23 @@ from pdeloop.domain import own_domain
 from pdeloop.pairs import pair_cores, pair_nodes
 from pdeloop.supervisor import keep_on, node_command
 
+PATIENCE = 60.0
+"""Seconds within which a process must be at work, or have ended."""
+READER = (sys.executable, "-m", "benchmarks.reader")
+
 
 @dataclass
 class Setting:
     """Where a measurement takes place. Processes that `start` has started end with it."""
 
+    problem: str
     folder: Path
     environment: dict[str, str]
     others: Sequence[int] = ()
     """Cores that plant and controller, which share one, leave to others."""
     processes: list[subprocess.Popen[bytes]] = field(default_factory=list)
 
-    def start(self, command: Sequence[str], name: str) -> subprocess.Popen[bytes]:
+    def start(self, name: str, *command: str) -> subprocess.Popen[bytes]:
         """Run a command with its output in the file NAME.log."""
         with (self.folder / f"{name}.log").open("ab") as log:
             process = subprocess.Popen(
@@ -46,58 +56,111 @@ class Setting:
         self.processes.append(process)
         return process
 
-    def start_child(self, command: Sequence[str], name: str) -> subprocess.Popen[bytes]:
-        """The same, where `pdeloop train` starts such a process itself."""
-        process = self.start(command, name)
-        keep_on(process.pid, self.others)
-        return process
+    def start_beside(self, name: str, *command: str) -> None:
+        """The same, off the pair's core, where `pdeloop train` starts such a process itself."""
+        keep_on(self.start(name, *command).pid, self.others)
 
-    def log(self, name: str) -> str:
-        """What the command with that name has printed."""
-        return (self.folder / f"{name}.log").read_text(errors="replace")
+    def wait(self, name: str, pattern: str) -> str:
+        """What its output says where it matches `pattern`, once it does."""
+        limit = time.monotonic() + PATIENCE
+        while True:
+            said = (self.folder / f"{name}.log").read_text(errors="replace")
+            if found := re.search(pattern, said):
+                return found[0]
+            if time.monotonic() > limit:
+                raise BenchError(f"{name} is not at work after {PATIENCE:g} s: {said[-300:]}")
+            time.sleep(0.05)
 
 
-Company = Callable[[Setting, int], AbstractContextManager[None]]
-"""What comes beside the loop in a window of this number: it is there within the block."""
+def recorder(setting: Setting, window: int) -> None:
+    """A recorder, once it is matched and its start is over."""
+    bag = setting.folder / f"bag{window}"
+    setting.start_beside("recorder", *node_command("recorder_node", "-p", f"bag:={bag}"))
+    while not (bag / "parameters.json").exists():
+        time.sleep(0.05)
 
 
-def measure(
-    problem: str, windows: int, seconds: float, company: Company, tuner: Sequence[str] = ()
-) -> dict[str, Any]:
+def viewer(setting: Setting, window: int) -> None:
+    """A viewer, and who looks at it."""
+    given = ("--params-file", str(find_problem(setting.problem)))
+    setting.start_beside("viewer", *node_command("viewer_node", *given))
+    setting.start(f"views{window}", *READER)
+    setting.wait(f"views{window}", "reading")
+
+
+def monitor(setting: Setting, window: int) -> None:
+    """`pdeloop monitor`, and an open page."""
+    name = f"monitor{window}"
+    setting.start(name, sys.executable, "-m", "pdeloop.cli", "monitor", "--port", "0")
+    address = setting.wait(name, r"http://[\d.:]+/")
+    setting.start(f"page{window}", *READER, address)
+    setting.wait(f"page{window}", "reading")
+
+
+COMPANY: dict[str, Callable[[Setting, int], None]] = {
+    "recorder": recorder,
+    "viewer": viewer,
+    "monitor": monitor,
+}
+
+
+@contextlib.contextmanager
+def beside(what: str, setting: Setting, window: int) -> Iterator[None]:
+    """Have it at work within the block, and end it then."""
+    before = len(setting.processes)
+    COMPANY[what](setting, window)
+    yield
+    for process in setting.processes[before:]:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(PATIENCE / 10)
+        except subprocess.TimeoutExpired:  # rclpy.spin now and then sleeps through a signal
+            process.kill()
+            process.wait()
+
+
+def run(what: str, problem: str = "burgers", windows: int = 6, seconds: float = 3.0) -> Any:
     """Time of an iteration, and processor time of plant and controller for one, without and beside.
 
-    windows: of each of the two; tuner: parameters NAME:=VALUE of the tuner.
+    Parameters
+    ----------
+    what
+        One of `COMPANY`.
+    problem, windows, seconds
+        The loop's; how many windows of so many seconds without it, and with it.
     """
     times: tuple[list[float], list[float]] = ([], [])
     processor: tuple[list[float], list[float]] = ([], [])
     with tempfile.TemporaryDirectory() as name, own_domain() as domain:
         given = {"ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": name}
-        setting = Setting(Path(name), {**os.environ, **loopback_environment(), **given})
-        run = setting.folder / "run"
+        environment = {**os.environ, **loopback_environment(), **given}
+        setting = Setting(problem, Path(name), environment)
+        folder = setting.folder / "run"
 
         def start(node: str, *parameters: str) -> subprocess.Popen[bytes]:
             words = [word for p in parameters for word in ("-p", p)]
-            command = node_command(node, "--params-file", str(find_problem(problem)), *words)
-            return setting.start(command, node)
+            file = ("--params-file", str(find_problem(problem)))
+            return setting.start(node, *node_command(node, *file, *words))
 
         try:
             cores = pair_cores(1)
             setting.others = [core for core in usable_cores() if core not in cores]
             nodes = [start(node.package, *node.assignments) for node in pair_nodes(cores)]
-            start("tuner_node", f"out:={run}", "iterations:=100000", "optimizer:=two_point", *tuner)
-            progress = run / "progress.jsonl"
+            # The tuner's own share of the processor is small.
+            start("tuner_node", f"out:={folder}", "iterations:=100000", "optimizer:=two_point")
+            progress = folder / "progress.jsonl"
 
-            def observe(beside: int) -> None:
+            def observe(side: int) -> None:
                 before = _processor_time(nodes)
                 found = _iterations(progress, seconds)
-                times[beside].extend(found)
-                processor[beside].append((_processor_time(nodes) - before) / (len(found) + 1))
+                times[side].extend(found)
+                processor[side].append((_processor_time(nodes) - before) / (len(found) + 1))
 
             while not (progress.exists() and '"adapted"' in progress.read_text()):
                 time.sleep(0.1)
             for window in range(windows):
                 observe(0)
-                with company(setting, window):
+                with beside(what, setting, window):
                     time.sleep(0.5)
                     observe(1)
                 time.sleep(0.5)
@@ -106,6 +169,7 @@ def measure(
                 process.kill()
                 process.wait()
     return {
+        "what": what,
         "problem": problem,
         "iterations": [len(some) for some in times],
         "iteration": [statistics.median(some) for some in times],
@@ -113,12 +177,12 @@ def measure(
     }
 
 
-def text(result: dict[str, Any], what: str) -> str:
-    """The result for people; what: that which comes and goes, with its article."""
+def text(result: dict[str, Any]) -> str:
+    """The result for people."""
     (off, on), (cpu_off, cpu_on) = result["iteration"], result["processor"]
     count_off, count_on = result["iterations"]
     return (
-        f"{result['problem']}: median iteration {1e3 * off:.2f} ms without {what} "
+        f"{result['problem']}: median iteration {1e3 * off:.2f} ms without a {result['what']} "
         f"({count_off} iterations), {1e3 * on:.2f} ms with one ({count_on}), ratio {on / off:.3f}, "
         f"of the means {count_off / max(count_on, 1):.3f}\n"
         f"  processor time of plant and controller {1e3 * cpu_off:.2f} ms without, "

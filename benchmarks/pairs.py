@@ -26,6 +26,9 @@ from pdeloop.pairs import namespaces
 from pdeloop.training_run import resolve
 from tuner_node.build import build_training
 
+PROBLEM = "burgers"
+LOSS, DELAY = 0.01, 0.002
+"""Share of lost messages, and largest delay in s."""
 SEEDS = 4
 """Trainings side by side, so that there is an episode for each of four pairs."""
 LIMIT = 600.0
@@ -35,20 +38,17 @@ LIMIT = 600.0
 def run(
     pairs: Sequence[int] = (1, 2, 4),
     iterations: int = 20,
-    loss: float = 0.01,
-    delay: float = 0.002,
-    problem: str = "burgers",
 ) -> dict[str, Any]:
     """A row for each number of pairs, without and with faults, and one with a pair killed."""
     budget = {"iterations": iterations, "optimizer": "two_point"}
-    values = resolve(problem, {**budget, "seeds": SEEDS, "evaluation_fields": 4})
+    values = resolve(PROBLEM, {**budget, "seeds": SEEDS, "evaluation_fields": 4})
     training = build_training(values)
     began = time.monotonic()
     train(training, LocalPair(values), lambda row: None)
     alone = time.monotonic() - began
     expected = training.policies()
     rows = []
-    line = [f"loss:={loss}", f"delay:={delay}"]
+    line = [f"loss:={LOSS}", f"delay:={DELAY}"]
     plans: list[tuple[int, list[str], bool]] = [(k, [], False) for k in pairs]
     plans += [(k, line, False) for k in pairs]
     if max(pairs) > 1:
@@ -57,11 +57,7 @@ def run(
         row = serve(values, count, faults, kill, expected)
         rows.append({"pairs": count, "faults": bool(faults), "killed": kill, **row})
     return {
-        "problem": values["problem"],
         "iterations": iterations,
-        "seeds": SEEDS,
-        "loss": loss,
-        "delay": delay,
         "in_process_seconds": alone,
         "machine": machine(),
         "rows": rows,
@@ -163,7 +159,7 @@ def text(result: dict[str, Any]) -> str:
         for row in result["rows"]
     ]
     return (
-        f"{result['problem']}, {result['iterations']} iterations of {result['seeds']} seeds; faults: "
-        f"{result['loss']:.0%} of the messages lost, delayed by up to {1e3 * result['delay']:g} ms; "
+        f"{PROBLEM}, {result['iterations']} iterations of {SEEDS} seeds; faults: {LOSS:.0%} of the "
+        f"messages lost, delayed by up to {1e3 * DELAY:g} ms; "
         f"in one process {result['in_process_seconds']:.1f} s\n{markdown(head, rows)}"
     )

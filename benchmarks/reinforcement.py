@@ -8,7 +8,7 @@ exploration and the check before it. What the agent is told and may do is chosen
 - observed is e = U'(z - z_r), U of the reduced model that all methods know, divided by the root mean
   square in the rollouts of the check, instead of the whole field;
 - actions of magnitude 1 are `reach` times the largest one of LQ tracking there;
-- rewards are divided by the stage cost of LQ tracking, a diverged episode costs `PENALTY` of those.
+- rewards are `scale` under LQ tracking, on the average; a diverged episode costs `PENALTY` of those.
 
 Its deterministic policy is measured on the validation and the test fields as it learns, which counts as
 no rollout.
@@ -19,14 +19,14 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.baselines import TEST, VALIDATION
+from benchmarks.baselines import BUDGETS, TEST, VALIDATION, pairs
 from benchmarks.methods import evaluation_fields, training_field
 from benchmarks.warm_start import warm_start
 from loop_interfaces.files import make_folder, write_atomically
@@ -38,10 +38,13 @@ from pdeloop.training_run import resolve
 
 Array = NDArray[np.float64]
 PENALTY = 100.0
-MARKS = (20, 80, 160, 320, 640, 1280, 2560, 5120, 10240, 20480, 40960)
+MARKS = (20, 40, 80, 160, 320, 640, 1280, 2560, 5120, 10240, 20480, 40960)
 """Rollouts after which the policy is measured."""
-BUDGET = 80
-"""Of the tables of `benchmarks.baselines`."""
+CONSTANTS: dict[str, dict[str, Any]] = {
+    "ppo": {"scale": 0.01, "policy_kwargs": {"log_std_init": -1.5}},
+    "sac": {"scale": 1.0},
+}
+"""What is not the default of the library or of `run`."""
 
 
 def run(
@@ -50,22 +53,30 @@ def run(
     algorithm: str = "ppo",
     seed: int = 0,
     minutes: float = 20.0,
-    reach: float = 1.0,
-    environments: int = 4,
+    rollouts: int = MARKS[-1],
+    settings: Sequence[str] = (),
     folder: Path | None = None,
 ) -> dict[str, Any]:
     """One learning curve, which ends where the policy costs less than LQ tracking, or with the time.
+
+    The budgets of `benchmarks.baselines` are measured in any case.
 
     Parameters
     ----------
     problem, algorithm, seed
         What is controlled; "ppo" or "sac"; of the training, as in the other methods.
-    minutes
-        Of processor time, at most.
-    reach, environments
-        Bound of the actions; how many are advanced in a batch.
+    minutes, rollouts
+        Of processor time, and of the plant, at most.
+    settings
+        Words NAME=JSON: `reach`, `environments` (how many are advanced in a batch), `scale`, or what
+        the library's agent is called with.
     folder
-        That of `benchmarks.baselines`, for the cost after `BUDGET` rollouts.
+        That of `benchmarks.baselines`, for the costs after its budgets.
+
+    Raises
+    ------
+    ValueError
+        The library is not installed, or there is no such algorithm.
     """
     try:
         import stable_baselines3  # noqa: F401
@@ -75,6 +86,10 @@ def run(
             f"this needs {error.name}, which no extra installs: see docs/optimizers.md"
         ) from error
     torch.set_num_threads(1)
+    if algorithm not in CONSTANTS:
+        raise ValueError(f"algorithm is {algorithm!r}; expected {' or '.join(CONSTANTS)}")
+    constants = {"reach": 1.0, "environments": 4, **CONSTANTS[algorithm], **pairs(settings)}
+    reach, environments, reward = (constants.pop(n) for n in ("reach", "environments", "scale"))
     values = resolve(problem, {"seed": seed, "seeds": 1})
     pair = LocalPair(values)
     training = warm_start(values, pair)
@@ -82,7 +97,7 @@ def run(
     plant, U = pair.plant, unpack(training.models[0], values["n_a"]).U
     known = training.measured[0][-1].trajectory  # of the check of LQ tracking
     scale = np.sqrt(np.mean(((known.states - plant.target) @ U) ** 2, axis=0))
-    bound = reach * float(np.abs(known.actions).max())
+    bound: float = reach * float(np.abs(known.actions).max())
 
     def observe(states: Array) -> Array:
         return np.asarray((states - plant.target) @ U / scale, dtype=np.float32)
@@ -96,19 +111,22 @@ def run(
     unit = float(np.mean(lqt))
     source = VectorEnvironment(problem, num_envs=environments, divergence_penalty=PENALTY * unit)
     first = [training_field(values, m) for m in range(environments)]
-    episodes = batch_of_episodes(source, first, observe, bound, unit)
-    agent = make_agent(algorithm, episodes, seed, plant.horizon)
+    episodes = batch_of_episodes(source, first, observe, bound, unit / reward)
+    agent = make_agent(algorithm, episodes, seed, plant.horizon, constants)
 
     def law(k: int, states: Array) -> Array:
         return bound * np.asarray(
             agent.predict(observe(states), deterministic=True)[0], dtype=float
         )
 
-    began, rows, best, marks = time.process_time(), [], np.inf, list(MARKS)
-    while marks and time.process_time() - began < 60 * minutes and best >= unit:
+    marks = [mark for mark in MARKS if mark <= rollouts]
+    began, rows, best = time.process_time(), [], np.inf
+    while marks and time.process_time() - began < 60 * minutes:
+        if best < unit and marks[0] > BUDGETS[-1]:
+            break
         paid = int(training.budget.paid[0]) + episodes.ended
         if paid + environments > marks[0]:
-            marks.pop(0)
+            mark = marks.pop(0)
             cost, tested = float(np.mean(measured(law, VALIDATION))), measured(law, TEST)
             best = min(best, cost)
             minute = (time.process_time() - began) / 60
@@ -116,30 +134,28 @@ def run(
                 {"rollouts": paid, "minutes": minute, "cost": cost, "test": float(np.mean(tested))}
             )
             print(f"{algorithm} {problem} {rows[-1]}", file=sys.stderr, flush=True)
-            if folder is not None and paid + environments > BUDGET >= paid:
-                place = folder / str(BUDGET) / values["problem"] / algorithm / str(seed)
+            if folder is not None and mark in BUDGETS:
+                place = folder / problem / str(mark) / values["problem"] / algorithm / str(seed)
                 result = {"rollouts": [{"total": paid}], "costs_by_field": {"adapted": [tested]}}
                 make_folder(place)
                 write_atomically(place / "result.json", json.dumps(result).encode())
         agent.learn(environments * plant.horizon, reset_num_timesteps=False)
-    return {"problem": problem, "algorithm": algorithm, "seed": seed, "lqt": unit, "rows": rows}
+    given = {"problem": problem, "algorithm": algorithm, "seed": seed, "settings": list(settings)}
+    return {**given, "lqt": unit, "rows": rows}
 
 
-def make_agent(algorithm: str, episodes: Any, seed: int, horizon: int) -> Any:
-    """The agent; what is not said here is the library's default. ValueError of another algorithm."""
+def make_agent(
+    algorithm: str, episodes: Any, seed: int, horizon: int, constants: Mapping[str, Any]
+) -> Any:
+    """The agent; what is not said here is the library's default."""
     from stable_baselines3 import PPO, SAC
 
-    if algorithm == "ppo":
-        # An update after each batch of episodes, and an exploration that does not begin at the bounds.
-        quiet = {"log_std_init": -1.5}
-        size = horizon * episodes.num_envs // 4
-        return PPO(
-            "MlpPolicy", episodes, n_steps=horizon, batch_size=size, policy_kwargs=quiet, seed=seed
-        )
+    common = {"policy": "MlpPolicy", "env": episodes, "seed": seed}
+    batch = horizon * episodes.num_envs
     if algorithm == "sac":
-        starts = horizon * episodes.num_envs
-        return SAC("MlpPolicy", episodes, learning_starts=starts, gradient_steps=-1, seed=seed)
-    raise ValueError(f"algorithm is {algorithm!r}; expected ppo or sac")
+        return SAC(**{**common, "learning_starts": batch, **constants})
+    # An update after each batch of episodes.
+    return PPO(**{**common, "n_steps": horizon, "batch_size": batch // 4, **constants})
 
 
 def batch_of_episodes(

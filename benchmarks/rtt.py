@@ -9,6 +9,7 @@ and the controller's own threads, and of the middleware's threads in both.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from statistics import median
 from typing import Any
 
@@ -117,7 +118,7 @@ def _processor_times(pair: tuple[BenchProcess, BenchProcess]) -> dict[str, float
     }
 
 
-def run(turns: int = 7, seconds: float = 0.4, cores: tuple[str, ...] = CORES) -> dict[str, Any]:
+def run(turns: int = 7, seconds: float = 0.4, cores: Sequence[str] = CORES) -> dict[str, Any]:
     """Everything, as JSON-able data."""
     rows = [row for where in cores for row in measure(BATCHES, turns, seconds, where)]
     return {"problem": PROBLEM, "machine": machine(), "rows": rows}

@@ -21,10 +21,10 @@ from pdeloop.study.executors import processes
 
 
 def run(
-    problem: str = "burgers", seeds: int = 8, rollouts: int = 20, workers: Sequence[int] = (1, 2)
+    problem: str = "burgers", seeds: int = 8, workers: Sequence[int] = (1, 2)
 ) -> dict[str, Any]:
     """A row for each number of workers; the first is 1."""
-    content = {"problems": [problem], "seeds": seeds, "settings": {"rollouts": rollouts}}
+    content = {"problems": [problem], "seeds": seeds, "settings": {"rollouts": 20}}
     study, rows = Study.of(content), []
     for count in sorted({1, *workers}):
         with TemporaryDirectory() as folder:

@@ -161,9 +161,26 @@ def test_the_table_has_the_best_first_and_counts_what_diverges(tmp_path: Path) -
     ]
     rows = [{"problem": "p", **row} for row in rows]
     lines = baselines.text({"limits": {"p": 2.0}, "rows": rows}).splitlines()
-    assert lines[0] == "**p, 20 rollouts**"
-    assert lines[4].startswith("| better | 20 | 4 | 2.5 |") and "| 25.0 % | 0 |" in lines[4]
-    assert lines[5].endswith("| diverged | diverged | 50.0 % | 1 |")
+    assert lines[0] == "| p | 20 rollouts | over the limit |"
+    assert lines[2].startswith("| better | 2.5 (") and lines[2].endswith(") | 25.0 % |")
+    assert lines[3].startswith("| worse | 3 (") and lines[3].endswith("to diverged) | 50.0 % |")
+    assert lines[4] == "| any controller | 2 | 0 |"
+
+
+def test_the_table_has_a_column_for_each_budget_and_says_which_methods_diverged():
+    row = {"problem": "p", "method": "a", "seeds": 3, "interval": None, "diverged": 0}
+    rows = [
+        {**row, "budget": 20, "cost": 4.0, "interval": (3.0, 5.0)},
+        {**row, "budget": 40, "cost": 2.0},
+        {**row, "method": "b", "budget": 40, "cost": DIVERGED_COST, "diverged": 2},
+    ]
+    lines = baselines.text({"limits": {"p": None}, "rows": rows}).splitlines()
+    assert lines == [
+        "| p | 20 rollouts | 40 rollouts | over the limit |",
+        "|---|---|---|---|",
+        "| a | 4 (3 to 5) | 2 | - |",
+        "| b |  | diverged (2 of 3) | - |",
+    ]
 
 
 def test_results_of_other_constants_are_refused(tmp_path: Path) -> None:
@@ -196,20 +213,20 @@ def test_a_comparison_is_a_study_that_is_continued(
     file, folder = tmp_path / "small.yaml", tmp_path / "runs"
     file.write_text(STUDY)
     how: dict[str, Any] = {"rollouts": [9], "settings": ["evaluation_fields=2"], "folder": folder}
-    found = run(str(file), **how)
+    found = run([str(file)], **how)
     assert {(row["method"], row["seeds"]) for row in found["rows"]} == {
         ("no-control", 2),
         ("lqt-again", 2),
         ("two-point", 2),
     }
     assert found["rows"][-1]["method"] == "no-control" and found["limits"] == {"small": None}
-    written = {path: path.stat().st_mtime_ns for path in folder.glob("9/*/*/*/result.json")}
-    lost = folder / "9/small/lqt-again/1/result.json"
+    written = {path: path.stat().st_mtime_ns for path in folder.glob("small/9/*/*/*/result.json")}
+    lost = folder / "small/9/small/lqt-again/1/result.json"
     lost.unlink()
-    assert run(str(file), **how) == found
+    assert run([str(file)], **how) == found
     assert [p for p, at in written.items() if p.stat().st_mtime_ns != at] == [lost]
     with pytest.raises(StudyError, match="holds another study"):
-        run(str(file), **{**how, "seeds": 1})
+        run([str(file)], **{**how, "seeds": 1})
 
 
 @pytest.mark.skipif(
@@ -232,10 +249,10 @@ def test_the_command_line_hands_the_program_its_options_alone(
 @pytest.mark.parametrize(
     ("words", "why"),
     [
-        ({"problem": "kdv", "methods": ["mcp"]}, "no method mcp; expected some of gauss-newton"),
-        ({"problem": "kvd"}, "no study .*kvd.yaml; expected one of allen-cahn, burgers, kdv"),
+        ({"studies": ["kdv"], "methods": ["mcp"]}, "no method mcp; expected some of gauss-newton"),
+        ({"studies": ["kvd"]}, "no study .*kvd.yaml; expected one of allen-cahn, burgers, kdv"),
         (
-            {"problem": "kdv", "settings": ["sensors"]},
+            {"studies": ["kdv"], "settings": ["sensors"]},
             "'sensors' is no setting; expected NAME=JSON",
         ),
     ],

@@ -1,1 +1,0 @@
-"""Reads everything that a viewer publishes, as the tools of people do."""
