@@ -160,25 +160,18 @@ def children_seconds() -> float:
     return used.ru_utime + used.ru_stime
 
 
-@pytest.mark.parametrize("transport", [[], ["--in-process"]], ids=["topics", "in-process"])
-def test_ctrl_c_ends_everything_and_the_run_continues(loop: Processes, tmp_path, transport):
+def test_ctrl_c_ends_everything_and_says_how_to_go_on(loop: Processes, tmp_path):
     out = tmp_path / "run"
-    iterations = 2000 if transport else 400
-    options = ("--iterations", str(iterations), "--out", str(out))
     children = children_seconds()
-    run = loop.pdeloop("train", str(SMALL), *options, *transport)
-    until(lambda: iterations_done(out) >= 30, LIMIT, "iteration 30")
+    run = loop.pdeloop("train", str(SMALL), "--iterations", "100000", "--out", str(out))
+    until(lambda: iterations_done(out) >= 10, LIMIT, "iteration 10")
     before = processor_seconds(loop.left_behind())
     run.send_signal(signal.SIGINT)
     text = loop.wait(run, LIMIT, code=130)
     # Not by the clock: on an idle machine it takes as long as this, on a busy one longer.
     assert children_seconds() - children - before < 2.0
     until(lambda: loop.left_behind() == [], LIMIT, "end of all nodes")
-    assert iterations_done(out) < iterations
     assert f"continue with: pdeloop train --resume {out}" in text
-    again = loop.pdeloop("train", "--resume", str(out), *transport)
-    loop.wait(again, LIMIT)
-    assert_same_training(out, in_process(iterations=iterations))
 
 
 def test_a_rollout_that_diverges_is_marked_and_the_training_goes_on(loop: Processes, tmp_path):

@@ -8,15 +8,13 @@ import pytest
 
 from loop_interfaces.protocol import STOPPED
 from tests.loop_harness import Processes, until
-from tests.operator_harness import operator
+from tests.operator_harness import SLOW, full_speed, operator
 from tests.small import SMALL
 from tests.topics.test_faults import start_pair, start_tuner
 from tests.topics.test_loop import LIMIT, assert_same_training, in_process, iterations_done
 
 pytestmark = pytest.mark.topics
-ITERATIONS = 400
-"""Enough that the training goes on when an operator comes after 20 of them."""
-LONG = LIMIT
+ITERATIONS = 60
 
 
 def complaints(text: str) -> list[str]:
@@ -31,10 +29,10 @@ def test_a_paused_and_stepped_plant_gives_the_same_policy_and_nobody_complains(
 ):
     # The state would be void after 1 s without an answer, the episode silent after 2 s.
     running = start_pair(loop, max_repeats=20)
-    out = tmp_path / "run"
+    out, iterations = tmp_path / "run", 400  # it goes on when the operator comes
     with operator(loop) as desk:
-        running["tuner"] = start_tuner(loop, out, iterations=ITERATIONS, episode_timeout=2.0)
-        until(lambda: iterations_done(out) >= 20, LONG, "iteration 20")
+        running["tuner"] = start_tuner(loop, out, iterations=iterations, episode_timeout=2.0)
+        until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
         desk.call("/pde_sim_node/pause")
         until(lambda: desk.values("pde_sim_node").get("paused") == "yes", LIMIT, "paused plant")
         done = iterations_done(out)
@@ -58,8 +56,8 @@ def test_a_paused_and_stepped_plant_gives_the_same_policy_and_nobody_complains(
             desk.wait_for_reports("pde_sim_node", 2)
             assert desk.values("pde_sim_node")["step"] == str(step)
         desk.call("/pde_sim_node/resume")
-        loop.wait(running["tuner"], LONG)
-        assert_same_training(out, in_process(iterations=ITERATIONS))
+        loop.wait(running["tuner"], LIMIT)
+        assert_same_training(out, in_process(iterations=iterations))
         until(
             lambda: desk.status("controller_node")[2] == "no episode under way",
             LIMIT,
@@ -73,11 +71,11 @@ def test_a_paused_and_stepped_plant_gives_the_same_policy_and_nobody_complains(
 def test_a_plant_that_dies_in_a_pause_is_paused_again_and_so_is_nothing_changed(
     loop: Processes, tmp_path
 ):
-    running = start_pair(loop, max_repeats=20)
+    running = start_pair(loop, max_repeats=20, real_time_factor=SLOW)
     out = tmp_path / "run"
     with operator(loop) as desk:
         tuner = start_tuner(loop, out, iterations=ITERATIONS)
-        until(lambda: iterations_done(out) >= 20, LONG, "iteration 20")
+        until(lambda: iterations_done(out) >= 2, LIMIT, "iteration 2")
         desk.call("/pde_sim_node/pause")
         for process in running.values():  # the controller as well
             process.send_signal(signal.SIGKILL)
@@ -93,16 +91,16 @@ def test_a_plant_that_dies_in_a_pause_is_paused_again_and_so_is_nothing_changed(
         assert iterations_done(out) == done
         assert desk.status("pde_sim_node")[2].startswith("paused at step 0")
         assert desk.call("/pde_sim_node/resume") == "resumed"
-        loop.wait(tuner, LONG)
+        loop.wait(tuner, LIMIT)
     assert_same_training(out, in_process(iterations=ITERATIONS))
 
 
 def test_a_paused_tuner_begins_no_episode_and_keeps_the_plant(loop: Processes, tmp_path):
-    start_pair(loop, run_hold=3.0)
+    start_pair(loop, run_hold=3.0, real_time_factor=SLOW)
     out = tmp_path / "run"
     with operator(loop) as desk:
         tuner = start_tuner(loop, out, iterations=ITERATIONS)
-        until(lambda: iterations_done(out) >= 20, LONG, "iteration 20")
+        until(lambda: iterations_done(out) >= 2, LIMIT, "iteration 2")
         desk.call("/tuner_node/pause")
         until(
             lambda: desk.values("tuner_node").get("episodes under way") == "0", LIMIT, "quiet loop"
@@ -123,8 +121,9 @@ def test_a_paused_tuner_begins_no_episode_and_keeps_the_plant(loop: Processes, t
             LIMIT,
             "report of the first tuner",
         )
+        full_speed(desk)
         assert desk.call("/tuner_node/resume") == "resumed"
-        loop.wait(tuner, LONG)
+        loop.wait(tuner, LIMIT)
     assert_same_training(out, in_process(iterations=ITERATIONS))
     assert '"repeated"' not in (out / "progress.jsonl").read_text()
 
@@ -133,38 +132,36 @@ def test_a_paused_tuner_begins_no_episode_and_keeps_the_plant(loop: Processes, t
 def test_a_tuner_that_was_asked_to_stop_is_continued_to_the_same_policy(
     loop: Processes, tmp_path, paused
 ):
-    start_pair(loop)
+    start_pair(loop, real_time_factor=SLOW)
     out = tmp_path / "run"
     with operator(loop) as desk:
         tuner = start_tuner(loop, out, iterations=ITERATIONS)
-        until(lambda: iterations_done(out) >= 20, LONG, "iteration 20")
+        until(lambda: iterations_done(out) >= 2, LIMIT, "iteration 2")
         if paused:
             desk.call("/tuner_node/pause")
         desk.call("/tuner_node/stop")
         text = loop.wait(tuner, LIMIT, code=STOPPED)
         assert "stopped on request" in text
-        assert 20 <= iterations_done(out) < ITERATIONS
+        assert 2 <= iterations_done(out) < ITERATIONS
         until(
             lambda: desk.status("pde_sim_node")[2] == "no run; ready for one", LIMIT, "free plant"
         )
+        full_speed(desk)
     again = start_tuner(loop, out, iterations=ITERATIONS, resume="true")
-    loop.wait(again, LONG)
+    loop.wait(again, LIMIT)
     assert_same_training(out, in_process(iterations=ITERATIONS))
 
 
-def test_the_command_line_ends_with_a_stopped_tuner_and_continues(loop: Processes, tmp_path):
+def test_the_command_line_ends_with_a_stopped_tuner(loop: Processes, tmp_path):
     out = tmp_path / "run"
-    options = ("--iterations", str(ITERATIONS), "--optimizer", "two_point", "--out", str(out))
+    options = ("--iterations", "100000", "--optimizer", "two_point", "--out", str(out))
     with operator(loop) as desk:
         run = loop.pdeloop("train", str(SMALL), *options)
-        until(lambda: iterations_done(out) >= 20, LONG, "iteration 20")
+        until(lambda: iterations_done(out) >= 2, LIMIT, "iteration 2")
         desk.call("/tuner_node/stop")
         text = loop.wait(run, LIMIT, code=130)
     assert f"stopped by request; continue with: pdeloop train --resume {out}" in text
-    assert iterations_done(out) < ITERATIONS
     assert not (out / "result.json").exists()
-    loop.wait(loop.pdeloop("train", "--resume", str(out)), LONG)
-    assert_same_training(out, in_process(iterations=ITERATIONS))
 
 
 QUEUED = """

@@ -75,18 +75,6 @@ def test_a_recorded_run_is_complete_and_everything_in_it_is_recomputed(loop, tmp
     assert {"pde_sim_node", "tuner_node"} <= {m.name for m in messages if hasattr(m, "msg")}
 
 
-def test_the_policies_of_an_optimiser_that_uses_trajectories_are_recomputed_from_them(
-    loop, tmp_path
-):
-    words = ("--rollouts", "15", "--record", "--optimizer", "gauss_newton")
-    run = loop.pdeloop("train", str(SMALL), *words, "--out", str(tmp_path / "run"))
-    loop.wait(run, LIMIT)
-    report = verify(tmp_path / "run")
-    assert report.count == 0, report.differences
-    assert report.notes == []
-    assert report.compared["policies"] >= 14  # all but the exploration
-
-
 def test_two_libraries_read_the_same_numbers(recorded):
     mine = {e.number: e for e in Bag(recorded).episodes()}
     with (recorded / "bag" / "bag.mcap").open("rb") as file:
