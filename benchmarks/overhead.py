@@ -7,116 +7,60 @@ topics, the live page by a client that takes all that a browser would (benchmark
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import json
-import os
 import re
-import signal
 import statistics
-import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.processes import BenchError
+from benchmarks.processes import Bench, BenchProcess, bench
 from loop_interfaces.affinity import usable_cores
-from loop_interfaces.isolation import loopback_environment
-from loop_interfaces.problem import find_problem
-from pdeloop.domain import own_domain
 from pdeloop.pairs import pair_cores, pair_nodes
-from pdeloop.supervisor import keep_on, node_command
+from pdeloop.supervisor import keep_on
 
-PATIENCE = 60.0
-"""Seconds within which a process must be at work, or have ended."""
 READER = (sys.executable, "-m", "benchmarks.reader")
 
 
-@dataclass
-class Setting:
-    """Where a measurement takes place. Processes that `start` has started end with it."""
-
-    problem: str
-    folder: Path
-    environment: dict[str, str]
-    others: Sequence[int] = ()
-    """Cores that plant and controller, which share one, leave to others."""
-    processes: list[subprocess.Popen[bytes]] = field(default_factory=list)
-
-    def start(self, name: str, *command: str) -> subprocess.Popen[bytes]:
-        """Run a command with its output in the file NAME.log."""
-        with (self.folder / f"{name}.log").open("ab") as log:
-            process = subprocess.Popen(
-                command, env=self.environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log
-            )
-        self.processes.append(process)
-        return process
-
-    def start_beside(self, name: str, *command: str) -> None:
-        """The same, off the pair's core, where `pdeloop train` starts such a process itself."""
-        keep_on(self.start(name, *command).pid, self.others)
-
-    def wait(self, name: str, pattern: str) -> str:
-        """What its output says where it matches `pattern`, once it does."""
-        limit = time.monotonic() + PATIENCE
-        while True:
-            said = (self.folder / f"{name}.log").read_text(errors="replace")
-            if found := re.search(pattern, said):
-                return found[0]
-            if time.monotonic() > limit:
-                raise BenchError(f"{name} is not at work after {PATIENCE:g} s: {said[-300:]}")
-            time.sleep(0.05)
-
-
-def recorder(setting: Setting, window: int) -> None:
+def recorder(running: Bench, problem: str, others: Sequence[int]) -> list[BenchProcess]:
     """A recorder, once it is matched and its start is over."""
-    bag = setting.folder / f"bag{window}"
-    setting.start_beside("recorder", *node_command("recorder_node", "-p", f"bag:={bag}"))
+    bag = running.folder / f"bag{len(list(running.folder.glob('bag*')))}"
+    node = running.start("recorder_node", f"bag:={bag}")
+    keep_on(node.process.pid, others)
     while not (bag / "parameters.json").exists():
         time.sleep(0.05)
+    return [node]
 
 
-def viewer(setting: Setting, window: int) -> None:
+def viewer(running: Bench, problem: str, others: Sequence[int]) -> list[BenchProcess]:
     """A viewer, and who looks at it."""
-    given = ("--params-file", str(find_problem(setting.problem)))
-    setting.start_beside("viewer", *node_command("viewer_node", *given))
-    setting.start(f"views{window}", *READER)
-    setting.wait(f"views{window}", "reading")
+    node = running.start("viewer_node", problem=problem)
+    keep_on(node.process.pid, others)
+    reader = running.run("reader", READER)
+    reader.line()
+    return [node, reader]
 
 
-def monitor(setting: Setting, window: int) -> None:
+def monitor(running: Bench, problem: str, others: Sequence[int]) -> list[BenchProcess]:
     """`pdeloop monitor`, and an open page."""
-    name = f"monitor{window}"
-    setting.start(name, sys.executable, "-m", "pdeloop.cli", "monitor", "--port", "0")
-    address = setting.wait(name, r"http://[\d.:]+/")
-    setting.start(f"page{window}", *READER, address)
-    setting.wait(f"page{window}", "reading")
+    command = (sys.executable, "-u", "-m", "pdeloop.cli", "monitor", "--port", "0")
+    server = running.run("monitor", command)
+    while not (address := re.search(r"http://[\d.:]+/", server.line())):
+        pass
+    reader = running.run("reader", (*READER, address[0]))
+    reader.line()
+    return [server, reader]
 
 
-COMPANY: dict[str, Callable[[Setting, int], None]] = {
+COMPANY: dict[str, Callable[[Bench, str, Sequence[int]], list[BenchProcess]]] = {
     "recorder": recorder,
     "viewer": viewer,
     "monitor": monitor,
 }
-
-
-@contextlib.contextmanager
-def beside(what: str, setting: Setting, window: int) -> Iterator[None]:
-    """Have it at work within the block, and end it then."""
-    before = len(setting.processes)
-    COMPANY[what](setting, window)
-    yield
-    for process in setting.processes[before:]:
-        process.send_signal(signal.SIGINT)
-        try:
-            process.wait(PATIENCE / 10)
-        except subprocess.TimeoutExpired:  # rclpy.spin now and then sleeps through a signal
-            process.kill()
-            process.wait()
+"""What comes and goes, by name: starts it, off the cores of the pair where `pdeloop train` does so."""
 
 
 def run(what: str, problem: str = "burgers", windows: int = 6, seconds: float = 3.0) -> Any:
@@ -131,43 +75,35 @@ def run(what: str, problem: str = "burgers", windows: int = 6, seconds: float = 
     """
     times: tuple[list[float], list[float]] = ([], [])
     processor: tuple[list[float], list[float]] = ([], [])
-    with tempfile.TemporaryDirectory() as name, own_domain() as domain:
-        given = {"ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": name}
-        environment = {**os.environ, **loopback_environment(), **given}
-        setting = Setting(problem, Path(name), environment)
-        folder = setting.folder / "run"
+    with bench() as running:
+        cores = pair_cores(1)
+        others = [core for core in usable_cores() if core not in cores]
+        nodes = [
+            running.start(node.package, *node.assignments, problem=problem)
+            for node in pair_nodes(cores)
+        ]
+        folder = running.folder / "run"
+        # The tuner's own share of the processor is small.
+        given = (f"out:={folder}", "iterations:=100000", "optimizer:=two_point")
+        running.start("tuner_node", *given, problem=problem)
+        progress = folder / "progress.jsonl"
 
-        def start(node: str, *parameters: str) -> subprocess.Popen[bytes]:
-            words = [word for p in parameters for word in ("-p", p)]
-            file = ("--params-file", str(find_problem(problem)))
-            return setting.start(node, *node_command(node, *file, *words))
+        def observe(side: int) -> None:
+            before = _processor_time(nodes)
+            found = _iterations(progress, seconds)
+            times[side].extend(found)
+            processor[side].append((_processor_time(nodes) - before) / (len(found) + 1))
 
-        try:
-            cores = pair_cores(1)
-            setting.others = [core for core in usable_cores() if core not in cores]
-            nodes = [start(node.package, *node.assignments) for node in pair_nodes(cores)]
-            # The tuner's own share of the processor is small.
-            start("tuner_node", f"out:={folder}", "iterations:=100000", "optimizer:=two_point")
-            progress = folder / "progress.jsonl"
-
-            def observe(side: int) -> None:
-                before = _processor_time(nodes)
-                found = _iterations(progress, seconds)
-                times[side].extend(found)
-                processor[side].append((_processor_time(nodes) - before) / (len(found) + 1))
-
-            while not (progress.exists() and '"adapted"' in progress.read_text()):
-                time.sleep(0.1)
-            for window in range(windows):
-                observe(0)
-                with beside(what, setting, window):
-                    time.sleep(0.5)
-                    observe(1)
-                time.sleep(0.5)
-        finally:
-            for process in setting.processes:
-                process.kill()
-                process.wait()
+        while not (progress.exists() and '"adapted"' in progress.read_text()):
+            time.sleep(0.1)
+        for _ in range(windows):
+            observe(0)
+            beside = COMPANY[what](running, problem, others)
+            time.sleep(0.5)
+            observe(1)
+            for process in beside:
+                process.end()
+            time.sleep(0.5)
     return {
         "what": what,
         "problem": problem,
@@ -190,13 +126,9 @@ def text(result: dict[str, Any]) -> str:
     )
 
 
-def _processor_time(processes: Sequence[subprocess.Popen[bytes]]) -> float:
-    """Seconds of processor time that `processes` have used so far (Linux)."""
-    ticks = 0
-    for process in processes:
-        fields = Path(f"/proc/{process.pid}/stat").read_text().rsplit(")", 1)[1].split()
-        ticks += int(fields[11]) + int(fields[12])
-    return ticks / os.sysconf("SC_CLK_TCK")
+def _processor_time(nodes: Sequence[BenchProcess]) -> float:
+    """Seconds of processor time that the nodes have used so far."""
+    return sum(sum(node.processor_times().values()) for node in nodes)
 
 
 def _iterations(progress: Path, seconds: float) -> list[float]:

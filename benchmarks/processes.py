@@ -34,16 +34,21 @@ class BenchProcess:
 
     def ask(self, **request: Any) -> dict[str, Any]:
         """The answer to one request. BenchError when the process has ended instead."""
-        assert self.process.stdin is not None and self.process.stdout is not None
+        assert self.process.stdin is not None
         with contextlib.suppress(BrokenPipeError):
             self.process.stdin.write(json.dumps(request) + "\n")
             self.process.stdin.flush()
+        answer: dict[str, Any] = json.loads(self.line())
+        return answer
+
+    def line(self) -> str:
+        """The next line of its output. BenchError when the process has ended instead."""
+        assert self.process.stdout is not None
         line = self.process.stdout.readline()
         if not line:
             words = self.log().strip().splitlines()[-1:]
             raise BenchError(f"a process of the measurement ended: {' '.join(words)}")
-        answer: dict[str, Any] = json.loads(line)
-        return answer
+        return line
 
     def log(self) -> str:
         """What the node has logged."""
@@ -100,15 +105,22 @@ class Bench:
         words += ["-r", f"__ns:=/{namespace}"] if namespace else []
         words += [word for parameter in parameters for word in ("-p", parameter)]
         words += [word for remap in remaps for word in ("-r", remap)]
+        command = [*prefix, *node_command(name, *words)]
+        return self.run(name, command, {**self._environment, **(environment or {})})
+
+    def run(
+        self, name: str, command: Sequence[str], environment: Mapping[str, str] | None = None
+    ) -> BenchProcess:
+        """Start any command; its log has that name."""
         log = self.folder / f"{len(self._started)}-{name}.log"
         with log.open("wb") as stderr:
             process = subprocess.Popen(
-                [*prefix, *node_command(name, *words)],
+                command,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=stderr,
                 text=True,
-                env={**self._environment, **(environment or {})},
+                env=environment or self._environment,
                 process_group=0,  # Ctrl-C in the terminal reaches the measuring program only
                 preexec_fn=die_with_parent,
             )
