@@ -34,8 +34,6 @@ MAX_VALUES = 2**24
 
 _NATIVE = np.dtype("<f8")
 _HEAD = struct.Struct("<5d")
-_ONE_SUM = 8192
-"""Up to this many values one dot product tells whether all are finite; BLAS starts threads later."""
 
 
 class FrameError(ValueError):
@@ -71,15 +69,18 @@ def digest(values: NDArray[np.float64]) -> int:
     return hash(values.tobytes())
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class _Layout:
-    """The prefix of the last message, which says all but the numbers, and a frame with its ids."""
+    """What stands in front of the numbers of a message, and what it says of them."""
 
     prefix: bytes
     shape: tuple[int, ...]
-    start: int
+    count: int
     length: int
-    frame: Frame
+    """Of the whole message."""
+    type: np.dtype[np.float64]
+    swapped: bool
+    """Whether its numbers are in big-endian order."""
 
 
 class ArrayCodec:
@@ -106,10 +107,10 @@ class ArrayCodec:
 
     def prefix_of(self, shape: tuple[int, ...]) -> bytes | None:
         """What stands in front of the header in the messages of the peer that was decoded last; None
-        if their values had another shape.
+        if their values had another shape, or their numbers another byte order.
         """
         last = self._last
-        return last.prefix if last and last.shape == shape else None
+        return last.prefix if last and last.shape == shape and not last.swapped else None
 
     def encode(self, frame: Frame) -> bytes:
         """CDR bytes of `frame`, little-endian. Raises FrameError on a wrong number of axes."""
@@ -131,40 +132,28 @@ class ArrayCodec:
     def decode(self, raw: bytes) -> Frame:
         """The frame in the CDR bytes `raw`; its values are a view of them.
 
-        Raises FrameError when the bytes are no Float64MultiArray of these axes, an id is not a
-        whole number in [0, 2^53), or any number is NaN or infinite.
+        Raises
+        ------
+        FrameError
+            The bytes are no Float64MultiArray of these axes, an id is not a whole number in [0, 2^53),
+            or a number is NaN or infinite.
         """
-        known = self._last
+        layout = self._last
         # A peer of ours sends the same prefix each time; ordinary message objects leave padding
-        # bytes undefined and take the general path.
-        if known is None or len(raw) != known.length or not raw.startswith(known.prefix):
-            return self._decode_any(raw)
-        run, episode, step, time, plant = _HEAD.unpack_from(raw, known.start)
-        values = np.ndarray(known.shape, _NATIVE, raw, known.start + _HEAD.size)
-        # The sum is finite only if all five are; ids too large for it are no ids.
-        if not math.isfinite(run + episode + step + time + plant) or not _all_finite(values):
-            raise FrameError("expected finite numbers, got NaN or infinity")
-        last = known.frame
-        if run == last.run and episode == last.episode and plant == last.plant:
-            k = int(step)
-            if k == step and 0 <= k < MAX_ID:  # what is left to check within an episode
-                return Frame(last.run, last.episode, k, time, values, last.plant)
-        known.frame = frame = _frame(run, episode, step, time, plant, values)
-        return frame
-
-    def _decode_any(self, raw: bytes) -> Frame:
-        shape, start, order = self._parse(raw)
-        count = HEADER + math.prod(shape)
-        numbers = np.frombuffer(raw, dtype=f"{order}f8", offset=start, count=count)
-        numbers = numbers.astype(np.float64, copy=False)
+        # bytes undefined.
+        if layout is None or len(raw) != layout.length or not raw.startswith(layout.prefix):
+            layout = self._last = self._parse(raw)
+        numbers = np.frombuffer(raw, layout.type, offset=len(layout.prefix), count=layout.count)
+        if layout.swapped:
+            numbers = numbers.astype(np.float64)
         if not np.isfinite(numbers).all():
             raise FrameError("expected finite numbers, got NaN or infinity")
         run, episode, step, time, plant = numbers[:HEADER].tolist()
-        values = numbers[HEADER:].reshape(shape)
-        frame = _frame(run, episode, step, time, plant, values)
-        if order == "<":
-            self._last = _Layout(raw[:start], shape, start, start + 8 * count, frame)
-        return frame
+        for name, number in ("run", run), ("episode", episode), ("step", step), ("plant", plant):
+            if not (0.0 <= number < MAX_ID and number.is_integer()):
+                raise FrameError(f"expected {name} to be a whole number in [0, 2^53), got {number}")
+        values = numbers[HEADER:].reshape(layout.shape)
+        return Frame(int(run), int(episode), int(step), time, values, int(plant))
 
     def _template(self, shape: tuple[int, ...]) -> tuple[bytearray, int, NDArray[np.float64]]:
         if len(shape) != len(self.labels):
@@ -185,8 +174,8 @@ class ArrayCodec:
         self._templates[shape] = (buffer, start, data)
         return self._templates[shape]
 
-    def _parse(self, raw: bytes) -> tuple[tuple[int, ...], int, str]:
-        """Shape, offset of the data and byte order of the message in `raw`."""
+    def _parse(self, raw: bytes) -> _Layout:
+        """The layout of the message in `raw`."""
         if len(raw) < 8 or raw[0] != 0 or raw[1] not in (0, 1):
             raise FrameError("expected CDR bytes, got something else")
         order = "<" if raw[1] else ">"
@@ -228,32 +217,10 @@ class ArrayCodec:
         # RTPS rounds a payload up to 4 bytes; our data ends on 8, so at most 3 bytes may follow.
         if not 0 <= len(raw) - position - 8 * count < 4:
             raise FrameError(f"expected {count} numbers after the layout, got another length")
-        return tuple(shape), position, order
+        kind = np.dtype(f"{order}f8")
+        return _Layout(raw[:position], tuple(shape), count, len(raw), kind, order == ">")
 
 
 def _strides(shape: Sequence[int]) -> list[int]:
     """`layout.dim[i].stride`: how many values lie in one block of axis i, as ROS defines it."""
     return [math.prod(shape[axis:]) for axis in range(len(shape))]
-
-
-def _all_finite(values: NDArray[np.float64]) -> bool:
-    # A finite sum of squares has only finite terms; one that is not may also have overflowed.
-    if values.size <= _ONE_SUM and math.isfinite(np.vdot(values, values)):
-        return True
-    return bool(np.count_nonzero(np.isfinite(values)) == values.size)
-
-
-def _frame(
-    run: float, episode: float, step: float, time: float, plant: float, values: NDArray[np.float64]
-) -> Frame:
-    ids = int(run), int(episode), int(step), int(plant)
-    given = run, episode, step, plant
-    if ids != given or min(ids) < 0 or max(ids) >= MAX_ID:
-        _refuse_ids(given)
-    return Frame(ids[0], ids[1], ids[2], time, values, ids[3])
-
-
-def _refuse_ids(ids: Sequence[float]) -> None:
-    for name, number in zip(("run", "episode", "step", "plant"), ids, strict=True):
-        if not (0 <= number < MAX_ID and number == math.floor(number)):
-            raise FrameError(f"expected {name} to be a whole number in [0, 2^53), got {number}")
