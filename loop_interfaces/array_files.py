@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -52,40 +51,3 @@ def unpack_arrays(file: BinaryIO, most: int) -> dict[str, NDArray[Any]]:
         raise
     except Exception as error:  # zipfile and NumPy raise some twenty kinds on damaged files
         raise FileError(f"holds no arrays ({type(error).__name__}: {error})") from error
-
-
-def taken(
-    arrays: Mapping[str, NDArray[Any]], name: str, kind: str, shape: tuple[int | None, ...]
-) -> NDArray[Any]:
-    """The array of this name.
-
-    Parameters
-    ----------
-    arrays : dict of str to array
-        Those of a file.
-    name : str
-        Which of them.
-    kind : str
-        Of its type, as NumPy's `dtype.kind`.
-    shape : tuple
-        None: of any length.
-
-    Raises
-    ------
-    FileError
-        There is none, it has another kind or shape, or is not finite.
-    """
-    if name not in arrays:
-        raise FileError(f"it has no array '{name}'")
-    array = arrays[name]
-    fits = array.ndim == len(shape) and all(
-        expected in (None, length) for expected, length in zip(shape, array.shape, strict=True)
-    )
-    if array.dtype.kind != kind or not fits:
-        raise FileError(
-            f"expected '{name}' of kind {kind!r} and shape {shape}, "
-            f"got {array.dtype.kind!r} and {array.shape}"
-        )
-    if kind == "f" and not np.isfinite(array).all():
-        raise FileError(f"'{name}' is not finite")
-    return array

@@ -139,7 +139,7 @@ def sealed(arrays: dict[str, np.ndarray]) -> bytes:
     return checkpoint.MAGIC + hashlib.sha256(body).hexdigest().encode() + b"\n" + body
 
 
-def test_checkpoints_of_another_version_are_passed_over(run, capsys):
+def test_forged_checkpoints_with_a_good_checksum_are_passed_over(run, capsys):
     (run / "result.json").unlink()
     policy = (run / "policy.npz").read_bytes()
     path = run / "checkpoint"
@@ -147,16 +147,31 @@ def test_checkpoints_of_another_version_are_passed_over(run, capsys):
         file.readline()
         with np.load(io.BytesIO(file.read())) as archive:
             good = dict(archive)
-    plain = json.loads(str(good["plain"]))
-    wrong = [{k: v for k, v in good.items() if k != name} for name in ("plain", "budget")]
-    wrong += [good | {"plain": np.array(text)} for text in ("[", "{}", json.dumps([plain]))]
+    previous = checkpoint.previous(path).read_bytes()
+    rng = np.random.default_rng(0)
+    wrong: list[bytes] = []
+    for name, array in good.items():
+        wrong.append(sealed({k: v for k, v in good.items() if k != name}))
+        others = [a for a in arrays_like(array) if a.shape != array.shape or a.dtype != array.dtype]
+        wrong += [
+            sealed(good | {name: others[i]}) for i in rng.choice(len(others), 2, replace=False)
+        ]
+    wrong += [
+        sealed(good | {"phase": np.array("sleep")}),
+        sealed(good | {"history": np.array("[")}),
+    ]
+    wrong += [sealed(good | {"phase": np.array(phase)}) for phase in ("identify", "check")]
     values = RunFolder(run).values()
-    for arrays in wrong:
-        path.write_bytes(sealed(arrays))
-        found, (sentence,) = checkpoint.restore(path, build(values).restore)
-        assert found and "does not fit this training" in sentence
+    for content in wrong:
+        path.write_bytes(content)
+        checkpoint.previous(path).write_bytes(previous)
+        training = build(values)
+        found, passed_over = checkpoint.restore(path, lambda arrays, t=training: t.restore(arrays))
+        assert found and len(passed_over) <= 1
+        training.next_batch()
     # And by the command, which goes on from the one before, to the same policy.
-    path.write_bytes(sealed(wrong[0]))
+    path.write_bytes(sealed(good | {"plant": np.array("x")}))
+    checkpoint.previous(path).write_bytes(previous)
     capsys.readouterr()
     assert main(["train", "--resume", str(run), "--in-process"]) == 0
     assert "does not fit this training" in capsys.readouterr().out

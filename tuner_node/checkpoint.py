@@ -84,6 +84,27 @@ def restore(path: Path, take: Callable[[dict[str, NDArray[Any]]], None]) -> tupl
     return False, passed_over
 
 
+def taken(arrays: Arrays, name: str, kind: str, shape: tuple[int | None, ...]) -> NDArray[Any]:
+    """The array of this name, of this NumPy kind and shape (None: of any length), or a ValueError.
+
+    Floating-point numbers must be finite.
+    """
+    if name not in arrays:
+        raise CheckpointError(f"it has no array '{name}'")
+    array = arrays[name]
+    fits = array.ndim == len(shape) and all(
+        expected in (None, length) for expected, length in zip(shape, array.shape, strict=True)
+    )
+    if array.dtype.kind != kind or not fits:
+        raise CheckpointError(
+            f"expected '{name}' of kind {kind!r} and shape {shape}, "
+            f"got {array.dtype.kind!r} and {array.shape}"
+        )
+    if kind == "f" and not np.isfinite(array).all():
+        raise CheckpointError(f"'{name}' is not finite")
+    return array
+
+
 def _read(path: Path) -> dict[str, NDArray[Any]]:
     try:
         with open_ordinary(path) as file:

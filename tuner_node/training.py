@@ -166,6 +166,11 @@ class Training:
         return starts
 
     @property
+    def evaluation_shape(self) -> tuple[int, int, int]:
+        """(S, controllers, fields)."""
+        return self.settings.seeds, len(CONTROLLERS), self.settings.evaluation_fields
+
+    @property
     def generation(self) -> int:
         """Number of the present models: grows whenever one of them is another one."""
         return 1 + sum(self.attempts)
@@ -422,11 +427,10 @@ class Training:
         ]
 
     def _evaluated(self, result: BatchResult) -> list[dict[str, Any]]:
-        seeds = self.settings.seeds
-        shape = seeds, len(CONTROLLERS), self.settings.evaluation_fields
-        self.evaluation = result.costs[:, CostColumn.MEAN].reshape(shape)
-        self.ended = result.costs[:, CostColumn.ENDED].reshape(shape)
-        self.budget.count("evaluate", np.repeat(np.arange(seeds), self.ended[0].size))
+        settings = self.settings
+        self.evaluation = result.costs[:, CostColumn.MEAN].reshape(self.evaluation_shape)
+        self.ended = result.costs[:, CostColumn.ENDED].reshape(self.evaluation_shape)
+        self.budget.count("evaluate", np.repeat(np.arange(settings.seeds), self.ended[0].size))
         self.phase = "done"
         return [
             {

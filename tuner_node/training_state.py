@@ -8,32 +8,41 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces import model_rows
+from tuner_node.budget import PURPOSES
+from tuner_node.checkpoint import taken
 from tuner_node.optimizers import Measured, Trajectory
 
 if TYPE_CHECKING:
     from tuner_node.training import Training
 
+PHASES = (*PURPOSES, "done")
 Arrays = dict[str, NDArray[Any]]
-PLAIN = ("phase", "plant", "attempts", "pending", "history", "law_seen", "worse")
-"""What is stored as JSON."""
-ARRAYS = ("models", "target", "evaluation", "ended")
 
 
 def arrays_of(training: Training) -> Arrays:
     """Everything that `fill` needs."""
-    plain = {name: getattr(training, name) for name in PLAIN}
-    arrays = {"plain": np.array(json.dumps(plain)), "budget": training.budget.state()}
-    for name in ARRAYS:
-        if (array := getattr(training, name)) is not None:
-            arrays[name] = array
-    for m, exploration in enumerate(training.explorations):
-        if exploration is not None:
-            arrays |= _trajectory_arrays(f"exploration{m}", exploration)
+    arrays: Arrays = {
+        "phase": np.array(training.phase),
+        "plant": np.array(training.plant),
+        "attempts": np.array(training.attempts),
+        "pending": np.array(training.pending, dtype=np.int64),
+        "history": np.array(json.dumps(training.history)),
+        "budget": training.budget.state(),
+        "law_seen": np.array(training.law_seen),
+        "worse": np.array(training.worse),
+    }
     for m, rollouts in enumerate(training.measured):
         for i, rollout in enumerate(rollouts):
             name = f"measured{m}.{i}"
             arrays |= {f"{name}.policy": rollout.policy, f"{name}.cost": np.array(rollout.cost)}
             arrays |= _trajectory_arrays(name, rollout.trajectory)
+    for m, exploration in enumerate(training.explorations):
+        if exploration is not None:
+            arrays |= _trajectory_arrays(f"exploration{m}", exploration)
+    for name in ("models", "target", "evaluation", "ended"):
+        if (array := getattr(training, name)) is not None:
+            arrays[name] = array
     for m, optimizer in enumerate(training.optimizers):
         arrays |= {f"optimizer{m}.{key}": value for key, value in optimizer.state().items()}
     return arrays
@@ -44,21 +53,35 @@ def fill(training: Training, arrays: Arrays) -> None:
 
     Raises
     ------
-    ValueError, LookupError, TypeError
+    ValueError, LookupError, TypeError, OverflowError
         The arrays are not those of a training with these settings.
     """
-    plain = json.loads(str(arrays["plain"]))
-    for name in PLAIN:
-        setattr(training, name, plain[name])
-    training.budget.restore(arrays["budget"])
-    for name in ARRAYS:
-        setattr(training, name, arrays.get(name))
-    for m, rollouts in enumerate(training.measured):
+    seeds, n_a = training.settings.seeds, training.settings.n_a
+    training.phase = str(taken(arrays, "phase", "U", ()))
+    training.budget.restore(taken(arrays, "budget", "i", training.budget.state().shape))
+    training.law_seen = bool(taken(arrays, "law_seen", "b", ()))
+    training.plant = int(taken(arrays, "plant", "i", ()))
+    training.attempts = taken(arrays, "attempts", "i", (seeds,)).tolist()
+    training.pending = taken(arrays, "pending", "i", (None,)).tolist()
+    training.history = json.loads(str(taken(arrays, "history", "U", ())))
+    training.worse = taken(arrays, "worse", "b", (seeds,)).tolist()
+    if "models" in arrays:
+        training.models = taken(arrays, "models", "f", (seeds, None, None))
+        training.warm_starts()
+    if "target" in arrays:
+        training.target = taken(arrays, "target", "f", (None,))
+    if "evaluation" in arrays:
+        training.evaluation = taken(arrays, "evaluation", "f", training.evaluation_shape)
+        training.ended = taken(arrays, "ended", "f", training.evaluation_shape)
+    for m in range(seeds):
         if f"exploration{m}.states" in arrays:
-            training.explorations[m] = _trajectory(arrays, f"exploration{m}")
-        while (name := f"measured{m}.{len(rollouts)}") + ".policy" in arrays:
-            cost = float(arrays[f"{name}.cost"])
-            rollouts.append(Measured(arrays[f"{name}.policy"], cost, _trajectory(arrays, name)))
+            training.explorations[m] = _taken_trajectory(arrays, f"exploration{m}", n_a)
+        while (name := f"measured{m}.{len(training.measured[m])}") + ".policy" in arrays:
+            policy = taken(arrays, f"{name}.policy", "f", (n_a, None))
+            cost = float(taken(arrays, f"{name}.cost", "f", ()))
+            rollout = Measured(policy, cost, _taken_trajectory(arrays, name, n_a))
+            training.measured[m].append(rollout)
+    _check(training)
     if training.phase in ("adapt", "evaluate", "done"):
         training.start_optimizers()
     for m, optimizer in enumerate(training.optimizers):
@@ -67,9 +90,36 @@ def fill(training: Training, arrays: Arrays) -> None:
         optimizer.restore({key.removeprefix(prefix): value for key, value in own.items()})
 
 
+def _check(training: Training) -> None:
+    """A ValueError unless this is a state that a training can be in."""
+    phase, pending, history = training.phase, training.pending, training.history
+    if phase not in PHASES:
+        raise ValueError(f"its phase is {phase!r}; expected one of {', '.join(PHASES)}")
+    if not set(pending) <= set(range(training.settings.seeds)) or min(training.attempts) < 0:
+        raise ValueError("its seeds or attempts are out of range")
+    if not isinstance(history, list) or not all(isinstance(row, dict) for row in history):
+        raise ValueError("its history is not a list of rows")
+    if training.models is None and phase != "identify":
+        raise ValueError("it has no models")
+    if training.evaluation is None and phase == "done":
+        raise ValueError("it has no evaluation")
+    if not pending and phase in ("identify", "check"):
+        raise ValueError("it has no seed to identify")
+    if not training.settings.trajectories or training.models is None or phase == "identify":
+        return
+    n_z = len(model_rows.unpack(training.models[0], training.settings.n_a).U)
+    if training.target is None or training.target.shape != (n_z,):
+        raise ValueError(f"it has no target of {n_z} numbers")
+    for known in training.explorations:
+        if known is None or known.states.shape != (len(known.actions) + 1, n_z):
+            raise ValueError(f"it has an exploration without states of {n_z} numbers")
+
+
 def _trajectory_arrays(name: str, trajectory: Trajectory) -> Arrays:
     return {f"{name}.states": trajectory.states, f"{name}.actions": trajectory.actions}
 
 
-def _trajectory(arrays: Arrays, name: str) -> Trajectory:
-    return Trajectory(arrays[f"{name}.states"], arrays[f"{name}.actions"])
+def _taken_trajectory(arrays: Arrays, name: str, n_a: int) -> Trajectory:
+    """The trajectory of that name; ValueError if there is none with n_a actuators."""
+    states = taken(arrays, f"{name}.states", "f", (None, None))
+    return Trajectory(states, taken(arrays, f"{name}.actions", "f", (None, n_a)))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from controller_node.order import OrderStudy, study_orders
 from controller_node.policy import ProjectedLaw
-from loop_interfaces.array_files import read_arrays, taken
+from loop_interfaces.array_files import read_arrays
 from loop_interfaces.model_rows import ModelRows, unpack
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD, Plant
@@ -26,6 +26,7 @@ from pdeloop.reproduce.table import runs_of
 from pdeloop.study.description import Study
 from pdeloop.study.training import CURVE
 from tuner_node.build import build_training
+from tuner_node.checkpoint import taken
 from tuner_node.results import RunFolderError
 from tuner_node.seeds import Purpose, derive, evaluation_noise
 
