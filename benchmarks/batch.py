@@ -76,21 +76,18 @@ def fit(rows: list[dict[str, Any]]) -> dict[str, float]:
 
 def text(result: dict[str, Any]) -> str:
     """A table of `result`, with the knee in words."""
-    head = ("batch", "rounds/s", "environment-steps/s", "round µs", "solver µs", "overhead µs")
-    rows = [
-        (
-            row["batch"],
-            f"{row['rounds_per_second']:.0f}",
-            f"{row['environment_steps_per_second']:.0f}",
-            f"{row['round_us']:.0f}",
-            f"{row['solver_us']:.0f}",
-            f"{row['overhead_us']:.0f}",
-        )
-        for row in result["rows"]
-    ]
+    columns = {
+        "batch": "batch",
+        "rounds_per_second": "rounds/s",
+        "environment_steps_per_second": "environment-steps/s",
+        "round_us": "round µs",
+        "solver_us": "solver µs",
+        "overhead_us": "overhead µs",
+    }
+    rows = [[f"{row[name]:.0f}" for name in columns] for row in result["rows"]]
     model = result["model"]
     return (
-        f"{result['problem']}\n{markdown(head, rows)}\n"
+        f"{result['problem']}\n{markdown(tuple(columns.values()), rows)}\n"
         f"round = {model['message_us']:.0f} µs + M * ({model['environment_us']:.2f} µs for copies "
         f"and control law + {model['solver_us']:.2f} µs for the solver).\nThe knee is at M = "
         f"{model['knee']:.0f}: there half of a round is the message itself; far beyond it the rate "

@@ -10,8 +10,10 @@ and the controller's own threads, and of the middleware's threads in both.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from statistics import median
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.processes import Bench, BenchProcess, bench, machine, markdown
 from loop_interfaces.affinity import least_busy_cores
@@ -77,35 +79,25 @@ def _measure(
             )
     rows = []
     for batch in batches:
-        us = {what: 1e6 * median(samples[what, batch]) for what, own in samples if own == batch}
-        overheads = [
-            1e6 * (r - s)
-            for r, s in zip(samples["round", batch], samples["solver", batch], strict=True)
-        ]
-        ratios = {
-            name: median(
-                o / (1e6 * p) for o, p in zip(overheads, samples[name, batch], strict=True)
-            )
-            for name in ("ping", "ping_same")
-        }
+        own = {what: np.array(found) for (what, size), found in samples.items() if size == batch}
+        overhead = own["round"] - own["solver"]
         rows.append(
             {
                 "cores": cores,
                 "batch": batch,
-                "ping_us": us["ping"],
-                "ping_same_payload_us": us["ping_same"],
-                "rounds_per_second": 1e6 / us["round"],
-                "round_us": us["round"],
-                "solver_us": us["solver"],
-                "overhead_us": median(overheads),
-                "ratio": ratios["ping"],
-                "ratio_same_payload": ratios["ping_same"],
-                "plant_us": us["plant"],
-                "controller_us": us["controller"],
-                "middleware_us": us["middleware"],
+                "rounds_per_second": 1 / median(own["round"]),
+                "overhead_us": 1e6 * median(overhead),
+                "ratio": median(overhead / own["ping"]),
+                "ratio_same": median(overhead / own["ping_same"]),
+                **{f"{what}_us": 1e6 * median(times) for what, times in own.items()},
             }
         )
     return rows
+
+
+def median(values: NDArray[np.float64]) -> float:
+    """The median as a number of Python."""
+    return float(np.median(values))
 
 
 def _processor_times(pair: tuple[BenchProcess, BenchProcess]) -> dict[str, float]:
@@ -124,29 +116,31 @@ def run(turns: int = 7, seconds: float = 0.4, cores: Sequence[str] = CORES) -> d
     return {"problem": PROBLEM, "machine": machine(), "rows": rows}
 
 
+COLUMNS = {
+    "cores": "cores",
+    "batch": "batch",
+    "rounds_per_second": "rounds/s",
+    "round_us": "round µs",
+    "solver_us": "solver µs",
+    "overhead_us": "overhead µs",
+    "ping_us": "ping-pong µs",
+    "ratio": "ratio",
+    "ping_same_us": "same payload µs",
+    "ratio_same": "ratio",
+    "plant_us": "plant",
+    "controller_us": "controller",
+    "middleware_us": "middleware",
+}
+"""Entries of a row, and what stands above them."""
+
+
 def text(result: dict[str, Any]) -> str:
     """A table of `result`."""
-    head = (
-        "cores", "batch", "rounds/s", "round µs", "solver µs", "overhead µs",
-        "ping-pong µs", "ratio", "same payload µs", "ratio",
-        "plant", "controller", "middleware",
-    )  # fmt: skip
-    rows = [
-        (
-            row["cores"],
-            row["batch"],
-            f"{row['rounds_per_second']:.0f}",
-            f"{row['round_us']:.0f}",
-            f"{row['solver_us']:.0f}",
-            f"{row['overhead_us']:.0f}",
-            f"{row['ping_us']:.0f}",
-            f"{row['ratio']:.2f}",
-            f"{row['ping_same_payload_us']:.0f}",
-            f"{row['ratio_same_payload']:.2f}",
-            f"{row['plant_us']:.0f}",
-            f"{row['controller_us']:.0f}",
-            f"{row['middleware_us']:.0f}",
-        )
-        for row in result["rows"]
-    ]
-    return markdown(head, rows)
+
+    def shown(name: str, value: Any) -> str:
+        if isinstance(value, float):
+            return f"{value:.2f}" if name.startswith("ratio") else f"{value:.0f}"
+        return str(value)
+
+    rows = [[shown(name, row[name]) for name in COLUMNS] for row in result["rows"]]
+    return markdown(tuple(COLUMNS.values()), rows)

@@ -49,14 +49,9 @@ def run(
             "seconds": median(r["seconds"] for r in own),
             "ratio": ratios[way],
             "startup_seconds": median(r["startup"] for r in own),
-            "megabytes": {
-                k: max(r["megabytes"].get(k, 0.0) for r in own) for k in own[0]["megabytes"]
-            },
-            "running_megabytes": {
-                k: max(r["running"].get(k, 0.0) for r in own) for k in own[0]["running"]
-            },
-            "growth_megabytes": {
-                k: max(r["growth"].get(k, 0.0) for r in own) for k in own[0]["growth"]
+            **{
+                kind: {node: max(r[kind].get(node, 0.0) for r in own) for node in own[0][kind]}
+                for kind in ("megabytes", "growth")
             },
         }
         for way, own in runs.items()
@@ -100,14 +95,12 @@ def _train(problem: str, iterations: int, out: Path, words: list[str]) -> dict[s
         next(row["time"] for row in ordered if row["event"] == event)
         for ordered, event in ((rows, "designed"), (rows[::-1], "evaluated"))
     )
-    # In the middle of its life a node has all it needs: what comes on top from there is growth.
-    middle = {name: sizes[len(sizes) // 2] for name, sizes in memory.items()}
     return {
         "seconds": last - first,
         "startup": first - began,
         "megabytes": {name: max(sizes) for name, sizes in memory.items()},
-        "running": middle,
-        "growth": {name: sizes[-1] - middle[name] for name, sizes in memory.items()},
+        # In the middle of its life a node has all it needs: what comes on top from there is growth.
+        "growth": {name: sizes[-1] - sizes[len(sizes) // 2] for name, sizes in memory.items()},
         "policy": _policy(out),
     }
 
@@ -136,10 +129,7 @@ def _memory(pid: int) -> dict[str, float]:
 
 def text(result: dict[str, Any]) -> str:
     """A table of `result`."""
-    head = (
-        "way", "s without start-up", "ratio", "s to the first model",
-        "MB at most", "MB in the middle", "growth MB",
-    )  # fmt: skip
+    head = ("way", "s without start-up", "ratio", "s to the first model", "MB at most", "growth MB")
 
     def sizes(values: dict[str, float]) -> str:
         return ", ".join(f"{k.removesuffix('_node')} {v:.0f}" for k, v in values.items())
@@ -151,8 +141,7 @@ def text(result: dict[str, Any]) -> str:
             f"{row['ratio']:.2f}",
             f"{row['startup_seconds']:.2f}",
             sizes(row["megabytes"]),
-            sizes(row["running_megabytes"]),
-            sizes(row["growth_megabytes"]),
+            sizes(row["growth"]),
         )
         for row in result["rows"]
     ]
