@@ -17,8 +17,8 @@ from pdeloop.finished_run import FinishedRun
 from pdeloop.in_process import LocalPair
 from tuner_node.batch import Batch
 from tuner_node.results import RunFolderError
+from tuner_node.rollouts import CONTROLLERS
 from tuner_node.seeds import Purpose, derive, evaluation_noise
-from tuner_node.training import CONTROLLERS
 
 Array = NDArray[np.float64]
 AGREE = 0.1

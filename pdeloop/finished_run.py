@@ -17,7 +17,7 @@ from loop_interfaces.topics import COMPLETED
 from pde_sim_node.plant import DIVERGED_COST, EpisodeCosts
 from pdeloop.episode import EpisodeRecord
 from tuner_node.results import RunFolder
-from tuner_node.training import CONTROLLERS
+from tuner_node.rollouts import CONTROLLERS
 
 Array = NDArray[np.float64]
 RESAMPLES = 9999

@@ -17,7 +17,8 @@ from tuner_node import checkpoint
 from tuner_node.batch import BatchResult
 from tuner_node.budget import Budget
 from tuner_node.build import build_training
-from tuner_node.training import CHECK, Training
+from tuner_node.rollouts import CHECK
+from tuner_node.training import Training
 
 NOISE = {"measurement_noise": 0.05, "process_noise": 0.02}
 BUDGETS: list[dict[str, Any]] = [

@@ -15,7 +15,7 @@ from pdeloop.in_process import LocalPair
 from tests.small import SMALL, parameters
 from tuner_node.build import build_training
 from tuner_node.narration import Narration, closing_lines, failed, warnings
-from tuner_node.training import CHECK, CHECK_FIELDS
+from tuner_node.rollouts import CHECK, CHECK_FIELDS
 
 
 def phase(name: str, rollouts: list[int], budget: int = 20) -> dict[str, Any]:

@@ -91,6 +91,11 @@ class TrainingSettings:
     model: Array | None = None
     """Rows of a reduced model to start from instead of identifying one."""
 
+    @property
+    def all_seeds(self) -> list[int]:
+        """The seeds of the trainings side by side: seed, seed + 1, ..."""
+        return list(range(self.seed, self.seed + self.seeds))
+
 
 def batch_of(wanted: Sequence[tuple[int, Rollout]], trajectories: bool = False) -> Batch:
     """A batch of rollouts, each with the index of the model of its policy."""

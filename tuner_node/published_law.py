@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.model_rows import ModelRows
 from loop_interfaces.topics import MAX_GAIN
-from tuner_node.optimizers import Trajectory
+from tuner_node.optimizers import Rollout, Trajectory
 
 TOLERANCE = 1e-6
 """Relative difference of actions that rounding may explain."""
@@ -38,3 +40,25 @@ def follows(
         law = np.clip(law, -action_limit, action_limit)
     scale = max(1.0, float(np.abs(actions).max(initial=0.0)))
     return bool(np.allclose(actions, law, rtol=TOLERANCE, atol=TOLERANCE * scale))
+
+
+def check_law(
+    asked: Sequence[Rollout],
+    model: ModelRows,
+    seen: Sequence[Trajectory],
+    action_limit: float = 0.0,
+) -> None:
+    """See that rollouts of one model have the actions of the law.
+
+    Raises
+    ------
+    ValueError
+        They have not; the text says what to do.
+    """
+    for rollout, trajectory in zip(asked, seen, strict=True):
+        if not follows(rollout.policy, model, trajectory, action_limit):
+            raise ValueError(
+                "the actions are not those of the law a = K_a U^T z + K_b U^T z_r, which this "
+                "optimizer needs; with a control law of your own use the optimizer 'two_point' "
+                "or 'directions'"
+            )

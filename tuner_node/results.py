@@ -37,7 +37,8 @@ from loop_interfaces.parameters import EXECUTION, PLANT, RECORDER, VIEWER, as_re
 from loop_interfaces.spec import ParameterError, check, read_yaml, yaml_text
 from loop_interfaces.topics import COMPLETED
 from tuner_node import checkpoint
-from tuner_node.training import CONTROLLERS, Training
+from tuner_node.rollouts import CONTROLLERS
+from tuner_node.training import Training
 
 TRANSIENT = (
     *(

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces import model_rows
-from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn
+from loop_interfaces.topics import COMPLETED, CostColumn
 from tuner_node import training_state
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, TrainingSettings, batch_of
 from tuner_node.budget import Budget
@@ -38,18 +38,19 @@ from tuner_node.optimizers import (
     RolloutResult,
     Trajectory,
 )
-from tuner_node.published_law import follows
-from tuner_node.seeds import NOISE, Purpose, derive, evaluation_noise, rollout_noise
+from tuner_node.published_law import check_law
+from tuner_node.rollouts import (
+    CHECK,
+    CHECK_FIELDS,
+    CONTROLLERS,
+    EXPLORATION,
+    checks,
+    evaluations,
+    explorations,
+    noise_seeds,
+)
 
 Array = NDArray[np.float64]
-CHECK_FIELDS = 1
-"""Sampled fields on which a warm start must beat no control."""
-EXPLORATION = 1
-"""Rollouts of an exploration."""
-CHECK = 2 * CHECK_FIELDS
-"""Rollouts of a check: no control and the warm start."""
-CONTROLLERS = ("none", "lqt", "adapted")
-"""The controllers of the closing evaluation, in the order of its rows."""
 
 
 OptimizerFactory = Callable[[Array, int, Context | None, int], Optimizer]
@@ -102,29 +103,23 @@ class Training:
     def next_batch(self) -> Batch | None:
         """The rollouts wanted now; the same at every call until `finish`. None: all is done."""
         if self.phase == "identify":
-            seeds, attempts = self._seeds(), self.attempts
-            rows = [
-                [
-                    derive(seeds[m], Purpose.EXPLORATORY_FIELD, attempts[m]),
-                    derive(seeds[m], Purpose.EXCITATION, attempts[m]),
-                    self.settings.exploration_variance,
-                    m,
-                ]
-                for m in self.pending
-            ]
-            batch = Batch(np.array(rows, dtype=np.float64), None, self.settings.trajectories)
+            rows = explorations(self.settings, self.pending, self.attempts)
+            batch = Batch(rows, None, self.settings.trajectories)
         elif self.phase == "check":
             batch = batch_of(self._check_rollouts(), self.settings.trajectories)
         elif self.phase == "adapt":
             wanted = [(m, rollout) for m, asked in enumerate(self._asked()) for rollout in asked]
             batch = batch_of(wanted, self.settings.trajectories)
         elif self.phase == "evaluate":
-            batch = batch_of(self._evaluation_rollouts())
+            batch = batch_of(evaluations(self.settings, self.warm_starts(), self.policies()))
         else:
             return None
         if not self.settings.noise:
             return batch
-        return replace(batch, rows=np.column_stack([batch.rows, self._noise(batch.rows)]))
+        adapts = self.phase == "adapt"
+        counts = [optimizer.tells for optimizer in self.optimizers] if adapts else self.attempts
+        noise = noise_seeds(self.settings, self.phase, batch.rows, counts)
+        return replace(batch, rows=np.column_stack([batch.rows, noise]))
 
     def finish(self, result: BatchResult) -> list[dict[str, Any]]:
         """Take the results of the batch that `next_batch` gave, in its order."""
@@ -210,20 +205,6 @@ class Training:
             raise ValueError(f"does not fit this training ({error})") from error
         vars(self).update(vars(restored))
 
-    def _seeds(self) -> list[int]:
-        return [self.settings.seed + s for s in range(self.settings.seeds)]
-
-    def _noise(self, rows: Array) -> list[int]:
-        """The seed of the noise of every row of a batch."""
-        settings, counts = self.settings, self.attempts
-        if self.phase == "evaluate":
-            fields = evaluation_noise(settings.evaluation_seed, settings.evaluation_fields)
-            return fields * (settings.seeds * len(CONTROLLERS))
-        if self.phase == "adapt":
-            counts = [optimizer.tells for optimizer in self.optimizers]
-        owners = rows[:, StartColumn.MODEL].astype(int).tolist()
-        return rollout_noise(NOISE[self.phase], self._seeds(), owners, counts)
-
     def _identified(self, models: Array) -> list[dict[str, Any]]:
         if len(models) == self.settings.seeds:  # perhaps of another order than before
             self.models = models.copy()
@@ -241,7 +222,7 @@ class Training:
             rows.append(
                 {
                     "event": "designed",
-                    "seed": self._seeds()[m],
+                    "seed": self.settings.all_seeds[m],
                     "attempt": self.attempts[m] + 1,
                     "reduced_order": own.shape[1],
                     "spectral_radius": float(np.abs(np.linalg.eigvals(model.A)).max()),
@@ -271,13 +252,7 @@ class Training:
         self._start_adapting()
 
     def _check_rollouts(self) -> list[tuple[int, Rollout]]:
-        warm = self.warm_starts()
-        return [
-            (m, Rollout(policy, derive(self._seeds()[m], Purpose.CHECK_FIELD, i)))
-            for m in self.pending
-            for policy in (np.zeros_like(warm[m]), warm[m])
-            for i in range(CHECK_FIELDS)
-        ]
+        return checks(self.settings, self.pending, self.warm_starts())
 
     def _checked(self, result: BatchResult) -> list[dict[str, Any]]:
         costs = result.costs.reshape(len(self.pending), 2, CHECK_FIELDS, len(CostColumn))
@@ -292,7 +267,7 @@ class Training:
             rows.append(
                 {
                     "event": "checked",
-                    "seed": self._seeds()[m],
+                    "seed": self.settings.all_seeds[m],
                     "none": float(none_cost),
                     "lqt": float(lqt_cost),
                     "diverged": dict(zip(CONTROLLERS, lost, strict=False)),
@@ -344,7 +319,7 @@ class Training:
         self.optimizers = [
             self.make_optimizer(start, seed, self._context(m), rollouts)
             for m, (start, seed, rollouts) in enumerate(
-                zip(self.starts(), self._seeds(), budgets, strict=True)
+                zip(self.starts(), self.settings.all_seeds, budgets, strict=True)
             )
         ]
 
@@ -368,7 +343,8 @@ class Training:
         return [[] if optimizer.done else optimizer.ask() for optimizer in self.optimizers]
 
     def _tell(self, result: BatchResult) -> list[dict[str, Any]]:
-        rows, first = [], 0
+        assert self.models is not None
+        rows, first, limit = [], 0, self.settings.action_limit
         for m, (optimizer, asked) in enumerate(zip(self.optimizers, self._asked(), strict=True)):
             if not asked:
                 continue
@@ -376,7 +352,9 @@ class Training:
             seen: Sequence[Trajectory | None] = [None] * len(asked)
             if result.trajectories is not None:
                 seen = result.trajectories[first : first + len(asked)]
-                self._check_law(m, asked, result.trajectories[first : first + len(asked)])
+                model = model_rows.unpack(self.models[m], self.settings.n_a)
+                check_law(asked, model, result.trajectories[first : first + len(asked)], limit)
+                self.law_seen = True
             first += len(asked)
             report = optimizer.tell(
                 [
@@ -390,41 +368,16 @@ class Training:
             )
             self.budget.count("adapt", [m] * len(asked))
             paid = int(self.budget.paid[m])
-            rows.append({"event": "adapted", "seed": self._seeds()[m], **report, "rollouts": paid})
+            rows.append(
+                {"event": "adapted", "seed": self.settings.all_seeds[m], **report, "rollouts": paid}
+            )
         self.history += rows
         self._leave_adapt_if_done()
         return rows
 
-    def _check_law(self, m: int, asked: Sequence[Rollout], seen: Sequence[Trajectory]) -> None:
-        """ValueError if the actions are not those of the published law."""
-        assert self.models is not None
-        model = model_rows.unpack(self.models[m], self.settings.n_a)
-        limit = self.settings.action_limit
-        for rollout, trajectory in zip(asked, seen, strict=True):
-            if not follows(rollout.policy, model, trajectory, limit):
-                raise ValueError(
-                    "the actions are not those of the law a = K_a U^T z + K_b U^T z_r, which this "
-                    "optimizer needs; with a control law of your own use the optimizer 'two_point' "
-                    "or 'directions'"
-                )
-        self.law_seen = True
-
     def _leave_adapt_if_done(self) -> None:
         done = all(optimizer.done for optimizer in self.optimizers)
         self.phase = "evaluate" if done else "adapt"
-
-    def _evaluation_rollouts(self) -> list[tuple[int, Rollout]]:
-        fields = [
-            derive(self.settings.evaluation_seed, Purpose.EVALUATION_FIELD, i)
-            for i in range(self.settings.evaluation_fields)
-        ]
-        adapted, warm = self.policies(), self.warm_starts()
-        return [
-            (m, Rollout(policy, field_seed))
-            for m in range(self.settings.seeds)
-            for policy in (np.zeros_like(warm[m]), warm[m], adapted[m])
-            for field_seed in fields
-        ]
 
     def _evaluated(self, result: BatchResult) -> list[dict[str, Any]]:
         settings = self.settings
@@ -440,6 +393,6 @@ class Training:
                 "diverged": dict(zip(CONTROLLERS, lost.sum(axis=-1).tolist(), strict=True)),
             }
             for seed, costs, lost in zip(
-                self._seeds(), self.evaluation, self.ended != COMPLETED, strict=True
+                self.settings.all_seeds, self.evaluation, self.ended != COMPLETED, strict=True
             )
         ]
