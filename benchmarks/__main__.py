@@ -70,8 +70,6 @@ def parser() -> argparse.ArgumentParser:
         "wave cahn-hilliard",
     )
     linearised.add("problems", "PROBLEM", "names or YAML files", nargs="+")
-    linearised.add("--n-a", "N", "actuators [the problem's]", type=int)
-    linearised.add("--width", "X", "of one, as a share of L", type=float)
     environments = Program(
         programs, "environments", "steps a second of the Gymnasium environments", "--problem kdv"
     )

@@ -42,11 +42,11 @@ def linear(K: NDArray[np.float64]) -> Law:
     return lambda k, z: z @ K.T
 
 
-def costs(problem: str, changes: Mapping[str, Any]) -> dict[str, Any]:
+def costs(problem: str) -> dict[str, Any]:
     """Mean stage costs without control and with that law; None where no law stabilises A."""
     from scipy.linalg import solve_discrete_are
 
-    plant = build_plant(load_parameters(problem, changes))
+    plant = build_plant(load_parameters(problem, {}))
     A, B = linearisation(plant)
     R = plant.action_weight * np.eye(plant.n_a)
     laws: dict[str, NDArray[np.float64]] = {"none": np.zeros((plant.n_a, plant.n_z))}
@@ -67,13 +67,9 @@ def costs(problem: str, changes: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-def run(
-    problems: Sequence[str], n_a: int | None = None, width: float | None = None
-) -> list[dict[str, Any]]:
-    """One row for each problem: its costs, with so many actuators of that width (share of L)."""
-    given = {"n_a": n_a, "actuator_width": width}
-    changes = {name: value for name, value in given.items() if value is not None}
-    return [{"problem": problem, **costs(problem, changes)} for problem in problems]
+def run(problems: Sequence[str]) -> list[dict[str, Any]]:
+    """One row for each problem: its costs."""
+    return [{"problem": problem, **costs(problem)} for problem in problems]
 
 
 def text(rows: Sequence[Mapping[str, Any]]) -> str:

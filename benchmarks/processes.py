@@ -79,7 +79,7 @@ class Bench:
 
     def __init__(self, folder: Path, domain: int) -> None:
         self.folder = folder
-        self._environment = {
+        self.environment = {
             **os.environ,
             **loopback_environment(),
             "ROS_DOMAIN_ID": str(domain),
@@ -106,7 +106,7 @@ class Bench:
         words += [word for parameter in parameters for word in ("-p", parameter)]
         words += [word for remap in remaps for word in ("-r", remap)]
         command = [*prefix, *node_command(name, *words)]
-        return self.run(name, command, {**self._environment, **(environment or {})})
+        return self.run(name, command, {**self.environment, **(environment or {})})
 
     def run(
         self, name: str, command: Sequence[str], environment: Mapping[str, str] | None = None
@@ -120,7 +120,7 @@ class Bench:
                 stdout=subprocess.PIPE,
                 stderr=stderr,
                 text=True,
-                env=environment or self._environment,
+                env=environment or self.environment,
                 process_group=0,  # Ctrl-C in the terminal reaches the measuring program only
                 preexec_fn=die_with_parent,
             )

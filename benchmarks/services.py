@@ -5,9 +5,7 @@ from __future__ import annotations
 import os
 import resource
 import signal
-import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable
@@ -19,10 +17,7 @@ import rclpy
 from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 
-from benchmarks.processes import BenchError, machine, markdown
-from loop_interfaces.isolation import loopback_environment
-from pdeloop.domain import own_domain
-from pdeloop.supervisor import die_with_parent
+from benchmarks.processes import BenchError, BenchProcess, bench, machine, markdown
 
 LIMIT = 300.0
 """Seconds that anything may take."""
@@ -31,28 +26,17 @@ SERVICES = ("pde_sim_node/pause", "pde_sim_node/resume", "tuner_node/pause", "tu
 
 def run(problem: str = "burgers", calls: int = 20, queued: int = 20) -> dict[str, Any]:
     """Seconds of each call, of `queued` ones that are sent at once, and of the end by Ctrl-C."""
-    with tempfile.TemporaryDirectory() as folder, own_domain() as domain:
-        os.environ |= {**loopback_environment(), "ROS_DOMAIN_ID": str(domain)}
-        out, log = Path(folder) / "run", Path(folder) / "log"
-        command = [sys.executable, "-m", "pdeloop", "train", problem, "--record"]
-        with log.open("wb") as said:
-            training = subprocess.Popen(
-                [*command, "--optimizer", "two_point", "--iterations", "100000", "--out", str(out)],
-                stdout=said,
-                stderr=said,
-                process_group=0,
-                preexec_fn=die_with_parent,
-            )
-        try:
-            _until(lambda: "adapted" in _read(out / "progress.jsonl"), training, log)
-            rclpy.init()
-            result = _call(calls, queued)
-            rclpy.shutdown()
-            return {"machine": machine(), **result, **_interrupt(training, log)}
-        finally:
-            if training.poll() is None:
-                training.terminate()
-                training.wait(LIMIT)
+    with bench() as running:
+        os.environ |= running.environment
+        out = running.folder / "run"
+        command = [sys.executable, "-m", "pdeloop", "train", problem, "--record", "--out", str(out)]
+        words = ["--optimizer", "two_point", "--iterations", "100000"]
+        training = running.run("training", [*command, *words])
+        _until(lambda: "adapted" in _read(out / "progress.jsonl"), training)
+        rclpy.init()
+        result = _call(calls, queued)
+        rclpy.shutdown()
+        return {"machine": machine(), **result, **_interrupt(training)}
 
 
 def _call(calls: int, queued: int) -> dict[str, Any]:
@@ -86,28 +70,27 @@ def _call(calls: int, queued: int) -> dict[str, Any]:
     }
 
 
-def _interrupt(training: subprocess.Popen[bytes], log: Path) -> dict[str, float]:
+def _interrupt(training: BenchProcess) -> dict[str, float]:
     """Seconds after Ctrl-C: until a line says so, until the end, and of processor time meanwhile."""
-    length = len(_read(log))
-    used = sum(map(_processor_time, _family(training.pid)))
+    process = training.process
+    used = sum(map(_processor_time, _family(process.pid)))
     children = _reaped()
     began = time.perf_counter()
-    training.send_signal(signal.SIGINT)
-    _until(lambda: "stopping" in _read(log)[length:], training, log, every=0.001)
+    process.send_signal(signal.SIGINT)
+    while "stopping" not in training.line():
+        pass
     told = time.perf_counter() - began
-    training.wait(LIMIT)
+    process.wait(LIMIT)
     ended = time.perf_counter() - began
     return {"told": told, "ended": ended, "processor": _reaped() - children - used}
 
 
-def _until(
-    true: Callable[[], bool], training: subprocess.Popen[bytes], log: Path, every: float = 0.1
-) -> None:
+def _until(true: Callable[[], bool], training: BenchProcess) -> None:
     limit = time.monotonic() + LIMIT
     while not true():
-        if time.monotonic() > limit or training.poll() is not None:
-            raise BenchError(f"the training does not go on: {_read(log)[-300:]}")
-        time.sleep(every)
+        if time.monotonic() > limit or training.process.poll() is not None:
+            raise BenchError(f"the training does not go on: {training.log()[-300:]}")
+        time.sleep(0.1)
 
 
 def _read(path: Path) -> str:
