@@ -90,6 +90,13 @@ def test_a_diverged_rollout_never_reaches_the_policy():
     assert np.isfinite(training.policies()).all()
 
 
+def test_a_rollout_that_diverges_is_marked_and_the_training_goes_on():
+    # A bound just above the initial fields: what the perturbed policies do exceeds it now and then.
+    training = train_here(parameters(divergence_bound=1.1, smoothing_radius=5.0, iterations=12))
+    assert sum(row["diverged"] for row in training.history) > 0
+    assert np.isfinite(training.policies()).all()
+
+
 def test_a_plant_with_other_parameters_does_not_continue_a_training():
     values = parameters(iterations=2)
     training, pair = build_training(values), LocalPair(values)

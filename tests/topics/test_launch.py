@@ -59,57 +59,23 @@ def launch(installed: Processes, workspace: Workspace, file: str, **arguments: o
     return installed.start("-c", RUN, str(path), *words, name="launch")
 
 
-def test_a_launched_training_ends_with_its_tuner(
-    installed: Processes, workspace: Workspace, tmp_path: Path
-) -> None:
-    run = tmp_path / "run"
-    started = launch(
-        installed,
-        workspace,
-        "train.launch.py",
-        problem=SMALL,
-        iterations=20,
-        pairs=2,
-        record="true",
-        namespace="lab",
-        out=run,
-    )
-    said = installed.wait(started, LIMIT)
-    assert_same_training(run, in_process())
-    assert "lab.pair1.controller_node" in said
-    assert "Traceback" not in said
-    assert (run / "bag" / "metadata.yaml").is_file()
-
-
 def test_nodes_that_are_killed_in_a_launched_training_are_started_again(
     installed: Processes, workspace: Workspace, tmp_path: Path
 ) -> None:
     run = tmp_path / "run"
-    started = launch(
-        installed, workspace, "train.launch.py", problem=SMALL, iterations=400, out=run
-    )
+    options = {"problem": SMALL, "iterations": 40, "real_time_factor": 10.0, "namespace": "lab"}
+    options |= {"pairs": 2, "record": "true", "out": run}
+    started = launch(installed, workspace, "train.launch.py", **options)
     for name in ("pde_sim_node", "controller_node", "tuner_node"):
         rows = progress(run)
-        until(lambda rows=rows: progress(run) > rows + 5, LIMIT, "progress")
-        for pid in pids(installed, name):
-            os.kill(pid, signal.SIGKILL)
+        until(lambda rows=rows: progress(run) > rows + 2, LIMIT, "progress")
+        os.kill(pids(installed, name)[0], signal.SIGKILL)
     said = installed.wait(started, LIMIT)
     assert said.count("exit code -9") == 3
-    assert_same_training(run, in_process(iterations=400))
-
-
-def test_what_cannot_be_launched_is_one_sentence_and_a_failure(
-    installed: Processes, workspace: Workspace, tmp_path: Path
-) -> None:
-    for words, sentence in (
-        ({"problem": "stokes"}, "unknown problem 'stokes'"),
-        ({"rollouts": "3"}, "'rollouts' is 3; expected at least"),
-        ({"optimizer": "adam"}, "optimizer"),
-    ):
-        started = launch(installed, workspace, "train.launch.py", out=tmp_path / "run", **words)
-        said = installed.wait(started, LIMIT, code=1)
-        assert sentence in said
-        assert "process started" not in said
+    assert_same_training(run, in_process(iterations=40))
+    assert "lab.pair1.controller_node" in said
+    assert "Traceback" not in said
+    assert (run / "bag" / "metadata.yaml").is_file()
 
 
 def test_a_launched_loop_serves_a_tuner_and_ends_by_an_interrupt(
