@@ -66,7 +66,7 @@ def parser() -> argparse.ArgumentParser:
     linearised = Program(
         programs,
         "linearised",
-        "what the LQR law of the exact linearisation about 0 costs",
+        "what the LQR law of the exact linearisation at the target costs",
         "wave cahn-hilliard",
     )
     linearised.add("problems", "PROBLEM", "names or YAML files", nargs="+")

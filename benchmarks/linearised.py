@@ -1,4 +1,4 @@
-"""`python -m benchmarks linearised`: LQR of the exact linearisation about 0, with the full state.
+"""`python -m benchmarks linearised`: LQR of the exact linearisation at the target, with the full state.
 
 For the linear problems it is the optimum over an infinite horizon; for the others it is what a perfect
 model of small fields gives. Costs are those of `pdeloop train`'s closing evaluation.
@@ -24,22 +24,22 @@ FIELDS = 10
 
 
 def linearisation(plant: Plant) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A (n_z, n_z) and B (n_z, n_a) of z+ = A z + B a near z = 0, by central differences."""
-    n, n_a = plant.n_z, plant.n_a
+    """A (n_z, n_z) and B (n_z, n_a) of z+ near z = z_r and a = 0, by central differences."""
+    n, n_a, target = plant.n_z, plant.n_a, plant.target
     columns = []
     for states, actions in (
         (np.eye(n), np.zeros((n, n_a))),
         (np.zeros((n_a, n)), np.eye(n_a)),
     ):
-        plus, _ = plant.evaluate(SMALL * states, SMALL * actions)
-        minus, _ = plant.evaluate(-SMALL * states, -SMALL * actions)
+        plus, _ = plant.evaluate(target + SMALL * states, SMALL * actions)
+        minus, _ = plant.evaluate(target - SMALL * states, -SMALL * actions)
         columns.append((plus - minus).T / (2 * SMALL))
     return columns[0], columns[1]
 
 
-def linear(K: NDArray[np.float64]) -> Law:
-    """a = K z."""
-    return lambda k, z: z @ K.T
+def linear(K: NDArray[np.float64], target: NDArray[np.float64]) -> Law:
+    """a = K (z - z_r)."""
+    return lambda k, z: (z - target) @ K.T
 
 
 def costs(problem: str) -> dict[str, Any]:
@@ -62,7 +62,7 @@ def costs(problem: str) -> dict[str, Any]:
     seeds = [derive(0, Purpose.EVALUATION_FIELD, i) for i in range(FIELDS)]
     found: dict[str, Any] = {"radius": float(np.abs(np.linalg.eigvals(A)).max()), "lqr": None}
     for name, gain in laws.items():
-        episode = rollout(plant, linear(gain), seeds, keep=False)
+        episode = rollout(plant, linear(gain, plant.target), seeds, keep=False)
         found[name] = float(episode.costs.mean.mean())
     return found
 

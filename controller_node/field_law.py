@@ -18,68 +18,59 @@ section 6.7 (doubling).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from controller_node.reduced_model import leading_modes, steps_of
+from controller_node.reduced_model import Trajectory, leading_modes, pieces, steps_of
 from loop_interfaces.field_models import FieldModel
 from loop_interfaces.field_models.convolution import fit_convolutions
 from loop_interfaces.field_models.differential import fit_differential
 from loop_interfaces.model_rows import ModelRows
 
 Array = NDArray[np.float64]
-Trajectory = tuple[Array, Array]
 
 LARGEST = 512
 """Points of a field, at most: the work grows with their third power."""
-REPRODUCED = 0.05
-"""A model reproduces trajectories up to this share of their squared distance from the target."""
+PIECES, REPRODUCED = 8, 0.05
+"""A model reproduces that many pieces of a trajectory, up to this share of sum |z - z_r|^2."""
 DEGREE, RIDGE = 3, 1e-5
 """Of the convolution model."""
 
 
 def reproducing(trajectories: Sequence[Trajectory], target: Array) -> FieldModel | None:
-    """The simplest model of the whole field that reproduces the trajectories, if one does.
+    """The model of the whole field that reproduces pieces of the trajectories best, if well enough.
 
     Each step counts relative to how much changes in it: saturated fields say little about the plant
-    near its target.
+    near its target. Pieces, as a chaotic plant forgets where it began.
     """
     data = steps_of(trajectories)
     z, a, after = data.before, data.inputs, data.after
     change = np.sum((after - z) ** 2, axis=1)
     weights = 1.0 / np.maximum(change, 1e-12 * change.max())
-
-    def convolution(degree: int, components: int) -> FieldModel:
-        return fit_convolutions(
+    forms = [(DEGREE, 1), (1, 2)] if len(target) % 2 == 0 else [(DEGREE, 1)]
+    models: list[FieldModel] = [fit_differential(z, a, after)]
+    for degree, components in forms:
+        models += fit_convolutions(
             *(z, a, after, weights), degrees=[degree], ridges=[RIDGE], components=components
-        )[0]
-
-    kinds: list[Callable[[], FieldModel]] = [
-        lambda: convolution(DEGREE, 1),
-        lambda: fit_differential(z, a, after),
-    ]
-    if not len(target) % 2:
-        kinds.append(lambda: convolution(1, 2))
-    for kind in kinds:
-        model = kind()
-        error = size = 0.0
-        for states, actions in trajectories:
-            error += float(np.sum((simulated(model, states[0], actions) - states) ** 2))
-            size += float(np.sum((states - target) ** 2))
-        if error <= REPRODUCED * size:  # not where it overflows
-            return model
-    return None
+        )
+    size = sum(float(np.sum((states - target) ** 2)) for states, _ in trajectories)
+    errors = np.zeros(len(models))
+    with np.errstate(over="ignore", invalid="ignore"):
+        for i, model in enumerate(models):
+            for states, actions in pieces(trajectories, PIECES):
+                errors[i] += np.sum((simulated(model, states[0], actions) - states) ** 2)
+    best = int(np.argmin(np.nan_to_num(errors, nan=np.inf)))  # a model may overflow
+    return models[best] if errors[best] <= REPRODUCED * size else None
 
 
 def simulated(model: FieldModel, z: Array, actions: Array) -> Array:
     """z_0 .. z_N under given actions."""
     states = [z]
-    with np.errstate(over="ignore", invalid="ignore"):
-        for a in actions:
-            states.append(model.step(states[-1], a))
+    for a in actions:
+        states.append(model.step(states[-1], a))
     return np.array(states)
 
 

@@ -20,20 +20,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
 from threadpoolctl import threadpool_limits
 
-from controller_node.reduced_model import ReducedModel, numerical_rank, steps_of
+from controller_node.reduced_model import ReducedModel, Trajectory, numerical_rank, pieces, steps_of
 from controller_node.regression import fit
 
 __all__ = ["OrderStudy", "study_orders"]
 
 Array = NDArray[np.float64]
-Trajectory = tuple[Array, Array]
 ORDERS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 28, 32, 40, 48, 64)
 FOLDS, PIECES = 4, 8
 SHARE = 0.8
@@ -155,13 +153,10 @@ def _folds(
     trajectories: Sequence[Trajectory],
 ) -> Iterator[tuple[list[Trajectory], list[Trajectory]]]:
     """Pieces to fit to and pieces that are held out."""
-    pieces = []
-    for states, actions in trajectories:
-        edges = np.unique(np.linspace(0, len(actions), PIECES + 1).astype(int))
-        pieces += [(states[a : b + 1], actions[a:b]) for a, b in pairwise(edges)]
+    cut = pieces(trajectories, PIECES)
     for fold in range(FOLDS):
-        held = pieces[fold::FOLDS]
-        fitted = [piece for i, piece in enumerate(pieces) if i % FOLDS != fold]
+        held = cut[fold::FOLDS]
+        fitted = [piece for i, piece in enumerate(cut) if i % FOLDS != fold]
         if held and fitted:
             yield fitted, held
 

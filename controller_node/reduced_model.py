@@ -10,12 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
 
 Array = NDArray[np.float64]
+Trajectory = tuple[Array, Array]
+"""States (N + 1, n_z) and actions (N, n_a)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +113,15 @@ def steps_of(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> Steps:
         afters.append(z[1:])
         inputs.append(own)
     return Steps(*(np.concatenate(parts) for parts in (befores, afters, inputs)))
+
+
+def pieces(trajectories: Sequence[Trajectory], count: int) -> list[Trajectory]:
+    """Every trajectory cut into so many pieces of about one length; neighbours share a state."""
+    cut = []
+    for states, actions in trajectories:
+        edges = np.unique(np.linspace(0, len(actions), count + 1).astype(int))
+        cut += [(states[a : b + 1], actions[a:b]) for a, b in pairwise(edges)]
+    return cut
 
 
 def leading_modes(after: Array, n_s: int) -> tuple[Array, Array]:

@@ -22,6 +22,7 @@ from pde_sim_node.equations import (
     GinzburgLandau,
     KortewegDeVries,
     KuramotoSivashinsky,
+    KuramotoSivashinsky22,
     Schrodinger,
     Wave,
     allow,
@@ -75,6 +76,30 @@ def test_initial_fields_and_targets_are_those_of_the_method() -> None:
     np.testing.assert_allclose(KortewegDeVries().target(x), np.sin(np.pi * x / 10))
 
 
+@pytest.mark.parametrize("number, energy", [(1, 0.2609), (2, 0.4382), (3, 1.5876)])
+def test_the_equilibria_of_kuramoto_sivashinsky(number: int, energy: float) -> None:
+    """At rest, and with the energies of Cvitanovic, Davidchack, Siminos (2010), table 5.1."""
+    equation = KuramotoSivashinsky22(equilibrium=number)
+    x = grid(equation)
+    u, k = equation.target(x), 2 * np.pi / equation.length * np.arange(65)
+    rate = equation.linear_operator(k) * np.fft.rfft(u) + equation.multiplier(k) * np.fft.rfft(
+        u * u
+    )
+    np.testing.assert_allclose(np.fft.irfft(rate), 0.0, atol=1e-8)
+    assert np.mean(u**2) / 2 == pytest.approx(energy, abs=1e-4)
+
+
+def test_four_actuators_do_not_reach_two_waves() -> None:
+    """Symmetric ones at j L/4 and sin(4 pi x/L), which grows about rest with rate 0.22."""
+    equation = KuramotoSivashinsky22()
+    x = grid(equation)
+    supports = equation.supports(x, 4, 0.4 / 22)
+    wave = np.sin(4 * np.pi * x / equation.length)
+    np.testing.assert_allclose(wave @ supports, 0.0, atol=1e-12)
+    growth = equation.linear_operator(np.array([4 * np.pi / equation.length]))
+    assert growth[0] == pytest.approx(0.22, abs=0.001)
+
+
 def test_random_parameters_stay_in_their_ranges() -> None:
     x = np.array([1.0])  # where Allen-Cahn's field is its offset
     offsets = [AllenCahn().initial_field(x, np.random.default_rng(s))[0] for s in range(200)]
@@ -97,7 +122,7 @@ def derivatives(equation: Equation, u: np.ndarray, w: float, x: np.ndarray) -> n
             return -(equation.diffusivity**2) * w**2 * s - equation.potential * (u**3 - u)
         case KortewegDeVries():
             return w**3 * c + 6 * u * w * c
-        case KuramotoSivashinsky():
+        case KuramotoSivashinsky() | KuramotoSivashinsky22():
             return -u * w * c + w**2 * s - w**4 * s
         case Fisher():
             return -equation.diffusivity * w**2 * s + equation.reaction * u * (1 - u)

@@ -11,6 +11,8 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
+from loop_interfaces.problem import load_parameters
+from pde_sim_node.build import build_plant
 from pde_sim_node.equations import LinearEquation
 from pde_sim_node.plant import Plant
 from pdeloop.cli import FAILED, main
@@ -57,6 +59,21 @@ def test_waves_on_which_equally_spaced_actuators_have_one_phase_are_not_reached(
     """A pair cos, sin of one growth rate needs two columns of B, and they see wave n_a / 2 as one."""
     found = reach(plant(n_a, 0.1))
     assert sorted(set(found.waves[found.margins < 1e-6])) == lost
+
+
+@pytest.mark.parametrize(
+    ("equilibrium", "growth"),
+    [(1, [0.1308, 0.1308, 0.0824, 0.0824]), (2, [0.139] * 2), (3, [0.0933] * 2)],
+)
+def test_four_actuators_reach_the_unstable_modes_of_the_equilibria(
+    equilibrium: int, growth: list[float]
+) -> None:
+    """Rates of Cvitanovic, Davidchack, Siminos (2010); a shift of the field keeps its size."""
+    values = load_parameters("kuramoto-sivashinsky-22", {"physical.equilibrium": equilibrium})
+    found = reach(build_plant(values))
+    grows = found.growth > 1e-3
+    np.testing.assert_allclose(np.sort(found.growth[grows])[::-1], growth, atol=2e-4)
+    assert found.margins[grows].min() > 0.2
 
 
 def named(**changes: Any) -> dict[str, tuple[bool, str]]:

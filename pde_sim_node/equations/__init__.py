@@ -20,6 +20,9 @@ from pde_sim_node.equations.fisher import Fisher as Fisher
 from pde_sim_node.equations.ginzburg_landau import GinzburgLandau as GinzburgLandau
 from pde_sim_node.equations.korteweg_de_vries import KortewegDeVries as KortewegDeVries
 from pde_sim_node.equations.kuramoto_sivashinsky import KuramotoSivashinsky as KuramotoSivashinsky
+from pde_sim_node.equations.kuramoto_sivashinsky_22 import (
+    KuramotoSivashinsky22 as KuramotoSivashinsky22,
+)
 from pde_sim_node.equations.loading import ALLOWED as ALLOWED
 from pde_sim_node.equations.loading import allow as allow
 from pde_sim_node.equations.loading import configured_equation as configured_equation

@@ -12,6 +12,7 @@ from pde_sim_node.equations.fisher import Fisher
 from pde_sim_node.equations.ginzburg_landau import GinzburgLandau
 from pde_sim_node.equations.korteweg_de_vries import KortewegDeVries
 from pde_sim_node.equations.kuramoto_sivashinsky import KuramotoSivashinsky
+from pde_sim_node.equations.kuramoto_sivashinsky_22 import KuramotoSivashinsky22
 from pde_sim_node.equations.schrodinger import Schrodinger
 from pde_sim_node.equations.wave import Wave
 
@@ -23,6 +24,7 @@ EQUATIONS: Mapping[str, type[Equation]] = MappingProxyType(
             AllenCahn,
             KortewegDeVries,
             KuramotoSivashinsky,
+            KuramotoSivashinsky22,
             Fisher,
             CahnHilliard,
             GinzburgLandau,
