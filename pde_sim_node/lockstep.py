@@ -50,7 +50,7 @@ from loop_interfaces.topics import (
 )
 from pde_sim_node.plant import Plant
 from pde_sim_node.real_time import RealTimePacer
-from pde_sim_node.taken_actions import Episode, TakenActions
+from pde_sim_node.taken_actions import Episode, TakenActions, two_actions
 
 PAUSED_REPORT = 1.0
 """Seconds between two messages on `episode/paused` while the plant is paused."""
@@ -303,15 +303,8 @@ class Lockstep:
             raise FrameError(
                 f"expected an action of shape {expected} (env, actuator), got {frame.values.shape}"
             )
-        if not self._actions.is_signed(frame):
-            if self._actions.signs is False:
-                return [self._finish(now, void=True, contradiction=_TWO_CONTROLLERS)]
-            raise FrameError(
-                f"the action for step {frame.step} was not computed from the policy, model and target "
-                "of its episode; expected one controller and one tuner"
-            )
-        if self._actions.episode.contradicted_by(frame):
-            return [self._finish(now, void=True, contradiction=_contradiction(frame))]
+        if contradiction := self._actions.contradiction(frame):
+            return [self._finish(now, void=True, contradiction=contradiction)]
         if not awaited:
             return []
         if self._phase is Phase.READY:
@@ -320,8 +313,7 @@ class Lockstep:
         if plant.step_index == plant.horizon:
             self._tuner_heard = now
             return [self._finish(now, void=False)]
-        self._actions.signs = frame.time < 0.0
-        if self._actions.signs:
+        if self._actions.take_signature(frame):
             self.signed_run = self.run
         self._state = plant.step(frame.values)
         self.advance_counters([digest(frame.values)], now)
@@ -401,7 +393,7 @@ class Lockstep:
         cost = self._actions.retract(frame) if frame.values.shape[1] == self.plant.n_a else None
         if cost is None:
             return []
-        self.contradiction = _contradiction(frame)
+        self.contradiction = two_actions(frame)
         self.counters["costs taken back"] += 1
         return [Publication(COST, cost)]
 
@@ -440,15 +432,3 @@ class Lockstep:
     def _stamped(self, topic: Topic, values: np.ndarray) -> Publication:
         ids = self.run, self.episode, self.step
         return Publication(topic, Frame(*ids, self.time, values, self._fingerprint))
-
-
-_TWO_CONTROLLERS = (
-    "a signed action came in a run whose controller does not sign; expected one controller"
-)
-
-
-def _contradiction(action: Frame) -> str:
-    return (
-        f"two different actions came for step {action.step} of episode {action.episode}; "
-        "expected one controller, which answers a repeated state with the same action"
-    )

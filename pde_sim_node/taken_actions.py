@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from loop_interfaces.frames import Frame, digest
+from loop_interfaces.frames import Frame, FrameError, digest
 from loop_interfaces.signature import NOT_SIGNED, signature_in
 from loop_interfaces.topics import START_COLUMNS, VOID, CostColumn
 
@@ -73,6 +73,31 @@ class TakenActions:
             found in (NOT_SIGNED, self.episode.signature) if expected is None else found == expected
         )
 
+    def contradiction(self, action: Frame) -> str:
+        """Why the episode cannot be relied on any more, as this action of it has come; else empty.
+
+        Raises
+        ------
+        FrameError
+            The run's controller signs, and the action is not signed for this episode.
+        """
+        if not self.is_signed(action):
+            if self.signs is False:
+                return (
+                    "a signed action came in a run whose controller does not sign; "
+                    "expected one controller"
+                )
+            raise FrameError(
+                f"the action for step {action.step} was not computed from the policy, model and target "
+                "of its episode; expected one controller and one tuner"
+            )
+        return two_actions(action) if self.episode.contradicted_by(action) else ""
+
+    def take_signature(self, action: Frame) -> bool:
+        """An action is taken: from now on the run's controller signs, or does not."""
+        self.signs = action.time < NOT_SIGNED
+        return self.signs
+
     def end(self, cost: Frame, *, void: bool) -> None:
         """The episode came to this cost."""
         self.episode.cost = cost
@@ -94,3 +119,11 @@ class TakenActions:
         values = ended.cost.values.copy()
         values[:, CostColumn.ENDED] = VOID
         return replace(ended.cost, values=values)
+
+
+def two_actions(action: Frame) -> str:
+    """That another action than this one was taken, in words."""
+    return (
+        f"two different actions came for step {action.step} of episode {action.episode}; "
+        "expected one controller, which answers a repeated state with the same action"
+    )
