@@ -10,7 +10,7 @@ from tuner_node.dispatch import DispatchError, PairPublication
 from tuner_node.session import Session
 
 SECOND_TUNER_GRACE = 6.0
-"""Seconds a second tuner may be seen before it counts as one: a killed one is seen for 3 s."""
+"""Seconds a second tuner may be seen before it counts as one: a killed one is seen for 4 s."""
 
 
 @dataclass(frozen=True)

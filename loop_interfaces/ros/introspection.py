@@ -34,7 +34,7 @@ PERIOD = 1.0
 WORKING = 1.0
 """Seconds of one computation after which it is reported while it lasts."""
 NAMESAKE_GRACE = 6.0
-"""Seconds a second node of our name may be seen before it counts: a killed one is seen for 3 s."""
+"""Seconds a second node of our name may be seen before it counts: a killed one is seen for 4 s."""
 
 
 def full_name(endpoint: Any) -> str:

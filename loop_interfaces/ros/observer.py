@@ -26,8 +26,9 @@ STUCK = 0.5
 SUSPENDED = 2.0
 """Seconds without being scheduled after which a process takes its peers to have dropped it.
 
-The DDS lease is 3 s: peers that stop hearing a participant forget it, while it does not know and
-does not introduce itself again. Joining as a new participant is the way back."""
+The DDS lease is 4 s, and announcements come every second: peers that stop hearing a participant
+forget it, while it does not know and does not introduce itself again. Joining as a new participant is
+the way back."""
 
 
 class EventLoop:

@@ -40,7 +40,7 @@ from tests.simulation.processes import (
 from tuner_node.dispatch import DispatchError
 from tuner_node.training import Training
 
-LEASE = 3.0
+LEASE = 4.0
 """Seconds after which a process that has gone is missed."""
 LIMIT = 3600.0
 """Virtual seconds in which every training ends."""

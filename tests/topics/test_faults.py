@@ -63,13 +63,13 @@ def test_lost_repeated_delayed_and_reordered_messages_change_nothing(loop, tmp_p
 
 @pytest.mark.parametrize("victim", ["plant", "controller", "tuner"])
 def test_a_stopped_process_that_goes_on_later_changes_nothing(loop, tmp_path, victim):
-    # Stopped for longer than the action timeout, the void limit and the DDS lease of 3 s.
+    # Stopped for longer than the action timeout, the void limit and the DDS lease of 4 s.
     running = start_pair(loop, max_repeats=20)
     out = tmp_path / "run"
     running["tuner"] = start_tuner(loop, out, iterations=100)
     until(lambda: iterations_done(out) >= 20, LIMIT, "iteration 20")
     running[victim].send_signal(signal.SIGSTOP)
-    time.sleep(4.0)
+    time.sleep(5.0)
     running[victim].send_signal(signal.SIGCONT)
     loop.wait(running["tuner"], LIMIT)
     assert_same_training(out, in_process(iterations=100))
