@@ -16,8 +16,6 @@ from loop_interfaces.signature import design_digest, digest_of, signature
 from loop_interfaces.topics import COMPLETED, MODEL_IDENTIFIED, VOID, CostColumn, StartColumn
 
 Array = NDArray[np.float64]
-DRAWN_AT_ONCE = 32
-"""Exploratory actions that are drawn at once, of all environments: well below a millisecond."""
 
 
 class Exploration:
@@ -44,21 +42,13 @@ class Exploration:
         self._start, self._settings = start, settings
         seeds, variances = start.values[:, [StartColumn.EXCITATION, StartColumn.VARIANCE]].T
         self._draws = list(zip(seeds.astype(int).tolist(), variances.tolist(), strict=True))
-        self._actions: dict[int, Array] = {}
-        """Of some steps of the episode."""
         self._states: dict[tuple[int, int], Array] = {}
         """By plant and step."""
         self._unusable: ModelFailure | None = None
 
     def actions(self, step: int) -> Array:
-        """The actions of a step, (M, n_a); those of the next steps are drawn with them.
-
-        To make a generator of random numbers takes several times as long in between as again at once.
-        """
-        if step not in self._actions:
-            steps = range(step, step + max(1, DRAWN_AT_ONCE // len(self._draws)))
-            self._actions = {k: np.stack([self._draw(*d, k) for d in self._draws]) for k in steps}
-        return self._actions[step]
+        """The actions of all environments in a step, (M, n_a)."""
+        return np.stack([self._draw(seed, variance, step) for seed, variance in self._draws])
 
     def lacks(self, state: Frame) -> bool:
         """Whether the state is to be kept. Two different ones of a step make the episode unusable."""

@@ -86,7 +86,6 @@ def remembering() -> Iterator[None]:
 
     with (
         mock.patch.object(exploration, "design", design),
-        mock.patch.object(exploration, "DRAWN_AT_ONCE", 5),  # the steps of an episode
         mock.patch.object(Proposer, "propose", propose),
     ):
         yield
