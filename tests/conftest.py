@@ -37,8 +37,20 @@ def _own_environment(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest test first, so that at the end no worker waits for it."""
-    items.sort(key=lambda item: "test_soak" not in item.nodeid)
+    """Each worker begins with its share of the long tests: so none is left alone with them.
+
+    Workers are given equal parts of the list. The others stay together by their modules.
+    """
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    topics = [item for item in items if item.get_closest_marker("topics")]
+    topics.sort(key=lambda item: "test_soak" not in item.nodeid)
+    others = [item for item in items if not item.get_closest_marker("topics")]
+    parts = [len(others) * i // workers for i in range(workers + 1)]
+    items[:] = [
+        item
+        for i in range(workers)
+        for item in (*topics[i::workers], *others[parts[i] : parts[i + 1]])
+    ]
 
 
 @pytest.hookimpl(wrapper=True)

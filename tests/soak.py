@@ -20,15 +20,12 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from pdeloop.in_process import LocalPair, train
-from pdeloop.progress import Progress
 from pdeloop.training_run import resolve
 from tests.relay.train import FAULTS
 from tuner_node.build import build_training
@@ -40,8 +37,6 @@ PAUSE = (0.1, 2.5)
 """Seconds between two faults: now within a start-up, now after some checkpoints."""
 LIMIT = 600.0
 """Seconds that one training may take under faults."""
-SETTLE = 3.0
-"""Seconds of processor time before a process's memory counts as its memory at the start."""
 
 
 @dataclass
@@ -51,12 +46,11 @@ class SoakReport:
     seconds: float = 0.0
     trainings: int = 0
     mismatches: int = 0
-    environment_steps: int = 0
+    rollouts: int = 0
+    """Of the adapt phase."""
     restarts: int = 0
     resumes: int = 0
     faults: Counter[str] = field(default_factory=Counter)
-    memory_mb: dict[str, list[float]] = field(default_factory=dict)
-    """Per node: resident memory shortly after its start and last, of the process that grew most."""
 
 
 def soak(
@@ -66,7 +60,6 @@ def soak(
     iterations: int,
     seed: int,
     tell: Callable[[str], None],
-    tick: Callable[[float, str], None] = lambda share, status: None,
     folder: Path | None = None,
     most: float = math.inf,
 ) -> SoakReport:
@@ -74,7 +67,7 @@ def soak(
 
     The last training is brought to its end undisturbed.
 
-    tell: a line after each training; tick(share, status): often, with the share of the time.
+    tell: a line after each training.
     """
     report, rng = SoakReport(), np.random.default_rng(seed)
     began = time.monotonic()
@@ -89,11 +82,7 @@ def soak(
             number = report.trainings
             training = _Training(problem, iterations, seed + number, place / f"{number}", report)
 
-            def now() -> None:
-                faults = report.faults.total()
-                tick(min(1.0, share()), f"training {report.trainings + 1}, {faults} faults")
-
-            training.run(rng, lambda: share() < 1, now)
+            training.run(rng, lambda: share() < 1)
             report.trainings += 1
             same = training.matches()
             report.mismatches += not same
@@ -120,15 +109,12 @@ class _Training:
         self._options = {**budget, "seed": seed, "optimizer": optimizer}
         self._problem, self._out, self._report = problem, out, report
         self._log = out.with_suffix(".log")
-        self._first: dict[int, float] = {}
         # Before the faults: it compiles what is not compiled, which a killed node would begin again.
         values = resolve(problem, self._options)
         self._quiet = build_training(values)
         train(self._quiet, LocalPair(values), lambda row: None)
 
-    def run(
-        self, rng: np.random.Generator, disturbing: Callable[[], bool], tick: Callable[[], None]
-    ) -> None:
+    def run(self, rng: np.random.Generator, disturbing: Callable[[], bool]) -> None:
         """Start it, disturb it, and start it again until it has its result."""
         report = self._report
         options = [
@@ -151,18 +137,13 @@ class _Training:
                 )
             deadline = time.monotonic() + float(rng.uniform(*PAUSE))
             while time.monotonic() < deadline and process.poll() is None:
-                self._watch_memory()
-                tick()
                 time.sleep(0.05)
             if disturbing() and process.poll() is None and not (self._out / "result.json").exists():
                 self._disturb(process, rng)
         self._end_of(process)
         report.restarts += self._log.read_text(errors="replace").count("; starting it again")
-        settings = resolve(self._problem, self._options)
-        report.environment_steps += settings["horizon"] * sum(
-            row.get("rollouts", 0) - previous.get("rollouts", 0)
-            for previous, row in _pairs(self._history())
-        )
+        result = json.loads((self._out / "result.json").read_text())
+        report.rollouts += sum(seed["adaptation"] for seed in result["rollouts"])
 
     def matches(self) -> bool:
         """Whether policy and costs are those of the quiet training, bit for bit."""
@@ -238,24 +219,6 @@ class _Training:
                 raise RuntimeError(f"nodes outlive their supervisor: {self._nodes()}")
             time.sleep(0.02)
 
-    def _watch_memory(self) -> None:
-        for pid, name in self._nodes():
-            with contextlib.suppress(OSError, IndexError):
-                used = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13]
-                pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-                size = pages * os.sysconf("SC_PAGE_SIZE") / 2**20
-                if sum(map(int, used)) / os.sysconf("SC_CLK_TCK") < SETTLE:
-                    continue
-                first = self._first.setdefault(pid, size)
-                known = self._report.memory_mb.setdefault(name, [first, size])
-                if size - first >= known[1] - known[0]:
-                    self._report.memory_mb[name] = [round(first, 1), round(size, 1)]
-
-    def _history(self) -> list[dict[str, Any]]:
-        result = json.loads((self._out / "result.json").read_text())
-        history: list[dict[str, Any]] = result["history"]
-        return history
-
 
 MARK = "PDELOOP_SOAK"
 """Environment variable by which the processes of one training are found."""
@@ -276,57 +239,17 @@ def _hear_interruptions() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-def _pairs(rows: list[dict[str, Any]]) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-    return list(zip([{}, *rows[:-1]], rows, strict=True))
-
-
-def run(minutes: float, problem: str, iterations: int, seed: int) -> dict[str, Any]:
-    """The soak of the command line: on stderr a line per training and, on a terminal, a bar.
-
-    Raises RuntimeError when a training ended with another policy or other costs.
-    """
-    console = Console(stderr=True, highlight=False, soft_wrap=True)
-    progress = Progress(console, "soak")
-
-    def tell(text: str) -> None:
-        console.print(text, markup=False)
-
-    try:
-        report = soak(
-            minutes,
-            problem=problem,
-            iterations=iterations,
-            seed=seed,
-            tell=tell,
-            tick=lambda share, status: progress.tell(share, status=status),
-        )
-    finally:
-        progress.close()
-    result = as_dict(report)
-    if report.mismatches:
-        tell(text(result))
-        raise RuntimeError(f"{report.mismatches} of {report.trainings} trainings differ")
-    return result
-
-
-def as_dict(report: SoakReport) -> dict[str, Any]:
-    """The report as JSON knows it."""
-    return asdict(replace(report, faults=Counter())) | {"faults": dict(report.faults)}
-
-
-def text(result: dict[str, Any]) -> str:
+def text(report: SoakReport) -> str:
     """The report as people read it."""
     lines = [
-        f"{result['trainings']} trainings in {result['seconds']:.0f} s, "
-        f"{result['environment_steps']} environment steps of the adapt phase",
-        f"mismatches: {result['mismatches']}",
-        f"nodes restarted: {result['restarts']}, trainings resumed: {result['resumes']}",
+        f"{report.trainings} trainings in {report.seconds:.0f} s, "
+        f"{report.rollouts} rollouts of the adapt phase",
+        f"mismatches: {report.mismatches}",
+        f"nodes restarted: {report.restarts}, trainings resumed: {report.resumes}",
         "faults:",
-        *(f"  {count:5d}  {kind}" for kind, count in sorted(result["faults"].items())),
+        *(f"  {count:5d}  {kind}" for kind, count in sorted(report.faults.items())),
         "  and on the line between plant and controller: "
         + ", ".join(f"{name} {value}" for name, value in FAULTS.items()),
-        "memory in MB, after the start and last, of the process that grew most:",
-        *(f"  {n:<16} {a:8.1f} {b:8.1f}" for n, (a, b) in sorted(result["memory_mb"].items())),
     ]
     return "\n".join(lines)
 
@@ -337,4 +260,6 @@ if __name__ == "__main__":
     words.add_argument("--problem", default="allen-cahn", metavar="PROBLEM", help="[allen-cahn]")
     words.add_argument("--iterations", type=int, default=100, metavar="N", help="of each [100]")
     words.add_argument("--seed", type=int, default=0, metavar="S", help="of faults and trainings")
-    print(text(run(**vars(words.parse_args()))))
+    found = soak(**vars(words.parse_args()), tell=lambda line: print(line, flush=True))
+    print(text(found))
+    sys.exit(bool(found.mismatches))

@@ -159,8 +159,7 @@ def through_file(optimizer: Optimizer) -> dict[str, np.ndarray]:
 
 
 @BOTH
-@pytest.mark.parametrize("stop", [0, 1, 4])
-def test_a_restored_training_ends_with_the_same_bits(make: Make, stop: int) -> None:
+def test_a_restored_training_ends_with_the_same_bits(make: Make) -> None:
     def step(optimizer: Optimizer) -> dict[str, Any]:
         results = measure(optimizer)
         if optimizer.tells == 2:
@@ -168,20 +167,14 @@ def test_a_restored_training_ends_with_the_same_bits(make: Make, stop: int) -> N
         return optimizer.tell(results)
 
     whole = make()
-    rows = []
     while not whole.done:
-        rows.append(step(whole))
-    first = make()
-    for _ in range(stop):
-        step(first)
-    first.ask()
-    second = make()
-    second.restore(through_file(first))
-    assert second.tells == stop
-    assert [step(second) for _ in range(len(rows) - stop)] == rows[stop:]
-    assert second.done
-    assert np.array_equal(second.policy, whole.policy)
-    assert np.array_equal(second.best_policy, whole.best_policy)
+        again = make()
+        again.restore(through_file(whole))
+        assert again.tells == whole.tells
+        assert step(again) == step(whole)
+        assert np.array_equal(again.best_policy, whole.best_policy)
+        state, expected = again.state(), whole.state()
+        assert all(np.array_equal(state[k], expected[k], equal_nan=True) for k in expected)
 
 
 @BOTH

@@ -78,34 +78,6 @@ def quadratic(seed: int) -> tuple[np.ndarray, np.ndarray]:
     return half @ half.T, rng.standard_normal(12)
 
 
-def test_mean_estimate_agrees_with_the_finite_difference_gradient() -> None:
-    H, g = quadratic(0)
-    policy = np.random.default_rng(1).standard_normal(SHAPE)
-
-    def cost(pi: np.ndarray) -> float:
-        x = pi.ravel()
-        return float(g @ x + 0.5 * x @ H @ x + 0.1 * np.sum(np.cos(x)))
-
-    h, difference = 1e-5, np.zeros(12)
-    for i in range(12):
-        e = np.zeros(12)
-        e[i] = h
-        step = e.reshape(SHAPE)
-        difference[i] = (cost(policy + step) - cost(policy - step)) / (2 * h)
-
-    radius, count = 1e-2, 20000
-    estimates = np.empty((count, 12))
-    for k in range(count):
-        theta = oracle.unit_direction(3, k, SHAPE)
-        estimates[k] = oracle.gradient(
-            cost(policy + radius * theta), cost(policy - radius * theta), theta, radius
-        ).ravel()
-    error = estimates.mean(axis=0) - difference
-    standard_error = estimates.std(axis=0) / np.sqrt(count)
-    assert (np.abs(error) < 4.5 * standard_error).all()
-    assert np.linalg.norm(error) < 0.05 * np.linalg.norm(difference)
-
-
 def test_all_orthonormal_directions_give_the_gradient_of_a_quadratic_exactly() -> None:
     H, g = quadratic(4)
     policy = np.random.default_rng(5).standard_normal(SHAPE)

@@ -110,13 +110,17 @@ def test_the_table_says_where_the_papers_figure_lies(ratio, mean, words):
     assert words in beside_the_paper(row)
 
 
-def test_an_interrupted_reproduction_continues_to_the_same_bits(reproduction, tmp_path):
+def test_an_interrupted_reproduction_continues_to_the_same_bits(reproduction, tmp_path, capsys):
     whole, _ = reproduction
     out = tmp_path / "out"
     shutil.copytree(whole, out, ignore=shutil.ignore_patterns("report"))
     (out / "table.json").unlink()
     shutil.rmtree(out / "small" / "lqt_po" / "1")
-    assert main(["reproduce", "--out", str(out), "--processes", "1"]) == 0
+    assert main(["reproduce", "--out", str(out), "--processes", "1", "--json"]) == 0
+    captured = capsys.readouterr()
+    assert "\x1b" not in captured.err
+    rows = json.loads((out / "table.json").read_text())["rows"]
+    assert json.loads(captured.out) == {"folder": str(out), "rows": rows}
     for path in (whole / "table.json", *whole.glob("small/*/*/*")):
         assert (out / path.relative_to(whole)).read_bytes() == path.read_bytes()
 
