@@ -18,10 +18,10 @@ from controller_node.order import OrderStudy, study_orders
 from loop_interfaces.model_rows import ModelRows, pack
 from loop_interfaces.parameters import as_recorded, model_order, table
 from loop_interfaces.topics import COMPLETED, CostColumn
+from pdeloop.bags.episodes import RecordedEpisode
 from pdeloop.bags.reader import Bag
 from pdeloop.data_file import read_measurements
 from recorder_node.bag import BagError
-from recorder_node.episodes import RecordedEpisode
 
 Array = NDArray[np.float64]
 Trajectories = Sequence[tuple[Array, Array]]

@@ -19,6 +19,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 
 from loop_interfaces.affinity import lower_priority
+from loop_interfaces.diagnostics import Level, Rate, Status
 from loop_interfaces.frames import FrameError
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.parameters import taken_by
@@ -31,7 +32,6 @@ from loop_interfaces.ros.sample_subscription import SampleSubscription, Serializ
 from loop_interfaces.samples import ACTION_KIND, CLOCK_KIND, STATE_KIND
 from loop_interfaces.topics import ACTION, RECORDER_STATUS, START, STATE
 from recorder_node.bag import BagError
-from recorder_node.diagnostics import RecorderDiagnostics
 from recorder_node.peers import Peers
 from recorder_node.recording import Recording
 from recorder_node.sources import CLOCK, DIAGNOSTICS, ROSOUT, Source, sources
@@ -44,9 +44,6 @@ FLUSH = 0.3
 """Seconds of recording that a SIGKILL may lose at the most."""
 LOOK = 0.1
 """Seconds between two rounds of reading the ROS graph."""
-HELD_UP, CATCH_UP = 0.15, 0.5
-"""Stall threshold: seconds between two batches; and seconds after a stall before an episode is
-indexed, so that what arrived meanwhile is not reported as missing."""
 DEPTH = 1000
 """Messages of a topic that may wait: seconds of the fastest loop, if this process is held up."""
 LATCHED = DurabilityPolicy.TRANSIENT_LOCAL
@@ -68,10 +65,7 @@ class RecorderNode:
         self._sources += [DIAGNOSTICS, ROSOUT, *([CLOCK] if values["record_clock"] else [])]
         folder = str(values["bag"]) or time.strftime("bags/%Y%m%d-%H%M%S")
         self._recording = Recording(Path(folder), self._sources)
-        self._diagnostics = RecorderDiagnostics(self._recording)
-        self._until = 0
-        """Everything that arrived by then (ns since the epoch) was recorded."""
-        self._batch_at = self._index_at = 0.0
+        self._rate = Rate()
         self._wire(node, loop)
         self._log.info(f"recording to {self._recording.path}")
 
@@ -97,11 +91,9 @@ class RecorderNode:
             others=[f"{n}{START.name}" for n in self._namespaces],
         )
         self._status: Publisher | None = None
-        loop.introspection.report(
-            "recording", lambda now: self._diagnostics.report(now, self._status is not None)
-        )
+        loop.introspection.report("recording", self._report)
         loop.every(DRAIN, self._record)
-        loop.every(FLUSH, self._flush)
+        loop.every(FLUSH, self._recording.flush)
         loop.every(LOOK, self._look)
 
     def _subscribe(self, source: Source) -> None:
@@ -139,10 +131,7 @@ class RecorderNode:
         except BagError as error:
             print(f"recorder_node: {error}", file=sys.stderr)
             return RECORDING_FAILED
-        self._log.info(
-            f"{recording.messages} messages of {recording.episodes} episodes in {recording.path}, "
-            f"{recording.incomplete} of them incomplete"
-        )
+        self._log.info(f"{recording.messages} messages in {recording.path}")
         return 0
 
     def _record(self) -> None:
@@ -151,29 +140,36 @@ class RecorderNode:
         It takes all topics up to the same moment, so that what stands together in the bag belongs
         together, even if this process is held up between two topics and then killed.
         """
-        self._until, begin = time.time_ns(), time.monotonic()
-        if begin - self._batch_at > HELD_UP:
-            self._index_at = begin + CATCH_UP
-        self._batch_at = begin
+        until = time.time_ns()
         taken: list[tuple[int, int, Source, bytes]] = []
         for samples, by_kind in self._samples:
             try:
-                for kind, when, raw in samples.drain(self._until):
+                for kind, when, raw in samples.drain(until):
                     taken.append((when, len(taken), by_kind[kind], raw))
             except FrameError as error:
                 self._log.warning(f"samples: {error}", throttle_duration_sec=1.0)
         for source, subscription in self._others:
-            for raw, info in subscription.take(self._until):
+            for raw, info in subscription.take(until):
                 taken.append((info["received_timestamp"], len(taken), source, raw))
         taken.sort()  # no two have the same number
         for when, _, source, raw in taken:
             self._recording.take(source, when, raw)
         self._recording.pause()
 
-    def _flush(self) -> None:
-        self._recording.flush()
-        if time.monotonic() >= self._index_at:
-            self._recording.index(self._until)
+    def _report(self, now: float) -> Status:
+        """How the recording is, at time `now` (monotonic s)."""
+        recording, matched = self._recording, self._status is not None
+        return Status(
+            Level.OK if matched else Level.WARN,
+            "recording" if matched else "not yet matched with all publishers of the loop",
+            {
+                "run": recording.run or None,
+                "bag": str(recording.path.resolve()),
+                "matched": matched,
+                "messages": recording.messages,
+                "messages/s": self._rate.per_second(recording.messages, now),
+            },
+        )
 
     def _look(self) -> None:
         """Read the ROS graph, and say when nothing can be missed any more."""

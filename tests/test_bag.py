@@ -167,23 +167,20 @@ def test_the_hash_of_a_type_is_that_of_the_installed_ros(source):
     } in hashes
 
 
-def test_an_episode_is_found_through_the_index(tmp_path):
+def test_an_episode_is_found_by_its_number(tmp_path):
     bag = Bag(written(tmp_path))
-    assert [(row["episode"], row["complete"]) for row in bag.index()] == [(7, True), (8, True)]
+    assert [(e.number, e.missing) for e in bag.episodes()] == [(7, []), (8, [])]
     (found,) = bag.find(8)
     assert found.missing == []
     states, actions = found.trajectory()
     assert states.shape == (6, 1, 16) and actions.shape == (5, 1, 4)
     assert np.array_equal(states[3], frame(3, 1, 16, episode=8).values)
-    row = bag.index()[1]
-    between = list(bag.messages(row["first"], row["last"] + 1))
-    assert len(between) == 14  # nothing else had to be read
+    assert len(list(bag.messages(found.first, found.last + 1))) == 14
     assert bag.parameters() == {RUN: {"n_z": 16}}
 
 
 def test_a_lost_sample_makes_the_episode_incomplete(tmp_path):
     bag = Bag(written(tmp_path, skip=2))
-    assert [row["missing"] for row in bag.index()] == [["1 of 6 states"]] * 2
     assert [episode.missing for episode in bag.episodes()] == [["1 of 6 states"]] * 2
 
 
@@ -192,7 +189,6 @@ def test_what_was_flushed_is_readable_without_an_end(tmp_path):
     recording = Recording(path, WHAT)
     recorded_episode(recording, 7)
     recording.flush()
-    recording.index(7 * SECOND)
     recorded_episode(recording, 8)  # never flushed: as if killed now
     path = killed(path)
     recording.close()
@@ -228,7 +224,6 @@ def test_a_file_that_ends_within_a_record_is_read_up_to_there(tmp_path, cut):
         recorded_episode(recording, episode)
         whole = (path / "bag.mcap").stat().st_size
         recording.flush()
-        recording.index(episode * SECOND)
     file = killed(path) / "bag.mcap"
     recording.close()
     os.truncate(file, whole + cut)
@@ -258,7 +253,6 @@ def test_a_full_disk_stops_the_recording_and_keeps_what_was_written(tmp_path):
             for episode in range(1000):
                 recorded_episode(recording, episode, steps=50)
                 recording.flush()
-                recording.index(episode * SECOND)
 
         with pytest.raises(BagError, match=r"No space left.*; recording stopped"):
             fill()
@@ -494,7 +488,7 @@ OLD = Path(__file__).parent / "data" / "bag_0_1"
 
 def test_a_bag_of_the_version_before_is_read_verified_and_identified_from(tmp_path):
     bag = Bag(OLD)
-    assert bag.finished and len(bag.index()) == len(list(bag.episodes())) == 5
+    assert bag.finished and len(list(bag.episodes())) == 5
     report = verify(OLD)
     assert (report.incomplete, len(report.notes)) == ([], 2), report.text()
     assert "another fingerprint of the plant" in report.notes[0]

@@ -23,9 +23,6 @@ from loop_interfaces.ros.introspection import Introspection
 from loop_interfaces.topics import COST, STATE, TARGET, VOID
 from pde_sim_node.diagnostics import PlantDiagnostics
 from pde_sim_node.lockstep import Timing
-from recorder_node.diagnostics import RecorderDiagnostics
-from recorder_node.recording import Recording
-from recorder_node.sources import sources
 from tests.small import parameters
 from tests.test_lockstep import RUN, answer, plant_protocol, run_episode, start
 from tests.test_session import ITERATIONS, Loop, values
@@ -260,18 +257,3 @@ def test_a_tuner_tells_how_far_it_is_who_is_missing_and_what_holds_it():
     assert health.report(50.0).message.endswith("stopping after it")
     restarted = Loop(build_training(values()), incarnation=3)
     assert TunerDiagnostics(restarted.session).report(0.0).values["restarts"] == 3
-
-
-def test_a_recorder_warns_until_it_is_matched_and_once_for_what_it_missed(tmp_path):
-    what = sources("/")
-    recording = Recording(tmp_path / "bag", what)
-    health = RecorderDiagnostics(recording)
-    assert health.report(0.0, matched=False).level is Level.WARN
-    good = health.report(1.0, matched=True)
-    assert (good.level, good.message) == (Level.OK, "recording")
-    recording.incomplete += 2
-    worse = health.report(2.0, matched=True)
-    assert worse.level is Level.WARN
-    assert worse.values["episodes incomplete"] == 2
-    assert health.report(3.0, matched=True).level is Level.OK
-    recording.close()

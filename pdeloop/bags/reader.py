@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.topics import TARGET
+from pdeloop.bags.episodes import EpisodeIndex, RecordedEpisode
 from pdeloop.bags.mcap_messages import Message, files, finished, read, text_of
 from recorder_node.bag import METADATA, BagError
-from recorder_node.episodes import EpisodeIndex, RecordedEpisode
-from recorder_node.recording import INDEX, PARAMETERS
+from recorder_node.recording import PARAMETERS
 from recorder_node.sources import source_of
 
 Array = NDArray[np.float64]
@@ -57,13 +57,8 @@ class Bag:
                     yield message
 
     def find(self, episode: int) -> Iterator[RecordedEpisode]:
-        """The episodes of this number: through the index, without a scan, if the bag has one."""
-        rows = [row for row in self.index() if row.get("episode") == episode]
-        for row in rows:
-            window = int(row["first"]), int(row["last"]) + 1
-            yield from (e for e in self.episodes(*window) if e.number == episode)
-        if not rows:
-            yield from (e for e in self.episodes() if e.number == episode)
+        """The episodes of this number; there may be one in each namespace."""
+        return (found for found in self.episodes() if found.number == episode)
 
     def target(self) -> Array | None:
         """The target z_r, which is among the first messages of a bag; None if it has none."""
@@ -72,16 +67,6 @@ class Bag:
             if source is not None and source.array is TARGET:
                 return source.codec.decode(message.data).values
         return None
-
-    def index(self) -> list[dict[str, Any]]:
-        """The recorder's index of episodes; empty if another recorder wrote the bag."""
-        rows = []
-        for line in text_of(self.path / INDEX).splitlines():
-            try:
-                rows.append(dict(json.loads(line)))
-            except (ValueError, TypeError, RecursionError):
-                continue  # the line that was being written when the recorder was killed
-        return rows
 
     def parameters(self) -> dict[int, dict[str, Any]]:
         """The nodes' parameters by run, as far as the bag or the run's folder knows them."""
@@ -96,7 +81,7 @@ class Bag:
     ) -> Iterator[RecordedEpisode]:
         """The episodes in the order of their ends, each when nothing more of it is to come.
 
-        start, stop: only what lies in this time (ns), as `index` gives it for an episode.
+        start, stop: only the messages that arrived in [start, stop) ns.
         """
         index, known = EpisodeIndex(), cache(source_of)
         for message in self.messages(start, stop):

@@ -23,10 +23,10 @@ from loop_interfaces.parameters import PLANT, as_recorded, table, with_budget
 from loop_interfaces.spec import check, read_yaml
 from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn, noise_seeds
 from pde_sim_node.build import fingerprint
+from pdeloop.bags.episodes import RecordedEpisode
 from pdeloop.bags.reader import bags_of
 from pdeloop.episode import rollout
 from pdeloop.in_process import LocalPair, cost_table
-from recorder_node.episodes import RecordedEpisode
 from tuner_node.batch import Batch, BatchResult
 from tuner_node.build import build_training
 from tuner_node.optimizers import NEED_TRAJECTORIES, Trajectory

@@ -5,20 +5,24 @@ Needs no ROS: what was on the topics is in the bag.
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import signal
 import threading
 import time
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, NamedTuple
 
+from loop_interfaces.frames import Frame
 from pdeloop.display import ProgressFile
 from pdeloop.monitor.finder import Finder, run_id
 from pdeloop.monitor.names import component_names, short
 from tuner_node.results import RunFolder
 from viewer_node.loop_view import LoopView
 from viewer_node.web.page import Page, Recorded, ShowEpisode
+
+if TYPE_CHECKING:  # both need the extra `record`
+    from pdeloop.bags.episodes import Key, RecordedEpisode
 
 REFRESH = 0.5
 """Period (s) of updating rates and progress, and of checking whether a run goes on again."""
@@ -36,79 +40,77 @@ class Replay:
                 self._view.curve.row(row)
         values = RunFolder(folder).values()
         self._view.components = component_names(values)
-        self._bag = _RecordedEpisodes(folder)
-        self._recorded = Recorded(
-            finished=(folder / "result.json").is_file(),
-            episodes=len(self._bag.rows),
-            note=self._bag.note,
-        )
+        recorded = Recorded(finished=(folder / "result.json").is_file())
+        recorded.note = "Looking for recorded episodes."
         with page.lock:
-            page.show(self._view, folder=short(folder), recorded=self._recorded)
+            page.show(self._view, folder=short(folder), recorded=recorded)
             page.take_parameters(values)
         page.refresh(time.monotonic())  # before the bag is read, which may take seconds
-        if self._bag.rows:
-            self.show(len(self._bag.rows) - 1)
+        self._recorded, self._episodes = recorded, list[_Place]()
+        self._open(folder)
+        recorded.episodes = len(self._episodes)
+        if self._episodes:
+            self.show(len(self._episodes) - 1)
+        else:
+            page.refresh(time.monotonic())
 
-    def show(self, index: int) -> None:
-        """Show the recorded episode of this index, from its newest state."""
-        episode, view, now = self._bag.read(index), self._view, time.monotonic()
-        with self._page.lock:
-            view.current = view.finished = None
-            if episode is not None:
-                known = (episode.bases, episode.policy, episode.start)
-                for frame, take in zip(known, (view.model, view.policy, view.start), strict=True):
-                    if frame is not None:
-                        take(frame, now)
-                for step, frame in sorted(episode.states.items()):
-                    if self._bag.target is not None:
-                        view.targets[frame.plant] = self._bag.target
-                    view.state(frame, now)
-                    if step in episode.actions:
-                        view.action(episode.actions[step], now)
-                if episode.cost is not None:
-                    view.cost(episode.cost, now)
-            self._recorded.chosen = index
-            self._recorded.label = self._bag.label(index)
-        self._page.refresh(now)
-
-
-class _RecordedEpisodes:
-    """The episodes in the bag of a run; without rows and with a note if there are none.
-
-    rows: of the recorder's index.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self.rows: list[Mapping[str, Any]] = []
-        self.target, self.note = None, ""
+    def _open(self, folder: Path) -> None:
+        """Find the episodes in the bag of the run, if it has one."""
+        recorded = self._recorded
         try:
             from pdeloop.bags.reader import Bag
             from recorder_node.bag import BagError
         except ModuleNotFoundError as error:
-            self.note = f"Its episodes need {error.name}: pip install 'pdeloop[record]'"
+            recorded.note = f"Its episodes need {error.name}: pip install 'pdeloop[record]'"
             return
-        try:
+        recorded.note = "The episodes of this run were not recorded (pdeloop train --record)."
+        with contextlib.suppress(BagError):
             self._bag = Bag(folder)
-            self.rows = [row for row in self._bag.index() if "episode" in row]
-            self.target = self._bag.target()
-        except BagError:
-            self.note = "The episodes of this run were not recorded (pdeloop train --record)."
+            self._target = self._bag.target()
+            for e in self._bag.episodes():
+                self._episodes.append(_Place(e.key, e.first, e.last, e.bases, _label(e)))
 
-    def read(self, index: int) -> Any:
-        """The recorded episode, None if the bag lacks it."""
-        row = self.rows[index]
-        found = self._bag.find(int(row["episode"]))
-        return next((e for e in found if e.key[0] == row.get("namespace", e.key[0])), None)
+    def show(self, index: int) -> None:
+        """Show the recorded episode of this index, from its newest state."""
+        place, view, now = self._episodes[index], self._view, time.monotonic()
+        around = self._bag.episodes(place.first, place.last + 1)
+        episode = next(e for e in around if e.key == place.key)
+        with self._page.lock:
+            view.current = view.finished = None
+            known = (place.models, episode.policy, episode.start)
+            for frame, take in zip(known, (view.model, view.policy, view.start), strict=True):
+                if frame is not None:
+                    take(frame, now)
+            for step, frame in sorted(episode.states.items()):
+                if self._target is not None:
+                    view.targets[frame.plant] = self._target
+                view.state(frame, now)
+                if step in episode.actions:
+                    view.action(episode.actions[step], now)
+            if episode.cost is not None:
+                view.cost(episode.cost, now)
+            self._recorded.chosen, self._recorded.label = index, place.label
+        self._page.refresh(now)
 
-    def label(self, index: int) -> str:
-        """The episode in words."""
-        row = self.rows[index]
-        words = [f"episode {int(row['episode']) % 2**32}"]
-        words += ["exploration"] if row.get("exploratory") else []
-        words += [f"{row['environments']} environments"] if row.get("environments") else []
-        words += [str(row["namespace"])] if row.get("namespace", "/") != "/" else []
-        words += [f"incomplete: {', '.join(row['missing'])}"] if row.get("missing") else []
-        return ", ".join(words)
+
+class _Place(NamedTuple):
+    """Where a recorded episode is: its first and last time (ns), the models it is about, its words."""
+
+    key: Key
+    first: int
+    last: int
+    models: Frame | None
+    label: str
+
+
+def _label(episode: RecordedEpisode) -> str:
+    """An episode in words."""
+    words = [f"episode {episode.number % 2**32}"]
+    words += ["exploration"] if episode.exploratory else []
+    words += [f"{episode.environments} environments"] if episode.environments else []
+    words += [episode.key[0]] if episode.key[0] != "/" else []
+    words += [f"incomplete: {', '.join(episode.missing)}"] if episode.missing else []
+    return ", ".join(words)
 
 
 def stop_event() -> threading.Event:

@@ -235,14 +235,14 @@ def test_a_run_that_is_over_opens_with_its_curve_its_seeds_and_its_recorded_epis
     page.wait_for(lambda: page.ask(PAINTED % "curve") > 20, LIMIT, "picture of the curve")
 
     bag = Bag(out)
-    target, index = bag.target(), bag.index()
+    target, index = bag.target(), list(bag.episodes())
     move = (
         "(() => { const s = document.querySelector('%s'); s.value = '%d';"
         " for (const kind of ['input', 'change']) s.dispatchEvent(new Event(kind)); })()"
     )
     for chosen in (len(index) - 1, 1):
         page.ask(move % ("#recorded", chosen))
-        number = index[chosen]["episode"]
+        number = index[chosen].number
         page.until(f"{FIELD}.includes('episode {number % 2**32} ')", LIMIT)
         (episode,) = bag.find(number)
         for step in (0, 7):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import signal
@@ -46,8 +45,8 @@ def test_a_recorded_run_is_complete_and_everything_in_it_is_recomputed(recorded)
     assert report.episodes == EPISODES
     assert report.compared["policies"] == report.compared["costs"] - 2
     assert report.compared["steps"] == report.compared["costs"] * STEPS
-    index = Bag(recorded).index()
-    assert [row["complete"] for row in index] == [True] * EPISODES
+    episodes = list(Bag(recorded).episodes())
+    assert [episode.missing for episode in episodes] == [[]] * EPISODES
     found = {topic: set() for topic in ("/state", "/clock")}  # a busy plant may repeat a state
     for message in Bag(recorded).messages():
         found.setdefault(message.topic, set()).add(message.data)
@@ -152,7 +151,6 @@ def test_identify_needs_nothing_but_the_topics_of_a_foreign_plant(recorded, tmp_
     copy = tmp_path / "bag"
     shutil.copytree(recorded / "bag", copy)
     (copy / "parameters.json").unlink()
-    (copy / "episodes.jsonl").unlink()
     found = identify_bag(copy, {"reduced_order": 4}, environment=0)
     with np.load(recorded / "policy.npz") as live:
         assert same_bits(pack(found.model), live["model"][0])
@@ -338,12 +336,7 @@ def test_one_recorder_records_several_pairs(loop, tmp_path):
     assert_same_training(tmp_path / "run", in_process(seeds=2))
     report = verify(tmp_path / "bag")
     assert (report.count, report.incomplete, report.notes) == (0, [], []), report.text()
-    namespaces = {json.loads(line)["namespace"] for line in _index(tmp_path / "bag")}
-    assert namespaces == {"/a", "/b"}
-
-
-def _index(bag: Path) -> list[str]:
-    return (bag / "episodes.jsonl").read_text().splitlines()
+    assert {e.key[0] for e in Bag(tmp_path / "bag").episodes()} == {"/a", "/b"}
 
 
 def test_a_killed_recorder_is_started_again_and_goes_on_in_another_bag(loop, tmp_path):

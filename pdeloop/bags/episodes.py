@@ -1,13 +1,12 @@
 """The episodes of a bag: what belongs to each, and whether all of it was recorded. Pure.
 
-The recorder follows the messages with it as they arrive, and who reads a bag as they are read.
+A reader follows the messages with it in the order in which they were recorded.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,10 +29,9 @@ from loop_interfaces.topics import (
 from recorder_node.sources import Source
 
 Array = NDArray[np.float64]
-SETTLING = 0.3
-"""Seconds after an episode's cost in which its other messages may still come in."""
-MODEL_SETTLING = 10.0
-"""The same after an exploratory episode, whose model is still to come."""
+SETTLING, MODEL_SETTLING = 0.3, 10.0
+"""Seconds after an episode's last message in which further ones may still come; the longer ones for an
+episode without its cost or its model."""
 REMEMBERED = 1000
 """Episodes that were taken out and whose late messages are recognised as such."""
 
@@ -65,8 +63,6 @@ class RecordedEpisode:
         Samples that were recorded more than once.
     contradictions : list of str
         Messages that were recorded twice with different content, in words.
-    cost_at : int or None
-        Arrival of its cost.
     """
 
     key: Key
@@ -82,7 +78,6 @@ class RecordedEpisode:
     bases: Frame | None = None
     repeats: int = 0
     contradictions: list[str] = field(default_factory=list)
-    cost_at: int | None = None
 
     @property
     def number(self) -> int:
@@ -132,23 +127,20 @@ class RecordedEpisode:
         states = [self.states[k].values for k in range(self.horizon + 1)]
         return np.stack(states), np.stack([self.actions[k].values for k in range(self.horizon)])
 
-    def settled(self, now: int) -> bool:
-        """Whether nothing more is expected of it at time `now` (ns)."""
-        if self.cost_at is None:
-            return False
-        waits = self.exploratory and self.model is None and self.failure is None and not self.void
-        return now - self.cost_at > (MODEL_SETTLING if waits else SETTLING) * 1e9
+    def over(self, now: int, newest: int) -> bool:
+        """Whether nothing more is expected of it at time `now` (ns).
 
-    def given_up(self, now: int, newest: int) -> bool:
-        """Whether it got no cost and has a successor, with number `newest`, of some age at `now` (ns).
-
-        Episodes of a pair follow each other.
+        Episodes of a pair follow each other: one without a cost is given up when there is a later one,
+        `newest` being the largest number.
         """
-        unended = self.cost is None and self.number < newest
-        return unended and now - self.last > MODEL_SETTLING * 1e9
+        if self.cost is None and self.number >= newest:
+            return False
+        model = self.model is not None or self.failure is not None or self.void
+        waits = self.cost is None or (self.exploratory and not model)
+        return now - self.last > (MODEL_SETTLING if waits else SETTLING) * 1e9
 
-    def put(self, source: Source, when: int, frame: Frame) -> None:
-        """Keep a message that arrived at `when` (ns)."""
+    def put(self, source: Source, frame: Frame) -> None:
+        """Keep a message."""
         assert source.array is not None
         topic, before = source.array, None
         if topic in (STATE, ACTION):
@@ -158,30 +150,10 @@ class RecordedEpisode:
         else:
             before = getattr(self, _ONCE[topic])
             setattr(self, _ONCE[topic], frame)
-            if topic is COST:
-                self.cost_at = when
         if before is not None and before.values.tobytes() != frame.values.tobytes():
             self.contradictions.append(
                 f"{topic.name} of step {frame.step} was recorded twice with different values"
             )
-
-    def row(self) -> dict[str, Any]:
-        """Its line in the index."""
-        missing = self.missing
-        return {
-            **dict(zip(("namespace", "run", "episode"), self.key, strict=True)),
-            "first": self.first,
-            "last": self.last,
-            "environments": self.environments,
-            "exploratory": self.exploratory,
-            "horizon": self.horizon,
-            "void": self.void,
-            "states": len(self.states),
-            "actions": len(self.actions),
-            "repeats": self.repeats,
-            "complete": not missing,
-            "missing": missing,
-        }
 
 
 class EpisodeIndex:
@@ -210,16 +182,14 @@ class EpisodeIndex:
             return None  # the run is over: no episode
         episode = self._find((source.namespace, frame.run, frame.episode), when)
         if episode is not None:
-            episode.put(source, when, frame)
+            episode.put(source, frame)
         return episode
 
     def take_over(self, now: int | None) -> list[RecordedEpisode]:
         """Take out the episodes of which nothing more is expected at time `now` (ns); None: all."""
         newest = max((e.number for e in self._open.values()), default=-1)
         done = [
-            episode
-            for episode in self._open.values()
-            if now is None or episode.settled(now) or episode.given_up(now, newest)
+            episode for episode in self._open.values() if now is None or episode.over(now, newest)
         ]
         for episode in done:
             if episode.start is not None:
