@@ -1,24 +1,24 @@
 """`pdeloop bag verify`: computes a recorded run again and compares it bit by bit.
 
 Every complete episode is run again from its seeds, policies and models (or the excitation's seed):
-initial fields, actions, states, costs, and the reduced model after exploration. Of the run, every
-policy and its models follow from the costs before it, by running the tuner's own training on the
-recorded costs.
+initial fields, actions, states, costs, and the reduced model after exploration. The whole training is
+run again, too: every recorded policy, with its models, must be one that it asks for.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from controller_node.identification import DesignSettings, design
 from loop_interfaces import model_rows
+from loop_interfaces.frames import Frame
 from loop_interfaces.parameters import PLANT, as_recorded, table, with_budget
 from loop_interfaces.spec import check, read_yaml
 from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn, noise_seeds
@@ -27,11 +27,8 @@ from pdeloop.bags.episodes import RecordedEpisode
 from pdeloop.bags.reader import bags_of
 from pdeloop.episode import rollout
 from pdeloop.in_process import LocalPair, cost_table
-from tuner_node.batch import Batch, BatchResult
+from tuner_node.batch import Batch
 from tuner_node.build import build_training
-from tuner_node.optimizers import NEED_TRAJECTORIES, Trajectory
-from tuner_node.training import Training
-from tuner_node.trajectory_collector import cut
 
 Array = NDArray[np.float64]
 _TUNERS = ("seed", "seeds", "rollouts", "iterations", "start", "optimizer")
@@ -123,22 +120,15 @@ def _complete(values: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
     return values if told else None
 
 
-class _Rollout(NamedTuple):
-    """What one environment of an episode gave."""
-
-    episode: RecordedEpisode
-    environment: int
-    cost: Array
-    model: Array | None
-    trajectory: Trajectory | None
-
-
 class _Run:
     """The episodes of one run, and what they must be."""
 
     def __init__(self, number: int, values: Mapping[str, Any] | None, report: Report) -> None:
         self._name, self._report = f"run {number}", report
-        self._rollouts: dict[bytes, _Rollout] = {}
+        self._rollouts: dict[bytes, list[str]] = {}
+        """What was recorded, in words, by what identifies a rollout (`_keys`)."""
+        self._models: dict[int, Frame] = {}
+        """The models that policies are about, by their number."""
         self._values: dict[str, Any] | None = None
         if values is None:
             self._note(
@@ -170,12 +160,12 @@ class _Run:
                 f"{self._fingerprint}): its parameters or the source of its equation are others. "
                 "What it computes is compared all the same"
             )
-        self._keep(episode, where)
+        self._keep(episode)
         if not episode.missing:
             self._run_again(episode, where)
 
     def finish(self) -> None:
-        """Run the training again on the recorded costs."""
+        """Run the training again, until it has asked for all that was recorded."""
         if self._values is None or not self._rollouts:
             return
         if unknown := [name for name in _TUNERS if name not in self._given]:
@@ -183,76 +173,40 @@ class _Run:
                 f"the tuner's {', '.join(unknown)} not known, so its policies cannot be followed"
             )
             return
-        if not any(rollout.episode.exploratory for rollout in self._rollouts.values()):
-            self._note(
-                "its exploratory episode is not here, so its policies cannot be followed (give the "
-                "folder of the run, or all its bags)"
-            )
-            return
         training = build_training({**self._values, "plant": self._fingerprint})
-        unused = dict(self._rollouts)
-        while (batch := training.next_batch()) is not None:
-            keys = _keys(batch.rows, batch.policies, training.generation)
-            if absent := [i for i, key in enumerate(keys) if key not in self._rollouts]:
-                self._explain(batch, absent[0], list(unused.values()), training)
-                return
-            rollouts = [self._rollouts[key] for key in keys]
-            for key in keys:
-                unused.pop(key, None)
-            models = [r.model for r in rollouts if batch.exploratory and r.model is not None]
-            if batch.exploratory and len(models) < len(keys):
-                self._note("a model is missing, so the training is not followed further")
-                return
-            if batch.policies is not None:
-                self._report.compared["policies"] += len(keys)
-                self._compare_models(training, rollouts)
-            seen = [r.trajectory for r in rollouts if r.trajectory is not None]
-            if batch.trajectories and len(seen) < len(keys):
-                self._note(
-                    f"samples of an episode after rollout {sum(training.progress['rollouts'])} are "
-                    "missing, and the optimiser used them, so the training is not followed further"
-                )
-                return
-            training.finish(
-                BatchResult(
-                    np.stack([r.cost for r in rollouts]),
-                    np.stack(models) if models else None,
-                    self._fingerprint,
-                    seen if batch.trajectories else None,
-                    self._pair.plant.target,
-                )
-            )
-        if unused:
-            number = next(iter(unused.values())).episode.number
-            self._report.differs(f"episode {number} is none of those that the training asks for")
+        pair = LocalPair(self._values, self._pair.plant)
+        pair.follow(training)
+        unseen = dict(self._rollouts)
+        while unseen and (batch := training.next_batch()) is not None:
+            for key in _keys(batch.rows, batch.policies, training.generation):
+                found = len(unseen.pop(key, ()))
+                self._report.compared["policies"] += found * (not batch.exploratory)
+            if batch.policies is not None and (
+                known := self._models.pop(training.generation, None)
+            ):
+                assert training.models is not None
+                where = f"models number {known.step} of {self._name}"
+                self._report.compare("models", where, known.values, training.models)
+            training.finish(pair.run(batch, self._values["max_batch"]))
+            pair.follow(training)
+        for places in unseen.values():
+            for place in places:
+                self._report.differs(f"policy of {place}: the training asks for none like it")
 
     def _note(self, text: str) -> None:
         self._report.notes.append(f"{self._name}: {text}")
 
-    def _compare_models(self, training: Training, rollouts: Sequence[_Rollout]) -> None:
-        """The models that rollouts were about, against those of the repeated training."""
-        assert training.models is not None
-        bases = {id(frame): frame for r in rollouts if (frame := r.episode.bases) is not None}
-        for frame in bases.values():
-            where = f"models number {frame.step} of {self._name}"
-            self._report.compare("models", where, frame.values, training.models)
-
-    def _keep(self, episode: RecordedEpisode, where: str) -> None:
-        """Note what each rollout of the episode gave, for the repetition of the training."""
-        assert self._values is not None and episode.start is not None and episode.cost is not None
-        if (episode.model if episode.exploratory else episode.policy) is None:
+    def _keep(self, episode: RecordedEpisode) -> None:
+        """Note what the rollouts of an episode were, to be looked for in the training."""
+        assert episode.start is not None
+        if episode.policy is None and not episode.exploratory:
             return
         policies = None if episode.policy is None else episode.policy.values
-        seen: Sequence[Trajectory | None] = [None] * episode.environments
-        if self._values["optimizer"] in NEED_TRAJECTORIES and not episode.missing:
-            seen = cut(*episode.trajectory(), episode.cost.values[:, CostColumn.ENDED])
         for i, key in enumerate(_keys(episode.start.values, policies, episode.start.step)):
-            model = None if episode.model is None else episode.model.values[i]
-            found = _Rollout(episode, i, episode.cost.values[i], model, seen[i])
-            known = self._rollouts.setdefault(key, found)
-            if known is not found:
-                text = f"cost of {where}, repeating episode {known.episode.number}"
-                self._report.compare("repeated rollouts", text, found.cost, known.cost)
+            place = f"episode {episode.number}, environment {i}"
+            self._rollouts.setdefault(key, []).append(place)
+        if episode.bases is not None:
+            self._models[episode.bases.step] = episode.bases
 
     def _run_again(self, episode: RecordedEpisode, where: str) -> None:
         """The whole episode from its seeds, under its policies or its excitation."""
@@ -289,44 +243,6 @@ class _Run:
                 own = design([(states[:, env], actions[:, env])], plant.target, settings)
                 text = f"model of {where}, environment {env}"
                 report.compare("rows of models", text, model, model_rows.pack(own))
-
-    def _explain(
-        self, batch: Batch, index: int, unused: Sequence[_Rollout], training: Training
-    ) -> None:
-        """Say why the training wants a rollout that is not in the bag."""
-        report, rollouts = self._report, sum(training.progress["rollouts"])
-        if not unused:
-            self._note(
-                f"the bag ends after rollout {rollouts}; up to there the training was followed"
-            )
-            return
-        row = batch.rows[index]
-        for r in unused:
-            start, policy = r.episode.start, r.episode.policy
-            assert start is not None
-            same = start.step == training.generation and np.array_equal(
-                start.values[r.environment], row
-            )
-            if same and policy is not None and batch.policies is not None:
-                report.compare(
-                    "policies",
-                    f"policy of episode {r.episode.number}, environment {r.environment}, "
-                    f"after rollout {rollouts}",
-                    policy.values[r.environment],
-                    batch.policies[index],
-                )
-                return
-        if report.incomplete:
-            self._note(
-                f"an episode after rollout {rollouts} is not in the bag, so the training is not "
-                "followed further"
-            )
-            return
-        report.differs(
-            f"after rollout {rollouts} the training asks for a rollout from seed "
-            f"{int(row[StartColumn.SEED])} with models number {training.generation}, which is not in "
-            f"the bag; episode {unused[0].episode.number} has another one"
-        )
 
 
 def _keys(rows: Array, policies: Array | None, models: int) -> list[bytes]:
