@@ -19,7 +19,7 @@ DONE, FAILED, CRASHED, INTERRUPTED, NOBODY_READS = 0, 1, 70, 130, 141
 """Exit codes; 2, a command that is not understood, is argparse's."""
 COMMANDS = (
     *("train", "evaluate", "identify", "bag", "monitor", "reproduce"),
-    *("study", "problems", "new", "check", "completion"),
+    *("study", "problems", "new", "check"),
 )
 """The modules of `pdeloop.commands`, in the order of the help."""
 _EXTRAS = {
@@ -28,7 +28,6 @@ _EXTRAS = {
     "matplotlib": "report",
     "jinja2": "report",
     "aiohttp": "monitor",
-    "shtab": "completion",
     "gymnasium": "gym",
     "distributed": "cluster",
     "cmaes": "bench",
@@ -42,6 +41,10 @@ _MESSAGES = ("_msgs", "_srvs")
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Console script `pdeloop`."""
+    if "_ARGCOMPLETE" in os.environ:  # called by a shell, to complete a line
+        import argcomplete
+
+        argcomplete.autocomplete(parser())
     return run(parser, arguments)
 
 
@@ -105,7 +108,6 @@ def parser() -> argparse.ArgumentParser:
     for name in COMMANDS:
         # Imported here, where `main` catches Ctrl-C: it takes most of a short command's time.
         importlib.import_module(f"pdeloop.commands.{name}").add(commands)
-    root.set_defaults(root=root)  # for what is made from the parser itself
     return root
 
 

@@ -171,12 +171,6 @@ def test_a_bug_is_a_traceback_and_a_code_of_its_own(monkeypatch, capsys) -> None
     assert "Traceback" in capsys.readouterr().err
 
 
-def test_a_missing_extra_is_named(monkeypatch, capsys) -> None:
-    monkeypatch.setitem(sys.modules, "shtab", None)
-    assert main(["completion", "bash"]) == 1
-    assert capsys.readouterr().err == "pdeloop: needs shtab: pip install 'pdeloop[completion]'\n"
-
-
 def test_a_machine_without_ros_is_told_what_to_do(monkeypatch, capsys, tmp_path: Path) -> None:
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda n: None if n == "rclpy" else find(n))
@@ -334,12 +328,12 @@ def test_every_optional_part_that_is_not_installed_is_named_in_one_line(tmp_path
     """All optional modules are missing; each command names the extra that it needs."""
     code = f"""
 import contextlib, io, sys
-for name in ("rclpy", "rosbags", "mcap", "aiohttp", "matplotlib", "shtab", "std_msgs"):
+for name in ("rclpy", "rosbags", "mcap", "aiohttp", "matplotlib", "std_msgs"):
     sys.modules[name] = None
 from pdeloop.cli import main
 run = {str(tmp_path / "run")!r}
 assert main(["train", {str(SMALL)!r}, "--in-process", "--rollouts", "11", "--out", run]) == 0
-for words in (["monitor"], ["report", run], ["completion", "bash"], ["bag", "info", run],
+for words in (["monitor"], ["report", run], ["bag", "info", run],
               ["identify", "--bag", run],
               ["train", {str(SMALL)!r}, "--record", "--out", run + "2"],
               ["train", {str(SMALL)!r}, "--out", run + "3"]):
@@ -358,7 +352,7 @@ for words in (["monitor"], ["report", run], ["completion", "bash"], ["bag", "inf
     )
     assert done.returncode == 0, done.stderr
     lines = [line for line in done.stdout.splitlines() if line.startswith("@")]
-    assert len(lines) == 7, done.stdout
+    assert len(lines) == 6, done.stdout
     said = r"@ 1 .*\| pdeloop: needs \w+: .*pip install 'pdeloop\[\w+\]'[^|]*\|"
     for line in lines:
         assert re.fullmatch(said, line), line
@@ -406,12 +400,18 @@ def test_durations_are_in_words(seconds: float, words: str) -> None:
 
 
 SHELLS = {
-    "bash": (["bash", "--norc", "--noprofile", "-i"], 'eval "$({} completion bash)"'),
+    "bash": (
+        ["bash", "--norc", "--noprofile", "-i"],
+        'eval "$(register-python-argcomplete pdeloop)"',
+    ),
     "zsh": (
         ["zsh", "-f", "-i"],
-        'autoload -Uz compinit; compinit -u -D; eval "$({} completion zsh)"',
+        'autoload -Uz compinit; compinit -u -D; eval "$(register-python-argcomplete pdeloop)"',
     ),
-    "fish": (["fish", "--no-config", "-i"], "{} completion fish | source"),
+    "fish": (
+        ["fish", "--no-config", "-i"],
+        "register-python-argcomplete --shell fish pdeloop | source",
+    ),
 }
 
 
@@ -423,10 +423,10 @@ def test_a_real_shell_completes(shell: str, tmp_path: Path) -> None:
     (tmp_path / "zzz-own.yaml").write_text("")
     (tmp_path / "zzz-other.txt").write_text("")
     (tmp_path / "runs").mkdir()
-    program = shlex.join(PDELOOP)
-    home = {"HOME": str(tmp_path), "PYTHONPATH": str(ROOT), "PS1": "$ "}
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    home = {"HOME": str(tmp_path), "PYTHONPATH": str(ROOT), "PS1": "$ ", "PATH": path}
     with terminal(*command, cwd=tmp_path, **home) as shown:
-        shown.type(load.format(program) + "; echo load''ed\n")
+        shown.type(load + "; echo load''ed\n")
         shown.until("loaded")
         for typed, completed in (
             ("pdeloop tra", "pdeloop train "),

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import TypeAlias
 
 from loop_interfaces.parameters import PROBLEM, TUNER, flags
+from loop_interfaces.problem import shipped_problems
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 """Where a command adds its parser."""
@@ -56,6 +57,20 @@ def allow_equation(options: argparse.Namespace) -> dict[str, str]:
     from pde_sim_node.equations import allow
 
     return {"equation": allow(options.equation)}
+
+
+def add_problem(
+    parser: argparse._ActionsContainer, help: str, name: str = "problem", nargs: str = "?"
+) -> None:
+    """The positional argument PROBLEM, which shells complete to shipped names and YAML files."""
+    action = parser.add_argument(name, nargs=nargs, metavar="PROBLEM", help=help)
+
+    def complete(prefix: str, **_: object) -> list[str]:
+        from argcomplete.completers import FilesCompleter
+
+        return [*shipped_problems(), *FilesCompleter(["yaml"])(prefix)]
+
+    action.completer = complete  # type: ignore[attr-defined]  # as argcomplete asks for it
 
 
 def add_flags(parser: argparse._ActionsContainer, group: str) -> None:

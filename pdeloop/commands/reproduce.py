@@ -12,6 +12,7 @@ from pdeloop.commands.common import (
     DEFAULTS,
     Commands,
     add_equation,
+    add_problem,
     allow_equation,
     command,
 )
@@ -42,7 +43,7 @@ def _add_reproduce(commands: Commands) -> None:
         example="pdeloop reproduce burgers kdv --seeds 6 --out runs/paper",
     )
     add = reproduce.add_argument
-    add("problems", nargs="*", metavar="PROBLEM", help="shipped names or YAML files [the paper's]")
+    add_problem(reproduce, "shipped names or YAML files [the paper's]", "problems", "*")
     add("--seeds", type=int, metavar="N", help="trainings of each problem, side by side [6]")
     add("--iterations", type=int, metavar="N", help="iterations of the adapt phase [40]")
     add("--seed", type=int, metavar="S", help="the first seed [0]")

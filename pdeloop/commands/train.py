@@ -12,6 +12,7 @@ from pdeloop.commands.common import (
     add_equation,
     add_flags,
     add_json,
+    add_problem,
     allow_equation,
     command,
     given_flags,
@@ -31,13 +32,8 @@ def add(commands: Commands) -> None:
         example="pdeloop train burgers --rollouts 80 --seed 0",
     )
     problem = train.add_argument_group("problem")
-    add = problem.add_argument
-    add(
-        "problem",
-        nargs="?",
-        metavar="PROBLEM",
-        help=f"{', '.join(shipped_problems())}, or the path of a problem's YAML file",
-    )
+    names = ", ".join(shipped_problems())
+    add_problem(problem, f"{names}, or the path of a problem's YAML file")
     add_equation(problem)
     add_flags(problem, "problem")
     method = train.add_argument_group("budget and method")
