@@ -222,7 +222,7 @@ def test_the_command_runs_continues_and_refuses_another_study(
 def test_an_interrupted_command_ends_its_processes_in_the_middle(tmp_path: Path):
     file, out = tmp_path / "study.yaml", tmp_path / "out"
     endless = {"rollouts": 2_000_000, "optimizer": "two_point"}
-    file.write_text(json.dumps({"problems": [str(SMALL)], "seeds": 2, "settings": endless}))
+    file.write_text(json.dumps({"problems": [str(SMALL)], "seeds": 9, "settings": endless}))
     words = [sys.executable, "-m", "pdeloop.cli", "study", str(file), "--out", str(out)]
     process = subprocess.Popen(
         [*words, "--processes", "2"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
@@ -230,12 +230,13 @@ def test_an_interrupted_command_ends_its_processes_in_the_middle(tmp_path: Path)
     assert process.stdout is not None
     try:
         # A busy machine may say first that it compiles.
-        assert any("0 of 2 trainings" in line for line in process.stdout)
+        assert any("0 of 9 trainings" in line for line in process.stdout)
         process.send_signal(signal.SIGINT)
         told, _ = process.communicate(timeout=LIMIT)
     finally:
         process.kill()
     assert process.returncode == 130 and f"continue with: pdeloop study --out {out}" in told
+    assert "Traceback" not in told, told
     assert not list(out.rglob("result.json"))
 
 
@@ -293,6 +294,15 @@ def test_a_dask_cluster_that_loses_a_worker_gives_the_same_bits(
 
         assert run(Study.of(CONTENT), out, partial(cluster, address), tell=kill_one) == []
         assert workers[0].wait(LIMIT) == -signal.SIGKILL and workers[1].poll() is None
+
+        def kill_the_other(done: int, total: int, status: str) -> None:
+            if workers[1].poll() is None:
+                os.kill(workers[1].pid, signal.SIGKILL)
+            if "no worker is left, waiting for one: dask worker tcp" in status:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            run(Study.of(CONTENT), tmp_path / "no", partial(cluster, address), tell=kill_the_other)
     assert contents(out) == contents(reference)
 
 

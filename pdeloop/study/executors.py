@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import multiprocessing
 import signal
 import warnings
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import contextmanager
 from importlib import metadata
 from typing import Any
 
@@ -23,7 +23,7 @@ RETRIES = 3
 """How often a cluster may begin a training again whose worker has gone."""
 
 
-@contextmanager
+@contextlib.contextmanager
 def processes(count: int | None = None) -> Iterator[Executor]:
     """So many processes of this machine, a core each; as many as cores by default.
 
@@ -35,6 +35,7 @@ def processes(count: int | None = None) -> Iterator[Executor]:
         try:
             yield pool
         except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
             for process in multiprocessing.active_children():
                 if process.pid not in others:
                     process.terminate()
@@ -49,7 +50,7 @@ def _begin() -> None:
     use_cores(usable_cores()[:1])  # the others have trainings of their own
 
 
-@contextmanager
+@contextlib.contextmanager
 def cluster(address: str) -> Iterator[Executor]:
     """The workers of the Dask scheduler at `address` (tcp://HOST:PORT).
 
@@ -85,7 +86,34 @@ def cluster(address: str) -> Iterator[Executor]:
                 raise StudyError(
                     f"the worker at {at} has no pdeloop; install pdeloop[cluster] there"
                 )
-        yield client.get_executor(retries=RETRIES)
+        pool = client.get_executor(retries=RETRIES)
+        pool.client = client
+        try:
+            yield pool
+        except BaseException:
+            pool.shutdown(wait=False)
+            raise
+
+
+def no_worker(pool: Executor) -> str:
+    """That a Dask cluster has no worker left, in words; empty if it has, and for other executors.
+
+    Parameters
+    ----------
+    pool : Executor
+        Of `processes` or `cluster`, or any other.
+
+    Returns
+    -------
+    str
+        With the command that starts a worker; its trainings go on then.
+    """
+    client = getattr(pool, "client", None)
+    with contextlib.suppress(OSError):  # no scheduler, either: the trainings fail
+        if client is not None and not client.scheduler_info()["workers"]:
+            start = f"dask worker {client.scheduler.address} --nthreads 1"
+            return f"no worker is left, waiting for one: {start}"
+    return ""
 
 
 def _check_versions(versions: Mapping[str, str], own: str) -> None:

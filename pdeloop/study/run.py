@@ -8,6 +8,7 @@ DIR/PROBLEM/VARIANT/SEED/     parameters.yaml, policy.npz, result.json of a fini
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import (
     FIRST_COMPLETED,
@@ -24,13 +25,14 @@ from typing import Any, NamedTuple
 
 from loop_interfaces.files import make_folder, read_json, write_atomically
 from pdeloop.study.description import Study, StudyError
+from pdeloop.study.executors import no_worker
 from pdeloop.study.training import EnvironmentMismatchError, environment, train_one
 
 ASKED = "study.json"
 ATTEMPTS = 3
 """Executors that may break, as when the system kills a process for its memory."""
-POLL = 0.1
-"""Seconds between two calls of `tell`."""
+POLL, LOOK = 0.1, 2.0
+"""Seconds between two calls of `tell`, and between two looks for workers while nothing is done."""
 
 Progress = Callable[[int, int, str], None]
 Task = Callable[[Mapping[str, Any], Mapping[str, str] | None], dict[str, bytes]]
@@ -131,7 +133,7 @@ def run(
                     pool.submit(tasks.get(n.split("/")[1], train), v, expected): n
                     for n, v in todo.items()
                 }
-                _collect(waiting, folder, finished, failures, len(trainings), tell)
+                _collect(pool, waiting, folder, finished, failures, len(trainings), tell)
             return failures
         except (BrokenExecutor, CancelledError) as error:
             broken = error
@@ -142,6 +144,7 @@ def run(
 
 
 def _collect(
+    pool: Executor,
     waiting: dict[Future[dict[str, bytes]], str],
     folder: Path,
     finished: set[str],
@@ -150,34 +153,32 @@ def _collect(
     tell: Progress,
 ) -> None:
     """Write every result as it comes."""
-    status = ""
-    try:
-        while waiting:
-            tell(len(finished), total, status)
-            done, _ = wait(waiting, timeout=POLL, return_when=FIRST_COMPLETED)
-            for future in done:
-                status = waiting.pop(future)
-                try:
-                    files = future.result()
-                except EnvironmentMismatchError as error:
-                    raise StudyError(
-                        f"{error}: its results may differ in the last bits; install the same "
-                        "everywhere, or take them with --any-environment"
-                    ) from error
-                except (BrokenExecutor, CancelledError):
-                    raise
-                except (ValueError, RuntimeError) as error:
-                    failures.append(Failure(status, str(error)))
-                except Exception as error:  # of a worker: no memory, no disk, no pdeloop, given up
-                    failures.append(Failure(status, f"{type(error).__name__}: {error}"))
-                else:
-                    _write(folder / status, files)
-                finished.add(status)
-        tell(len(finished), total, status)
-    except BaseException:
-        for future in waiting:
-            future.cancel()
-        raise
+    status, lacking, look_at = "", "", time.monotonic() + LOOK
+    while waiting:
+        tell(len(finished), total, lacking or status)
+        done, _ = wait(waiting, timeout=POLL, return_when=FIRST_COMPLETED)
+        if done or time.monotonic() > look_at:
+            look_at = time.monotonic() + LOOK
+            lacking = no_worker(pool)
+        for future in done:
+            status = waiting.pop(future)
+            try:
+                files = future.result()
+            except EnvironmentMismatchError as error:
+                raise StudyError(
+                    f"{error}: its results may differ in the last bits; install the same "
+                    "everywhere, or take them with --any-environment"
+                ) from error
+            except (BrokenExecutor, CancelledError):
+                raise
+            except (ValueError, RuntimeError) as error:
+                failures.append(Failure(status, str(error)))
+            except Exception as error:  # of a worker: no memory, no disk, no pdeloop, given up
+                failures.append(Failure(status, f"{type(error).__name__}: {error}"))
+            else:
+                _write(folder / status, files)
+            finished.add(status)
+    tell(len(finished), total, status)
 
 
 def _write(folder: Path, files: Mapping[str, bytes]) -> None:
