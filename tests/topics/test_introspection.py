@@ -32,7 +32,7 @@ VALUES = {
         "waiting for",
     },
     "recorder_node": {
-        *("run", "bag", "matched", "messages", "messages/s", "episodes", "episodes incomplete"),
+        *("run", "bag", "matched", "messages", "messages/s"),
     },
 }
 
