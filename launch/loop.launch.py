@@ -21,58 +21,35 @@ from loop_interfaces.isolation import NETWORK
 from loop_interfaces.parameters import flags
 from loop_interfaces.problem import find_problem, load_parameters, shipped_problems
 from pde_sim_node.equations import ALLOWED, allow
-from pdeloop.pairs import PAIRS, core_parameters, namespaces, pair_cores
+from pdeloop.pairs import PAIRS, pair_cores, pair_nodes
 from pdeloop.supervisor import REFUSED
 
 PLANT_FLAGS = [spec for spec in flags() if "P" in spec.nodes]
+ARGUMENTS = {
+    "problem": ("burgers", f"one of {', '.join(shipped_problems())}, or the path of a YAML file"),
+    "namespace": ("", "namespace of all nodes; empty: none"),
+    "pairs": ("1", PAIRS.description),
+    "pin": ("false", "true: a core of its own for each pair"),
+    "equation": ("", "the problem's PDE; own code (file.py:Class) has to be named here, too"),
+    **{spec.name: ("", f"{spec.description} [the problem's]") for spec in PLANT_FLAGS},
+    "network": ("false", "true: let messages leave this machine; false: loopback only"),
+    "log_level": ("info", "least severe messages that are shown"),
+}
+"""Defaults and meanings."""
 
 
 def generate_launch_description() -> LaunchDescription:
     """Called by launch."""
     return LaunchDescription(
         [
-            DeclareLaunchArgument(
-                "problem",
-                default_value="burgers",
-                description=f"a shipped problem ({', '.join(shipped_problems())}) or the path of a "
-                "YAML file",
-            ),
-            DeclareLaunchArgument(
-                "namespace", default_value="", description="namespace of all nodes; empty: none"
-            ),
-            DeclareLaunchArgument("pairs", default_value="1", description=PAIRS.description),
-            DeclareLaunchArgument(
-                "pin",
-                default_value="false",
-                choices=["true", "false"],
-                description="a core of its own for each pair",
-            ),
-            DeclareLaunchArgument(
-                "equation",
-                default_value="",
-                description="the plant's PDE; an own one, file.py:Class or package.module:Class, has "
-                "to be named here, as a problem's file alone runs no code; empty: the problem's",
-            ),
             *(
                 DeclareLaunchArgument(
-                    spec.name,
-                    default_value="",
-                    description=f"{spec.description} [{spec.default}, if the problem's file does not "
-                    "say otherwise]",
+                    name,
+                    default_value=default,
+                    description=meaning,
+                    choices=["true", "false"] if default == "false" else None,
                 )
-                for spec in PLANT_FLAGS
-            ),
-            DeclareLaunchArgument(
-                "network",
-                default_value="false",
-                choices=["true", "false"],
-                description="let messages leave this machine; false: loopback only",
-            ),
-            DeclareLaunchArgument(
-                "log_level",
-                default_value="info",
-                choices=["debug", "info", "warn", "error", "fatal"],
-                description="least severe messages that are shown",
+                for name, (default, meaning) in ARGUMENTS.items()
             ),
             SetEnvironmentVariable("PYTHONUNBUFFERED", "1"),
             RegisterEventHandler(OnProcessExit(on_exit=end_if_refused)),
@@ -95,27 +72,20 @@ def pairs_of_nodes(context: LaunchContext) -> list[Any]:
     # look for a relative file of an equation in their working directory.
     own["equation"] = load_parameters(given["problem"], own)["equation"]
     problem = find_problem(given["problem"]).resolve()
-    pinned = given["pin"] == "true"
-    cores = pair_cores(PAIRS.parse(given["pairs"]), pinned)
-    for number, (pair, core) in enumerate(zip(namespaces(len(cores)), cores, strict=True)):
-        for executable in ("pde_sim_node", "controller_node"):
-            parameters = {**own, **core_parameters(core)}
-            if executable == "pde_sim_node":
-                parameters["publish_clock"] = number == 0  # /clock is one topic for all
-            actions.append(
-                Node(
-                    package="pdeloop",
-                    executable=executable,
-                    namespace="/".join(n for n in (given["namespace"].rstrip("/"), pair) if n)
-                    or None,
-                    parameters=[problem, parameters],
-                    ros_arguments=["--log-level", given["log_level"]],
-                    output="screen",
-                    respawn=True,
-                    respawn_delay=1.0,
-                )
-            )
-    return actions
+    return actions + [
+        Node(
+            package="pdeloop",
+            executable=node.package,
+            namespace="/".join(n for n in (given["namespace"].rstrip("/"), node.namespace) if n)
+            or None,
+            parameters=[problem, {**own, **node.parameters}],
+            ros_arguments=["--log-level", given["log_level"]],
+            output="screen",
+            respawn=True,
+            respawn_delay=1.0,
+        )
+        for node in pair_nodes(pair_cores(PAIRS.parse(given["pairs"]), given["pin"] == "true"))
+    ]
 
 
 def end_if_refused(event: ProcessExited, context: LaunchContext) -> None:

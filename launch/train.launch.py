@@ -24,14 +24,24 @@ from launch_ros.actions import Node
 from loop_interfaces.parameters import flags
 from loop_interfaces.protocol import STOPPED
 from loop_interfaces.spec import ParameterError
-from pde_sim_node.build import fingerprint
 from pde_sim_node.equations import allow
-from pdeloop.pairs import PAIRS, check_pairs, namespaces
+from pdeloop.pairs import PAIR, PAIRS, Transport
 from pdeloop.supervisor import RECORDER_GRACE
 from pdeloop.training_run import begin, reopen, unused
 
 LOOP = Path(__file__).parent / "loop.launch.py"
 FLAGS = flags()
+ARGUMENTS = {
+    # Those of the plant are arguments of the loop.
+    **{s.name: ("", f"{s.description} [the problem's]") for s in FLAGS if "P" not in s.nodes},
+    "model": ("", "start from this model of pdeloop identify; empty: identify one"),
+    "out": ("", "new folder of the results; empty: runs/PROBLEM-TIME"),
+    "resume": ("", "folder of an interrupted run to continue; empty: a new run"),
+    "record": ("false", "true: record all topics to a rosbag2 bag in the folder"),
+    "record_or_stop": ("false", "true: as record, and end if the recording fails"),
+    "view": ("false", "true: a viewer_node, for RViz, Foxglove and PlotJuggler"),
+}
+"""Defaults and meanings."""
 ENDED = (0, 130, STOPPED)
 """Exit codes of a tuner that is done, was interrupted, or was stopped on request."""
 
@@ -43,32 +53,12 @@ def generate_launch_description() -> LaunchDescription:
         [
             *(
                 DeclareLaunchArgument(
-                    spec.name,
-                    default_value="",
-                    description=f"{spec.description} [{spec.default}, if the problem's file does not "
-                    "say otherwise]",
-                    choices=[*spec.choices, ""] if spec.choices else None,
+                    name,
+                    default_value=default,
+                    description=meaning,
+                    choices=["true", "false"] if default == "false" else None,
                 )
-                for spec in FLAGS
-                if "P" not in spec.nodes  # these are arguments of the loop
-            ),
-            *(
-                DeclareLaunchArgument(name, default_value="", description=description)
-                for name, description in (
-                    ("model", "start from this model of pdeloop identify; empty: identify one"),
-                    ("out", "new folder of the results; empty: runs/PROBLEM-TIME"),
-                    ("resume", "folder of an interrupted run to continue; empty: a new run"),
-                )
-            ),
-            *(
-                DeclareLaunchArgument(
-                    name, default_value="false", choices=["true", "false"], description=description
-                )
-                for name, description in (
-                    ("record", "record all topics to a rosbag2 bag in the folder"),
-                    ("record_or_stop", "as record, and end if the recording fails"),
-                    ("view", "a viewer_node, for RViz, Foxglove and PlotJuggler"),
-                )
+                for name, (default, meaning) in ARGUMENTS.items()
             ),
             *loop.get_launch_description(LaunchContext()).get_launch_arguments(),
             OpaqueFunction(function=training),
@@ -79,9 +69,44 @@ def generate_launch_description() -> LaunchDescription:
 def training(context: LaunchContext) -> list[Any]:
     """Begin a run, or go on with one, in its folder, and start the nodes for it."""
     given = context.launch_configurations
-    pairs = PAIRS.parse(given["pairs"])
-    check_pairs(pairs, given["pin"] == "true")
-    own = {spec.name: spec.parse(given[spec.name]) for spec in FLAGS if given[spec.name]}
+    on = {name for name in ("record", "record_or_stop", "view", "pin") if given[name] == "true"}
+    required, recorded = "record_or_stop" in on, bool(on & {"record", "record_or_stop"})
+    transport = Transport(
+        recorder="required" if required else "start" if recorded else "none",
+        pairs=PAIRS.parse(given["pairs"]),
+        pin="pin" in on,
+        view="view" in on,
+    )
+    folder = run_folder(given)
+    given["problem"] = str(folder / "parameters.yaml")
+    actions: list[Any] = [LogInfo(msg=f"training in {folder}")]
+    for node in transport.nodes(folder):
+        if node.package in PAIR:
+            continue  # of the loop
+        own, options = dict(node.parameters), {"respawn": True, "respawn_delay": 1.0}
+        if node.package == "recorder_node":  # not started again: it has a bag to finish
+            own["bag"] = str(unused(folder / "bag"))
+            grace = str(RECORDER_GRACE)
+            options = {"sigterm_timeout": grace, "sigkill_timeout": grace}
+        action = Node(
+            package="pdeloop",
+            executable=node.package,
+            namespace="/".join(n for n in (given["namespace"].rstrip("/"), node.namespace) if n)
+            or None,
+            parameters=[folder / "parameters.yaml", own],
+            ros_arguments=["--log-level", given["log_level"]],
+            output="screen",
+            **options,
+        )
+        actions.append(action)
+    ended = OnProcessExit(target_action=action, on_exit=end_with_tuner)  # the tuner is the last
+    loop = IncludeLaunchDescription(PythonLaunchDescriptionSource(str(LOOP)))
+    return [*actions, RegisterEventHandler(ended), loop]
+
+
+def run_folder(given: dict[str, str]) -> Path:
+    """The folder of the run: a new one, or that of the run to continue."""
+    own: dict[str, Any] = {s.name: s.parse(given[s.name]) for s in FLAGS if given[s.name]}
     if given["model"]:
         own["model"] = str(Path(given["model"]).resolve())
     equation = {"equation": allow(given["equation"])} if given["equation"] else {}
@@ -91,57 +116,10 @@ def training(context: LaunchContext) -> list[Any]:
             raise ParameterError(
                 f"resume:={given['resume']} continues a run with its own parameters; leave out {names}"
             )
-        folder = Path(given["resume"]).resolve()
-        values = reopen(folder)
-    else:
-        out = Path(given["out"]).resolve() if given["out"] else None
-        folder, values = begin(given["problem"], {**own, **equation}, out)
-        folder = folder.resolve()
-    context.launch_configurations["problem"] = str(folder / "parameters.yaml")
-
-    def node(executable: str, namespace: str = "", **options: Any) -> Node:
-        more = options.pop("parameters", {})
-        return Node(
-            package="pdeloop",
-            executable=executable,
-            namespace="/".join(n for n in (given["namespace"].rstrip("/"), namespace) if n) or None,
-            parameters=[folder / "parameters.yaml", more],
-            ros_arguments=["--log-level", given["log_level"]],
-            output="screen",
-            **options,
-        )
-
-    required = given["record_or_stop"] == "true"
-    recorded = required or given["record"] == "true"
-    serving = {"pairs": namespaces(pairs)}
-    tuner = node(
-        "tuner_node",
-        parameters={
-            **serving,
-            "out": str(folder),
-            "resume": True,  # so that a tuner that is started again goes on where it was
-            "plant": fingerprint(values),
-            "recorder": "required" if required else "start" if recorded else "none",
-        },
-        respawn=True,
-        respawn_delay=1.0,
-    )
-    actions = [
-        LogInfo(msg=f"training in {folder}"),
-        IncludeLaunchDescription(PythonLaunchDescriptionSource(str(LOOP))),
-        tuner,
-        RegisterEventHandler(OnProcessExit(target_action=tuner, on_exit=end_with_tuner)),
-    ]
-    if recorded:
-        grace = str(RECORDER_GRACE)  # it has a bag to finish
-        bag = {"bag": str(unused(folder / "bag")), **serving}
-        recorder = node(
-            "recorder_node", parameters=bag, sigterm_timeout=grace, sigkill_timeout=grace
-        )
-        actions.insert(1, recorder)
-    if given["view"] == "true":
-        actions.append(node("viewer_node", namespaces(pairs)[0], respawn=True))
-    return actions
+        reopen(Path(given["resume"]))
+        return Path(given["resume"]).resolve()
+    out = Path(given["out"]) if given["out"] else None
+    return begin(given["problem"], {**own, **equation}, out)[0].resolve()
 
 
 def end_with_tuner(event: ProcessExited, context: LaunchContext) -> list[Any]:
