@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -16,7 +17,7 @@ from tests.browser import browser
 from viewer_node.loop_nodes import Endpoint
 from viewer_node.operation import Call
 from viewer_node.web.page import Page, Recorded, ShowEpisode, ShowLoop
-from viewer_node.web.server import FILES, STATIC, TOKEN, Server
+from viewer_node.web.server import FILES, STATIC, Server
 
 
 @contextlib.contextmanager
@@ -31,32 +32,32 @@ def served() -> Iterator[tuple[Server, Page]]:
         server.stop()
 
 
-async def ask(
-    server: Server, method: str, path: str, *, json: Any = None, **headers: str
-) -> tuple[int, str]:
+async def ask(server: Server, path: str, **headers: str) -> tuple[int, str]:
     url = f"http://127.0.0.1:{server.port}{path}"
-    headers = {name.replace("_", "-"): value for name, value in headers.items()}
     async with (
         aiohttp.ClientSession() as session,
-        session.request(method, url, json=json, headers=headers) as answer,
+        session.get(url, headers=headers) as answer,
     ):
         return answer.status, await answer.text()
 
 
-async def connected(server: Server, origin: str) -> dict[str, Any]:
-    """The first message of the WebSocket to a page of `origin`."""
+async def refusal(server: Server, said: Any, **headers: str) -> str:
+    """Why a page is refused what it says over its WebSocket."""
     async with aiohttp.ClientSession() as session:
         url = f"http://127.0.0.1:{server.port}/ws"
-        async with session.ws_connect(url, headers={"Origin": origin}) as page:
-            first: dict[str, Any] = await page.receive_json(timeout=10)
-            return first
+        async with session.ws_connect(url, headers=headers) as page:
+            assert (await page.receive_json(timeout=10))["part"] == "hello"
+            await page.send_json(said)
+            while (answer := await page.receive_json(timeout=10))["part"] != "refusal":
+                pass
+            return str(answer["text"])
 
 
 def test_every_file_of_the_page_is_served_and_nothing_else():
     with served() as (server, _):
         assert {"index.html", "main.js", "uPlot.iife.min.js"} <= set(FILES)
         for name, path in {"": STATIC / "index.html", **FILES}.items():
-            status, text = asyncio.run(ask(server, "GET", f"/{name}"))
+            status, text = asyncio.run(ask(server, f"/{name}"))
             assert status == 200 and text == path.read_text()
         for name in (
             "node.py",
@@ -66,72 +67,57 @@ def test_every_file_of_the_page_is_served_and_nothing_else():
             "style.css/x",
             "README.md",
         ):
-            status, _ = asyncio.run(ask(server, "GET", f"/{name}"))
+            status, _ = asyncio.run(ask(server, f"/{name}"))
             assert status in (403, 404), name
 
 
 def test_a_foreign_host_name_or_page_is_refused():
     with served() as (server, page):
+        pause = {"node": "/p", "verb": "pause"}
         own = f"http://127.0.0.1:{server.port}"
-        token = asyncio.run(connected(server, own))["token"]
-        body = {"node": "/p", "verb": "pause"}
-        allowed = {"Origin": own, TOKEN: token}
         for wrong in (
             {"Host": f"evil.example:{server.port}"},
             {"Host": "127.0.0.1"},
             {"Origin": "http://evil.example"},
             {"Origin": "null"},
             {"Origin": f"https://127.0.0.1:{server.port}"},
-            {TOKEN: "x" * 43},
-            {TOKEN: ""},
         ):
-            status, _ = asyncio.run(
-                ask(server, "POST", "/api/call", json=body, **{**allowed, **wrong})
-            )
-            assert status == 403, wrong
-        without = {TOKEN: token}
-        assert asyncio.run(ask(server, "POST", "/api/call", json=body, **without))[0] == 403
-        for wrong in ({"Host": "evil.example"}, {"Origin": "http://evil.example"}):
-            assert asyncio.run(ask(server, "GET", "/", **wrong))[0] == 403
-        assert page.requests.empty()
-        for origin in ("http://evil.example", "null", ""):
+            assert asyncio.run(ask(server, "/", **wrong))[0] == 403, wrong
             with pytest.raises(aiohttp.WSServerHandshakeError):
-                asyncio.run(connected(server, origin))
+                asyncio.run(refusal(server, pause, **{"Origin": own, **wrong}))
+        with pytest.raises(aiohttp.WSServerHandshakeError):
+            asyncio.run(refusal(server, pause))  # from no page
+        assert page.requests.empty()
 
 
 def test_a_page_of_ours_reaches_the_nodes_and_nothing_but_what_they_offer():
     with served() as (server, page):
         own = f"http://localhost:{server.port}"
-        allowed = {"Origin": own, TOKEN: asyncio.run(connected(server, own))["token"]}
-
-        body = {"node": "/p", "verb": "pause"}
-        # Confirmed at once, whatever the node is doing.
-        assert asyncio.run(ask(server, "POST", "/api/call", json=body, **allowed))[0] == 200
-        assert page.requests.get(timeout=10) == Call("/p", "pause")
-        for body in (
-            {"node": "/p", "verb": "stop"},
-            {"node": "/q", "verb": "pause"},
-            {"node": ["/p"], "verb": "pause"},
-            [],
-            None,
-        ):
-            assert asyncio.run(ask(server, "POST", "/api/call", json=body, **allowed))[0] == 400
+        text = asyncio.run(refusal(server, {"node": "/p", "verb": "stop"}, Origin=own))
+        assert "no node of this loop offers" in text
         page.place["namespaces"] = ["/", "/lab"]
         page.recorded = Recorded(finished=True, episodes=2)
-        show = "/api/show"
-        for body, status in (
-            ({"namespace": "/lab"}, 200),
-            ({"namespace": "/other"}, 400),
-            ({"environment": 3}, 200),
-            ({"environment": -1}, 400),
-            ({"environment": True}, 400),
-            ({"component": 1}, 200),
-            ({"component": "u"}, 400),
-            ({"episode": 1}, 200),
-            ({"episode": 2}, 400),
-            ({"episode": -1}, 400),
+        for said, done in (
+            ({"node": "/p", "verb": "pause"}, True),
+            ({"node": "/q", "verb": "pause"}, False),
+            ({"node": ["/p"], "verb": "pause"}, False),
+            ([], False),
+            (None, False),
+            ({"namespace": "/lab"}, True),
+            ({"namespace": "/other"}, False),
+            ({"environment": 3}, True),
+            ({"environment": -1}, False),
+            ({"environment": True}, False),
+            ({"component": 1}, True),
+            ({"component": "u"}, False),
+            ({"episode": 1}, True),
+            ({"episode": 2}, False),
+            ({"episode": -1}, False),
         ):
-            assert asyncio.run(ask(server, "POST", show, json=body, **allowed))[0] == status, body
+            assert (server.take(json.dumps(said)) == "") == done, said
+        assert "expected an environment" in server.take("[" * 100_000)
+        # Confirmed at once, whatever the node is doing.
+        assert page.requests.get(timeout=10) == Call("/p", "pause")
         assert page.requests.get(timeout=10) == ShowLoop("/lab")
         assert page.requests.get(timeout=10) == ShowEpisode(0)  # again, in the other environment
         assert page.requests.get(timeout=10) == ShowEpisode(1) and page.requests.empty()
@@ -236,7 +222,7 @@ def test_connections_that_ask_nothing_are_closed_and_a_page_stays(monkeypatch):
                 writer.write(b"GET / HTTP/1.1\r\nHost: ")  # and never the rest
             await closed(half[49:])  # beyond the limit: at once
             await closed(half[:49])
-            assert (await ask(server, "GET", "/"))[0] == 200
+            assert (await ask(server, "/"))[0] == 200
             assert not page.closed and content.open
             await page.ping()
 

@@ -1,14 +1,13 @@
 """The web server of the live page: on 127.0.0.1 only, and for no other page than its own.
 
-GET   /, /NAME     the page and its files, all of them from this package
-GET   /ws          a WebSocket with what is new (viewer_node.web.page), at most FRAMES times a second
-POST  /api/call    {"node", "verb"}: call a service of a node; the status tells what comes of it
-POST  /api/show    {"namespace"}, {"episode"}, {"environment"} or {"component"}: what is shown
+GET /, /NAME    the page and its files, all of them from this package
+GET /ws         a WebSocket: what is new (viewer_node.web.page), at most FRAMES times a second; and
+                from the page {"node", "verb"}, to call a service, or what to show: {"namespace"},
+                {"episode"}, {"environment"} or {"component"}
 
 Any page of the web that is open in a browser can send requests to 127.0.0.1. So a request must name
 this server as its host (a foreign name that was made to resolve to 127.0.0.1 does not), one from a
-page must come from ours, and one that changes something must carry a token that only ours knows: it
-comes over the WebSocket.
+page must come from ours, and the WebSocket always: a browser says which page opens it.
 """
 
 from __future__ import annotations
@@ -16,14 +15,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import secrets
 import socket
 import threading
 import time
 from collections.abc import Awaitable, Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from aiohttp import WSMsgType, web
 
@@ -42,7 +39,6 @@ LINGER = 10.0
 that is still not over after as long again at once."""
 MAX_BODY = 10_000
 HOST = "127.0.0.1"
-TOKEN = "X-Pdeloop-Token"
 STATIC = Path(__file__).parent / "static"
 FILES = {
     path.name: path
@@ -71,7 +67,6 @@ class Server:
 
     def __init__(self, page: Page, port: int) -> None:
         self._page = page
-        self._token = secrets.token_urlsafe(32)
         self._socket = socket.create_server((HOST, port))
         self.port: int = self._socket.getsockname()[1]
         self._sockets: dict[object, web.WebSocketResponse] = {}
@@ -99,8 +94,6 @@ class Server:
     async def _main(self) -> None:
         app = web.Application(middlewares=[self._guard], client_max_size=MAX_BODY)
         app.router.add_get("/ws", self._on_page)
-        app.router.add_post("/api/call", self._on_call)
-        app.router.add_post("/api/show", self._on_show)
         app.router.add_get("/{name:[A-Za-z.]*}", _on_file)
         runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
         await runner.setup()
@@ -134,14 +127,10 @@ class Server:
         names = [f"{name}:{self.port}" for name in (HOST, "localhost")]
         own = [f"http://{name}" for name in names]
         origin = request.headers.get("Origin")
-        changes = request.method not in ("GET", "HEAD")
         if request.headers.get("Host") not in names:
             raise web.HTTPForbidden(text=f"expected a request to {names[0]}")
-        if origin not in own and (origin is not None or changes or request.path == "/ws"):
+        if origin not in own and (origin is not None or request.path == "/ws"):
             raise web.HTTPForbidden(text="expected a request from the monitor's own page")
-        given = request.headers.get(TOKEN, "").encode()
-        if changes and not secrets.compare_digest(given, self._token.encode()):
-            raise web.HTTPForbidden(text="expected the page's token; load the page again")
         response = await handler(request)
         if not response.prepared:
             response.headers.update(_HEADERS)
@@ -156,9 +145,11 @@ class Server:
         self._page.open = True
         sending = asyncio.create_task(self._send(websocket))
         try:
-            async for message in websocket:  # a page says nothing; this notices that it has gone
-                if message.type is not WSMsgType.PING:
+            async for message in websocket:
+                if message.type is not WSMsgType.TEXT:
                     break
+                if refusal := self.take(message.data):
+                    await websocket.send_json({"part": "refusal", "text": refusal})
         finally:
             del self._sockets[request.protocol]
             self._page.open = bool(self._sockets)
@@ -171,8 +162,7 @@ class Server:
     async def _send(self, websocket: web.WebSocketResponse) -> None:
         """Send a page what is new; a slow one gets fewer pictures, as each `send` waits for it."""
         sent: dict[str, object] = {}
-        hello = {"part": "hello", "token": self._token, "controllers": CONTROLLERS}
-        await websocket.send_json(hello)
+        await websocket.send_json({"part": "hello", "controllers": CONTROLLERS})
         while not websocket.closed:
             for message in self._page.updates(sent, time.monotonic()):
                 if isinstance(message, str):
@@ -181,20 +171,20 @@ class Server:
                     await websocket.send_bytes(message)
             await asyncio.sleep(1.0 / FRAMES)
 
-    async def _on_call(self, request: web.Request) -> web.Response:
-        asked = await _body(request)
-        if not self._page.request_call(asked.get("node"), asked.get("verb")):
-            raise web.HTTPBadRequest(
-                text=f"no node of this loop offers that; expected one of {', '.join(VERBS)}"
-            )
-        return web.json_response({"success": True})
-
-    async def _on_show(self, request: web.Request) -> web.Response:
-        if not self._page.choose(await _body(request)):
-            raise web.HTTPBadRequest(
-                text="expected an environment, a component, a recorded episode or a known namespace"
-            )
-        return web.json_response({"success": True})
+    def take(self, text: str) -> str:
+        """Do what a page asks for; why not, if it cannot be done."""
+        try:
+            wanted = json.loads(text)
+        except (ValueError, RecursionError):
+            wanted = None
+        match wanted:
+            case {"node": node, "verb": verb}:
+                done = self._page.request_call(node, verb)
+                offers = f"no node of this loop offers that; expected one of {', '.join(VERBS)}"
+                return "" if done else offers
+            case dict() if self._page.choose(wanted):
+                return ""
+        return "expected an environment, a component, a recorded episode or a known namespace"
 
 
 async def _on_file(request: web.Request) -> web.FileResponse:
@@ -202,14 +192,3 @@ async def _on_file(request: web.Request) -> web.FileResponse:
         return web.FileResponse(FILES[request.match_info["name"] or "index.html"])
     except KeyError:
         raise web.HTTPNotFound from None
-
-
-async def _body(request: web.Request) -> dict[str, Any]:
-    """The JSON object in the request."""
-    try:
-        content = json.loads(await request.text())
-    except (ValueError, RecursionError):
-        content = None
-    if not isinstance(content, dict):
-        raise web.HTTPBadRequest(text="expected a JSON object")
-    return content

@@ -1,4 +1,4 @@
-// The connection to the monitor: a WebSocket that comes back by itself, and requests with its token.
+// The connection to the monitor: a WebSocket that comes back by itself.
 
 const FIRST = 500; // ms before the first attempt to come back, doubled up to LAST
 const LAST = 4000;
@@ -8,7 +8,6 @@ export class Link {
   constructor(take, tell) {
     this.take = take; // called with (header, numbers) of every message
     this.tell = tell; // called with true and false as the connection comes and goes
-    this.token = "";
     this.wait = FIRST;
     // A page that nobody looks at costs the loop nothing.
     document.addEventListener("visibilitychange", () => this.look());
@@ -45,9 +44,7 @@ export class Link {
 
   read(data) {
     if (typeof data === "string") {
-      const message = JSON.parse(data);
-      if (message.part === "hello") this.token = message.token;
-      this.take(message, null);
+      this.take(JSON.parse(data), null);
       return;
     }
     const length = new DataView(data).getUint32(0, true);
@@ -55,17 +52,7 @@ export class Link {
     this.take(header, new Float32Array(data, JSON_START + length));
   }
 
-  async post(path, content) {
-    try {
-      const answer = await fetch(path, {
-        method: "POST",
-        headers: { "Content-Type": "application/json", "X-Pdeloop-Token": this.token },
-        body: JSON.stringify(content),
-      });
-      if (!answer.ok) return { success: false, message: await answer.text() };
-      return await answer.json();
-    } catch {
-      return { success: false, message: "the monitor does not answer" };
-    }
+  send(content) {
+    if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(content));
   }
 }

@@ -65,6 +65,10 @@ const take = {
     update(ofEpisode);
     if (model.status?.recorded) set({});
   },
+  refusal({ text }) {
+    set({ notice: text });
+    setTimeout(() => set({ notice: "" }), NOTICE);
+  },
 };
 
 const link = new Link(
@@ -74,12 +78,12 @@ const link = new Link(
 update(ofEpisode);
 
 // Call a service of a node; one that stops the training is to be confirmed.
-function press(node, role, verb, words) {
+function press(node, role, verb) {
   const confirmed = verb !== "stop" || model.confirming;
   set({ confirming: !confirmed });
   if (confirmed) {
     set({ called: `${role}/${verb}` });
-    request("/api/call", { node, verb }, `${words}: `);
+    link.send({ node, verb });
   } else {
     setTimeout(() => set({ confirming: false }), CONFIRM);
   }
@@ -87,14 +91,7 @@ function press(node, role, verb, words) {
 
 // Ask for another environment, component, namespace or recorded episode.
 function choose(what) {
-  request("/api/show", what, "");
-}
-
-async function request(path, content, words) {
-  const answer = await link.post(path, content);
-  if (answer.success) return;
-  set({ notice: words + answer.message });
-  setTimeout(() => set({ notice: "" }), NOTICE);
+  link.send(what);
 }
 
 // Show another column of the episode.

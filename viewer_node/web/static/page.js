@@ -26,7 +26,7 @@ const ROLES = { plant: "plant", tuner: "training" };
 const LEVELS = ["good", "warn", "bad", "warn"];
 const MOST_CHOICES = 4096;
 
-// actions: press(node, role, verb, words), choose(what), seek(column), point(episode).
+// actions: press(node, role, verb), choose(what), seek(column), point(episode).
 export function showPage(model, actions) {
   const { status, curve } = model;
   const known = status && curve;
@@ -126,7 +126,7 @@ function Button({ role, verb, status, connected, called, confirming, press }) {
       disabled=${!offer || !connected || under || called === `${role}/${verb}`}
       aria-label="${name} ${ROLES[role]}: ${meaning}"
       title=${offer ? `${meaning} (${offer.node}/${verb})` : `no ${role} offers the service ~/${verb}`}
-      onClick=${() => press(offer.node, role, verb, `${name} ${ROLES[role]}`)}
+      onClick=${() => press(offer.node, role, verb)}
     >
       ${sure ? "Really stop?" : under ? going : name}
     </button>
