@@ -28,24 +28,58 @@ AGREE = 0.1
 def evaluate(
     run: FinishedRun, *, fields: int, seed: int, mean_field: bool = False
 ) -> dict[str, Array]:
-    """Costs (training seeds, fields) of no control, LQT and the adapted policy of a run.
+    """Costs of no control, LQT and the adapted policy of a run, with the built-in plant and law.
 
-    The built-in plant and law compute them. A run that had others is refused with a RunFolderError:
-    its closing evaluation is computed again for that, for its first seed.
+    Parameters
+    ----------
+    run : FinishedRun
+        Whose policies and models they are.
+    fields, seed : int
+        How many initial fields are drawn, from which seed.
+    mean_field : bool
+        Use the mean of the initial distribution instead.
 
-    fields, seed: how many initial fields are drawn, from which seed; mean_field: use the mean of the
-    initial distribution instead.
+    Returns
+    -------
+    dict of (training seeds, fields) array
+        Mean stage costs by controller: none, lqt, adapted.
+
+    Raises
+    ------
+    RunFolderError
+        The run had another plant or law.
     """
-    pair = LocalPair(run.values)
+    if reason := another_loop(run):
+        raise RunFolderError(f"{reason}; its policies cannot be evaluated here")
+    seeds = len(run.policies)
+    return _costs(run, _pair(run), seeds, fields=fields, seed=seed, mean_field=mean_field)
+
+
+def another_loop(run: FinishedRun) -> str:
+    """That a run's costs are not those of the built-in plant and law, in words; empty: they are.
+
+    The closing evaluation is computed again for that, for its first seed.
+    """
     try:
-        pair.use_models(np.stack([pack(model) for model in run.models]))
+        pair = _pair(run)
     except ValueError as error:
-        raise RunFolderError(
-            "the run had another plant than the built-in one, so its policies cannot be evaluated "
-            f"here: {error}"
-        ) from error
-    _refuse_another_loop(run, pair)
-    return _costs(run, pair, len(run.policies), fields=fields, seed=seed, mean_field=mean_field)
+        return f"the run had another plant than the built-in one ({error})"
+    count, seed = run.costs["none"].shape[1], int(run.values["evaluation_seed"])
+    here = _costs(run, pair, 1, fields=count, seed=seed)
+    nodes = ", ".join(run.result.get("controller", {}).get("nodes", ()))
+    for name, what, law in (
+        ("none", "plant", "no control"),
+        ("lqt", "control law", "the LQT law"),
+        ("adapted", "control law", "the adapted policy"),
+    ):
+        there, own = run.costs[name][0], here[name][0]
+        if not _agree(there, own):
+            whose = f" (its controller: {nodes})" if nodes and name != "none" else ""
+            return (
+                f"the run had another {what} than the built-in one{whose}: {law} cost "
+                f"{_text(there)} in its closing evaluation, and {_text(own)} here"
+            )
+    return ""
 
 
 def another_plant(run: FinishedRun) -> str:
@@ -102,24 +136,11 @@ def _costs(run: FinishedRun, pair: LocalPair, seeds: int, **fields: Any) -> dict
     return dict(zip(laws, np.split(costs, len(laws)), strict=True))
 
 
-def _refuse_another_loop(run: FinishedRun, pair: LocalPair) -> None:
-    """RunFolderError if the run's costs are not those of the built-in plant and law."""
-    count = run.costs["none"].shape[1]
-    here = _costs(run, pair, 1, fields=count, seed=int(run.values["evaluation_seed"]))
-    nodes = ", ".join(run.result.get("controller", {}).get("nodes", ()))
-    for name, what, law in (
-        ("none", "plant", "no control"),
-        ("lqt", "control law", "the LQT law"),
-        ("adapted", "control law", "the adapted policy"),
-    ):
-        there, own = run.costs[name][0], here[name][0]
-        if not _agree(there, own):
-            raise RunFolderError(
-                f"the run had another {what} than the built-in one"
-                + (f" (its controller: {nodes})" if nodes and name != "none" else "")
-                + f", so its policies cannot be evaluated here: {law} cost "
-                f"{_text(there)} in its closing evaluation, and {_text(own)} here"
-            )
+def _pair(run: FinishedRun) -> LocalPair:
+    """The built-in plant and law with a run's models; ValueError if they do not fit."""
+    pair = LocalPair(run.values)
+    pair.use_models(np.stack([pack(model) for model in run.models]))
+    return pair
 
 
 def _agree(there: Array, here: Array) -> bool:

@@ -17,7 +17,7 @@ from loop_interfaces.model_rows import ModelRows, unpack
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD, Plant
 from pdeloop.episode import rollout
-from pdeloop.evaluation import another_plant
+from pdeloop.evaluation import another_loop, another_plant
 from pdeloop.finished_run import FinishedRun, field_means, load
 from pdeloop.in_process import LocalPair
 from pdeloop.reference import Reference, find
@@ -28,11 +28,8 @@ from pdeloop.study.training import CURVE
 from tuner_node.build import build_training
 from tuner_node.checkpoint import taken
 from tuner_node.results import RunFolderError
-from tuner_node.seeds import Purpose, derive, evaluation_noise
 
 Array = NDArray[np.float64]
-SAME_LAW = 0.05
-"""Relative, of a cost that is computed again: rounding on another machine moves a chaotic field."""
 
 
 @dataclass(frozen=True)
@@ -248,19 +245,16 @@ def _problem(
         data.missing.append(
             f"The run's own plant: {note}. The fields shown are of the built-in one."
         )
+    if reason := another_loop(data.first):
+        data.missing.append(
+            f"Behaviour, gains, spectrum and share of the possible gain: {reason}. All costs are "
+            "those that the run measured."
+        )
+        return data
     behaviours = _behaviours(data)
-    if behaviours:
-        reference = find(values, behaviours[0].cost, limits)
-        orders = _orders(data.first, shown, data.plant)
-        return replace(data, behaviours=behaviours, orders=orders, reference=reference)
-    nodes = ", ".join(data.first.result.get("controller", {}).get("nodes", ()))
-    data.missing.append(
-        "Behaviour, gains, spectrum and share of the possible gain: the costs of this run are not "
-        "those of the built-in plant and law, so that it had another plant or another law"
-        + (f" (its controller: {nodes})" if nodes else "")
-        + ", which cannot be computed here. All costs are those that the run measured."
-    )
-    return data
+    reference = find(values, behaviours[0].cost, limits)
+    orders = _orders(data.first, shown, data.plant)
+    return replace(data, behaviours=behaviours, orders=orders, reference=reference)
 
 
 def _orders(run: FinishedRun, shown: int, plant: Plant) -> OrderStudy | None:
@@ -284,26 +278,16 @@ def _orders(run: FinishedRun, shown: int, plant: Plant) -> OrderStudy | None:
 
 
 def _behaviours(data: ProblemData) -> list[Behaviour]:
-    """The shown seed's controllers from the mean field; none if they are not those of the run.
-
-    Each also starts from the first field of the closing evaluation, whose cost is known.
-    """
+    """The shown seed's controllers from the mean field."""
     policies, values, plant = data.policies, data.first.values, data.plant
     models = {name: run.models[data.shown] for name, run in data.runs.items()}
     bases = [models.get(name, data.models[data.shown]).U for name in policies]
-    if any(len(basis) != plant.target.size for basis in bases):
-        return []
     law = ProjectedLaw(bases, plant.target, values["action_limit"])
-    count, seed = len(policies), values["evaluation_seed"]
-    law.set(np.stack([*policies.values()] * 2), np.tile(np.arange(count), 2))
-    starts = [MEAN_FIELD, derive(seed, Purpose.EVALUATION_FIELD, 0)]
-    noise = np.repeat([0, *evaluation_noise(seed, 1)], count)
-    episode = rollout(plant, lambda k, states: law.actions(states), np.repeat(starts, count), noise)
-    costs = episode.costs
-    known = [data.costs[name][data.shown, 0] for name in policies]
-    if not np.allclose(costs.mean[count:], known, rtol=SAME_LAW):
-        return []
-    found = []
+    count = len(policies)
+    law.set(np.stack([*policies.values()]), np.arange(count))
+    starts, noise = np.full(count, MEAN_FIELD), np.zeros(count, dtype=np.int64)
+    episode = rollout(plant, lambda k, states: law.actions(states), starts, noise)
+    costs, found = episode.costs, []
     for i, name in enumerate(policies):
         diverged = int(costs.diverged_step[i])
         field, action = episode.fields[:, i], episode.actions[:, i]
