@@ -100,17 +100,12 @@ def pair_cores(pairs: int, pin: bool = False) -> list[int | None]:
     return list(least_busy_cores(pairs))
 
 
-def core_parameters(core: int | None) -> dict[str, Any]:
-    """What keeps a node of a pair on its core."""
-    return {} if core is None else {"pin": core}
-
-
 def pair_nodes(cores: Sequence[int | None]) -> list[LoopNode]:
     """The nodes of as many pairs as there are `cores` (see `pair_cores`)."""
     nodes = []
     for number, (namespace, core) in enumerate(zip(namespaces(len(cores)), cores, strict=True)):
         for package in PAIR:
-            own = core_parameters(core)
+            own: dict[str, Any] = {} if core is None else {"pin": core}
             if number and package == "pde_sim_node":
                 own["publish_clock"] = False  # /clock is one topic for all
             name = f"{package}-{namespace}" if namespace else package

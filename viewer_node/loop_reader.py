@@ -10,21 +10,20 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from rclpy.node import Node
-from rclpy.subscription import Subscription
 from std_msgs.msg import Float64MultiArray
 
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.ros.endpoints import raw_subscription, reader_qos, scoped
-from loop_interfaces.ros.sample_subscription import SampleSubscription
+from loop_interfaces.ros.sample_subscription import SampleSubscription, SerializedSubscription
 from loop_interfaces.samples import ACTION_KIND, STATE_KIND
 from loop_interfaces.topics import ACTION, COST, MODEL, PAUSED, POLICY, START, STATE, TARGET, Topic
 from viewer_node.loop_view import LoopView
 
 PERIOD = 0.03
 """Seconds between two reads."""
+Decoder = Callable[[bytes], Frame]
 Handler = Callable[[Frame, float], None]
 """Called with a frame and the time (monotonic s)."""
 
@@ -32,7 +31,14 @@ Handler = Callable[[Frame, float], None]
 class LoopReader:
     """Subscribes to what a view shows: the latched topics, and the samples while `listen` says so.
 
-    namespace: of the pair; empty: the node's own.
+    Parameters
+    ----------
+    node : Node
+        Whose subscriptions they are.
+    namespace : str
+        Of the pair; empty: the node's own.
+    view : LoopView
+        What is read goes there.
     """
 
     def __init__(self, node: Node, namespace: str, view: LoopView) -> None:
@@ -43,11 +49,16 @@ class LoopReader:
             POLICY: view.policy,
             START: view.start,
             PAUSED: view.paused,
+            COST: view.cost,
         }
-        self._latched = [self._subscribe(topic, handle) for topic, handle in handlers.items()]
-        self._costs = self._subscribe(COST, view.cost)
+        self._topics: list[tuple[SerializedSubscription, Decoder, Handler]] = []
+        for topic, handle in handlers.items():
+            name, qos = scoped(namespace, topic.name), reader_qos(topic)
+            raw = raw_subscription(node, Float64MultiArray, name, qos)
+            taken = SerializedSubscription(raw, Float64MultiArray, qos.depth)
+            self._topics.append((taken, ArrayCodec(topic.labels).decode, handle))
         self._samples: SampleSubscription | None = None
-        self._handlers: dict[int, tuple[Callable[[bytes], Frame], Handler]] = {
+        self._handlers: dict[int, tuple[Decoder, Handler]] = {
             STATE_KIND: (ArrayCodec(STATE.labels).decode, view.state),
             ACTION_KIND: (ArrayCodec(ACTION.labels).decode, view.action),
         }
@@ -72,49 +83,25 @@ class LoopReader:
         Taken in one order and handled in another: when a cost has come in, so have all samples of
         its episode, and its start.
         """
-        costs = self._costs.take()
-        for topic in self._latched:
-            topic.handle(topic.take())
-        now = time.monotonic()
+        now, costs = time.monotonic(), list(self._topics[-1][0].take())
+        for topic, decode, handle in self._topics[:-1]:
+            for raw, _ in topic.take():
+                _hand_on(raw, decode, handle, now)
         if self._samples is not None:
             with contextlib.suppress(ValueError):  # the loop's nodes report what they refuse
                 for kind, _, raw in self._samples.drain():
                     if kind in self._handlers:
-                        decode, handle = self._handlers[kind]
-                        with contextlib.suppress(ValueError):
-                            handle(decode(raw), now)
-        self._costs.handle(costs)
+                        _hand_on(raw, *self._handlers[kind], now)
+        for raw, _ in costs:
+            _hand_on(raw, *self._topics[-1][1:], now)
 
     def close(self) -> None:
         """Stop reading."""
         self.listen(False)
-        for topic in (*self._latched, self._costs):
+        for topic, _, _ in self._topics:
             self._node.destroy_subscription(topic.subscription)
 
-    def _subscribe(self, topic: Topic, handle: Handler) -> _Latched:
-        name = scoped(self._namespace, topic.name)
-        subscription = raw_subscription(self._node, Float64MultiArray, name, reader_qos(topic))
-        return _Latched(subscription, ArrayCodec(topic.labels).decode, handle)
 
-
-@dataclass(frozen=True)
-class _Latched:
-    """A latched topic of arrays."""
-
-    subscription: Subscription
-    decode: Callable[[bytes], Frame]
-    handler: Handler
-
-    def take(self) -> list[bytes]:
-        """What has come in."""
-        take, found = self.subscription.handle.take_message, []
-        while (taken := take(Float64MultiArray, True)) is not None:
-            found.append(taken[0])
-        return found
-
-    def handle(self, messages: list[bytes]) -> None:
-        """Hand messages on."""
-        now = time.monotonic()
-        for raw in messages:
-            with contextlib.suppress(ValueError):
-                self.handler(self.decode(raw), now)
+def _hand_on(raw: bytes, decode: Decoder, handle: Handler, now: float) -> None:
+    with contextlib.suppress(ValueError):
+        handle(decode(raw), now)

@@ -59,8 +59,6 @@ class RecordedEpisode:
         Why there is no model.
     bases : Frame or None
         The models that its policies are about.
-    repeats : int
-        Samples that were recorded more than once.
     contradictions : list of str
         Messages that were recorded twice with different content, in words.
     """
@@ -76,7 +74,6 @@ class RecordedEpisode:
     actions: dict[int, Frame] = field(default_factory=dict)
     failure: ModelFailure | None = None
     bases: Frame | None = None
-    repeats: int = 0
     contradictions: list[str] = field(default_factory=list)
 
     @property
@@ -146,7 +143,6 @@ class RecordedEpisode:
         if topic in (STATE, ACTION):
             samples = self.states if topic is STATE else self.actions
             before, samples[frame.step] = samples.get(frame.step), frame
-            self.repeats += before is not None
         else:
             before = getattr(self, _ONCE[topic])
             setattr(self, _ONCE[topic], frame)
