@@ -6,7 +6,6 @@ out. `now` is any monotonic time in s.
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
 
 import numpy as np
@@ -18,7 +17,7 @@ from viewer_node.episode_samples import EpisodeSamples, Key, key_of, rows_of
 from viewer_node.learning_curve import LearningCurve
 from viewer_node.loop_nodes import LoopNodes
 from viewer_node.operation import Operation
-from viewer_node.rollout_costs import RolloutCosts
+from viewer_node.rollout_costs import RolloutCosts, remember
 
 Array = NDArray[np.float64]
 SLOW = 1.0
@@ -29,9 +28,6 @@ EXTREMES = (0.3, 99.7)
 """Percentiles of the field that the colours span, as in the report."""
 STEADY = 0.15
 """Share of the colours' range by which it must change to be changed: they would only flicker."""
-MAX_KEPT = 100
-"""Plants whose targets are remembered."""
-
 COSTS = {"none": "cost_no_control", "lqt": "cost_lqt", "adapted": "cost"}
 """The number with the cost of each controller (loop_interfaces.controllers)."""
 
@@ -72,7 +68,7 @@ class LoopView:
         self.rounds = self.episodes = self.samples = 0
         self.current: EpisodeSamples | None = None
         self.finished: EpisodeSamples | None = None
-        self.targets: OrderedDict[int, Array] = OrderedDict()
+        self.targets: dict[int, Array] = {}
         self.run = 0
         self._costs = RolloutCosts()
         self._numbers: dict[str, float] = {}
@@ -169,9 +165,7 @@ class LoopView:
     def target(self, frame: Frame, now: float) -> None:
         """Take z_r of a plant."""
         self.nodes.heard(now, "plant")
-        self.targets[frame.plant] = frame.values
-        if len(self.targets) > MAX_KEPT:
-            self.targets.popitem(last=False)
+        remember(self.targets, frame.plant, frame.values)
 
     def paused(self, frame: Frame, now: float) -> None:
         """Take whether an operator holds the plant."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,8 @@ from loop_interfaces.frames import Frame
 from loop_interfaces.topics import COMPLETED, START_COLUMNS, CostColumn, StartColumn
 
 Array = NDArray[np.float64]
+Key = TypeVar("Key")
+Value = TypeVar("Value")
 MAX_KEPT = 100
 """Episodes whose gains are remembered until their costs come."""
 MAX_MODELS = 4
@@ -48,58 +50,40 @@ class Rollouts:
         return float(self.mean[rows].mean()) if rows.any() else None
 
 
-class Recent:
-    """The newest frames of a topic by run and episode: of several episodes all starts may come before
-    all costs.
-    """
-
-    def __init__(self) -> None:
-        self._frames: OrderedDict[tuple[int, int], Frame] = OrderedDict()
-
-    def add(self, frame: Frame) -> None:
-        """Keep it, in place of one of the same episode, or of the oldest."""
-        key = frame.run, frame.episode
-        self._frames[key] = frame
-        self._frames.move_to_end(key)
-        if len(self._frames) > MAX_KEPT:
-            self._frames.popitem(last=False)
-
-    def get(self, run: int, episode: int) -> Frame | None:
-        """The one of this episode."""
-        return self._frames.get((run, episode))
-
-    @property
-    def newest(self) -> Frame | None:
-        return next(reversed(self._frames.values()), None)
+def remember(known: dict[Key, Value], key: Key, value: Value, most: int = MAX_KEPT) -> None:
+    """Keep a value as the newest; of more than `most` the oldest goes."""
+    known.pop(key, None)
+    known[key] = value
+    if len(known) > most:
+        del known[next(iter(known))]
 
 
 class RolloutCosts:
     """Joins starts, policies, models and costs, in whatever order they come."""
 
     def __init__(self) -> None:
-        self._starts, self._policies = Recent(), Recent()
-        self._models: OrderedDict[tuple[int, int], Frame] = OrderedDict()
+        # By run and episode: of several episodes all starts may come before all costs.
+        self._starts: dict[tuple[int, int], Frame] = {}
+        self._policies: dict[tuple[int, int], Frame] = {}
+        self._models: dict[tuple[int, int], Frame] = {}
 
     def start(self, frame: Frame) -> None:
         """Take the start of an episode."""
         if frame.values.shape[1] in (START_COLUMNS, len(StartColumn)):
-            self._starts.add(frame)
+            remember(self._starts, (frame.run, frame.episode), frame)
 
     def policy(self, frame: Frame) -> None:
         """Take the gains of an episode."""
-        self._policies.add(frame)
+        remember(self._policies, (frame.run, frame.episode), frame)
 
     def model(self, frame: Frame) -> None:
         """Take a run's reduced models, which have the LQT gains in them."""
-        self._models[frame.run, frame.step] = frame
-        if len(self._models) > MAX_MODELS:
-            self._models.popitem(last=False)
+        remember(self._models, (frame.run, frame.step), frame, MAX_MODELS)
 
     def cost(self, frame: Frame) -> Rollouts | None:
         """What the costs of an episode are of; None if its start is not known."""
-        start, policy = (
-            kept.get(frame.run, frame.episode) for kept in (self._starts, self._policies)
-        )
+        ids = frame.run, frame.episode
+        start, policy = self._starts.get(ids), self._policies.get(ids)
         if start is None or len(start.values) != len(frame.values):
             return None
         return Rollouts(
@@ -114,7 +98,7 @@ class RolloutCosts:
         """Who acts in an environment: a key of loop_interfaces.controllers, 'exploration', or empty if
         it is not known.
         """
-        start, policy = (kept.get(run, episode) for kept in (self._starts, self._policies))
+        start, policy = self._starts.get((run, episode)), self._policies.get((run, episode))
         if start is not None and _explores(start):
             return "exploration"
         if start is None or policy is None or environment >= len(policy.values):
@@ -124,8 +108,8 @@ class RolloutCosts:
 
     def gains(self, environment: int) -> tuple[Array | None, Array | None]:
         """Gains of an environment in the newest episode, and its LQT gains; None where not known."""
-        start = self._starts.newest
-        policy = None if start is None else self._policies.get(start.run, start.episode)
+        ids, start = next(reversed(self._starts.items()), ((0, 0), None))
+        policy = self._policies.get(ids)
         if start is None or policy is None or len(start.values) != len(policy.values):
             return None, None
         row = min(environment, len(policy.values) - 1)

@@ -50,6 +50,7 @@ class Replay:
         self._open(folder)
         recorded.episodes = len(self._episodes)
         if self._episodes:
+            recorded.note = ""
             self.show(len(self._episodes) - 1)
         else:
             page.refresh(time.monotonic())

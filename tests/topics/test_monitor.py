@@ -258,6 +258,7 @@ def test_a_run_that_is_over_opens_with_its_curve_its_seeds_and_its_recorded_epis
             )
             assert float(said.group(1)) == pytest.approx(distance, rel=1e-3)
     page.wait_for(lambda: page.ask(PAINTED % "field") > 250, LIMIT, "picture of the field")
+    assert page.ask("document.querySelector('#notice').hidden")
     assert not page.ask(
         "[...document.querySelectorAll('#controls button')].some((b) => b.offsetParent)"
     )
