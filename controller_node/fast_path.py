@@ -78,9 +78,10 @@ class ControllerFastPath(FastPath):
     def prepare(self) -> bool:
         """Within an episode that a law answers."""
         state, plan = self.last_state, self.plan
-        law = self._responder.law_for(state) if state is not None else None
-        if state is None or law is None:
+        answering = self._responder.answering(state) if state is not None else None
+        if state is None or answering is None or answering.law is None:
             return False
+        law = answering.law
         batch, n_z = state.values.shape
         if not self.expect(state, (batch, n_z), (batch, law.n_a)):
             return False
@@ -89,7 +90,7 @@ class ControllerFastPath(FastPath):
         self._law = law  # the record has addresses of what it owns
         plan["law"], plan["batch"] = law.plan, batch
         plan["actions"] = self._actions.ctypes.data
-        plan["signature"] = self._responder.signature_for(state)
+        plan["signature"] = answering.signature
         return True
 
     def synchronise(self, answers: int, last: float) -> None:

@@ -39,6 +39,26 @@ MAX_BYTES = 2**29
 one; a run that has no room alone is refused, and an exploratory episode without room gives no model."""
 
 
+@dataclass(frozen=True)
+class Answering:
+    """What answers the states of an episode of a plant: made with its first one.
+
+    Attributes
+    ----------
+    plant, episode : int
+        Whose states.
+    law : ProjectedLaw or None
+        None where the controller explores.
+    signature : float
+        What the actions carry, see loop_interfaces.signature.
+    """
+
+    plant: int
+    episode: int
+    law: ProjectedLaw | None
+    signature: float
+
+
 @dataclass
 class _Run:
     """What one run's tuner has sent, and what was made of it."""
@@ -53,18 +73,16 @@ class _Run:
     models_digest: int = 0
     generation: int = -1
     """Number of these models; an episode names the one that its policies belong to."""
-    laws: dict[int, tuple[ProjectedLaw, int]] = field(default_factory=dict)
-    """The law for each plant, and the episode it is set for."""
-    signatures: dict[int, float] = field(default_factory=dict)
-    """What the actions of the episode carry, by plant."""
+    answering: Answering | None = None
+    """Dropped with whatever arrives that changes it."""
 
     @property
     def nbytes(self) -> int:
         frames = [frame.values.nbytes for frame in (self.start, self.policy) if frame is not None]
         models = [a.nbytes for model in self.models for a in (model.U, model.A, model.B)]
-        laws = len(self.laws) * sum(model.U.nbytes for model in self.models)
         samples = self.exploration.nbytes if self.exploration else 0
-        return sum(frames) + sum(models) + laws + samples
+        # The law has a copy of every U.
+        return sum(frames) + 2 * sum(models) + samples
 
     def episode_start(self, frame: Frame) -> Frame | None:
         """The start of the frame's episode, if it is the one this run is in."""
@@ -111,24 +129,33 @@ class Responder:
         return run is not None and run.exploration is not None
 
     def target(self, frame: Frame) -> list[Publication]:
-        """Take the target z_r of a plant."""
+        """Take the target z_r of a plant, (n_z,); returns the answer to a state that waited for it."""
         self._targets[frame.plant] = frame.values.copy()
         _forget(self._targets, frame.plant, self._served[1])
         for run in self._runs.values():
-            known = set(run.laws) & set(self._targets) - {frame.plant}
-            run.laws = {plant: run.laws[plant] for plant in known}
-            run.signatures = {}
+            run.answering = None
         return self._answer_pending()
 
     def start(self, frame: Frame) -> Sequence[Publication | ModelFailure]:
-        """Take the start of an episode: whether it explores, and which model each environment uses."""
+        """Take the start of an episode: whether it explores, and which model each environment uses.
+
+        Returns
+        -------
+        sequence of Publication or ModelFailure
+            The answer to a state that waited for it, or again what came out of an exploration.
+
+        Raises
+        ------
+        FrameError
+            Its rows are none of a start, or there is no room for another run.
+        """
         rows = start_rows(frame)
         if not len(rows):
             self._runs.pop(frame.run, None)
             return []
         run = self._run(frame.run, rows.nbytes)
         if run.episode_start(frame) is None:
-            run.start, run.signatures = replace(frame, values=rows.copy()), {}
+            run.start, run.answering = replace(frame, values=rows.copy()), None
             explores = rows[0, StartColumn.EXCITATION] >= 0
             run.exploration = Exploration(run.start, self._settings) if explores else None
             self.failure = ""
@@ -137,7 +164,18 @@ class Responder:
         return self._answer_pending()
 
     def policy(self, frame: Frame) -> list[Publication]:
-        """Take the policies [K_a K_b] of an episode's environments, (M, n_a, 2 n_s)."""
+        """Take the policies [K_a K_b] of an episode's environments, (M, n_a, 2 n_s).
+
+        Returns
+        -------
+        list of Publication
+            The answer to a state that waited for them.
+
+        Raises
+        ------
+        FrameError
+            Of another number of actuators, beyond MAX_GAIN, or other ones than came before.
+        """
         n_a = self._settings.n_a
         if frame.values.shape[1] != n_a:
             raise FrameError(f"expected gains of {n_a} actuators, got {frame.values.shape[1]}")
@@ -150,35 +188,58 @@ class Responder:
         if known and known.episode == frame.episode and known.values.shape == shape:
             if np.array_equal(known.values, frame.values):
                 return self._answer_pending()
-            run.disputed, run.laws = frame.episode, {}
+            run.disputed, run.answering = frame.episode, None
             raise FrameError(
                 f"two different policies came for episode {frame.episode}, which is therefore not "
                 "answered; expected one tuner"
             )
-        run.policy, run.signatures = replace(frame, values=frame.values.copy()), {}
-        run.laws = {plant: (law, -1) for plant, (law, _) in run.laws.items()}
+        run.policy, run.answering = replace(frame, values=frame.values.copy()), None
         return self._answer_pending()
 
     def model(self, frame: Frame) -> list[Publication]:
-        """Take a run's reduced models."""
+        """Take a run's reduced models, as in model_rows; returns the answer to a state that waited.
+
+        Raises
+        ------
+        ValueError
+            Their rows leave no room for U.
+        """
         run = self._run(frame.run, 2 * frame.values.nbytes)
         run.models = [model_rows.unpack(rows.copy(), self._settings.n_a) for rows in frame.values]
         run.models_digest = digest_of(frame.values)
-        run.generation, run.laws, run.signatures = frame.step, {}, {}
+        run.generation, run.answering = frame.step, None
         return self._answer_pending()
 
     def state(self, frame: Frame) -> list[Publication]:
-        """The action that answers a state; the state is kept until what it needs has arrived."""
-        actions = self._actions(frame)
-        if actions is None:
+        """Answer the states of an episode's environments, (M, n_z).
+
+        Returns
+        -------
+        list of Publication
+            The action; none while something is missing that it needs: then the state is kept.
+
+        Raises
+        ------
+        ValueError
+            The state does not fit the start, or the policies and models do not fit it.
+        """
+        answering = self._answering(frame)
+        if answering is None:
             self._pending = replace(frame, values=frame.values.copy())
             self.counters["states that had to wait"] += 1
             return []
+        if answering.law is not None:
+            actions = answering.law.actions(frame.values)
+        else:
+            exploration = self._runs[frame.run].exploration
+            assert exploration is not None
+            self._keep_sample(exploration, frame)
+            actions = exploration.actions(frame.step)
         self._pending = None
         self._served = (frame.run, frame.plant)
         self.episode = frame.episode
         self.advance_counters(1, frame.step)
-        time = self.signature_for(frame) or frame.time
+        time = answering.signature or frame.time
         answer = Frame(frame.run, frame.episode, frame.step, time, actions, frame.plant)
         return [Publication(ACTION, answer)]
 
@@ -187,40 +248,34 @@ class Responder:
         self.answered += answers
         self.step = step
 
-    def signature_for(self, state: Frame) -> float:
-        """What the actions carry that answer the states of an episode, like one that was answered."""
-        run = self._runs[state.run]
-        start = run.episode_start(state)
-        if start is None or not start.plant:
-            return NOT_SIGNED
-        if state.plant not in run.signatures:
-            target = self._targets[state.plant]
-            run.signatures[state.plant] = signature(self._digest(run, start), target)
-        return run.signatures[state.plant]
+    def answering(self, state: Frame) -> Answering | None:
+        """What answers the states of an episode, like one that was answered before.
 
-    def _digest(self, run: _Run, start: Frame) -> int:
-        """D: what the tuner published of an episode."""
-        published: list[Any] = [start.values, self._settings.action_limit]
-        if run.exploration is None and run.policy is not None:
-            published += [run.policy.values, run.models_digest]
-        return digest_of(*published)
-
-    def law_for(self, state: Frame) -> ProjectedLaw | None:
-        """The law that answers the states of an episode, like one that was answered before.
-
-        None where the controller explores, and while anything has to be looked at first: another
-        state waits, or something has arrived that changes the law.
+        None while anything has to be looked at first: another state waits, or something has arrived
+        that changes the answers.
         """
         run = self._runs.get(state.run)
         if run is None or run.episode_start(state) is None or self._pending is not None:
             return None
         if (state.run, state.plant, state.episode) != (*self._served, self.episode):
             return None
-        law, episode = run.laws.get(state.plant, (None, -1))
-        return law if run.exploration is None and episode == state.episode else None
+        known = run.answering
+        same = known is not None and (known.plant, known.episode) == (state.plant, state.episode)
+        return known if same else None
 
     def cost(self, frame: Frame) -> list[Publication | ModelFailure]:
-        """At the end of an exploratory episode: reduce and design."""
+        """At the end of an exploratory episode: reduce and design.
+
+        Returns
+        -------
+        list of Publication or ModelFailure
+            The models, or why there are none; empty after any other episode.
+
+        Raises
+        ------
+        FrameError
+            The costs are not of the episode's shape.
+        """
         self._ended = (frame.run, frame.episode)
         if frame.values.shape[1] == len(CostColumn) and len(frame.values):
             completed = frame.values[frame.values[:, CostColumn.ENDED] == COMPLETED]
@@ -290,7 +345,8 @@ class Responder:
         )
         exploration.give_up(reason, retry=False)
 
-    def _actions(self, frame: Frame) -> np.ndarray | None:
+    def _answering(self, frame: Frame) -> Answering | None:
+        """What answers a state; None while something has not arrived yet."""
         run = self._runs.get(frame.run)
         start = run.episode_start(frame) if run else None
         if run is None or start is None:
@@ -299,41 +355,36 @@ class Responder:
             raise FrameError(
                 f"expected the states of {len(start.values)} environments, got {len(frame.values)}"
             )
-        target = self._targets.get(frame.plant)
-        if target is None:
+        known, target = run.answering, self._targets.get(frame.plant)
+        if known is not None and (known.plant, known.episode) == (frame.plant, frame.episode):
+            return known
+        law = None
+        if target is None or (
+            run.exploration is None and (law := self._law(run, start, target)) is None
+        ):
             return None
-        if run.exploration:
-            self._keep_sample(run.exploration, frame)
-            return run.exploration.actions(frame.step)
-        law, episode = run.laws.get(frame.plant, (None, -1))
-        if law is None or episode != frame.episode:
-            law = self._prepare(run, start, law, target, self._settings.action_limit)
-            if law is None:
-                return None
-            run.laws[frame.plant] = (law, frame.episode)
-        return law.actions(frame.values)
+        signed = NOT_SIGNED
+        if start.plant:
+            published: list[Any] = [start.values, self._settings.action_limit]
+            if law is not None and run.policy is not None:
+                published += [run.policy.values, run.models_digest]
+            signed = signature(digest_of(*published), target)
+        run.answering = Answering(frame.plant, frame.episode, law, signed)
+        return run.answering
 
-    @staticmethod
-    def _prepare(
-        run: _Run,
-        start: Frame,
-        law: ProjectedLaw | None,
-        target: np.ndarray,
-        action_limit: float,
-    ) -> ProjectedLaw | None:
+    def _law(self, run: _Run, start: Frame, target: np.ndarray) -> ProjectedLaw | None:
         """The law set for the run's episode; None while something has not arrived yet."""
         policy = run.policy
         if policy is None or policy.episode != start.episode or run.disputed == start.episode:
             return None
         if not run.models or run.generation != start.step:
             return None
-        if law is None:
-            law = ProjectedLaw([model.U for model in run.models], target, action_limit)
         index = start.values[:, StartColumn.MODEL].astype(np.int64)
         if len(policy.values) != len(index):
             raise FrameError(
                 f"expected policies for {len(index)} environments, got {len(policy.values)}"
             )
+        law = ProjectedLaw([model.U for model in run.models], target, self._settings.action_limit)
         law.set(policy.values, index)
         return law
 

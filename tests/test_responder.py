@@ -264,7 +264,7 @@ def test_an_episode_with_two_different_policies_is_not_answered(when):
     assert len(responder.state(state)) == 1
     with pytest.raises(FrameError, match="two different policies came for episode 4"):
         responder.policy(second)
-    assert responder.state(state) == [] and responder.law_for(state) is None
+    assert responder.state(state) == [] and responder.answering(state) is None
     assert responder.waits_for() == ["policy (two different ones came)"]
     responder.policy(Frame(RUN, 5, 0, 0.0, good.values))
     responder.start(start(5, (1, -1, 0.0, 0)))
