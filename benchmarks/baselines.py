@@ -257,8 +257,8 @@ def cell(row: Mapping[str, Any]) -> str:
     """A cost with its interval, or how many of the seeds diverged."""
     if not finished(row["cost"]):
         return f"diverged ({row['diverged']} of {row['seeds']})"
-    between = " to ".join(number(end) for end in row["interval"] or ())
-    return f"{number(row['cost'])} ({between})" if between else number(row["cost"])
+    cost, ends = number(row["cost"]), [number(end) for end in row["interval"] or ()]
+    return cost if set(ends) <= {cost} else f"{cost} ({' to '.join(ends)})"
 
 
 def number(value: float) -> str:
@@ -286,7 +286,8 @@ def plot(result: Mapping[str, Any], path: Path) -> None:
                 own = [r for r in shown if (r["problem"], r["method"]) == (problem, method)]
                 ends = np.array([r["interval"] or (r["cost"],) * 2 for r in own]).reshape(-1, 2)
                 x, color = [r["budget"] for r in own], f"C{place % 10}"
-                ax.plot(x, [r["cost"] for r in own], "-o", ms=4, lw=1, color=color, label=method)
+                line = ("-o", "--s", ":^")[place % 3]  # two methods may lie upon each other
+                ax.plot(x, [r["cost"] for r in own], line, ms=4, lw=1, color=color, label=method)
                 ax.fill_between(x, *ends.T, alpha=0.15, lw=0, color=color)
             if bound is not None:
                 ax.axhline(bound, color="0.4", ls="--", lw=1, label="limit of any controller")
@@ -299,4 +300,5 @@ def plot(result: Mapping[str, Any], path: Path) -> None:
             ax.set_title(problem)
         axes[0].set_ylabel("mean stage cost, test fields")
         axes[-1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
-        figure.savefig(path, bbox_inches="tight")
+        undated = {"Date": None} if path.suffix == ".svg" else None
+        figure.savefig(path, bbox_inches="tight", metadata=undated)
