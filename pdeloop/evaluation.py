@@ -56,9 +56,14 @@ def evaluate(
 
 
 def another_loop(run: FinishedRun) -> str:
-    """That a run's costs are not those of the built-in plant and law, in words; empty: they are.
+    """Whether a run's costs are those of the built-in plant and law.
 
     The closing evaluation is computed again for that, for its first seed.
+
+    Returns
+    -------
+    str
+        That they are not, in words with the costs; empty if they are.
     """
     try:
         pair = _pair(run)
@@ -83,10 +88,15 @@ def another_loop(run: FinishedRun) -> str:
 
 
 def another_plant(run: FinishedRun) -> str:
-    """That a run's plant has another fingerprint than the built-in one, in words; empty: it has not.
+    """Whether a run's plant has the fingerprint of the built-in one.
 
     The fingerprint covers the source of the equation, so a plant with another one may still compute
     the same costs.
+
+    Returns
+    -------
+    str
+        That it has another one, in words; empty if it has not.
     """
     own = fingerprint(run.values)
     if run.result.get("plant", own) == own:

@@ -7,7 +7,7 @@ are compressed with zstd. The message definitions are in the bag, so that it is 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -16,6 +16,8 @@ from typing import IO, Any, cast
 import yaml
 from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
+
+from loop_interfaces.files import write_atomically
 
 FILE, METADATA = "bag.mcap", "metadata.yaml"
 VERSION = 9
@@ -70,7 +72,20 @@ def _jazzy() -> Any:
 
 
 class BagWriter:
-    """Writes one bag into the new folder `path`; BagError, at any time, when the disk refuses."""
+    """Writes one bag.
+
+    Parameters
+    ----------
+    path : Path
+        A new folder.
+    channels : iterable of Channel
+        The topics to be written.
+
+    Raises
+    ------
+    BagError
+        By every method, when the folder is there already or the disk refuses.
+    """
 
     def __init__(self, path: Path, channels: Iterable[Channel]) -> None:
         if path.exists():
@@ -127,22 +142,21 @@ class BagWriter:
             raise self._stopped(error) from error
         self._pending = 0
 
-    def close(self, notes: Mapping[str, str]) -> None:
-        """Finish the bag: indices, and metadata.yaml with `notes` as its custom data."""
+    def close(self) -> None:
+        """Finish the bag: indices, and metadata.yaml."""
         self.flush()
-        information = self._information(notes)
+        information = self._information()
         try:
             # As rosbag2 does it: a file without its folder says as much.
             self._mcap.add_metadata("rosbag2", {"serialized_metadata": _yaml(information)})
             self._mcap.finish()
             self._file.close()
-            part = self.path / f"{METADATA}.part"
-            part.write_text(_yaml({"rosbag2_bagfile_information": information}))
-            part.replace(self.path / METADATA)
+            text = _yaml({"rosbag2_bagfile_information": information})
+            write_atomically(self.path / METADATA, text.encode())
         except OSError as error:
             raise self._stopped(error) from error
 
-    def _information(self, notes: Mapping[str, str]) -> dict[str, Any]:
+    def _information(self) -> dict[str, Any]:
         """The content of metadata.yaml, without its outermost key."""
         first, last = (self._first, self._last) if self._counts else (0, 0)
         extent = {
@@ -172,7 +186,7 @@ class BagWriter:
             "compression_format": "",
             "compression_mode": "",
             "files": [{"path": FILE, **extent}],
-            "custom_data": dict(notes) or None,
+            "custom_data": None,
             "ros_distro": "jazzy",
         }
 

@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from loop_interfaces.files import write_atomically
 from loop_interfaces.frames import FrameError
 from loop_interfaces.topics import START
 from recorder_node.bag import BagError, BagWriter
@@ -21,9 +22,19 @@ PARAMETERS = "parameters.json"
 
 
 class Recording:
-    """Writes the messages that `take` is given into the bag at `path`, a new folder.
+    """Writes the messages that `take` is given into a bag.
 
-    Raises BagError when the bag cannot be written.
+    Parameters
+    ----------
+    path : Path
+        A new folder.
+    what : sequence of Source
+        The topics to be recorded.
+
+    Raises
+    ------
+    BagError
+        By every method, when the folder is there already or the disk refuses.
     """
 
     def __init__(self, path: Path, what: Sequence[Source]) -> None:
@@ -46,9 +57,7 @@ class Recording:
         """Keep the parameters of a run, beside what is already known of them."""
         self._notes[str(run)] = self._notes.get(str(run), {}) | dict(parameters)
         try:
-            part = self.path / (PARAMETERS + ".part")
-            part.write_text(json.dumps(self._notes, indent=1))
-            part.replace(self.path / PARAMETERS)
+            write_atomically(self.path / PARAMETERS, json.dumps(self._notes, indent=1).encode())
         except OSError as error:
             raise BagError(f"cannot write to {self.path}: {error.strerror}") from error
 
@@ -62,4 +71,4 @@ class Recording:
 
     def close(self) -> None:
         """Finish the bag."""
-        self._bag.close({"pdeloop.parameters": json.dumps(self._notes)} if self._notes else {})
+        self._bag.close()

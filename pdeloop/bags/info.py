@@ -10,7 +10,18 @@ from pdeloop.bags.reader import Bag
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """What is in the bag at `path`; the content of `pdeloop bag info --json`."""
+    """What is in the bag at `path`.
+
+    Returns
+    -------
+    dict
+        The content of `pdeloop bag info --json`: topics, episodes, runs, times (ns), sizes.
+
+    Raises
+    ------
+    BagError
+        There is none, or it cannot be read.
+    """
     bag = Bag(path)
     counts: Counter[tuple[str, str]] = Counter()
     first, last = None, None

@@ -27,9 +27,17 @@ Array = NDArray[np.float64]
 
 
 class Bag:
-    """A bag at `path`: its folder, or a run's folder with a bag in it.
+    """A recorded bag.
 
-    Raises BagError when there is none, or it cannot be read.
+    Parameters
+    ----------
+    path : Path
+        Its folder, or a run's folder with a bag in it.
+
+    Raises
+    ------
+    BagError
+        There is none, or, by every method, it cannot be read.
     """
 
     def __init__(self, path: Path) -> None:

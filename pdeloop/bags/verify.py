@@ -90,9 +90,25 @@ class Report:
 
 
 def verify(*paths: Path, parameters: Path | None = None) -> Report:
-    """Recompute what is in the bags at `paths`, or in all bags of runs; several of one run are one.
+    """Recompute what was recorded.
 
-    parameters: a parameter file to use instead of what the bags say.
+    Parameters
+    ----------
+    paths : Path
+        Folders of bags, or of runs with all their bags; several bags of one run are one.
+    parameters : Path, optional
+        A parameter file to use instead of what the bags say.
+
+    Returns
+    -------
+    Report
+
+    Raises
+    ------
+    BagError
+        A bag cannot be read.
+    ParameterError
+        The parameters do not describe a plant of this version.
     """
     bags = [bag for path in paths for bag in bags_of(path)]
     report = Report(", ".join(str(bag.path) for bag in bags))
@@ -187,7 +203,11 @@ class _Run:
                 assert training.models is not None
                 where = f"models number {known.step} of {self._name}"
                 self._report.compare("models", where, known.values, training.models)
-            training.finish(pair.run(batch, self._values["max_batch"]))
+            try:
+                training.finish(pair.run(batch, self._values["max_batch"]))
+            except ValueError as error:  # an exploration without a model, as it was then
+                self._note(f"the training ends there: {error}")
+                return
             pair.follow(training)
         for places in unseen.values():
             for place in places:

@@ -94,7 +94,7 @@ def rewrite(bag: Path, frame: Frame) -> None:
             data[place] ^= 1
             changed += 1
         writer.write(message.topic, message.when, bytes(data))
-    writer.close({})
+    writer.close()
     assert changed == 1
     (bag / "again" / "bag.mcap").rename(bag / "bag.mcap")
 
