@@ -39,7 +39,6 @@ def parser() -> argparse.ArgumentParser:
     train.add("--problem", "PROBLEM", "[burgers]")
     train.add("--turns", "N", "trainings of each [3]", type=int)
     train.add("--iterations", "N", "[40]", type=int)
-    train.switch("--pin", "with --pin as well")
     real = Program(
         programs, "realtime", "jitter and missed deadlines at P1's 20 Hz and at 1 kHz", "--pin"
     )

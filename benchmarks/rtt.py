@@ -25,8 +25,8 @@ PROBLEM = "allen-cahn"
 BATCHES = (2, 64)
 CORES = ("any", "shared", "pinned")
 """Where plant and controller are: wherever the scheduler puts them (nodes started by hand), on one
-core for both (as `pdeloop train` does it), the same on a core that no other pair has (`--pin`). The
-ping-pong is on any two, and with `pinned` on one each, polling."""
+core for both (as `pdeloop train` does it). The ping-pong is on any two, and with `pinned`, which is
+`shared` for the pair, on one each, polling."""
 PAYLOAD = 256
 """Numbers in a request of the bare ping-pong."""
 
@@ -46,8 +46,7 @@ def _measure(
     ping = running.start("benchmarks.ping", f"pin:={one}")
     running.start("benchmarks.ping", "end:=pong", f"pin:={two}")
     horizon = "horizon:=1000"
-    pinned = cores == "pinned"
-    chosen = [None] if cores == "any" else pair_cores(1, pinned)
+    chosen = [None] if cores == "any" else pair_cores(1)
     plant, controller = pair_nodes(chosen)
     pair = (
         running.start(plant.package, horizon, *plant.assignments, problem=PROBLEM),

@@ -24,13 +24,9 @@ LIMIT = 600.0
 """Seconds after which a training is given up."""
 
 
-def run(
-    problem: str = "burgers", turns: int = 3, iterations: int = 40, pin: bool = False
-) -> dict[str, Any]:
+def run(problem: str = "burgers", turns: int = 3, iterations: int = 40) -> dict[str, Any]:
     """One row for each way to train."""
     ways: dict[str, list[str]] = {"in-process": ["--in-process"], "topics": []}
-    if pin:
-        ways["topics --pin"] = ["--pin"]
     runs: dict[str, list[dict[str, Any]]] = {way: [] for way in ways}
     with tempfile.TemporaryDirectory() as folder:
         for turn in range(turns):

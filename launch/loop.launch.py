@@ -29,7 +29,6 @@ ARGUMENTS = {
     "problem": ("burgers", f"one of {', '.join(shipped_problems())}, or the path of a YAML file"),
     "namespace": ("", "namespace of all nodes; empty: none"),
     "pairs": ("1", PAIRS.description),
-    "pin": ("false", "true: a core of its own for each pair"),
     "equation": ("", "the problem's PDE; own code (file.py:Class) has to be named here, too"),
     **{spec.name: ("", f"{spec.description} [the problem's]") for spec in PLANT_FLAGS},
     "network": ("false", "true: let messages leave this machine; false: loopback only"),
@@ -84,7 +83,7 @@ def pairs_of_nodes(context: LaunchContext) -> list[Any]:
             respawn=True,
             respawn_delay=1.0,
         )
-        for node in pair_nodes(pair_cores(PAIRS.parse(given["pairs"]), given["pin"] == "true"))
+        for node in pair_nodes(pair_cores(PAIRS.parse(given["pairs"])))
     ]
 
 

@@ -69,12 +69,11 @@ def generate_launch_description() -> LaunchDescription:
 def training(context: LaunchContext) -> list[Any]:
     """Begin a run, or go on with one, in its folder, and start the nodes for it."""
     given = context.launch_configurations
-    on = {name for name in ("record", "record_or_stop", "view", "pin") if given[name] == "true"}
+    on = {name for name in ("record", "record_or_stop", "view") if given[name] == "true"}
     required, recorded = "record_or_stop" in on, bool(on & {"record", "record_or_stop"})
     transport = Transport(
         recorder="required" if required else "start" if recorded else "none",
         pairs=PAIRS.parse(given["pairs"]),
-        pin="pin" in on,
         view="view" in on,
     )
     folder = run_folder(given)

@@ -76,26 +76,13 @@ def namespaces(pairs: int) -> list[str]:
     return [f"pair{i}" for i in range(pairs)] if pairs > 1 else [""]
 
 
-def check_pairs(pairs: int, pin: bool = False) -> None:
-    """ParameterError when there are too many pairs for this machine; pin: with a core for each."""
-    if not 1 <= pairs <= MAX_PAIRS:
-        raise ParameterError(f"--pairs is {pairs}; expected a whole number from 1 to {MAX_PAIRS}")
-    cores = len(usable_cores())
-    if pin and cores < pairs:
-        raise ParameterError(
-            f"--pin gives each of the {pairs} pairs of plant and controller a core of its own, but "
-            f"there are {cores}; leave out --pin, or use fewer pairs"
-        )
-
-
-def pair_cores(pairs: int, pin: bool = False) -> list[int | None]:
+def pair_cores(pairs: int) -> list[int | None]:
     """The core that plant and controller of each pair share, the least busy ones first; None: any.
 
     They take turns, so that a message on one core wakes no idle one. On a machine with a single core
-    there is nothing to choose, unless `pin` asks for it.
+    there is nothing to choose.
     """
-    check_pairs(pairs, pin)
-    if not pin and (len(usable_cores()) == 1 or not hasattr(os, "sched_setaffinity")):
+    if len(usable_cores()) == 1 or not hasattr(os, "sched_setaffinity"):
         return [None] * pairs
     return list(least_busy_cores(pairs))
 
@@ -127,8 +114,6 @@ class Transport:
         Let the messages leave this machine.
     pairs : int
         Of plant and controller.
-    pin : bool
-        Keep each pair on a core of its own.
     view : bool
         With a viewer_node of the first pair.
     """
@@ -137,7 +122,6 @@ class Transport:
     recorder: str = "none"
     network: bool = False
     pairs: int = 1
-    pin: bool = False
     view: bool = False
 
     def __post_init__(self) -> None:
@@ -148,11 +132,9 @@ class Transport:
                 f"--network and {PROFILE}={os.environ[PROFILE]} both say where messages go; leave "
                 "out --network to use that profile, or unset the variable"
             )
-        if self.in_process and (self.pairs > 1 or self.pin or self.view):
-            raise ParameterError(
-                "--pairs, --pin and --view are about nodes; leave out --in-process"
-            )
-        check_pairs(self.pairs, self.pin)
+        if self.in_process and (self.pairs > 1 or self.view):
+            raise ParameterError("--pairs and --view are about nodes; leave out --in-process")
+        PAIRS.check(self.pairs)
 
     @property
     def recorded(self) -> bool:
@@ -166,7 +148,7 @@ class Transport:
         leave the cores of the pairs to them, if there are others.
         """
         serving = {"pairs": namespaces(self.pairs)}
-        cores = pair_cores(self.pairs, self.pin)
+        cores = pair_cores(self.pairs)
         nodes = pair_nodes(cores)
         others = tuple(core for core in usable_cores() if core not in cores)
         if self.view:

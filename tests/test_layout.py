@@ -39,20 +39,18 @@ def test_one_pair_has_no_namespace_and_several_share_one_clock() -> None:
     assert pairs.ros_value(pairs.namespaces(3)) == "['pair0', 'pair1', 'pair2']"
 
 
-def test_pairs_get_the_least_busy_cores_and_pinning_one_each(
+def test_pairs_get_the_least_busy_cores(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {3, 5, 6, 7})
     busy = iter([{}, {3: 10, 5: 4, 6: 0, 7: 9}])
     monkeypatch.setattr(affinity, "_busy_ticks", lambda: next(busy))
-    cores = pairs.pair_cores(3, pin=True)
+    cores = pairs.pair_cores(3)
     assert cores == [6, 5, 7]
     nodes = pairs.pair_nodes(cores)
     assert [node.parameters["pin"] for node in nodes] == [6, 6, 5, 5, 7, 7]
-    with pytest.raises(ParameterError, match="a core of its own, but there are 4"):
-        pairs.pair_cores(5, pin=True)
-    with pytest.raises(ParameterError, match="--pairs is 0; expected a whole number from 1 to 64"):
-        pairs.check_pairs(0)
+    with pytest.raises(ParameterError, match="'pairs' is 0; expected a whole number from 1 to 64"):
+        pairs.Transport(pairs=0)
     with pytest.raises(ValueError, match=r"'pin' is 4; expected -1 or one of the cores \[3, 5"):
         affinity.pin_process(4)
 
@@ -60,7 +58,6 @@ def test_pairs_get_the_least_busy_cores_and_pinning_one_each(
 def test_pairs_are_anywhere_where_there_is_one_core(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {3})
     assert pairs.pair_cores(2) == [None, None]
-    assert pairs.pair_cores(1, pin=True) == [3]
 
 
 def test_the_busy_time_of_a_core_is_what_it_neither_idled_nor_waited(tmp_path: Path) -> None:
@@ -106,9 +103,8 @@ def test_recorder_and_viewer_leave_the_core_of_the_pair_to_it(tmp_path: Path) ->
         (["--directions", "4", "--optimizer", "two_point"], "--directions goes with"),
         (["--directions", "99"], "'directions' is 99; expected at most 48"),
         (["--in-process", "--pairs", "2"], "leave out --in-process"),
-        (["--in-process", "--pin"], "leave out --in-process"),
         (["--in-process", "--view"], "leave out --in-process"),
-        (["--pairs", "65"], "--pairs is 65"),
+        (["--pairs", "65"], "'pairs' is 65"),
     ],
 )
 def test_flags_that_do_not_fit_together_are_refused(words, said, capsys, tmp_path) -> None:

@@ -235,7 +235,6 @@ def test_an_interrupted_launched_training_is_continued_with_its_own_parameters(
         ({"record": "yes"}, "yes"),
         ({"optimizer": "adam"}, "adam"),
         ({"real_time_factor": "-1"}, "parameter 'real_time_factor' is -1.0"),
-        ({"pairs": "64", "pin": "true"}, "a core of its own"),
     ],
 )
 def test_a_bad_argument_is_refused_before_anything_is_made(

@@ -74,12 +74,6 @@ def add(commands: Commands) -> None:
         help="let messages leave this machine (default: loopback interface only)",
     )
     add("--pairs", type=int, default=1, metavar="K", help="plants with a controller each [1]")
-    add(
-        "--pin",
-        action="store_true",
-        help="a core of its own for each plant and its controller, and let the plant's helpers on the "
-        "others look for work all the time: less time per step, more power",
-    )
 
 
 def _train(options: argparse.Namespace) -> int:
@@ -94,7 +88,6 @@ def _train(options: argparse.Namespace) -> int:
         recorder="required" if options.record_or_stop else "start" if recorded else "none",
         network=options.network,
         pairs=options.pairs,
-        pin=options.pin,
         view=options.view,
     )
     given = given_flags(options)
