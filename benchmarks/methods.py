@@ -27,8 +27,9 @@ from pde_sim_node.build import build_plant
 from pde_sim_node.measurement import InstrumentedPlant
 from pde_sim_node.plant import Plant
 from pdeloop.episode import Law, projected_law, rollout
-from pdeloop.in_process import LocalPair
+from pdeloop.in_process import LocalPair, train
 from pdeloop.study.training import require_environment
+from tuner_node.build import build_training
 from tuner_node.seeds import Purpose, derive
 
 Array = NDArray[np.float64]
@@ -318,6 +319,55 @@ def lqg(values: Values, *, whole: bool) -> tuple[LocalPair, Law, int]:
     return identified_again(values, controller, whole)
 
 
+class LikeliestField:
+    """A law of the whole field, on the likeliest field of the true plant given all readings so far.
+
+    Candidates are drawn from the distribution of initial fields and advanced by the true plant under
+    the actions that were taken; the one whose readings fit best, in the sum of squares, is taken for
+    the field. Without process noise that is maximum likelihood on the candidates: what is lost against
+    the law on the whole field is the price of the sensors, and no model's.
+    """
+
+    def __init__(self, sensed: InstrumentedPlant, true: Plant, law: Law, seeds: list[int]) -> None:
+        self._sensed, self._true, self._law = sensed, true, law
+        draw = true.equation.initial_field
+        self._candidates = np.stack([draw(true.x, np.random.default_rng(s)).ravel() for s in seeds])
+        self._scale = np.sqrt(true.n_z / sensed.state_size)
+
+    def __call__(self, k: int, states: Array) -> Array:
+        positions, (count, n_z) = self._sensed.positions, self._candidates.shape
+        if k == 0:
+            self._fields = np.tile(self._candidates, (len(states), 1, 1))
+            self._misfit = np.zeros((len(states), count))
+        readings = states[:, None, : positions.size] / self._scale
+        self._misfit += np.sum((self._fields[:, :, positions] - readings) ** 2, axis=2)
+        likeliest = self._fields[np.arange(len(states)), np.argmin(self._misfit, axis=1)]
+        actions = self._law(k, likeliest)
+        after, _ = self._true.evaluate(
+            self._fields.reshape(-1, n_z), np.repeat(actions, count, axis=0)
+        )
+        self._fields = after.reshape(self._fields.shape)
+        return actions
+
+
+def true_model(values: Values, *, candidates: int) -> tuple[LocalPair, Law, int]:
+    """`LikeliestField` with the law that Gauss-Newton finds where the whole field is measured.
+
+    The limit for any estimator, as it has the true plant and the distribution of initial fields.
+    """
+    whole = {**values, "sensors": 0, "optimizer": "gauss_newton", "seeds": 1}
+    pair, training = LocalPair(whole), build_training(whole)
+    train(training, pair, lambda row: None)
+    assert training.models is not None
+    U = unpack(training.models[0], values["n_a"]).U
+    law = projected_law(pair.plant, U, training.policies()[0])
+    sensed = LocalPair(values)
+    assert isinstance(sensed.plant, InstrumentedPlant)
+    seeds = [training_field(values, i) for i in range(candidates)]
+    true = build_plant(whole)
+    return sensed, LikeliestField(sensed.plant, true, law, seeds), int(training.budget.paid[0])
+
+
 METHODS: dict[str, Method] = {
     "no-control": no_control,
     "lqt": lqt_law,
@@ -325,6 +375,7 @@ METHODS: dict[str, Method] = {
     "mpc": mpc,
     "cma-es": cma_es,
     "lqg": lqg,
+    "true-model": true_model,
 }
 LIBRARIES = {"mpc": "osqp", "cma-es": "cmaes"}
 """What a method needs besides the project's own dependencies: the extra `bench`."""

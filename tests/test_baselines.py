@@ -21,6 +21,7 @@ from benchmarks.methods import (
     LIBRARIES,
     METHODS,
     Identified,
+    LikeliestField,
     Predictive,
     evaluation_fields,
     measure,
@@ -28,9 +29,10 @@ from benchmarks.methods import (
 from controller_node import lqt
 from controller_node.reduced_model import ReducedModel
 from pde_sim_node.build import build_plant
+from pde_sim_node.measurement import InstrumentedPlant
 from pde_sim_node.plant import DIVERGED_COST, Plant
 from pdeloop import cli
-from pdeloop.episode import projected_law
+from pdeloop.episode import projected_law, rollout
 from pdeloop.finished_run import interval
 from pdeloop.study import StudyError
 from pdeloop.study.training import train_one
@@ -40,6 +42,7 @@ CONSTANTS: dict[str, dict[str, Any]] = {
     "cma-es": {"sigma": 0.01, "population": 4},
     "mpc": {"steps": 5},
     "lqg": {"whole": False},
+    "true-model": {"candidates": 16},
 }
 ROLLOUTS = 11
 
@@ -47,7 +50,7 @@ ROLLOUTS = 11
 def values_of(method: str) -> dict[str, Any]:
     if library := LIBRARIES.get(method):
         pytest.importorskip(library, reason=f"needs {library}: pip install 'pdeloop[bench]'")
-    sensors = {"sensors": 8} if method == "lqg" else {}
+    sensors = {"sensors": 8} if method in ("lqg", "true-model") else {}
     return {**parameters(rollouts=ROLLOUTS, optimizer="gauss_newton"), **sensors}
 
 
@@ -80,6 +83,19 @@ def test_a_method_improves_on_no_control_pays_for_each_rollout_and_sees_no_field
     assert len(learnt_from) == paid <= ROLLOUTS and free == 0
     assert not {*learnt_from} & {*evaluation_fields({**values, "evaluation_seed": VALIDATION})}
     assert {*test} <= {*asked} and found.mean() < nothing.mean()
+
+
+def test_the_likeliest_field_is_the_true_one_where_it_is_a_candidate() -> None:
+    values = parameters(sensors=4)
+    sensed, true = build_plant(values), build_plant({**values, "sensors": 0})
+    assert isinstance(sensed, InstrumentedPlant)
+    gains = np.random.default_rng(0).standard_normal((true.n_a, true.n_z))
+    law = lambda k, states: 0.1 * (states - true.target) @ gains.T  # noqa: E731
+    estimated = LikeliestField(sensed, true, law, [3, 4, 5])
+    found, whole = (
+        rollout(*pair, [5, 3]).costs.mean for pair in ((sensed, estimated), (true, law))
+    )
+    np.testing.assert_allclose(found, whole, rtol=1e-12)
 
 
 def test_the_splits_are_disjoint() -> None:
