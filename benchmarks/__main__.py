@@ -101,7 +101,6 @@ def parser() -> argparse.ArgumentParser:
     )
     kernel.add("--batches", "M", "[1 2 12 64]", type=int, nargs="+")
     kernel.add("--jax", "PYTHON", "interpreter that can import JAX")
-    kernel.add("--controlgym", "PYTHON", "interpreter with controlgym 1.0.0")
     return root
 
 

@@ -2,8 +2,8 @@
 
 All of them integrate the same equation with the same ETDRK4 and the same dealiasing. NumPy stands
 for what one writes first, vectorised over the environments with SciPy's FFT; JAX for the same,
-jitted; controlgym for the library that the paper used. The last two run in Python environments of
-their own, named by the path of their interpreter.
+jitted, in a Python environment of its own, named by the path of its interpreter. Beside controlgym,
+the library that the paper used: benchmarks.environments.
 """
 
 import json
@@ -138,45 +138,7 @@ def time_jax(problem: str, batch: int) -> float:
     return least_microseconds(lambda: step(z, a).block_until_ready(), batch)
 
 
-def time_controlgym(problem: str, batch: int) -> float:
-    import controlgym  # type: ignore[import-not-found, unused-ignore]
-
-    grid, equation = GRIDS[problem], EQUATIONS[problem]()
-    names = {"burgers": "burgers", "allen-cahn": "allen_cahn", "kdv": "korteweg_de_vries"}
-    environments = [
-        controlgym.make(
-            names[problem],
-            n_steps=10**9,
-            domain_length=equation.length,
-            integration_time=grid.integration_time,
-            # It counts steps by a floor division, which must not come out one short.
-            sample_time=grid.sample_time * (1 + 1e-12),
-            n_state=grid.n_z,
-            n_action=grid.n_a,
-            control_sup_width=grid.width,
-            sensor_noise_cov=0.0,
-        )
-        for _ in range(batch)
-    ]
-    actions = np.random.default_rng(0).normal(0, 0.3, (batch, grid.n_a))
-    for environment in environments:
-        environment.reset(seed=0)
-    fields = [environment.state.copy() for environment in environments]
-
-    def step() -> None:
-        for environment, field, action in zip(environments, fields, actions, strict=True):
-            environment.state = field
-            environment.step(action)
-
-    return least_microseconds(step, batch)
-
-
-METHODS = {
-    "pdeloop": time_pdeloop,
-    "numpy": time_numpy,
-    "jax": time_jax,
-    "controlgym": time_controlgym,
-}
+METHODS = {"pdeloop": time_pdeloop, "numpy": time_numpy, "jax": time_jax}
 
 
 def measure(method: str, batches: Sequence[int]) -> list[dict[str, Any]]:
@@ -210,7 +172,6 @@ def run(
     batches: Sequence[int] = BATCHES,
     *,
     jax: str | None = None,
-    controlgym: str | None = None,
 ) -> list[dict[str, Any]]:
     """Measure the plant and its references, one after the other.
 
@@ -218,13 +179,11 @@ def run(
     ----------
     batches
         Numbers of environments.
-    jax, controlgym
-        Interpreters that can import JAX, and controlgym 1.0.0; left out where not given.
+    jax
+        Interpreter that can import JAX, which is left out where not given.
     """
     rows = measure("pdeloop", batches) + measure_with(sys.executable, "numpy", batches)
-    for method, python in (("jax", jax), ("controlgym", controlgym)):
-        rows += measure_with(python, method, batches) if python else []
-    return rows
+    return rows + (measure_with(jax, "jax", batches) if jax else [])
 
 
 def text(rows: Sequence[Mapping[str, Any]]) -> str:
