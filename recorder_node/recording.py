@@ -12,7 +12,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from loop_interfaces.files import write_atomically
 from loop_interfaces.frames import FrameError
 from loop_interfaces.topics import START
 from recorder_node.bag import BagError, BagWriter
@@ -57,7 +56,11 @@ class Recording:
         """Keep the parameters of a run, beside what is already known of them."""
         self._notes[str(run)] = self._notes.get(str(run), {}) | dict(parameters)
         try:
-            write_atomically(self.path / PARAMETERS, json.dumps(self._notes, indent=1).encode())
+            part = (
+                self.path / f"{PARAMETERS}.part"
+            )  # not synchronised: that could hold the recorder up
+            part.write_text(json.dumps(self._notes, indent=1))
+            part.replace(self.path / PARAMETERS)
         except OSError as error:
             raise BagError(f"cannot write to {self.path}: {error.strerror}") from error
 
