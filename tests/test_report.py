@@ -8,12 +8,14 @@ import shutil
 from pathlib import Path
 from xml.etree import ElementTree
 
+import matplotlib
 import numpy as np
 import pytest
 from matplotlib.image import imread
 
 from loop_interfaces.controllers import CONTROLLERS
 from pdeloop.report.data import gather
+from pdeloop.report.style import STYLE
 from tests.browser import browser
 from tests.loop_harness import processes
 from tests.made_once import made_once
@@ -286,12 +288,14 @@ def test_a_run_whose_policies_diverged_is_reported(folder, tmp_path):
 
 def test_a_plant_of_two_fields_shows_both(tmp_path):
     from pdeloop.cli import main
+    from pdeloop.report.figures import behaviour
 
-    out = str(tmp_path / "run")
+    out = tmp_path / "run"
     command = ["train", "wave", "--iterations", "1", "--optimizer", "two_point", "--in-process"]
-    assert main([*command, "--out", out]) == 0
-    assert main(["report", out]) == 0
-    svg = (tmp_path / "run" / "report" / "wave-behaviour.svg").read_text()
+    assert main([*command, "--out", str(out)]) == 0
+    with matplotlib.rc_context(STYLE):
+        behaviour(gather(out).problems[0]).savefig(tmp_path / "both.svg")
+    svg = (tmp_path / "both.svg").read_text()
     for words in (">u(x, t)<", ">u_t(x, t)<", ">u(x, T)<", ">u_t(x, T)<"):
         assert words in svg, words
     # A map of each field and a profile of each, under every controller, beside two colour bars.

@@ -69,15 +69,6 @@ def test_the_numbers_of_a_sample_are_those_of_their_definitions():
     assert set(numbers) <= set(VIEW_NUMBERS)
 
 
-def test_the_chosen_environment_is_shown_and_of_a_smaller_episode_the_last():
-    shown = view()
-    z = RNG.normal(size=(3, N_Z))
-    for environment, row in ((1, 1), (2, 2), (7, 2)):
-        shown.environment = environment
-        shown.state(frame(z), 0.0)
-        assert shown.profile()[0].tolist() == z[row].tolist()
-
-
 @pytest.mark.parametrize("noise", [(), (3.0,)])  # the column of a plant with noise, or none
 def test_costs_are_told_apart_by_the_gains_that_caused_them(noise):
     shown = view()
@@ -144,17 +135,6 @@ def test_a_picture_has_a_row_for_every_step_or_shares_them(horizon):
     assert not (diverging(rows) == UNSEEN).all(axis=(1, 2)).any()
 
 
-def test_more_steps_than_expected_are_squeezed_in_and_other_batches_are_left_out():
-    shown = LoopView(horizon=10)
-    shown.state(frame([np.full(4, 1.0)], step=0), 0.0)
-    shown.state(frame([np.full(4, -1.0)], step=1500), 0.0)
-    shown.state(frame(np.zeros((2, 4)), step=3), 0.0)
-    colours = diverging(shown.space_time(0.0))
-    assert len(colours) <= COLUMNS
-    assert (colours[0] == [178, 24, 43]).all() and (colours[-1] == [33, 102, 172]).all()
-    assert (colours[1:-1] == UNSEEN).all()
-
-
 def test_a_viewer_that_sees_nothing_any_more_is_stale():
     shown = view()
     health = ViewerDiagnostics(shown)
@@ -166,19 +146,3 @@ def test_a_viewer_that_sees_nothing_any_more_is_stale():
     assert good.values["samples/s"] == 0.5
     stale = health.report(8.0, 3)
     assert (stale.level, stale.message) == (Level.STALE, "nothing heard for 7 s")
-
-
-def test_several_episodes_that_come_in_at_once_are_told_apart():
-    shown = view()
-    lqt = MODEL.policy
-    shown.model(frame(pack(MODEL)[None], 0, step=1), 0.0)
-    policies = {1: [np.zeros_like(lqt), lqt], 2: [lqt + 0.1, lqt + 0.1]}
-    for episode, gains in policies.items():
-        shown.policy(frame(gains, episode, step=1), 0.0)
-    for episode in policies:
-        shown.start(frame([(i, -1.0, 0.0, 0.0) for i in range(2)], episode, step=1), 0.0)
-    shown.start(frame(np.empty((0, 4)), 0), 0.0)  # the end of the run
-    shown.cost(frame([(10.0, 100.0, -1), (5.0, 50.0, -1)], 1), 0.0)
-    shown.cost(frame([(4.0, 40.0, -1), (2.0, 20.0, -1)], 2), 0.0)
-    numbers = shown.numbers()
-    assert [numbers[name] for name in ("cost_no_control", "cost_lqt", "cost")] == [10.0, 5.0, 3.0]
