@@ -22,9 +22,10 @@ run: setup
 test: setup packages
 	$(BIN)/python -m pytest -n 4 --dist worksteal
 
-# The same, with the branch coverage of the pure modules (pyproject.toml).
+# The tests without topics, with what they cover of the pure modules (pyproject.toml). Not in .ci/run: five
+# minutes of processor time.
 coverage: setup packages
-	$(BIN)/python -m pytest -n 4 --dist worksteal -p pytest_cov --cov
+	$(BIN)/python -m pytest -n 4 --dist worksteal -m "not topics" -p pytest_cov --cov
 
 # Debian's packages that tests need: a real browser for the report's page, faketime to make a clock
 # jump, iproute2 for hosts made of network namespaces, zsh and fish for their
