@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections import Counter
 
 import numpy as np
 import pytest
@@ -25,17 +24,16 @@ def test_a_run_that_explored_again_is_verified_identified_from_evaluated_and_rep
     loop: Processes, tmp_path
 ):
     run, model = tmp_path / "run", tmp_path / "model.npz"
-    options = ("--optimizer", "two-point", "--rollouts", 26, "--seed", 1, "--seeds", 2)
+    options = ("--optimizer", "two-point", "--rollouts", 26, "--seed", 1)
     text = pdeloop(loop, "train", "burgers", "--record", *options, "--out", run)
     assert f"recorded in {run / 'bag'}" in text
     rows = [json.loads(line) for line in (run / "progress.jsonl").read_text().splitlines()]
-    explored = Counter(row["seed"] for row in rows if row.get("event") == "designed")
-    assert [explored[seed] for seed in sorted(explored)] == [2, 1]
+    assert [row["event"] for row in rows].count("designed") == 2
     text = pdeloop(loop, "bag", "verify", run)
     assert "no difference, to the bit" in text
     assert "not followed" not in text and "incomplete" not in text
     (policies,) = re.findall(r"(\d+) policies", text)
-    assert int(policies) >= 60  # the closing evaluation alone has three on ten fields, twice
+    assert int(policies) >= 30  # the closing evaluation alone has three on ten fields
 
     text = pdeloop(loop, "identify", "--bag", run, "--environment", 0, "--out", model)
     assert "reduced model of order" in text
