@@ -136,13 +136,17 @@ def test_a_second_plant_with_other_parameters_never_mixes_in(loop, tmp_path):
     start_pair(loop, real_time_factor=SLOW)
     out = tmp_path / "run"
     with operator(loop) as desk:
-        tuner = start_tuner(loop, out, iterations=40)
+        tuner = start_tuner(loop, out, iterations=60)
         until(lambda: iterations_done(out) >= 1, LIMIT, "iteration 1")
-        with held_training(desk, "/pde_sim_node"):
-            loop.node("pde_sim_node", *PARAMETERS, "-p", "physical.viscosity:=0.02")
-    text = loop.wait(tuner, LIMIT)
-    assert_same_training(out, in_process(iterations=40))
-    assert "plant with other parameters" in text
+        desk.call("/tuner_node/pause")
+        other = ("-r", "__node:=other_plant", "-p", "physical.viscosity:=0.02")
+        loop.node("pde_sim_node", *PARAMETERS, *other)
+        until(lambda: "/other_plant" in desk.ask(nodes=None), LIMIT, "other plant")
+        desk.call("/tuner_node/resume")
+        until(lambda: "plant with other parameters" in loop.output(tuner), LIMIT, "refusal")
+        full_speed(desk)
+    loop.wait(tuner, LIMIT)
+    assert_same_training(out, in_process(iterations=60))
 
 
 def test_of_two_plants_there_from_the_start_the_one_that_was_asked_for_is_trained(loop, tmp_path):
@@ -318,17 +322,18 @@ def test_a_second_controller_that_answers_otherwise_never_mixes_in(loop, tmp_pat
     running = start_pair(loop, real_time_factor=10.0)
     out = tmp_path / "run"
     with operator(loop) as desk:
-        tuner = start_tuner(loop, out, iterations=40)
+        tuner = start_tuner(loop, out, iterations=100)
         until(lambda: iterations_done(out) >= 1, LIMIT, "iteration 1")
         desk.call("/tuner_node/pause")
         second = loop.start("-c", SECOND_CONTROLLER, name="second")
         until(lambda: "/second_controller" in desk.ask(nodes=None), LIMIT, "second controller")
         desk.call("/tuner_node/resume")
-    refused = "was not computed from the policy, model and target of its episode"
-    until(lambda: refused in loop.output(running["plant"]), LIMIT, "refusal")
+        refused = "was not computed from the policy, model and target of its episode"
+        until(lambda: refused in loop.output(running["plant"]), LIMIT, "refusal")
+        full_speed(desk)
     loop.wait(tuner, LIMIT)
     second.kill()
-    assert_same_training(out, in_process(iterations=40))
+    assert_same_training(out, in_process(iterations=100))
 
 
 SECOND_CONTROLLER = """
