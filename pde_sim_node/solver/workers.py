@@ -15,9 +15,11 @@ from pde_sim_node.solver import step_context
 from pde_sim_node.solver.memory import Constants, aligned
 from pde_sim_node.solver.step_context import STEP_CONTEXT, advance, step_code
 
-SHARED_POINTS = 120_000
-"""Grid points, in all stages, from which on a step is shared: some 250 microseconds of one thread. A
-smaller one is done before another thread has woken up, and is compiled code alone."""
+SHARED_POINTS = 90_000
+"""Grid points, in all stages, from which on a step is shared: some 190 microseconds of one thread. A
+smaller one is done before another thread has woken up."""
+COMPILED_POINTS = 120_000
+"""Below this a step is compiled code alone where that saves the way through the interpreter."""
 
 
 def compile_part(sources: str) -> Any:
@@ -86,8 +88,8 @@ class ParallelStep:
         for name, array in zip(names, self._arrays, strict=True):
             context[name] = array.ctypes.data
         context["batch"], context["step"] = batch, k
-        shared = batch * self._points_per_step >= SHARED_POINTS
-        parts = min(len(self.plans), batch) if shared else 1
+        self._points = batch * self._points_per_step
+        parts = min(len(self.plans), batch) if self._points >= SHARED_POINTS else 1
         edges = [batch * part // parts for part in range(parts + 1)]
         addresses = (self.plans[part : part + 1].ctypes.data for part in range(parts))
         self._parts = list(zip(addresses, edges[:-1], edges[1:], strict=True))
@@ -97,8 +99,11 @@ class ParallelStep:
         own, *others = self._parts
         begun = [solver_threads.pool().submit(advance_part, self._contexts, *it) for it in others]
         advance_part(self._contexts, *own)
-        for part in begun:
-            part.result()
+        for part, it in zip(begun, others, strict=True):
+            if part.cancel():  # its thread has not woken up: its core is busy
+                advance_part(self._contexts, *it)
+            else:
+                part.result()
         self._context["step"] += 1
 
     def begin_compiled(self) -> tuple[int, int] | None:
@@ -109,7 +114,7 @@ class ParallelStep:
         Addresses of a C function that makes one, and of what it is called with; None where several
         threads are better, which have to be called from Python.
         """
-        if len(self._parts) > 1:
+        if len(self._parts) > 1 and self._points >= COMPILED_POINTS:
             return None
         return step_code(), self._contexts.ctypes.data
 
