@@ -75,8 +75,7 @@ def pairs_of_nodes(context: LaunchContext) -> list[Any]:
         Node(
             package="pdeloop",
             executable=node.package,
-            namespace="/".join(n for n in (given["namespace"].rstrip("/"), node.namespace) if n)
-            or None,
+            namespace=node.namespace_in(given["namespace"]),
             parameters=[problem, {**own, **node.parameters}],
             ros_arguments=["--log-level", given["log_level"]],
             output="screen",

@@ -90,8 +90,7 @@ def training(context: LaunchContext) -> list[Any]:
         action = Node(
             package="pdeloop",
             executable=node.package,
-            namespace="/".join(n for n in (given["namespace"].rstrip("/"), node.namespace) if n)
-            or None,
+            namespace=node.namespace_in(given["namespace"]),
             parameters=[folder / "parameters.yaml", own],
             ros_arguments=["--log-level", given["log_level"]],
             output="screen",

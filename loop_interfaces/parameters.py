@@ -54,6 +54,14 @@ INSTRUMENTS = _section(
 )
 """What stands between the field and its controller (docs/robustness.md)."""
 
+IDENTIFICATION = Spec(
+    "identification", "regression", choices=("field", "regression", "dmdc"), nodes="CT"
+).means(
+    "how the reduced model is identified. regression: least squares in reduced coordinates with the "
+    "inputs whole; field: a linearised model of the whole field, where its law is better; dmdc: the "
+    "paper's truncated DMDc, which the optimizers that learn from costs begin with"
+)
+
 PROBLEM = _section(
     "PT",
     Spec("problem", "burgers", file_name=True, nodes="PCTV").means(
@@ -88,11 +96,7 @@ PROBLEM = _section(
     Spec("reduced_order", 4, 0, 1024, nodes="CT", group="budget and method").means(
         "n_s, order of the reduced model; 0: as the exploratory episode suggests, of one seed"
     ),
-    Spec("identification", "regression", choices=("field", "regression", "dmdc"), nodes="CT").means(
-        "how the reduced model is identified: least squares in reduced coordinates with the inputs "
-        "whole; field: or a linearised model of the whole field, where its law is better; or the "
-        "paper's truncated DMDc, which the optimizers that learn from costs begin with"
-    ),
+    IDENTIFICATION,
     Spec("dmdc_rank", 0, 0, 4096, nodes="CT").means(
         "p of the identification dmdc, rank of [Z; Y]; 0: n_s + n_a"
     ),

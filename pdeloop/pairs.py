@@ -51,6 +51,14 @@ class LoopNode:
         """Its parameters as NAME:=VALUE."""
         return [f"{name}:={ros_value(value)}" for name, value in self.parameters.items()]
 
+    def namespace_in(self, outer: str) -> str | None:
+        """Its namespace where that of the run is `outer`, as a launch file takes it.
+
+        >>> LoopNode("plant", "pde_sim_node", namespace="pair1").namespace_in("lab")
+        'lab/pair1'
+        """
+        return "/".join(name for name in (outer.rstrip("/"), self.namespace) if name) or None
+
     def having(self, **parameters: Any) -> LoopNode:
         """The same node with these parameters."""
         return replace(self, parameters={**self.parameters, **parameters})

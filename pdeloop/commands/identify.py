@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from loop_interfaces.parameters import IDENTIFICATION
 from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import Commands, add_json, command
 from pdeloop.output import print_json
@@ -40,7 +41,7 @@ def add(commands: Commands) -> None:
     )
     add(
         "--identification",
-        choices=("field", "regression", "dmdc"),
+        choices=IDENTIFICATION.choices,
         help="a model of the whole field where its law is better, least squares with the inputs whole, "
         "or truncated DMDc [that of the run, or regression]",
     )

@@ -31,8 +31,8 @@ from pdeloop.study.training import EnvironmentMismatchError, environment, train_
 ASKED = "study.json"
 ATTEMPTS = 3
 """Executors that may break, as when the system kills a process for its memory."""
-POLL, LOOK = 0.1, 2.0
-"""Seconds between two calls of `tell`, and between two looks for workers while nothing is done."""
+POLL, WORKER_CHECK = 0.1, 2.0
+"""Seconds between two calls of `tell`, and between two checks for workers while no task ends."""
 
 Progress = Callable[[int, int, str], None]
 Task = Callable[[Mapping[str, Any], Mapping[str, str] | None], dict[str, bytes]]
@@ -153,12 +153,12 @@ def _collect(
     tell: Progress,
 ) -> None:
     """Write every result as it comes."""
-    status, lacking, look_at = "", "", time.monotonic() + LOOK
+    status, lacking, check_at = "", "", time.monotonic() + WORKER_CHECK
     while waiting:
         tell(len(finished), total, lacking or status)
         done, _ = wait(waiting, timeout=POLL, return_when=FIRST_COMPLETED)
-        if done or time.monotonic() > look_at:
-            look_at = time.monotonic() + LOOK
+        if done or time.monotonic() > check_at:
+            check_at = time.monotonic() + WORKER_CHECK
             lacking = no_worker(pool)
         for future in done:
             status = waiting.pop(future)
