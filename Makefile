@@ -22,8 +22,7 @@ run: setup
 test: setup packages
 	$(BIN)/python -m pytest -n 4 --dist worksteal
 
-# The tests without topics, with what they cover of the pure modules (pyproject.toml). Not in .ci/run: five
-# minutes of processor time.
+# The tests without topics, with what they cover of the pure modules (pyproject.toml).
 coverage: setup packages
 	$(BIN)/python -m pytest -n 4 --dist worksteal -m "not topics" -p pytest_cov --cov
 

@@ -1,4 +1,4 @@
-"""Simulates seeds and prints what fails, with the smallest plan that does."""
+"""Simulates seeds on all cores and prints what fails, with the smallest plan that does."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import argparse
 import sys
 from collections import Counter
 
-from tests.simulation.audit import audit, failure, shrunk
-from tests.simulation.plan import draw
+from pdeloop.study.executors import processes
+from tests.simulation.audit import judge
 
 
 def main() -> int:
@@ -15,12 +15,11 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, nargs=2, default=(0, 100), metavar=("FIRST", "END"))
     options = parser.parse_args()
     ends: Counter[str] = Counter()
-    for seed in range(*options.seeds):
-        if reason := failure(plan := draw(seed)):
-            ends["wrong"] += 1
-            print(f"seed {seed}: {reason}\n  {shrunk(plan)}", flush=True)
-        else:
-            ends[audit(plan).split(":")[0]] += 1
+    with processes() as pool:
+        for end, finding in pool.map(judge, range(*options.seeds), chunksize=10):
+            ends[end] += 1
+            if finding:
+                print(finding, flush=True)
     print(", ".join(f"{count} {end}" for end, count in sorted(ends.items())))
     return bool(ends["wrong"])
 

@@ -9,7 +9,7 @@ import re
 from functools import cache
 
 from tests.simulation.history import History
-from tests.simulation.plan import Plan
+from tests.simulation.plan import Plan, draw
 from tests.simulation.processes import remembering, values
 from tests.small import same_bits, train_here
 from tuner_node.dispatch import DispatchError
@@ -50,18 +50,24 @@ def audit(plan: Plan) -> str:
     return "same bits"
 
 
-def failure(plan: Plan) -> str:
-    """Why the plan's history is wrong, or empty."""
+def verdict(plan: Plan) -> tuple[str, str]:
+    """'same bits' or 'error' and nothing; or 'wrong', and why."""
     try:
-        audit(plan)
+        return audit(plan).split(":")[0], ""
     except Exception as error:  # whatever it is, it is the finding
-        return f"{type(error).__name__}: {error}".splitlines()[0]
-    return ""
+        return "wrong", f"{type(error).__name__}: {error}".splitlines()[0]
 
 
 def shrunk(plan: Plan) -> Plan:
     """A plan that still fails, of which nothing can be left out."""
     for smaller in plan.smaller():
-        if failure(smaller):
+        if verdict(smaller)[1]:
             return shrunk(smaller)
     return plan
+
+
+def judge(seed: int) -> tuple[str, str]:
+    """The verdict on the plan of a seed; where it is wrong, with the smallest plan that is."""
+    plan = draw(seed)
+    end, reason = verdict(plan)
+    return end, f"seed {seed}: {reason}\n  {shrunk(plan)}" if reason else ""
