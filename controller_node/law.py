@@ -114,6 +114,8 @@ def act(law: Any, states: int, actions: int, batch: int) -> None:
 
 
 def compile_control(sources: str) -> Any:
+    """The compiled `act` on arrays; `sources` is part of its key in the cache on disk."""
+
     @cached_njit
     def control(
         laws: NDArray[np.void], states: NDArray[np.float64], actions: NDArray[np.float64]

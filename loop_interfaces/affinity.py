@@ -89,8 +89,9 @@ def _busy_ticks(file: Path = Path("/proc/stat")) -> dict[int, int]:
 
 
 def lower_priority(niceness: int = 0) -> None:
-    """Schedule this process as batch work, so that a message that arrives here does not preempt its
-    sender; `niceness` is added to that of the process.
+    """Schedule this process as batch work, with `niceness` added to its own.
+
+    A message that arrives here then does not preempt its sender.
     """
     with contextlib.suppress(OSError, AttributeError):
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))

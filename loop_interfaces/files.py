@@ -1,5 +1,6 @@
-"""Files that are whole or not there, whatever moment a crash comes at, and no link is followed. No ROS
-import.
+"""Files that are whole or not there, whatever moment a crash comes at.
+
+No symbolic link is followed.
 """
 
 from __future__ import annotations

@@ -368,6 +368,7 @@ def grid_points(equation: Equation, n_z: int) -> int:
 
 
 def whole(name: str, value: int, minimum: int) -> int:
+    """A whole number of at least `minimum`; ValueError otherwise."""
     try:
         number = operator.index(value)
     except TypeError:
@@ -378,6 +379,7 @@ def whole(name: str, value: int, minimum: int) -> int:
 
 
 def positive(name: str, value: float) -> float:
+    """A positive, finite number; ValueError otherwise."""
     if not 0 < value < math.inf:
         raise ValueError(f"{name} must be positive and finite, got {value!r}")
     return float(value)

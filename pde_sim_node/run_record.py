@@ -16,8 +16,7 @@ FOLDER = Path(tempfile.gettempdir()) / f"pdeloop-plants-{os.getuid()}"
 
 
 class RunRecord:
-    """The runs in which the plant `name` of the ROS domain `domain` is paused, and has a controller
-    that signs; 0 for none.
+    """The runs in which a plant is paused, and has a controller that signs; 0 for none.
 
     Parameters
     ----------

@@ -128,8 +128,9 @@ class BagWriter:
         self._first, self._last = min(self._first, when), max(self._last, when)
 
     def pause(self) -> None:
-        """Between two batches of messages, each of which is kept as a whole or not at all: write what
-        has become large.
+        """Write what has become large.
+
+        To be called between two batches of messages: each is kept as a whole or not at all.
         """
         if self._pending > LARGE:
             self.flush()

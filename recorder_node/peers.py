@@ -1,5 +1,6 @@
-"""The other nodes of the loop, as the ROS graph shows them: whether all have discovered the
-recorder's subscriptions, and what parameters they have.
+"""The other nodes of the loop, as the ROS graph shows them.
+
+Whether all have discovered the recorder's subscriptions, and what parameters they have.
 """
 
 from __future__ import annotations

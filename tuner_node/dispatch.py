@@ -245,8 +245,10 @@ class Dispatcher:
         return []
 
     def state(self, pair: int, frame: Frame) -> bool:
-        """Take a sample z_k of a pair's episode; whether it is the last one, and the cost is there:
-        then `tick`, they come in their order. Raises FrameError for one of another shape.
+        """Take a sample z_k of a pair's episode.
+
+        True if it is the last one and the cost is there: `tick` then handles them in their order.
+        Raises FrameError for a sample of another shape.
         """
         known = self.pairs[pair]
         for late in known.used_samples():

@@ -95,8 +95,9 @@ class RolloutCosts:
         )
 
     def controller(self, run: int, episode: int, environment: int) -> str:
-        """Who acts in an environment: a key of loop_interfaces.controllers, 'exploration', or empty if
-        it is not known.
+        """Who acts in an environment: a key of loop_interfaces.controllers, or 'exploration'.
+
+        Empty if it is not known.
         """
         start, policy = self._starts.get((run, episode)), self._policies.get((run, episode))
         if start is not None and _explores(start):

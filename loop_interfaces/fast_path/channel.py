@@ -123,11 +123,13 @@ def slot_after(channel: Any, messages: int) -> int:
 
 @jit
 def lock(channel: Any) -> None:
+    """Wait for the channel's mutex and take it."""
     call_c(channel.lock, (channel.mutex,))
 
 
 @jit
 def unlock(channel: Any) -> None:
+    """Release the channel's mutex."""
     call_c(channel.unlock, (channel.mutex,))
 
 
@@ -156,6 +158,7 @@ def put_into_mailbox(channel: Any) -> None:
 
 @jit
 def remove_oldest(channel: Any) -> None:
+    """Drop the oldest message of the mailbox."""
     channel.first = (channel.first + 1) % SLOTS
     channel.waiting -= 1
 
@@ -173,6 +176,7 @@ def on_message(channel: Any) -> bool:
 
 
 def compile_on_new_message() -> Any:
+    """The compiled callback of the middleware: `on_message` for each message that arrived."""
     channels_at = types.CPointer(numba.from_dtype(CHANNEL))  # type: ignore[no-untyped-call]
 
     @numba.cfunc(types.void(channels_at, types.intp), cache=True)
@@ -323,14 +327,17 @@ class RclChannel:
         self._answer.buffer, self._answer.length = begin, length
 
     def arm(self) -> bool:
-        """Answer what waits, and from now on every message at once; False if one cannot be answered:
-        it waits, and the channel is not armed.
+        """Answer what waits, and from now on every message at once.
+
+        False if a message cannot be answered: it waits, and the channel is not armed.
         """
         return bool(arm(self.record))
 
     def disarm(self) -> tuple[int, float]:
-        """From now on every message waits. How many were answered since `arm`, and when the last one
-        was, in s on the clock of time.monotonic.
+        """Let every message wait from now on.
+
+        Returns how many were answered since `arm`, and when the last one was, in s on the clock of
+        time.monotonic.
         """
         disarm(self.record)
         return int(self._channel["answered"]), 1e-9 * float(self._channel["answered_at"])

@@ -64,6 +64,10 @@ def fast_handler(
 
 
 def compile_handler(plan: np.dtype[np.void], answer: Callable[..., bool], sources: str) -> Any:
+    """The compiled handler of a channel, which answers with `answer`.
+
+    The fingerprint `sources` is part of its key in the cache on disk.
+    """
     plans_at = types.CPointer(numba.from_dtype(plan))  # type: ignore[no-untyped-call]
 
     @numba.cfunc(types.int32(plans_at, types.intp, types.intp), cache=True)

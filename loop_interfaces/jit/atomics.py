@@ -11,6 +11,7 @@ WORD = ir.IntType(64)
 
 
 def place(builder: Any, address: Any) -> Any:
+    """The pointer to the word at an address."""
     return builder.inttoptr(address, WORD.as_pointer())
 
 

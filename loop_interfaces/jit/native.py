@@ -25,8 +25,9 @@ STATUS = ir.IntType(32)
 
 @intrinsic
 def call_c(typing_context: Any, address: Any, arguments: Any) -> Any:
-    """Call an int (*)(intptr_t, ...) with a tuple of integers or addresses; of a void one the result
-    has no meaning.
+    """Call an int (*)(intptr_t, ...) with a tuple of integers or addresses.
+
+    The result of a void function has no meaning.
     """
 
     def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:

@@ -46,6 +46,8 @@ eight_lanes = types.UniTuple(lanes, WIDTH)  # type: ignore[no-untyped-call]
 
 @register_model(Lanes)
 class LanesModel(models.PrimitiveModel):
+    """Data model of `Lanes`: an LLVM vector."""
+
     def __init__(self, manager: Any, fe_type: Any) -> None:
         super().__init__(manager, fe_type, VECTOR)  # type: ignore[no-untyped-call]
 
@@ -57,11 +59,13 @@ def intrinsic(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def pointer(builder: Any, address: Any, offset: Any, kind: Any = NUMBER) -> Any:
+    """The pointer to the number `offset` behind an address, as one to `kind`."""
     numbers = builder.inttoptr(address, NUMBER.as_pointer())
     return builder.bitcast(builder.gep(numbers, [offset], inbounds=True), kind.as_pointer())
 
 
 def shuffle(builder: Any, a: Any, b: Any, order: Sequence[int]) -> Any:
+    """The lanes of a followed by b, in this order."""
     mask = ir.Constant(ir.VectorType(ir.IntType(32), len(order)), list(order))
     return builder.shuffle_vector(a, b, mask)
 
@@ -163,6 +167,7 @@ def transpose(typing_context: Any, rows: Any) -> Any:
 
 
 def fused(builder: Any, a: Any, b: Any, c: Any) -> Any:
+    """The value a * b + c by LLVM's intrinsic."""
     kind = ir.FunctionType(VECTOR, [VECTOR] * 3)
     name = f"llvm.fma.v{WIDTH}f64"
     function = get_or_insert_function(builder.module, kind, name)  # type: ignore[no-untyped-call]
@@ -171,8 +176,9 @@ def fused(builder: Any, a: Any, b: Any, c: Any) -> Any:
 
 @intrinsic
 def fma(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
-    """a * b + c with one rounding, by an instruction of its own or, slowly, by the C library: never
-    two roundings, so that all machines agree.
+    """a * b + c with one rounding on every machine, so that all agree.
+
+    By an instruction of its own or, slowly, by the C library.
     """
 
     def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:

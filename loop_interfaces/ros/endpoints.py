@@ -125,8 +125,9 @@ class _BatchPublisher:
 
 
 class SampleBatcher:
-    """Publishes all samples on `samples`, and those of some episodes on `samples_throttled`; nothing is
-    stored while there are no subscribers.
+    """Publishes all samples on `samples`, and those of some episodes on `samples_throttled`.
+
+    Nothing is stored while there are no subscribers.
 
     Make it before the publisher of the states: a process that has discovered the states has
     then discovered the samples.

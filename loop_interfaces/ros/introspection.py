@@ -1,5 +1,4 @@
-"""What every node of the loop offers to ROS tools: /diagnostics and trigger services; and who else is
-in the graph.
+"""What every node offers to ROS tools, and who else is in the graph: /diagnostics, trigger services.
 
 All of it runs in the node's housekeeping, off the hot path: nothing here is called for a message of
 the loop.

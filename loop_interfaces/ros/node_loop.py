@@ -284,8 +284,9 @@ class NodeLoop(EventLoop):
             self._guard.trigger_guard_condition()
 
     def _takes(self, fast: _Fast | None) -> dict[Any, Callable[[], int]]:
-        """What to wait for, and what takes from it; the watched ones first: a cost comes after
-        the samples of its episode, and is to be handled after them.
+        """What to wait for, and what takes from it, the watched subscriptions first.
+
+        A cost comes after the samples of its episode, and is to be handled after them.
         """
         found: dict[Any, Callable[[], int]] = {}
         for watched in self._watched.values():

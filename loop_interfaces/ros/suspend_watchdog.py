@@ -15,8 +15,9 @@ most PERIOD before it was stopped. One that is starved by others still gets more
 
 
 def sleep_for(seconds: float) -> None:
-    """Sleep for so long, and not until a point of a clock: clocks jump, and tools that move them for
-    tests (libfaketime) let time.sleep fail.
+    """Sleep for a time, not until a point of a clock.
+
+    Clocks jump, and tools that move them for tests (libfaketime) let time.sleep fail.
     """
     select.select((), (), (), seconds)
 

@@ -123,6 +123,7 @@ def complete(name: str, class_name: str, found: Any) -> type[Equation]:
 
 
 def load_module(dotted: str) -> ModuleType:
+    """Import a module by its dotted name; ValueError if that fails."""
     try:
         return importlib.import_module(dotted)
     except Exception as error:

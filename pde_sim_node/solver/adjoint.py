@@ -159,6 +159,8 @@ def pull_back_internal(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> 
 
 
 def compile_pull_back(sources: str) -> Any:
+    """The compiled `pull_back` of many states; `sources` is part of its key in the cache on disk."""
+
     @cached_njit
     def pull_back(
         states: Array,
@@ -169,9 +171,7 @@ def compile_pull_back(sources: str) -> Any:
         on_actions: Array,
         plans: NDArray[np.void],
     ) -> None:
-        """Write f(z, a) and the two products with its transposed derivatives: after, on_states and
-        on_actions.
-        """
+        """Write `after`, f(z, a), and `on_states` and `on_actions`, the transposed products."""
         sources  # noqa: B018  # closed over to be part of the key on disk
         plan = plans[0]
         w, d, c, e = plan.scratch, plan.scratch_apart, plan.constants, plan.constants_apart

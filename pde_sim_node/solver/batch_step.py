@@ -19,6 +19,7 @@ from loop_interfaces.jit.simd import fma, load, read, read_word, splat, store, w
 
 @jit
 def stage_cost(state: int, action: int, w: int, plan: Any, c: int) -> float:
+    """q |z - z_r|^2 + r |a|^2 of one environment."""
     lanes = splat(0.0)
     whole = plan.n_z // 8 * 8
     for i in range(0, whole, 8):
@@ -58,6 +59,7 @@ def environments_of(plan: Any, advance: Callable[..., None], *sources: ModuleTyp
 
 
 def compile_environments(plan_type: Any, advance: Callable[..., None], sources: str) -> Any:
+    """The compiled loop over environments, each advanced by `advance`."""
     plan_at = types.CPointer(numba.from_dtype(plan_type))  # type: ignore[no-untyped-call]
 
     @numba.cfunc(types.void(plan_at, *[types.intp] * 7), cache=True)

@@ -76,12 +76,14 @@ def twiddles_of(m: int) -> NDArray[np.complex128]:
 
 
 def root(power: NDArray[np.int64], n: int) -> NDArray[np.complex128]:
+    """exp(-2 pi i power / n), with the power reduced first so that no digit is lost."""
     factors: NDArray[np.complex128] = np.exp(-2j * np.pi * (power % n) / n)
     return factors
 
 
 @jit
 def times(ar: Any, ai: Any, br: Any, bi: Any) -> Any:
+    """The complex product a b, in lanes."""
     return minus_product(ai, bi, ar * br), fma(ai, br, ar * bi)
 
 
@@ -214,6 +216,7 @@ pass3, pass2 = later_pass(3, butterfly3), later_pass(2, butterfly2)
 def one_pass(
     radix: int, w: int, x: int, y: int, d: int, m: int, s: int, c: int, v: int, e: int
 ) -> int:
+    """A pass of this radix, see `later_pass`; radix 2 for any other."""
     if radix == 8:
         return pass8(w, x, y, d, m, s, c, v, e)
     if radix == 4:

@@ -66,6 +66,7 @@ def reason(function: Callable[[float], float]) -> str:
 
 
 def compile_loop(scalar: Callable[[float], float], sources: str) -> Any:
+    """The compiled function that applies a scalar function to an array in place."""
     signature = types.void(types.CPointer(types.float64), types.intp)  # type: ignore[no-untyped-call]
 
     @numba.cfunc(signature, cache=True)

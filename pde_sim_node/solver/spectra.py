@@ -35,22 +35,26 @@ TRANSFORM = np.dtype(
 
 @jit
 def get(w: int, x: int, d: int) -> Complex:
+    """Eight complex numbers from x on."""
     return load(w, x), load(w, x + d)
 
 
 @jit
 def put(w: int, x: int, d: int, value: Complex) -> None:
+    """Store eight complex numbers from x on."""
     store(w, x, value[0])
     store(w, x + d, value[1])
 
 
 @jit
 def plus(a: Complex, b: Complex) -> Complex:
+    """a + b."""
     return a[0] + b[0], a[1] + b[1]
 
 
 @jit
 def minus(a: Complex, b: Complex) -> Complex:
+    """a - b."""
     return a[0] - b[0], a[1] - b[1]
 
 
@@ -78,6 +82,7 @@ def with_mirror(w: int, x: int, d: int, m: int, k: int) -> tuple[Complex, Comple
 
 @jit
 def rfft_unpack(w: int, x: int, z: int, d: int, t: Any, c: int, e: int) -> None:
+    """Z from X, see above: the input of the complex inverse transform."""
     m, factors = t.m, t.split
     for k in range(0, m, 8):
         (s, r), v = with_mirror(w, x, d, m, k), get(c, factors + k, e)
@@ -109,6 +114,7 @@ def forward(w: int, z: int, other: int, d: int, t: Any, c: int, e: int) -> int:
 
 @jit
 def inverse(w: int, z: int, other: int, d: int, t: Any, c: int, e: int) -> int:
+    """The inverse transform of the numbers at z, without its factor; returns where the result is."""
     return fft(w, z + d, other + d, -d, t, c, e) - d
 
 

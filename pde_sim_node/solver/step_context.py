@@ -34,6 +34,7 @@ def advance(context: Any, plan: int, first: int, last: int) -> None:
 
 
 def compile_step() -> Any:
+    """The compiled `advance` of a whole batch, at an address that other compiled code calls."""
     contexts_at = types.CPointer(numba.from_dtype(STEP_CONTEXT))  # type: ignore[no-untyped-call]
     sources = fingerprint(native)
 

@@ -23,6 +23,8 @@ COMPILED_POINTS = 120_000
 
 
 def compile_part(sources: str) -> Any:
+    """The compiled step of a part of a batch; `sources` is part of its key in the cache on disk."""
+
     @cached_njit
     def advance_part(contexts: NDArray[np.void], plan: int, first: int, last: int) -> None:
         """Advance the environments first, ..., last - 1 of the STEP_CONTEXT in an array."""

@@ -1,5 +1,4 @@
-"""Reads the loop's messages back from an MCAP bag, finished or not, anybody's, and sorts them into
-episodes.
+"""Reads the loop's messages back from an MCAP bag, and sorts them into episodes.
 
 A bag was not finished if its recorder was killed, or the disk was full.
 """

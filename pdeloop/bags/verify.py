@@ -266,8 +266,10 @@ class _Run:
 
 
 def _keys(rows: Array, policies: Array | None, models: int) -> list[bytes]:
-    """What identifies each rollout, bit by bit: its seeds, and under a policy that policy and the
-    number of the models it is about, for each exploration repeats the rollouts without control.
+    """What identifies each rollout, bit by bit: its seeds, and the policy if there is one.
+
+    A policy stands with the number of the models it is about, as each exploration repeats the
+    rollouts without control.
     """
     rows = np.ascontiguousarray(rows)
     if policies is None:

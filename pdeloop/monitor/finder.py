@@ -30,8 +30,9 @@ class Finder:
         self._found: Live | None = None
 
     def find(self) -> Live | None:
-        """The loop to show now; None as long as there is none. One that has ended stays, until
-        there is another.
+        """The loop to show now; None as long as there is none.
+
+        One that has ended stays until there is another.
         """
         running = self._loops()
         if self._folder is not None:

@@ -1,5 +1,4 @@
-"""What every optimiser of a policy is: it asks for rollouts, is told their outcome, and holds a
-policy.
+"""What every optimiser of a policy is: it asks for rollouts, and is told their outcome.
 
     while not optimizer.done:
         rollouts = optimizer.ask()                # the same until tell
@@ -218,8 +217,10 @@ def require_state(
     fixed: Sequence[str],
     growing: Sequence[str] = (),
 ) -> None:
-    """A ValueError unless `state` has the keys of `own`, with arrays of the same types and shapes, and
-    agrees with it in the `fixed` ones. Of the `growing` ones there may be any number.
+    """Raise ValueError unless `state` could be a later one of `own`.
+
+    It has the same keys, with arrays of the same types and shapes, and agrees in the `fixed` ones. Of
+    the `growing` ones there may be any number.
     """
     if set(state) != set(own):
         raise ValueError(

@@ -1,5 +1,6 @@
-"""A local model of the plant, fitted to measured trajectories: affine plus quadratic in a few
-modes, plus cubic in fewer.
+"""A local model of the plant, fitted to measured trajectories.
+
+It is affine, plus quadratic in a few modes, plus cubic in fewer.
 
 On coordinates x = V^T z, with V = [U, further modes] orthonormal, centred and scaled by their
 spread,
@@ -222,8 +223,6 @@ def _symmetric(coefficients: Array, products: IndexArray, size: int) -> Array:
 
 
 def _spread(share: Array, values: Array) -> float:
-    """One scale for all coordinates, so that the ridge holds small modes back more than large
-    ones.
-    """
+    """One scale for all coordinates: the ridge then holds small modes back more than large ones."""
     square = float(np.mean(share @ (values * values)))
     return float(np.sqrt(square)) if square > 0.0 else 1.0

@@ -1,5 +1,4 @@
-"""The next policy to try: fit local models, choose the one that predicts, take a damped
-Gauss-Newton step.
+"""The next policy to try: a damped Gauss-Newton step on the local model that predicts best.
 
 A pure function of the remembered trajectories; see `tuner_node.optimizers.gauss_newton` for the
 method.
