@@ -161,17 +161,15 @@ def _add_optimum(programs: Commands) -> None:
     )
     program.add("problems", "PROBLEM", "shipped names or YAML files [the paper's]", nargs="*")
     program.add("--seeds", "N", "trainings whose basis U is used [6]", type=int)
-    program.add("--first-seed", "S", "the first of them [0]", type=int)
     program.add("--fields", "M", "initial fields a law is optimised on [16]", type=int)
     program.add(
         "--evaluation-seed", "S", "draws of held-out fields to measure on [0]", type=int, nargs="+"
     )
     program.add("--evaluation-fields", "N", "fields of each draw [10]", type=int)
     program.add("--tolerance", "SHARE", "converged when 20 iterations gain less [2e-4]", type=float)
-    program.add("--iterations", "N", "of L-BFGS, at most [1000]", type=int)
     program.add("--jobs", "N", "processes [one a core]", type=int)
-    program.switch("--no-checks", "not from zero, and not with twice the fields")
-    program.add("--save", "DIR", "write DIR/PROBLEM.json, which reports read", type=Path)
+    program.switch("--from-zero", "begin with zero gains and inputs instead of those of LQT")
+    program.add("--save", "DIR", "write the limits to DIR/PROBLEM.json", type=Path)
 
 
 class Program:

@@ -26,6 +26,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from benchmarks.limits import find
 from benchmarks.methods import LIBRARIES, METHODS, measure
 from loop_interfaces.files import read_json
 from loop_interfaces.parameters import table as parameters
@@ -33,7 +34,6 @@ from loop_interfaces.problem import load_parameters
 from loop_interfaces.spec import read_document
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.finished_run import interval
-from pdeloop.reference import find
 from pdeloop.study import Study
 from pdeloop.study import run as carry_out
 from pdeloop.study.executors import processes as pool

@@ -26,16 +26,14 @@ WINDOW = 20
 class Descent:
     """Where a descent ended, and how far it had come.
 
-    x: the argument; cost; iterations; evaluations: of cost and gradient; gradient_norm: |x|
-    |dJ/dx|/J at the end; last_fall: of the last WINDOW iterations, relative to the cost; converged:
-    whether that, or the gradient norm's square, is below the tolerance (else the iterations were
-    used up).
+    x: the argument; cost; iterations; gradient_norm: |x| |dJ/dx|/J at the end; last_fall: of the last
+    WINDOW iterations, relative to the cost; converged: whether that, or the gradient norm's square,
+    is below the tolerance (else the iterations were used up).
     """
 
     x: Array
     cost: float
     iterations: int
-    evaluations: int
     gradient_norm: float
     last_fall: float
     converged: bool
@@ -46,7 +44,7 @@ def descend(
     x: Array,
     *,
     tolerance: float,
-    iterations: int,
+    iterations: int = 1000,
 ) -> Descent:
     """Minimise function(x) = (J, dJ/dx) from x on.
 
@@ -104,7 +102,6 @@ def descend(
         x=end.x.reshape(x.shape),
         cost=float(end.fun),
         iterations=len(costs) - 1,
-        evaluations=int(end.nfev) + 2,
         gradient_norm=norm,
         last_fall=float(fall()),
         converged=bool(len(costs) > WINDOW and fall() < tolerance) or flat,

@@ -8,8 +8,7 @@ Two limits, both with exact gradients (`pde_sim_node.solver.adjoint`) of the noi
   which no controller of any kind can undercut there (a local optimum, as the problem is not
   convex).
 
-Both are measured on the fields of a training's closing evaluation, which the law has not seen. What
-is saved lets reports say which share of the possible gain a training has reached.
+Both are measured on the fields of a training's closing evaluation, which the law has not seen.
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ import os
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -30,54 +29,30 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from benchmarks.descent import WINDOW, Descent, descend
+from benchmarks.limits import content
 from benchmarks.warm_start import warm_start
+from loop_interfaces.files import make_folder
 from loop_interfaces.model_rows import unpack
 from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from pdeloop.gradients import Gradients, features
 from pdeloop.in_process import LocalPair
-from pdeloop.reference import FORMAT, bound_parameters, no_control_cost
 from pdeloop.reproduce.experiment import PAPER
-from tuner_node.results import RunFolderError, versions
 from tuner_node.seeds import Purpose, derive
 
 __all__ = ["run", "text"]
 
 Array = NDArray[np.float64]
+Function = Callable[[Array], tuple[float, Array]]
+"""A cost and its gradient."""
+Law = tuple[Array, Array]
+"""U (n_z, n_s) and theta (n_a, n_s + 1) of a = theta [U^T z; 1]."""
 TRAINING_SEED = 7000
 """Draws the fields that a law is optimised on: no evaluation uses it."""
 RIDGE = 1e-2
 """Of the scaling of a law's gains, relative to the mean square of the features."""
-
-
 FLOOR = 1e-4
 """Of the eigenvalues of the Hessian in the scaling, relative to the largest."""
-
-
-@dataclass(frozen=True)
-class LawJob:
-    """Optimise the law of one seed."""
-
-    problem: str
-    seed: int
-    fields: int
-    evaluations: tuple[int, ...]
-    evaluation_fields: int
-    tolerance: float
-    iterations: int
-    from_zero: bool = False
-
-
-@dataclass(frozen=True)
-class InputJob:
-    """Optimise the inputs of one initial field, from those of a law or from none."""
-
-    problem: str
-    field_seed: int
-    U: Array | None
-    theta: Array | None
-    tolerance: float
-    iterations: int
 
 
 def evaluation_seeds(seed: int, fields: int) -> list[int]:
@@ -85,25 +60,50 @@ def evaluation_seeds(seed: int, fields: int) -> list[int]:
     return [derive(seed, Purpose.EVALUATION_FIELD, i) for i in range(fields)]
 
 
-def optimise_law(job: LawJob) -> dict[str, Any]:
-    """The optimum of the class for the basis of one seed, and its costs on evaluation fields.
+def optimise_law(
+    problem: str,
+    seed: int,
+    *,
+    fields: int,
+    evaluations: Mapping[int, Sequence[int]],
+    tolerance: float,
+    from_zero: bool = False,
+) -> tuple[Descent, Law, dict[str, dict[int, list[float]]]]:
+    """The optimum of the class for the basis of one training seed.
 
     L-BFGS runs on a quarter of the fields first, in coordinates in which the features [s; 1] have
     unit covariance, and then on all, in coordinates in which the Hessian found there is the unit
     matrix (differences of exact gradients): what is left is well conditioned and takes few steps.
+
+    Parameters
+    ----------
+    problem, seed
+        Shipped name or YAML file, and the seed of the training.
+    fields
+        Initial fields that the law is optimised on.
+    evaluations
+        Seeds of the initial fields that it is measured on, by evaluation seed.
+    tolerance
+        Of `descend`.
+    from_zero
+        Begin with zero gains instead of those of LQ tracking.
+
+    Returns
+    -------
+    Where the descent ended, the law, and the costs by field of the laws lqt and optimum.
     """
     with threadpool_limits(limits=1):
-        values = load_parameters(job.problem, {})
+        values = load_parameters(problem, {})
         gradients = Gradients(build_plant(values))
         plant = gradients.plant
-        training = warm_start({**values, "seed": job.seed}, LocalPair(values, plant))
+        training = warm_start({**values, "seed": seed}, LocalPair(values, plant))
         assert training.models is not None
         policy, U = training.starts()[0], unpack(training.models[0], plant.n_a).U
         target, n_s = plant.target, U.shape[1]
         warm = np.column_stack([policy[:, :n_s], policy[:, n_s:] @ (U.T @ target)])
-        fields = evaluation_seeds(TRAINING_SEED, job.fields)
-        theta = np.zeros_like(warm) if job.from_zero else warm
-        while not (episode := gradients.law(U, theta, fields)).whole:
+        chosen = evaluation_seeds(TRAINING_SEED, fields)
+        theta = np.zeros_like(warm) if from_zero else warm
+        while not (episode := gradients.law(U, theta, chosen)).whole:
             theta = 0.5 * theta
         rows = features(U, target, episode.states[:-1]).reshape(-1, n_s + 1)
         moments = rows.T @ rows / len(rows)
@@ -112,39 +112,36 @@ def optimise_law(job: LawJob) -> dict[str, Any]:
             np.eye(plant.n_a), np.linalg.inv(np.linalg.cholesky(moments)).T
         ).astype(np.float64)
 
-        def cost(chosen: Sequence[int], scale: Array) -> Callable[[Array], tuple[float, Array]]:
+        def cost(seeds: Sequence[int], scale: Array) -> Function:
             """J and its gradient at theta = scale x."""
 
             def function(x: Array) -> tuple[float, Array]:
-                value, gradient, _ = gradients.of_law(U, (scale @ x).reshape(theta.shape), chosen)
+                value, gradient, _ = gradients.of_law(U, (scale @ x).reshape(theta.shape), seeds)
                 return value, scale.T @ gradient.ravel()
 
             return function
 
-        few = cost(fields[: -(-len(fields) // 4)], scale)
-        how = {"iterations": job.iterations}
+        few = cost(chosen[: -(-fields // 4)], scale)
         first: Array = np.linalg.solve(scale, theta.ravel()).astype(np.float64)
-        near = descend(few, first, tolerance=10 * job.tolerance, **how)
+        near = descend(few, first, tolerance=10 * tolerance)
         start = scale @ near.x
-        if not np.isfinite(cost(fields, scale)(near.x)[0]):
+        if not np.isfinite(cost(chosen, scale)(near.x)[0]):
             start = theta.ravel()  # good on few fields and diverging on another
         scale = scale @ inverse_root(hessian(few, near.x))
         first = np.linalg.solve(scale, start).astype(np.float64)
-        found = descend(cost(fields, scale), first, tolerance=job.tolerance, **how)
+        found = descend(cost(chosen, scale), first, tolerance=tolerance)
         best = (scale @ found.x).reshape(theta.shape)
-        measured = {
-            seed: {
-                name: gradients.law(
-                    U, law, evaluation_seeds(seed, job.evaluation_fields)
-                ).costs.mean.tolist()
-                for name, law in (("lqt", warm), ("optimum", best))
+        costs = {
+            name: {
+                draw: gradients.law(U, law, seeds).costs.mean.tolist()
+                for draw, seeds in evaluations.items()
             }
-            for seed in job.evaluations
+            for name, law in (("lqt", warm), ("optimum", best))
         }
-    return {"U": U, "theta": best, "costs": measured, **_summary(found)}
+    return found, (U, best), costs
 
 
-def hessian(function: Callable[[Array], tuple[float, Array]], x: Array) -> Array:
+def hessian(function: Function, x: Array) -> Array:
     """The symmetric part of the differences of exact gradients, (p, p)."""
     step = 1e-4 * max(float(np.linalg.norm(x)), 1e-3)
     rows = [function(x + e)[1] - function(x - e)[1] for e in step * np.eye(x.size)]
@@ -160,205 +157,94 @@ def inverse_root(matrix: Array) -> Array:
     return root
 
 
-def optimise_inputs(job: InputJob) -> dict[str, Any]:
-    """The optimal inputs of one initial field."""
+def optimise_inputs(
+    problem: str, field_seed: int, *, law: Law | None, tolerance: float
+) -> tuple[Descent]:
+    """The optimal inputs of one initial field, from those of a law, or from none."""
     with threadpool_limits(limits=1):
-        gradients = Gradients(build_plant(load_parameters(job.problem, {})))
-        plant = gradients.plant
-        inputs = np.zeros((plant.horizon, 1, plant.n_a))
-        if job.U is not None and job.theta is not None:
-            episode = gradients.law(job.U, job.theta, [job.field_seed])
+        gradients = Gradients(build_plant(load_parameters(problem, {})))
+        inputs = np.zeros((gradients.plant.horizon, 1, gradients.plant.n_a))
+        if law is not None:
+            episode = gradients.law(*law, [field_seed])
             inputs = episode.actions if episode.whole else inputs
-
         found = descend(
-            lambda given: gradients.of_actions(given, [job.field_seed])[:2],
-            inputs,
-            tolerance=job.tolerance,
-            iterations=job.iterations,
+            lambda given: gradients.of_actions(given, [field_seed])[:2], inputs, tolerance=tolerance
         )
-    return _summary(found)
-
-
-def _summary(found: Descent) -> dict[str, Any]:
-    return {name: value for name, value in asdict(found).items() if name != "x"}
+    return (found,)
 
 
 def run(
     problems: Sequence[str] = (),
     *,
     seeds: int = 6,
-    first_seed: int = 0,
     fields: int = 16,
     evaluation_seed: Sequence[int] = (0,),
     evaluation_fields: int = 10,
     tolerance: float = 2e-4,
-    iterations: int = 1000,
     jobs: int | None = None,
-    no_checks: bool = False,
+    from_zero: bool = False,
     save: Path | None = None,
 ) -> list[dict[str, Any]]:
-    """The limits of each problem, as JSON-able numbers.
-
-    Parameters
-    ----------
-    problems
-        Shipped names or YAML files; none: the paper's.
-    seeds, first_seed
-        Trainings whose basis U is used.
-    fields
-        Initial fields that a law is optimised on.
-    evaluation_seed, evaluation_fields
-        Draws of held-out fields to measure on, and how many in each.
-    tolerance, iterations
-        See `descend`.
-    jobs
-        Processes; none: one a core.
-    no_checks
-        Leave out the first seed and field from zero, and with twice the fields: what the result
-        depends on.
-    save
-        Folder for PROBLEM.json, which reports read (`pdeloop.reference`).
-    """
-    for name, number in (("seeds", seeds), ("fields", fields), ("iterations", iterations)):
+    """The limits of each problem, as JSON-able numbers; the command line explains the parameters."""
+    for name, number in (("seeds", seeds), ("fields", fields)):
         if number < 1:
             raise ValueError(f"--{name} must be at least 1, got {number}")
     if evaluation_fields < 1 or not 0 < tolerance < 1:
         raise ValueError("--evaluation-fields must be at least 1 and --tolerance between 0 and 1")
-    settings = {
-        "first_seed": first_seed,
-        "seeds": seeds,
-        "fields": fields,
-        "evaluation_fields": evaluation_fields,
-        "tolerance": tolerance,
-        "iterations": iterations,
-    }
-
-    def law(problem: str, seed: int, count: int, from_zero: bool = False) -> LawJob:
-        draws = tuple(evaluation_seed)
-        return LawJob(
-            problem, seed, count, draws, evaluation_fields, tolerance, iterations, from_zero
-        )
-
+    evaluations = {draw: evaluation_seeds(draw, evaluation_fields) for draw in evaluation_seed}
     results = []
     # Processes, as L-BFGS and the loop over the steps hold the interpreter's lock.
     cores = jobs or len(os.sched_getaffinity(0))
     with ProcessPoolExecutor(cores, mp_context=get_context("spawn")) as pool:
         for problem in problems or tuple(PAPER):
             values = load_parameters(problem, {})
-            laws: dict[Any, LawJob] = {
-                seed: law(problem, seed, fields) for seed in range(first_seed, first_seed + seeds)
-            }
-            if not no_checks:
-                laws["from zero"] = law(problem, first_seed, fields, from_zero=True)
-                laws["twice the fields"] = law(problem, first_seed, 2 * fields)
-            name = str(values["problem"])
-            found = _all(pool, optimise_law, laws, f"{name}, law of seed")
-            first = found[first_seed]
-            given: dict[Any, InputJob] = {
-                (seed, i): InputJob(
-                    problem, field, first["U"], first["theta"], tolerance, iterations
-                )
-                for seed in evaluation_seed
-                for i, field in enumerate(evaluation_seeds(seed, evaluation_fields))
-            }
-            if not no_checks:
-                field = evaluation_seeds(evaluation_seed[0], 1)[0]
-                given["from zero"] = InputJob(problem, field, None, None, tolerance, iterations)
-            inputs = _all(pool, optimise_inputs, given, f"{name}, inputs of field")
-            result = _result(values, settings, found, inputs)
+            work: partial[Any] = partial(
+                optimise_law,
+                problem,
+                fields=fields,
+                evaluations=evaluations,
+                tolerance=tolerance,
+                from_zero=from_zero,
+            )
+            laws = _all(pool, work, range(seeds), f"{values['problem']}, law of seed")
+            law = None if from_zero else laws[0][1]
+            work = partial(optimise_inputs, problem, law=law, tolerance=tolerance)
+            drawn = [field for own in evaluations.values() for field in own]
+            inputs = _all(pool, work, drawn, f"{values['problem']}, inputs of field")
+            costs = iter([found.cost for (found,) in inputs])
+            open_loop = {str(draw): [next(costs) for _ in own] for draw, own in evaluations.items()}
             if save is not None:
-                _save(save / f"{name}.json", result)
-            results.append(result)
+                make_folder(save)
+                kept = json.dumps(content(values, open_loop), indent=1)
+                (save / f"{values['problem']}.json").write_text(f"{kept}\n")
+            found = [each[0] for each in (*laws, *inputs)]
+            results.append(
+                {
+                    "problem": values["problem"],
+                    "fields": fields,
+                    "costs": [own for _, _, own in laws],
+                    "open_loop": open_loop,
+                    "iterations": [each.iterations for each in found],
+                    "last_fall": [each.last_fall for each in found],
+                    "converged": [each.converged for each in found],
+                }
+            )
     return results
 
 
-def _all(
-    pool: ProcessPoolExecutor, work: Any, jobs: Mapping[Any, Any], what: str
-) -> dict[Any, dict[str, Any]]:
-    """The results of all jobs by their key, with a line on stderr for each that is done."""
+def _all(pool: ProcessPoolExecutor, work: Any, given: Sequence[int], what: str) -> list[Any]:
+    """The results of `work` in order, with a line on stderr for each."""
     began = time.monotonic()
-    waiting: dict[Future[Any], Any] = {pool.submit(work, job): key for key, job in jobs.items()}
-    done = {}
-    try:
-        for future in as_completed(waiting):
-            key = waiting[future]
-            done[key] = result = future.result()
-            print(
-                f"{what} {key}: {result['cost']:.5g} after {result['iterations']} iterations "
-                f"({len(done)} of {len(jobs)}, {time.monotonic() - began:.0f} s)",
-                file=sys.stderr,
-                flush=True,
-            )
-    except BaseException:
-        pool.shutdown(wait=False, cancel_futures=True)
-        raise
-    return {key: done[key] for key in jobs}
-
-
-def _result(
-    values: Mapping[str, Any],
-    settings: Mapping[str, Any],
-    laws: Mapping[Any, dict[str, Any]],
-    inputs: Mapping[Any, dict[str, Any]],
-) -> dict[str, Any]:
-    own = [key for key in laws if isinstance(key, int)]
-    draws = list(laws[own[0]]["costs"])
-    shown = ("cost", "iterations", "evaluations", "gradient_norm", "last_fall", "converged")
-    return {
-        "format": FORMAT,
-        "problem": values["problem"],
-        "versions": versions(),
-        "settings": dict(settings),
-        "parameters": bound_parameters(values),
-        "no_control_cost": no_control_cost(values),
-        "evaluations": [
-            {
-                "evaluation_seed": draw,
-                "lqt": {str(seed): laws[seed]["costs"][draw]["lqt"] for seed in own},
-                "optimum": {str(seed): laws[seed]["costs"][draw]["optimum"] for seed in own},
-                "open_loop": [
-                    inputs[draw, i]["cost"] for i in range(settings["evaluation_fields"])
-                ],
-            }
-            for draw in draws
-        ],
-        "laws": {
-            str(seed): {
-                **{k: laws[seed][k] for k in shown},
-                "theta": laws[seed]["theta"].tolist(),
-            }
-            for seed in own
-        },
-        "inputs": [{k: v[k] for k in shown} for key, v in inputs.items() if key != "from zero"],
-        "checks": _checks(laws, inputs, own[0], draws[0]),
-    }
-
-
-def _checks(
-    laws: Mapping[Any, dict[str, Any]], inputs: Mapping[Any, dict[str, Any]], seed: int, draw: int
-) -> dict[str, Any]:
-    """What a result of the first seed and field depends on, as costs on the held-out fields."""
-    if "from zero" not in laws:
-        return {}
-
-    def cost(key: Any) -> float:
-        return float(np.mean(laws[key]["costs"][draw]["optimum"]))
-
-    return {
-        "law": cost(seed),
-        "law_from_zero": cost("from zero"),
-        "law_twice_the_fields": cost("twice the fields"),
-        "inputs": inputs[draw, 0]["cost"],
-        "inputs_from_zero": inputs["from zero"]["cost"],
-    }
-
-
-def _save(path: Path, result: Mapping[str, Any]) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(result, indent=1) + "\n")
-    except OSError as error:
-        raise RunFolderError(f"cannot write {path}: {error.strerror}") from error
+    results = []
+    for one, result in zip(given, pool.map(work, given), strict=True):
+        results.append(result)
+        print(
+            f"{what} {one}: {result[0].cost:.5g} after {result[0].iterations} iterations "
+            f"({len(results)} of {len(given)}, {time.monotonic() - began:.0f} s)",
+            file=sys.stderr,
+            flush=True,
+        )
+    return results
 
 
 def text(results: Sequence[Mapping[str, Any]]) -> str:
@@ -368,30 +254,26 @@ def text(results: Sequence[Mapping[str, Any]]) -> str:
         f"{'cost of the class':>19}"
     ]
     for result in results:
-        for draw in result["evaluations"]:
-            lqt, best = (np.mean(list(draw[name].values()), axis=1) for name in ("lqt", "optimum"))
-            limit = float(np.mean(draw["open_loop"]))
+        for draw, open_loop in result["open_loop"].items():
+            lqt, best = (
+                np.mean([own[name][int(draw)] for own in result["costs"]], axis=1)
+                for name in ("lqt", "optimum")
+            )
+            limit = float(np.mean(open_loop))
             lines.append(
-                f"{result['problem']:<14}{draw['evaluation_seed']:>7}"
+                f"{result['problem']:<14}{draw:>7}"
                 f"{f'{lqt.mean():.4g} ({lqt.max():.4g})':>18}"
                 f"{f'{best.mean():.4g} ({best.max():.4g})':>20}{limit:>12.4g}"
                 f"{100 * (best.mean() / limit - 1):>17.1f} %"
             )
     for result in results:
-        ends = [*result["laws"].values(), *result["inputs"]]
-        late = max((e["last_fall"] for e in ends if e["iterations"] > WINDOW), default=0.0)
-        open_ended = sum(not end["converged"] for end in ends)
+        falls = zip(result["iterations"], result["last_fall"], strict=True)
+        late = max((fall for count, fall in falls if count > WINDOW), default=0.0)
+        open_ended = result["converged"].count(False)
         lines.append(
-            f"{result['problem']}: laws of {len(result['laws'])} seeds on "
-            f"{result['settings']['fields']} fields, {max(e['iterations'] for e in ends)} "
-            f"iterations at most, the last {WINDOW} lowered no cost by more than {100 * late:.2g} %"
+            f"{result['problem']}: laws of {len(result['costs'])} seeds on {result['fields']} fields, "
+            f"{max(result['iterations'])} iterations at most, the last {WINDOW} lowered no cost by "
+            f"more than {100 * late:.2g} %"
             + (f"; {open_ended} did not converge" if open_ended else "")
         )
-        if checks := result["checks"]:
-            lines.append(
-                f"  first seed, held-out fields: {checks['law']:.5g}; from zero "
-                f"{checks['law_from_zero']:.5g}; twice the fields "
-                f"{checks['law_twice_the_fields']:.5g}; first field's inputs "
-                f"{checks['inputs']:.5g}, from zero {checks['inputs_from_zero']:.5g}"
-            )
     return "\n".join(lines)

@@ -26,9 +26,6 @@ CONTROLLERS = {
     "lqt_po": Controller("LQT-PO", "#e69f00", "#f7dc6f"),
     "pure_po": Controller("pure PO", "#009e73", "#2fd6a4"),
     "gauss_newton": Controller("Gauss-Newton", "#d55e00", "#ff8c42"),
-    # What `python -m benchmarks optimum` computes.
-    "optimum": Controller("best of class", "#cc79a7", "#e6a8cc"),
-    "open_loop": Controller("open-loop limit", "#000000", "#ffffff"),
 }
 """By the key under which result.json, table.json and the history of a run have their costs.
 

@@ -29,7 +29,7 @@ VISION = {
     ),
 }
 TOGETHER = [name for name in CONTROLLERS if name != "adapted"]
-"""Those of one figure of a reproduction with its limits; `adapted` is there as `gauss_newton`."""
+"""Those of one figure of a reproduction; `adapted` is there as `gauss_newton`."""
 
 
 def linear(colour: str) -> np.ndarray:

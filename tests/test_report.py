@@ -35,7 +35,7 @@ FIGURES = (
 
 @pytest.fixture(scope="module", params=["run", "reproduction"])
 def folder(request, tmp_path_factory) -> Path:
-    """A small finished run with its limits, or a small reproduction without them."""
+    """A small finished run, or a small reproduction."""
     given = request.getfixturevalue("reproduction")[0] if request.param == "reproduction" else None
     name = f"report-{request.param}"
     return made_once(tmp_path_factory, name, lambda base: reported(base, given))
@@ -43,19 +43,13 @@ def folder(request, tmp_path_factory) -> Path:
 
 def reported(base: Path, reproduced: Path | None) -> Path:
     """The folder of a run that is made here, or of a reproduction, with its report."""
-    out, report = reproduced or base / "out", ()
+    out = reproduced or base / "out"
     with processes(base) as running:
         if not reproduced:
             options = ("--in-process", "--rollouts", "33", "--optimizer", "gauss_newton")
             words = ("train", str(SMALL), "--seeds", "2", *options, "--out", str(out))
             running.wait(running.pdeloop(*words), LIMIT)
-            limits = ("optimum", str(SMALL), "--seeds", "2", "--fields", "2", "--no-checks")
-            words = ("--jobs", "1", "--tolerance", "0.01", "--save", str(base / "limits"))
-            running.wait(
-                running.start("-m", "benchmarks", *limits, *words, name="benchmarks"), LIMIT
-            )
-            report = ("--limits", str(base / "limits"))
-        running.wait(running.pdeloop("report", str(out), *report), LIMIT)
+        running.wait(running.pdeloop("report", str(out)), LIMIT)
     return out
 
 
@@ -99,9 +93,6 @@ def test_a_controller_has_the_same_colour_in_every_figure(folder):
         svg = (folder / "report" / f"{name}.svg").read_text().lower()
         for controller in ("none", "lqt", *controllers_of(folder)):
             assert CONTROLLERS[controller].colour in svg, (name, controller)
-    for name in ("training-curves", "costs"):
-        svg = (folder / "report" / f"{name}.svg").read_text().lower()
-        assert (CONTROLLERS["optimum"].colour in svg) == is_run(folder), name
 
 
 def test_steps_damping_and_model_error_are_those_of_the_history(folder):
@@ -141,22 +132,6 @@ def test_a_curve_is_the_cost_of_the_policy_at_so_many_rollouts(folder):
             beginning = problem.costs[start].mean(axis=1)
             np.testing.assert_allclose(curve.relative[0], beginning / lqt, rtol=1e-12)
         np.testing.assert_allclose(curve.relative[-1], ends / lqt, rtol=1e-12)
-
-
-def test_the_page_says_which_share_of_the_possible_gain_was_reached(folder):
-    page = (folder / "report" / "index.html").read_text()
-    if not is_run(folder):
-        assert "possible gain" not in page and "open-loop limit" not in page
-        return
-    limits = folder.parent / "limits"
-    share = gather(folder, limits).problems[0].share("adapted")
-    known = json.loads((limits / "small.json").read_text())["evaluations"][0]
-    costs = json.loads((folder / "result.json").read_text())["mean_cost"]
-    best = np.mean(list(known["optimum"].values()))
-    assert share == pytest.approx((costs["lqt"] - costs["adapted"]) / (costs["lqt"] - best))
-    assert 0.2 < share < 1.05
-    assert f"{100 * share:.1f} %" in page and f"{best:.4g}" in page
-    assert "A negative share means that the controller costs more than LQT" in page
 
 
 def test_the_page_says_what_it_reports(folder, tab):

@@ -72,12 +72,6 @@ def _add_report(commands: Commands) -> None:
     )
     add_equation(report)
     report.add_argument("--out", type=Path, metavar="DIR", help="[DIR/report]")
-    report.add_argument(
-        "--limits",
-        type=Path,
-        metavar="DIR",
-        help="what `python -m benchmarks optimum --save DIR` wrote [that of the shipped problems]",
-    )
 
 
 def _reproduce(options: argparse.Namespace) -> int:
@@ -121,7 +115,7 @@ def _report(options: argparse.Namespace) -> int:
     from pdeloop.report.page import report
 
     allow_equation(options)
-    page, missing = report(options.folder, options.out, options.limits)
+    page, missing = report(options.folder, options.out)
     for sentence in missing:
         print(f"not shown: {sentence}")
     print(f"report in {page}")

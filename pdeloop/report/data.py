@@ -20,7 +20,6 @@ from pdeloop.episode import rollout
 from pdeloop.evaluation import another_loop, another_plant
 from pdeloop.finished_run import FinishedRun, field_means, load
 from pdeloop.in_process import LocalPair
-from pdeloop.reference import Reference, find
 from pdeloop.reproduce.experiment import reproduction_in
 from pdeloop.reproduce.table import runs_of
 from pdeloop.study.description import Study
@@ -87,8 +86,7 @@ class ProblemData:
     runs: by adapted controller; curves: their costs while they learn; shown: index of the seed whose
     behaviour, gains and steps are shown; plant: the built-in one; behaviours: empty where they cannot
     be computed; orders: what the shown seed's exploratory episode says about the order, None where
-    that is not known; reference: the limits, where they are known; missing: a sentence for each thing
-    that cannot be shown.
+    that is not known; missing: a sentence for each thing that cannot be shown.
     """
 
     runs: Mapping[str, FinishedRun]
@@ -98,7 +96,6 @@ class ProblemData:
     missing: list[str] = field(default_factory=list)
     behaviours: list[Behaviour] = field(default_factory=list)
     orders: OrderStudy | None = None
-    reference: Reference | None = None
 
     @property
     def first(self) -> FinishedRun:
@@ -132,20 +129,6 @@ class ProblemData:
         found = {name: _steps(run, self.shown) for name, run in self.runs.items()}
         return {name: steps for name, steps in found.items() if steps is not None}
 
-    def share(self, controller: str) -> float | None:
-        """(J_LQT - J)/(J_LQT - J_opt) of the means over the seeds, None where it is not known."""
-        if self.reference is None:
-            return None
-        return self.reference.share(self.first.seeds, self.costs["lqt"], self.costs[controller])
-
-    def limits(self) -> dict[str, Array]:
-        """Costs of the best of the class, (seeds, fields), and of the open loop; empty if unknown."""
-        if self.reference is None or self.share("lqt") is None:
-            return {}
-        known = self.reference.optimum
-        rows = [known[seed] for seed in self.first.seeds if seed in known]
-        return {"optimum": np.stack(rows), "open_loop": self.reference.open_loop}
-
 
 @dataclass(frozen=True)
 class ReportData:
@@ -166,25 +149,22 @@ class ReportData:
         ]
 
 
-def gather(folder: Path, limits: Path | None = None) -> ReportData:
-    """The content of a report of `folder`. RunFolderError when it holds nothing to report.
-
-    limits: folder of what `python -m benchmarks optimum` saved; the shipped one if not given.
-    """
+def gather(folder: Path) -> ReportData:
+    """The content of a report of `folder`. RunFolderError when it holds nothing to report."""
     if (study := reproduction_in(folder)) is not None:
-        problems = [_reproduced(study, folder, name, limits) for name in study.problems]
+        problems = [_reproduced(study, folder, name) for name in study.problems]
         return ReportData(folder, problems, study)
     if (folder / "parameters.yaml").exists():
-        return ReportData(folder, [of_run(load(folder), limits)])
+        return ReportData(folder, [of_run(load(folder))])
     raise RunFolderError(f"{folder} holds neither a run nor a reproduction")
 
 
-def of_run(run: FinishedRun, limits: Path | None = None) -> ProblemData:
-    """A single run's part of a report; `limits` as of `gather`."""
-    return _problem({"adapted": run}, _history(run), 0, limits)
+def of_run(run: FinishedRun) -> ProblemData:
+    """A single run's part of a report."""
+    return _problem({"adapted": run}, _history(run), 0)
 
 
-def _reproduced(study: Study, folder: Path, name: str, limits: Path | None) -> ProblemData:
+def _reproduced(study: Study, folder: Path, name: str) -> ProblemData:
     runs = runs_of(study, folder, name)
     lqt = field_means(runs["lqt_po"].costs["lqt"])
     curves = []
@@ -203,7 +183,7 @@ def _reproduced(study: Study, folder: Path, name: str, limits: Path | None) -> P
     ratio = field_means(runs["lqt_po"].costs["adapted"]) / lqt
     known = max(1, int(np.isfinite(ratio).sum()))
     median = int(np.argsort(ratio, kind="stable")[(known - 1) // 2])
-    return _problem(runs, curves, median, limits)
+    return _problem(runs, curves, median)
 
 
 def _history(run: FinishedRun) -> list[Curve]:
@@ -232,9 +212,7 @@ def _curve(controller: str, seeds: Sequence[tuple[Array, Array]]) -> list[Curve]
     return [Curve(controller, used, relative)] if np.isfinite(relative).any() else []
 
 
-def _problem(
-    runs: Mapping[str, FinishedRun], curves: Sequence[Curve], shown: int, limits: Path | None
-) -> ProblemData:
+def _problem(runs: Mapping[str, FinishedRun], curves: Sequence[Curve], shown: int) -> ProblemData:
     values = next(iter(runs.values())).values
     data = ProblemData(runs, curves, shown, build_plant(values))
     if not curves:
@@ -247,14 +225,11 @@ def _problem(
         )
     if reason := another_loop(data.first):
         data.missing.append(
-            f"Behaviour, gains, spectrum and share of the possible gain: {reason}. All costs are "
-            "those that the run measured."
+            f"Behaviour, gains, spectrum: {reason}. All costs are those that the run measured."
         )
         return data
-    behaviours = _behaviours(data)
-    reference = find(values, behaviours[0].cost, limits)
     orders = _orders(data.first, shown, data.plant)
-    return replace(data, behaviours=behaviours, orders=orders, reference=reference)
+    return replace(data, behaviours=_behaviours(data), orders=orders)
 
 
 def _orders(run: FinishedRun, shown: int, plant: Plant) -> OrderStudy | None:

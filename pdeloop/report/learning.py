@@ -24,12 +24,8 @@ def training_curves(problems: Sequence[ProblemData]) -> Figure:
     figure, axes = panels(len(problems), height=2.8, width=2.35, least=4.2)
     for ax, problem in zip(axes, problems, strict=True):
         reached = [1.0, *(bound for curve in problem.curves for bound in _band(ax, curve))]
-        levels = {"lqt": 1.0}
-        if (best := _relative_optimum(problem)) is not None:
-            levels["optimum"] = best
-        for name, level in levels.items():
-            ax.axhline(level, color=COLOURS[name], linestyle=LINES[name], label=NAMES[name])
-        low, top = min(*reached, *levels.values()), max(reached)
+        ax.axhline(1.0, color=COLOURS["lqt"], linestyle=LINES["lqt"], label=NAMES["lqt"])
+        low, top = min(reached), max(reached)
         plain_log(ax, top / low)
         ax.set_ylim(0.93 * min(low, 0.8), 1.08 * max(top, 1.25))
         ax.set_xlim(left=0)
@@ -59,14 +55,6 @@ def _band(ax: Axes, curve: Curve) -> tuple[float, float]:
     if len(used) == 1:
         ax.plot(used, mean, "o", color=colour)
     return float(below.min()), float((mean + std).max())
-
-
-def _relative_optimum(problem: ProblemData) -> float | None:
-    """The optimum of the policy class over LQT, the mean over the seeds; None if not known."""
-    best = problem.limits().get("optimum", np.empty(0))
-    if len(best) != len(problem.first.seeds):
-        return None
-    return float((best.mean(axis=1) / problem.costs["lqt"].mean(axis=1)).mean())
 
 
 def steps(shown: Steps, controller: str) -> Figure:
@@ -116,12 +104,11 @@ def _candidates(ax: Axes, shown: Steps, colour: str) -> None:
 
 def bars(problems: Sequence[ProblemData]) -> Figure:
     """Mean stage cost of each controller over seeds and fields, with the standard deviation."""
-    shown = [{**problem.costs, **problem.limits()} for problem in problems]
-    widest = max(len(costs) for costs in shown)
+    widest = max(len(problem.costs) for problem in problems)
     figure, axes = panels(len(problems), height=2.8, width=0.35 + 0.58 * widest, least=3.6)
-    for ax, problem, by_name in zip(axes, problems, shown, strict=True):
+    for ax, problem in zip(axes, problems, strict=True):
         high = 0.0
-        for i, (name, costs) in enumerate(by_name.items()):
+        for i, (name, costs) in enumerate(problem.costs.items()):
             good = costs[costs < DIVERGED_COST]
             if not good.size:
                 ax.text(i, 0, " diverged", ha="center", va="bottom", rotation=90)
@@ -134,9 +121,9 @@ def bars(problems: Sequence[ProblemData]) -> Figure:
             ax.text(i, mean + std, number, ha="center", va="bottom", fontsize=8)
             high = max(high, mean + std)
         ax.set_ylim(0, 1.12 * high or 1.0)
-        labels = [NAMES[n].replace(" ", "\n", 1).replace("-N", "-\nN") for n in by_name]
-        ax.set_xticks(range(len(by_name)), labels, fontsize=7.5)
-        ax.set_xlim(-0.6, len(by_name) - 0.4)
+        labels = [NAMES[n].replace(" ", "\n", 1).replace("-N", "-\nN") for n in problem.costs]
+        ax.set_xticks(range(len(labels)), labels, fontsize=7.5)
+        ax.set_xlim(-0.6, len(labels) - 0.4)
         ax.tick_params(axis="x", length=0)
         ax.set_title(problem.name)
     axes[0].set_ylabel("mean stage cost")

@@ -26,10 +26,6 @@ from tuner_node.results import RunFolderError
 
 PIXELS_PER_INCH = 115
 """On the page; the file has more, which an enlarged figure shows."""
-LIMITS = (
-    " Best of class: the law with these reduced states that exact gradients find; open-loop limit: the "
-    "optimal inputs of each field."
-)
 
 
 class Picture(NamedTuple):
@@ -42,15 +38,13 @@ class Picture(NamedTuple):
     png: str
 
 
-def report(folder: Path, out: Path | None, limits: Path | None = None) -> tuple[Path, list[str]]:
+def report(folder: Path, out: Path | None) -> tuple[Path, list[str]]:
     """Write the report of the run or reproduction in `folder`.
 
     Parameters
     ----------
     folder, out
         The run or reproduction; where the report goes, DIR/report if not given.
-    limits
-        See `gather`.
 
     Returns
     -------
@@ -64,7 +58,7 @@ def report(folder: Path, out: Path | None, limits: Path | None = None) -> tuple[
     RunFolderError
         There is nothing to report, or the report cannot be written.
     """
-    data = gather(folder, limits)
+    data = gather(folder)
     target = out or folder / "report"
     page = target / "index.html"
     try:
@@ -96,7 +90,6 @@ Drawn = Iterator[tuple[str, str, str, Figure]]
 def _shared(problems: Sequence[ProblemData]) -> Drawn:
     """The figures over all problems."""
     learned = [problem for problem in problems if problem.curves]
-    limits = LIMITS * any(problem.limits() for problem in problems)
     if learned:
         seeds = max(len(problem.first.seeds) for problem in learned)
         over = f" Line and band: mean and standard deviation over {seeds} seeds." * (seeds > 1)
@@ -111,7 +104,7 @@ def _shared(problems: Sequence[ProblemData]) -> Drawn:
         "costs",
         "Cost of each controller",
         "Mean stage cost after the adaptation, over the sampled initial fields and the seeds, with "
-        f"the standard deviation.{limits}",
+        "the standard deviation.",
         learning.bars(problems),
     )
 
@@ -184,7 +177,6 @@ def _page(data: ReportData, shared: list[Picture], own: list[list[Picture]]) -> 
         caveat=CAVEAT if len(problems[0].first.seeds) > 1 else "",
         paper=[sentence for row in rows if (sentence := beside_the_paper(row))],
         first_model=problems[0].first.values["identification_attempts"] == 1,
-        shares=_shares(problems),
         budget=_budget(problems),
     )
 
@@ -238,21 +230,6 @@ def _reductions(problems: Sequence[ProblemData], rows: Sequence[Mapping[str, Any
             cells = ("-" if figure is None else f"{figure:.1f}",) * paper
             found.append((row["problem"], NAMES[name], *texts, *cells))
     return (*head, *("paper",) * paper), found
-
-
-def _shares(problems: Sequence[ProblemData]) -> Table | None:
-    """The share of the possible gain, of the problems whose limits are known."""
-    rows = []
-    for problem in problems:
-        if not (limits := problem.limits()):
-            continue
-        best = [f"{limits[name].mean():.4g}" for name in ("optimum", "open_loop")]
-        for name in problem.runs:
-            share = problem.share(name)
-            text = "diverged" if share is None else f"{100 * share:.1f} %"
-            rows.append((problem.name, NAMES[name], text, *best))
-    head = ("problem", "controller", "share", NAMES["optimum"], NAMES["open_loop"])
-    return (head, rows) if rows else None
 
 
 def _budget(problems: Sequence[ProblemData]) -> Table:

@@ -18,7 +18,7 @@ from loop_interfaces.controllers import CONTROLLERS
 Array = NDArray[np.float64]
 COLOURS = {key: controller.colour for key, controller in CONTROLLERS.items()}
 NAMES = {key: controller.name for key, controller in CONTROLLERS.items()}
-LINES: dict[str, Any] = {"lqt": "--", "pure_po": "-.", "optimum": ":", "gauss_newton": (0, (5, 1))}
+LINES: dict[str, Any] = {"lqt": "--", "pure_po": "-.", "gauss_newton": (0, (5, 1))}
 """Line styles; the others are solid."""
 FIELD_MAP, GAIN_MAP = "cividis", "PuOr"
 STYLE: dict[Any, Any] = {

@@ -1,0 +1,72 @@
+"""The open-loop limits that `python -m benchmarks optimum --save` keeps, to compare costs with.
+
+A limit counts only for the plant it was computed for: all of the plant's parameters must agree, and
+it must still do the same (cost of the mean field without control).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loop_interfaces.files import read_json
+from loop_interfaces.parameters import PROBLEM
+from pde_sim_node.build import build_equation, build_plant
+from pdeloop.episode import mean_field_cost
+
+__all__ = ["FOLDER", "Limits", "content", "find"]
+
+FOLDER = Path(__file__).parent / "open_loop_limits"
+AGREEMENT = 1e-6
+"""Relative, of two plants' costs without control: another compiler rounds differently."""
+
+
+class Limits(NamedTuple):
+    """The costs that no controller undercuts, by field, (fields,)."""
+
+    open_loop: NDArray[np.float64]
+
+
+def content(values: Mapping[str, Any], open_loop: Mapping[str, list[float]]) -> dict[str, Any]:
+    """What is kept of the limits of a problem, by evaluation seed."""
+    return {
+        "parameters": _parameters(values),
+        "no_control_cost": mean_field_cost(build_plant(values)),
+        "open_loop": dict(open_loop),
+    }
+
+
+def find(values: Mapping[str, Any], folder: Path = FOLDER) -> Limits | None:
+    """The limits of a problem on the fields of its closing evaluation; None if they are not known.
+
+    Parameters
+    ----------
+    values
+        Resolved parameters, with `evaluation_seed` and `evaluation_fields`.
+    folder
+        Where PROBLEM.json is.
+    """
+    path = folder / f"{values['problem']}.json"
+    if not path.is_file():
+        return None
+    known = read_json(path)
+    costs = known["open_loop"].get(str(values["evaluation_seed"]), ())
+    if len(costs) != values["evaluation_fields"] or known["parameters"] != _parameters(values):
+        return None
+    now = mean_field_cost(build_plant(values))
+    same = abs(now / known["no_control_cost"] - 1) <= AGREEMENT
+    return Limits(np.array(costs, dtype=np.float64)) if same else None
+
+
+def _parameters(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters of the plant."""
+    own = {s.name: values[s.name] for s in PROBLEM if "P" in s.nodes and s.name != "problem"}
+    own["equation"] = str(values["equation"]).rpartition("/")[2]  # a file may stand elsewhere
+    physical = asdict(build_equation(values))
+    del physical["length"]
+    return {**own, **{f"physical.{name}": number for name, number in physical.items()}}
