@@ -37,7 +37,7 @@ from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from pdeloop.gradients import Gradients, features
 from pdeloop.in_process import LocalPair
-from pdeloop.reproduce.experiment import PAPER
+from pdeloop.reproduction import PAPER
 from tuner_node.seeds import Purpose, derive
 
 __all__ = ["run", "text"]

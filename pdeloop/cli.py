@@ -19,7 +19,7 @@ DONE, FAILED, CRASHED, INTERRUPTED, NOBODY_READS = 0, 1, 70, 130, 141
 """Exit codes; 2, a command that is not understood, is argparse's."""
 COMMANDS = (
     *("train", "evaluate", "identify", "bag", "monitor", "reproduce"),
-    *("study", "problems", "new", "check"),
+    *("report", "study", "problems", "new", "check"),
 )
 """The modules of `pdeloop.commands`, in the order of the help."""
 _EXTRAS = {

@@ -1,16 +1,34 @@
-"""Data on stdout, for scripts."""
+"""Data on stdout for scripts, and tables for people."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 
 def print_json(value: Any) -> None:
     """One line of JSON. A number that JSON has no word for is null."""
     print(json.dumps(_strict(value), allow_nan=False))
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """The rows of a table as lines, the columns beside each other.
+
+    Examples
+    --------
+    >>> aligned([("problem", "cost"), ("kdv", "33.71")])
+    ['problem   cost', 'kdv      33.71']
+    """
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(
+            cell.rjust(width) if place else cell.ljust(width)
+            for place, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]
 
 
 def _strict(value: Any) -> Any:

@@ -147,7 +147,7 @@ def test_the_page_says_what_it_reports(folder, tab):
         assert facts["Command"] == f"pdeloop train {folder}/parameters.yaml"
         assert facts["Controller adapted"] == "gauss_newton, started from the LQT gains"
     else:
-        assert facts["Command"].startswith(f"pdeloop reproduce {SMALL} --seeds 2")
+        assert facts["Command"] == f"pdeloop study {folder}/study.json"
         assert facts["Controller pure PO"] == "two_point, started from zero gains"
     words = tab.ask("document.body.innerText")
     for controller in ("none", "lqt", *controllers_of(folder)):

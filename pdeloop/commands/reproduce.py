@@ -1,11 +1,11 @@
-"""`pdeloop reproduce` and `pdeloop report`."""
+"""`pdeloop reproduce`."""
 
 from __future__ import annotations
 
 import argparse
-import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import (
@@ -17,21 +17,13 @@ from pdeloop.commands.common import (
     command,
 )
 from pdeloop.commands.study import add_execution, carry_out
-from pdeloop.output import print_json
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
-    from pdeloop.study import Failure, Study
+    from pdeloop.study import Study
 
 
 def add(commands: Commands) -> None:
-    """The commands `reproduce` and `report`."""
-    _add_reproduce(commands)
-    _add_report(commands)
-
-
-def _add_reproduce(commands: Commands) -> None:
+    """The command `reproduce`."""
     reproduce = command(
         commands,
         "reproduce",
@@ -58,24 +50,8 @@ def _add_reproduce(commands: Commands) -> None:
     add_execution(reproduce)
 
 
-def _add_report(commands: Commands) -> None:
-    report = command(
-        commands,
-        "report",
-        _report,
-        help="figures and an HTML page of a run or a reproduction",
-        description="Figures for a paper (PNG and SVG) and one HTML page that needs no network.",
-        example="pdeloop report runs/paper",
-    )
-    report.add_argument(
-        "folder", type=Path, metavar="DIR", help="folder of a finished run or reproduction"
-    )
-    add_equation(report)
-    report.add_argument("--out", type=Path, metavar="DIR", help="[DIR/report]")
-
-
 def _reproduce(options: argparse.Namespace) -> int:
-    from pdeloop.reproduce.experiment import reproduction_in, study_of
+    from pdeloop.reproduction import reproduction_in, study_of
 
     allow_equation(options)
     names = ("seeds", "iterations", "seed", "identification_attempts")
@@ -86,37 +62,18 @@ def _reproduce(options: argparse.Namespace) -> int:
         raise ParameterError("--iterations is 0; expected a whole number of at least 1")
 
     def study_in(folder: Path) -> Study:
-        there = reproduction_in(folder)
-        return (
-            there
-            if there and not (options.problems or given)
-            else study_of(options.problems, given)
-        )
+        there = None if options.problems or given else reproduction_in(folder)
+        return there or study_of(options.problems, given)
 
-    return carry_out("reproduce", options, study_in, _show)
+    return carry_out("reproduce", options, study_in, _remarks)
 
 
-def _show(study: Study, folder: Path, failures: list[Failure], console: Console) -> None:
-    from pdeloop.reproduce.table import rows_of, text
-    from tuner_node.results import versions
+def _remarks(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    from pdeloop.reproduction import beside_the_paper
 
-    if failures:
-        return
-    rows = rows_of(study, folder)
-    (folder / "table.json").write_text(json.dumps({"rows": rows, "versions": versions()}, indent=1))
-    if console.stderr:  # the data alone go to stdout
-        print_json({"folder": str(folder), "rows": rows})
-        return
-    console.print(text(rows), markup=False)
-    console.print(f"results in {folder} (figures: pdeloop report {folder})", markup=False)
-
-
-def _report(options: argparse.Namespace) -> int:
-    from pdeloop.report.page import report
-
-    allow_equation(options)
-    page, missing = report(options.folder, options.out)
-    for sentence in missing:
-        print(f"not shown: {sentence}")
-    print(f"report in {page}")
-    return 0
+    found = (
+        beside_the_paper(row["problem"], row["below_lqt_percent"])
+        for row in rows
+        if row["variant"] == "lqt_po"
+    )
+    return [sentence for sentence in found if sentence]

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+import importlib.util
+import json
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import Commands, add_json, command
 from pdeloop.output import print_json
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
-    from pdeloop.study import Failure, Study
+    from pdeloop.study import Study
 
 
 def add(commands: Commands) -> None:
@@ -63,7 +63,7 @@ def carry_out(
     name: str,
     options: argparse.Namespace,
     study_in: Callable[[Path], Study],
-    show: Callable[[Study, Path, list[Failure], Console], None],
+    remarks: Callable[[Sequence[Mapping[str, Any]]], list[str]] = lambda rows: [],
 ) -> int:
     """Train what is missing, as the flags of `add_execution` say; returns the exit code.
 
@@ -75,8 +75,8 @@ def carry_out(
         With the flags of `add_execution`.
     study_in : callable
         The study for a folder.
-    show : callable
-        Called with the study, its folder, what failed, and a console for what is not data.
+    remarks : callable
+        Lines that follow the table, from its rows.
     """
     from rich.console import Console
 
@@ -84,7 +84,8 @@ def carry_out(
     from pdeloop.progress import Progress
     from pdeloop.study.executors import cluster, processes
     from pdeloop.study.run import run
-    from tuner_node.results import timestamp
+    from pdeloop.study.table import plot, rows, text
+    from tuner_node.results import timestamp, versions
 
     if options.processes is not None and (options.processes < 1 or options.scheduler):
         raise ParameterError(
@@ -111,9 +112,20 @@ def carry_out(
             )
     finally:
         progress.close()
-    show(study, folder, failures, console)
+    table = rows(study, folder)
+    (folder / "table.json").write_text(
+        json.dumps({"rows": table, "versions": versions()}, indent=1)
+    )
+    if options.json:
+        told = [failure._asdict() for failure in failures]
+        print_json({"folder": str(folder), "rows": table, "failures": told})
+    elif table:
+        console.print("\n".join([text(table), *remarks(table)]), markup=False)
+        if importlib.util.find_spec("matplotlib"):
+            plot(table, folder / "costs.png")
     for failure in failures:
         console.print(f"failed: {failure.training}: {failure.reason}", markup=False)
+    console.print(f"results in {folder}", markup=False)
     return int(bool(failures))
 
 
@@ -132,18 +144,4 @@ def _study(options: argparse.Namespace) -> int:
             return kept(folder)
         return Study.of(read_document(options.file), options.file.parent)
 
-    return carry_out("study", options, study_in, _show)
-
-
-def _show(study: Study, folder: Path, failures: list[Failure], console: Console) -> None:
-    from pdeloop.study.table import plot, rows, text
-
-    table = rows(study, folder)
-    if console.stderr:  # the data alone go to stdout
-        print_json(
-            {"folder": str(folder), "rows": table, "failures": [f._asdict() for f in failures]}
-        )
-        return
-    console.print(text(table), markup=False)
-    plot(table, folder / "costs.png")
-    console.print(f"results in {folder}, figure in {folder / 'costs.png'}", markup=False)
+    return carry_out("study", options, study_in)

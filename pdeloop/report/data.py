@@ -20,8 +20,7 @@ from pdeloop.episode import rollout
 from pdeloop.evaluation import another_loop, another_plant
 from pdeloop.finished_run import FinishedRun, field_means, load
 from pdeloop.in_process import LocalPair
-from pdeloop.reproduce.experiment import reproduction_in
-from pdeloop.reproduce.table import runs_of
+from pdeloop.reproduction import reproduction_in, runs_of
 from pdeloop.study.description import Study
 from pdeloop.study.training import CURVE
 from tuner_node.build import build_training

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import base64
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jinja2
 import matplotlib
@@ -19,8 +19,10 @@ from matplotlib.figure import Figure
 from pdeloop.report import figures, learning
 from pdeloop.report.data import ProblemData, ReportData, gather
 from pdeloop.report.style import NAMES, STYLE
-from pdeloop.reproduce.experiment import command_of
-from pdeloop.reproduce.table import CAVEAT, beside_the_paper, cost_text, reduction_texts, row_of
+from pdeloop.reproduction import PAPER, beside_the_paper
+from pdeloop.study.run import ASKED
+from pdeloop.study.table import AVERAGES, CAVEAT, cost_text, reduction_texts
+from pdeloop.study.table import figures as figures_of
 from tuner_node.budget import PURPOSES
 from tuner_node.results import RunFolderError
 
@@ -164,7 +166,6 @@ def _page(data: ReportData, shared: list[Picture], own: list[list[Picture]]) -> 
         trim_blocks=True,
     )
     problems = data.problems
-    rows = [row_of(problem.name, problem.runs) for problem in problems]
     names = ", ".join(problem.name for problem in problems)
     return environment.get_template("page.html.j2").render(
         title="Reproduction of the paper's experiment" if data.study else f"Training of {names}",
@@ -172,10 +173,9 @@ def _page(data: ReportData, shared: list[Picture], own: list[list[Picture]]) -> 
         missing=data.missing,
         shared=shared,
         problems=list(zip(problems, own, strict=True)),
-        costs=_costs(problems, rows),
-        reductions=_reductions(problems, rows),
+        results=_results(problems),
         caveat=CAVEAT if len(problems[0].first.seeds) > 1 else "",
-        paper=[sentence for row in rows if (sentence := beside_the_paper(row))],
+        paper=_beside_the_paper(problems),
         first_model=problems[0].first.values["identification_attempts"] == 1,
         budget=_budget(problems),
     )
@@ -190,7 +190,7 @@ def _facts(data: ReportData) -> list[tuple[str, str]]:
     first = data.problems[0]
     seeds, values = first.first.seeds, first.first.values
     if data.study is not None:
-        command = command_of(data.study)
+        command = f"pdeloop study {data.folder / ASKED}"
     else:
         command = f"pdeloop train {data.folder}/parameters.yaml"
     facts = [("Command", command)]
@@ -213,23 +213,38 @@ def _facts(data: ReportData) -> list[tuple[str, str]]:
     ]
 
 
-def _costs(problems: Sequence[ProblemData], rows: Sequence[Mapping[str, Any]]) -> Table:
-    shown = list(problems[0].costs)
-    head = ("problem", *(NAMES[name] for name in shown))
-    return head, [(row["problem"], *(cost_text(row[name]) for name in shown)) for row in rows]
-
-
-def _reductions(problems: Sequence[ProblemData], rows: Sequence[Mapping[str, Any]]) -> Table:
-    paper = any(row["paper_percent"] for row in rows) and "lqt_po" in problems[0].runs
-    head = ("problem", "controller", "ratio of the means", "mean of the ratios")
+def _results(problems: Sequence[ProblemData]) -> Table:
+    """Costs, and how far they lie below LQT's."""
+    paper = ("the paper",) * any("lqt_po" in p.runs and p.name in PAPER for p in problems)
+    head = ("problem", "controller", "mean stage cost", "worst seed", *AVERAGES, *paper)
     found = []
-    for row in rows:
-        for name in problems[0].runs:
-            texts = reduction_texts(row[name]["below_lqt_percent"])
-            figure = row["paper_percent"] if name == "lqt_po" else None
-            cells = ("-" if figure is None else f"{figure:.1f}",) * paper
-            found.append((row["problem"], NAMES[name], *texts, *cells))
-    return (*head, *("paper",) * paper), found
+    for problem in problems:
+        known = {name: figures_of(run) for name, run in problem.runs.items()}
+        first = next(iter(known.values()))
+        blank = ("",) * (len(head) - 3)
+        for name in ("none", "lqt"):
+            found.append((problem.name, NAMES[name], cost_text(first[name]), *blank))
+        for name, own in known.items():
+            percent = f"{PAPER[problem.name]}" if name == "lqt_po" and problem.name in PAPER else ""
+            found.append(
+                (
+                    *(problem.name, NAMES[name], cost_text(own["cost"], own["interval"])),
+                    cost_text(own["worst"]),
+                    *reduction_texts(own["below_lqt_percent"]),
+                    *((percent,) if paper else ()),
+                )
+            )
+    return head, found
+
+
+def _beside_the_paper(problems: Sequence[ProblemData]) -> list[str]:
+    """A sentence on LQT-PO for each problem that the paper has."""
+    found = [
+        beside_the_paper(problem.name, figures_of(problem.runs["lqt_po"])["below_lqt_percent"])
+        for problem in problems
+        if "lqt_po" in problem.runs
+    ]
+    return [sentence for sentence in found if sentence]
 
 
 def _budget(problems: Sequence[ProblemData]) -> Table:

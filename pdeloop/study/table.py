@@ -3,53 +3,70 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pdeloop.finished_run import CONFIDENCE, Array, field_means, interval, load, reduction
+from loop_interfaces.controllers import CONTROLLERS
+from pdeloop.finished_run import (
+    CONFIDENCE,
+    Array,
+    FinishedRun,
+    field_means,
+    interval,
+    load,
+    merged,
+    reduction,
+)
+from pdeloop.output import aligned
 from pdeloop.study.description import Study
+
+CAVEAT = (
+    f"In brackets: {100 * CONFIDENCE:.0f} % percentile bootstrap over the seeds. The reduced model, "
+    "and with it LQT's cost, varies much from seed to seed: with few seeds such an interval is wide, "
+    "and still too narrow."
+)
+AVERAGES = ("ratio of the means", "mean of the ratios")
+"""Of the seeds' costs and LQT's: see `pdeloop.finished_run.Reduction`."""
 
 
 def rows(study: Study, folder: Path) -> list[dict[str, Any]]:
-    """The figures of every problem and variant, from the trainings in `folder` that are finished.
-
-    Means are over the seeds without those in which a rollout of the closing evaluation diverged,
-    which `diverged` counts; `interval` is the percentile bootstrap over the seeds.
-    """
+    """`figures` of every problem and variant, from the trainings in `folder` that are finished."""
     found = []
     for problem in study.problems:
         for variant in study.variants:
             places = [folder / problem / variant / str(seed) for seed in study.seeds]
             runs = [load(place) for place in places if (place / "result.json").exists()]
-            if not runs:
-                continue
-            costs = {
-                name: np.concatenate([run.costs[name] for run in runs])
-                for name in ("none", "lqt", "adapted")
-            }
-            means = {name: field_means(table) for name, table in costs.items()}
-            good = means["adapted"][np.isfinite(means["adapted"])]
-            below = reduction(costs["adapted"], costs["lqt"])
-            found.append(
-                {
-                    "problem": problem,
-                    "variant": variant,
-                    "seeds": len(runs),
-                    "missing": len(places) - len(runs),
-                    "rollouts": float(np.mean([run.rollouts[0]["total"] for run in runs])),
-                    "cost_by_seed": means["adapted"].tolist(),
-                    "none": _mean(means["none"]),
-                    "lqt": _mean(means["lqt"]),
-                    "cost": _mean(means["adapted"]),
-                    "interval": interval((good,), np.mean),
-                    "worst": float(good.max()) if good.size else None,
-                    "diverged": int(np.isnan(means["adapted"]).sum()),
-                    "below_lqt_percent": None if below is None else below.ratio_of_means,
-                }
-            )
+            if runs:
+                found.append({"problem": problem, "variant": variant, **figures(merged(runs))})
     return found
+
+
+def figures(run: FinishedRun) -> dict[str, Any]:
+    """The figures of a run over its seeds.
+
+    Means are over the seeds without those in which a rollout of the closing evaluation diverged,
+    which `diverged` counts; `interval` is the percentile bootstrap over the seeds, and
+    `below_lqt_percent` the `pdeloop.finished_run.Reduction`.
+    """
+    means = {name: field_means(costs) for name, costs in run.costs.items()}
+    adapted = means["adapted"]
+    good = adapted[np.isfinite(adapted)]
+    below = reduction(run.costs["adapted"], run.costs["lqt"])
+    return {
+        "seeds": len(adapted),
+        "rollouts": float(np.mean([own["total"] for own in run.rollouts])),
+        "cost_by_seed": [float(cost) if np.isfinite(cost) else None for cost in adapted],
+        "none": _mean(means["none"]),
+        "lqt": _mean(means["lqt"]),
+        "cost": _mean(adapted),
+        "interval": interval((good,), np.mean),
+        "worst": float(good.max()) if good.size else None,
+        "diverged": len(adapted) - len(good),
+        "below_lqt_percent": None if below is None else asdict(below),
+    }
 
 
 def _mean(values: Array) -> float | None:
@@ -59,24 +76,41 @@ def _mean(values: Array) -> float | None:
 
 def text(table: Sequence[Mapping[str, Any]]) -> str:
     """The table for a terminal."""
-    lines = [
-        f"{'problem':<16}{'variant':<18}{'seeds':>6}{'rollouts':>10}{'no control':>12}{'LQT':>10}"
-        f"{'adapted':>10}  {f'{100 * CONFIDENCE:.0f} % interval':<18}{'worst':>8}  diverged"
-    ]
+    costs = [("problem", "", "seeds", "rollouts", "no control", "LQT", "adapted", "worst", "lost")]
+    below = [("below LQT, %", "", *AVERAGES)]
     for row in table:
-        known = row["interval"]
-        between = f"{known[0]:.4g} to {known[1]:.4g}" if known else ""
-        cells = "".join(f"{_number(row[name]):>10}" for name in ("lqt", "cost"))
-        lines.append(
-            f"{row['problem']:<16}{row['variant']:<18}{row['seeds']:>6}{row['rollouts']:>10.0f}"
-            f"{_number(row['none']):>12}{cells}  {between:<18}{_number(row['worst']):>8}"
-            f"  {row['diverged']}"
-        )
-    return "\n".join(lines)
+        known = CONTROLLERS.get(row["variant"])
+        name = row["problem"], row["variant"] if known is None else known.name
+        numbers = [cost_text(row[each]) for each in ("none", "lqt")]
+        own = cost_text(row["cost"], row["interval"]), cost_text(row["worst"])
+        counts = str(row["seeds"]), f"{row['rollouts']:.0f}"
+        costs.append((*name, *counts, *numbers, *own, str(row["diverged"])))
+        below.append((*name, *reduction_texts(row["below_lqt_percent"])))
+    lost = "lost: seeds with a rollout that diverged, which are left out." * any(
+        row["diverged"] for row in table
+    )
+    return "\n".join([*aligned(costs), "", *aligned(below), CAVEAT, *([lost] if lost else [])])
 
 
-def _number(value: float | None) -> str:
-    return "diverged" if value is None else f"{value:.4g}"
+def cost_text(mean: float | None, between: Sequence[float] | None = None) -> str:
+    """A mean cost, with its interval if there is one."""
+    if mean is None:
+        return "diverged"
+    return f"{mean:.4g}" + (f" ({between[0]:.4g} to {between[1]:.4g})" if between else "")
+
+
+def reduction_texts(found: Mapping[str, Any] | None) -> tuple[str, str]:
+    """The ratio of the means and the mean of the ratios, each with its interval, in percent."""
+    if found is None:
+        return "diverged", "diverged"
+
+    def one(value: float, between: Sequence[float] | None) -> str:
+        return f"{value:.1f}" + (f" ({between[0]:.1f} to {between[1]:.1f})" if between else "")
+
+    return (
+        one(found["ratio_of_means"], found["ratio_interval"]),
+        one(found["mean_of_ratios"], found["mean_interval"]),
+    )
 
 
 def plot(table: Sequence[Mapping[str, Any]], path: Path) -> None:
@@ -91,7 +125,7 @@ def plot(table: Sequence[Mapping[str, Any]], path: Path) -> None:
         for ax, problem in zip(axes, problems, strict=True):
             own = [row for row in table if row["problem"] == problem]
             for place, row in enumerate(own):
-                costs = row["cost_by_seed"]
+                costs = np.array(row["cost_by_seed"], dtype=np.float64)
                 ax.plot([place - 0.15] * len(costs), costs, "o", ms=3, color="0.6")
                 if row["cost"] is not None:
                     low, high = row["interval"] or (row["cost"], row["cost"])

@@ -1,18 +1,13 @@
-"""The paper's experiment as a study: its three adapted controllers, on the paper's models.
-
-DIR is the folder of a study with curves (pdeloop.study.run), and with it
-
-DIR/table.json    the figures of the table (pdeloop.reproduce.table)
-"""
+"""The paper's experiment as a study: its three adapted controllers, on the paper's models."""
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pdeloop.study.description import Study, StudyError
+from pdeloop.finished_run import FinishedRun, load, merged
+from pdeloop.study.description import Study
 from pdeloop.study.run import ASKED, kept
 
 LEARNED = {
@@ -63,26 +58,34 @@ def reproduction_in(folder: Path) -> Study | None:
     Raises
     ------
     StudyError
-        It is one that an older version began, or the study there cannot be read.
+        The study there cannot be read.
     """
-    if (folder / "reproduction.json").exists():
-        raise StudyError(
-            f"{folder} holds a reproduction of an older version, which this one cannot read or "
-            "continue; make it again in another folder with: pdeloop reproduce --out DIR"
-        )
     if not (folder / ASKED).exists():
         return None
     study = kept(folder)
     return study if study.curves and set(study.variants) == set(LEARNED) else None
 
 
-def command_of(study: Study) -> str:
-    """The command that gives a reproduction."""
-    options = {
-        "seeds": len(study.seeds),
-        "iterations": study.variants["lqt_po"]["iterations"],
-        "seed": study.seeds[0],
-        **{name: value for name, value in study.settings.items() if name != "identification"},
+def runs_of(study: Study, folder: Path, problem: str) -> dict[str, FinishedRun]:
+    """The finished runs of a problem over all seeds, by adapted controller."""
+    return {
+        name: merged([load(folder / problem / name / str(seed)) for seed in study.seeds])
+        for name in LEARNED
     }
-    words = [word for k, v in options.items() for word in (f"--{k.replace('_', '-')}", str(v))]
-    return shlex.join(["pdeloop", "reproduce", *study.problems.values(), *words])
+
+
+def beside_the_paper(problem: str, below: Mapping[str, Any] | None) -> str:
+    """How LQT-PO relates to the paper's figure; empty where the paper has none.
+
+    below: its `below_lqt_percent` in the row of a study's table.
+    """
+    paper = PAPER.get(problem)
+    if paper is None or below is None:
+        return ""
+    start = f"{problem}: the paper reports {paper:.1f} % below LQT for LQT-PO"
+    if below["ratio_interval"] is None:
+        return f"{start}, over six seeds; one seed cannot be compared with that."
+    averages = {"ratio of the means": "ratio_interval", "mean of the ratios": "mean_interval"}
+    within = [name for name, key in averages.items() if below[key][0] <= paper <= below[key][1]]
+    place = f"within the interval of the {' and that of the '.join(within)}"
+    return f"{start}, which lies {place if within else 'outside both intervals'} here."

@@ -1,0 +1,36 @@
+"""`pdeloop report`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from pdeloop.commands.common import Commands, add_equation, allow_equation, command
+
+
+def add(commands: Commands) -> None:
+    """The command `report`."""
+    report = command(
+        commands,
+        "report",
+        _report,
+        help="figures and an HTML page of a run or a reproduction",
+        description="Figures for a paper (PNG and SVG) and one HTML page that needs no network.",
+        example="pdeloop report runs/paper",
+    )
+    report.add_argument(
+        "folder", type=Path, metavar="DIR", help="folder of a finished run or reproduction"
+    )
+    add_equation(report)
+    report.add_argument("--out", type=Path, metavar="DIR", help="[DIR/report]")
+
+
+def _report(options: argparse.Namespace) -> int:
+    from pdeloop.report.page import report
+
+    allow_equation(options)
+    page, missing = report(options.folder, options.out)
+    for sentence in missing:
+        print(f"not shown: {sentence}")
+    print(f"report in {page}")
+    return 0
