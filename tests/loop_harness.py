@@ -1,8 +1,9 @@
 """Real nodes in real processes on a ROS domain of their own, with a limit on every wait.
 
 Most of what it takes to start a node is imports and the loading of compiled code, a second of a
-core. So the nodes and commands that a test starts itself are forked from a process that has done
-that (tests/preloaded.py). The nodes that a training starts are programs of their own, as always.
+core. So what a test starts itself, nodes, commands and pieces of Python, is forked from a process
+that has done that (tests/preloaded.py). The nodes that a training starts are programs of their own,
+as always.
 """
 
 from __future__ import annotations
@@ -36,9 +37,10 @@ def until(condition: Callable[[], object], limit: float, what: str) -> None:
 
 
 class Forked:
-    """A node, or the command line, in a process that was forked, not executed; used like a Popen.
+    """A node or a program in a process that was forked, not executed; used like a Popen.
 
-    name: one of tests.preloaded.MAINS. Its output goes into the file `log`.
+    name: one of tests.preloaded.MAINS, or "-c" and the first argument is Python, as for an
+    interpreter. Its output goes into the file `log`.
     """
 
     def __init__(
@@ -70,8 +72,8 @@ class Forked:
         self.send_signal(signal.SIGKILL)
 
 
-def run_main(name: str, arguments: list[str], log: Path, environment: dict[str, str]) -> None:
-    """The main function called `name`, in a forked process."""
+def become(log: Path, environment: Mapping[str, str]) -> None:
+    """Make a forked process one of a test's own: its session, output, environment and folder."""
     os.setsid()
     with log.open("wb") as output, Path(os.devnull).open("rb") as nothing:
         for file, number in ((nothing, 0), (output, 1), (output, 2)):
@@ -79,17 +81,27 @@ def run_main(name: str, arguments: list[str], log: Path, environment: dict[str, 
     os.environ.clear()
     os.environ.update(environment)
     os.chdir(log.parent)
-    sys.argv = [name, *arguments]
+
+
+def run_main(name: str, arguments: list[str], log: Path, environment: dict[str, str]) -> None:
+    """What `Forked` runs, in the forked process."""
+    become(log, environment)
+    if name == "-c":
+        code, *arguments = arguments
+        sys.argv = [name, *arguments]
+        exec(code, {"__name__": "__main__"})
+        return
     from tests.preloaded import MAINS
 
+    sys.argv = [name, *arguments]
     sys.exit(MAINS[name]())
 
 
 class Processes:
     """The processes of one test. All are gone when it is over.
 
-    forks: whether its nodes and commands are forked; set it to False where they need an interpreter
-    that was started in this test's environment.
+    forks: whether what it starts is forked; set it to False where that needs an interpreter that
+    was started in this test's environment.
     """
 
     forks = True
@@ -106,9 +118,11 @@ class Processes:
         self._alive: list[subprocess.Popen[bytes] | Forked] = []
         self._count = 0
 
-    def start(self, *command: str, name: str = "") -> subprocess.Popen[bytes]:
+    def start(self, *command: str, name: str = "") -> Any:
         """Run `python COMMAND...` with its output in a file (see `output`)."""
         path = self._new_log(name or Path(command[-1]).name)
+        if self.forks and command[0] == "-c":
+            return self._fork(path, *command)
         with path.open("wb") as log:
             process = subprocess.Popen(
                 [sys.executable, *command],
@@ -127,21 +141,21 @@ class Processes:
         self._count += 1
         return self.folder / f"{self._count:02d}-{name}.log"
 
-    def _fork(self, name: str, *arguments: str) -> Forked:
-        forked = Forked(name, arguments, self._new_log(name), self.environment)
+    def _fork(self, log: Path, name: str, *arguments: str) -> Forked:
+        forked = Forked(name, arguments, log, self.environment)
         self._alive.append(forked)
         return forked
 
     def node(self, name: str, *ros_arguments: str) -> Any:
         """Start one of our nodes."""
         if self.forks:
-            return self._fork(name, "--ros-args", *ros_arguments)
+            return self._fork(self._new_log(name), name, "--ros-args", *ros_arguments)
         return self.start("-m", f"{name}.node", "--ros-args", *ros_arguments, name=name)
 
     def pdeloop(self, *arguments: str) -> Any:
         """Start the command line."""
         if self.forks and arguments[0] not in ("reproduce", "study"):  # they have their own workers
-            return self._fork("pdeloop", *arguments)
+            return self._fork(self._new_log("pdeloop"), "pdeloop", *arguments)
         return self.start("-m", "pdeloop.cli", *arguments, name="pdeloop")
 
     def output(self, process: subprocess.Popen[bytes]) -> str:

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import json
-import select
-import subprocess
-import sys
 from collections.abc import Iterator
 from typing import Any
 
-from tests.loop_harness import Processes, until
+from tests import operator_program
+from tests.loop_harness import FORKING, Processes, until
 
 LIMIT = 180.0
 SERVICES = [
@@ -23,31 +20,17 @@ class Operator:
     """Calls services and reads /diagnostics in the ROS domain of a test's processes."""
 
     def __init__(self, loop: Processes) -> None:
-        self._log = (loop.folder / "operator.log").open("wb")
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "tests.operator_program"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._log,
-            env=loop.environment,
-            cwd=loop.folder,
-            text=True,
-        )
-        assert self._read() == "ready"
+        self._pipe, other = FORKING.Pipe()
+        given = (other, loop.folder / "operator.log", loop.environment)
+        self._process = FORKING.Process(target=operator_program.serve, args=given)
+        self._process.start()
+        other.close()
         self.ask(know=SERVICES)
 
-    def _read(self) -> Any:
-        assert self._process.stdout is not None
-        ready, _, _ = select.select([self._process.stdout], [], [], LIMIT)
-        assert ready, f"the operator said nothing for {LIMIT} s"
-        line = self._process.stdout.readline()
-        assert line, "the operator has ended; see operator.log"
-        return json.loads(line)
-
     def ask(self, **command: Any) -> Any:
-        assert self._process.stdin is not None
-        print(json.dumps(command), file=self._process.stdin, flush=True)
-        return self._read()
+        self._pipe.send(command)
+        assert self._pipe.poll(LIMIT), f"the operator said nothing for {LIMIT} s"
+        return self._pipe.recv()  # EOFError: it has ended; see operator.log
 
     def call(self, service: str) -> str:
         """The message of a Trigger that must succeed."""
@@ -71,15 +54,10 @@ class Operator:
         until(lambda: self.status(node)[0] >= before + count, LIMIT, f"{count} reports of {node}")
 
     def close(self) -> None:
-        assert self._process.stdin is not None and self._process.stdout is not None
-        self._process.stdin.close()
-        try:
-            self._process.wait(10.0)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        self._process.stdout.close()
-        self._log.close()
+        self._pipe.close()
+        self._process.join(10.0)
+        self._process.kill()
+        self._process.join()
 
 
 SLOW = 2.0

@@ -1,21 +1,22 @@
-"""An operator's ROS tools in a process of their own: JSON commands on stdin, JSON answers on stdout.
+"""An operator's ROS tools in a process of their own, with commands and answers through a pipe.
 
 {"know": [SERVICE, ...]}            look for these already, so that a call is quick
 {"call": SERVICE}                   a std_srvs/Trigger; [success, message]
 {"set": [NODE, PARAMETER, VALUE]}   [successful, reason]
 {"get": [NODE, PARAMETER]}          the value
 {"describe": NODE}                  {parameter: read_only}
-{"diagnostics": null}               {status name: [reports so far, level, message, {key: value}]}
-{"topics": null}                    {topic: [types]}
-{"nodes": null}                     full names
+{"diagnostics": None}               {status name: [reports so far, level, message, {key: value}]}
+{"topics": None}                    {topic: [types]}
+{"nodes": None}                     full names
 """
 
 from __future__ import annotations
 
-import json
-import sys
+import contextlib
 import threading
 import time
+from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any
 
 import rclpy
@@ -24,6 +25,8 @@ from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
 from rclpy.parameter import Parameter, parameter_value_to_python
 from std_srvs.srv import Trigger
+
+from tests.loop_harness import become
 
 LIMIT = 300.0
 
@@ -89,7 +92,7 @@ class Operator:
             ).descriptors
             return {descriptor.name: descriptor.read_only for descriptor in found}
         if what == "diagnostics":
-            return self.statuses
+            return dict(self.statuses)
         if what == "topics":
             return dict(self.node.get_topic_names_and_types())
         if what == "nodes":
@@ -100,13 +103,11 @@ class Operator:
         raise SystemExit(f"unknown command {what}")
 
 
-def main() -> None:
+def serve(pipe: Connection, log: Path, environment: dict[str, str]) -> None:
+    """Answer the commands from `pipe` until its other end is closed."""
+    become(log, environment)
     operator = Operator()
-    print(json.dumps("ready"), flush=True)
-    for line in sys.stdin:
-        print(json.dumps(operator.answer(json.loads(line))), flush=True)
+    with contextlib.suppress(EOFError):
+        while True:
+            pipe.send(operator.answer(pipe.recv()))
     rclpy.shutdown()
-
-
-if __name__ == "__main__":
-    main()

@@ -6,6 +6,7 @@
 import controller_node.node
 import pde_sim_node.node
 import recorder_node.node
+import tests.operator_program  # noqa: F401
 import tuner_node.node
 import viewer_node.node
 from pdeloop import cli
