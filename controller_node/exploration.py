@@ -81,7 +81,7 @@ class Exploration:
             z_r; None where the plant's has not arrived.
         """
         ended = cost.values[:, CostColumn.ENDED]
-        if (ended == VOID).any():
+        if (ended == VOID).any() or not cost.step:
             return self._failure("the exploratory episode is void", retry=True)
         if (ended != COMPLETED).any():
             step = int(ended.max())

@@ -13,10 +13,10 @@ state T advances nothing: it acknowledges the last state.
     AWAITING  action(e, T)                          IDLE         cost(e)
     AWAITING  no answer for `action_timeout`        AWAITING     state(e, k) again
     AWAITING  no answer after `max_repeats`         IDLE         cost(e), void: not a cost
-    active    an action that contradicts one taken  IDLE         cost(e), void; active: not IDLE
+    active    contradicts what was taken of e       IDLE         cost(e), void; active: not IDLE
     any       end of the run, start of another run  IDLE         none; or as a start in IDLE
 
-Which actions contradict, and which are signed: pde_sim_node.taken_actions.
+Which starts and actions contradict, and which are signed: pde_sim_node.taken_actions.
 
 A pause is independent of the phase: a paused plant takes the answer it waits for, and sends no further
 state. Nothing is sent again and nothing is given up meanwhile; `episode/paused` says so to those who
@@ -50,7 +50,7 @@ from loop_interfaces.topics import (
 )
 from pde_sim_node.plant import Plant
 from pde_sim_node.real_time import RealTimePacer
-from pde_sim_node.taken_actions import Episode, TakenActions, two_actions
+from pde_sim_node.taken_actions import Episode, TakenActions, two_actions, two_starts
 
 PAUSED_REPORT = 1.0
 """Seconds between two messages on `episode/paused` while the plant is paused."""
@@ -120,7 +120,7 @@ class Lockstep:
         self.last_cost: np.ndarray | None = None
         """The rows of the last `episode/cost`."""
         self.contradiction = ""
-        """Why the last cost that was sent is void, if two answers to one state came."""
+        """Why the last cost that was sent is void, if two different messages came in one place."""
         self.deadline: float | None = None
         """When `tick` is to be called next; None while nothing is due."""
         self.paused = False
@@ -237,7 +237,8 @@ class Lockstep:
     def start(self, frame: Frame, now: float) -> list[Publication]:
         """Begin an episode, or answer again for one that is known.
 
-        Raises FrameError for a malformed seed list or another run's episode while one is under way.
+        Raises FrameError for a malformed seed list or another run's episode while one is under way,
+        or other seeds for an episode that asks for another signature.
         """
         rows = start_rows(frame)
         if len(rows) * max(self.plant.state_size, self.plant.n_a) > MAX_VALUES:
@@ -260,21 +261,13 @@ class Lockstep:
         if not len(rows):
             self._serve(0, now)
             return []
-        if frame.episode < self.episode:
-            self.counters["starts of an earlier episode"] += 1
-            return []
-        if frame.episode == self.episode:
-            if not np.array_equal(rows, self._actions.episode.rows):
-                raise FrameError(
-                    f"episode {frame.episode} was started with other seeds; "
-                    "a new episode needs a new number"
-                )
-            self.counters["starts repeated"] += 1
-            return self._answer_again()
+        signed = signature(frame.plant, self.plant.target)
+        if frame.episode <= self.episode:
+            return self._start_again(frame, rows, signed, now)
         self._state = self.plant.reset(
             rows[:, StartColumn.SEED].astype(np.int64), noise_seeds(rows)
         )
-        self._actions.episode = Episode(rows.copy(), signature(frame.plant, self.plant.target))
+        self._actions.episode = Episode(rows.copy(), signed)
         self.episode, self.contradiction, self._stepping = frame.episode, "", False
         self.time = max(self.time, frame.time) + self.plant.sample_time
         if self.pacer:
@@ -379,6 +372,32 @@ class Lockstep:
         self._actions = TakenActions(True if run == self.signed_run else None)
         self._end_episode(now)
 
+    def _start_again(
+        self, frame: Frame, rows: np.ndarray, signed: float, now: float
+    ) -> list[Publication]:
+        """Answer again for an episode that is known, which is void if its start was another one."""
+        episode = self._actions.episode
+        present = frame.episode == self.episode
+        if present and self.active and episode.started_otherwise(rows, signed):
+            return [self._finish(now, void=True, contradiction=two_starts(frame))]
+        if cost := self._actions.retract_start(frame.episode, rows, signed):
+            return [self._take_back(cost, two_starts(frame))]
+        if not present:
+            self.counters["starts of an earlier episode"] += 1
+            return []
+        if signed != episode.signature and not np.array_equal(rows, episode.rows):
+            raise FrameError(
+                f"episode {frame.episode} was started with other seeds; "
+                "a new episode needs a new number"
+            )
+        self.counters["starts repeated"] += 1
+        return self._answer_again()
+
+    def _take_back(self, cost: Frame, contradiction: str) -> Publication:
+        self.contradiction = contradiction
+        self.counters["costs taken back"] += 1
+        return Publication(COST, cost)
+
     def _answer_again(self) -> list[Publication]:
         """The state that is not answered, or the cost."""
         if self._phase is Phase.AWAITING:
@@ -391,11 +410,7 @@ class Lockstep:
         if frame.run != self.run or frame.plant != self._fingerprint:
             return []
         cost = self._actions.retract(frame) if frame.values.shape[1] == self.plant.n_a else None
-        if cost is None:
-            return []
-        self.contradiction = two_actions(frame)
-        self.counters["costs taken back"] += 1
-        return [Publication(COST, cost)]
+        return [self._take_back(cost, two_actions(frame))] if cost else []
 
     def _send_unless_paused(self, now: float) -> list[Publication]:
         if not self.paused:

@@ -1,9 +1,10 @@
-"""Which actions a plant has taken in a run, and which further ones contradict them. Pure.
+"""Which starts and actions a plant has taken in a run, and which further ones contradict them. Pure.
 
 Whoever is asked twice answers the same to the bit. So another answer to a state that was answered
 already comes from somebody else, or from a controller that cannot be relied on: which of the two was
-taken is chance, and the episode is void. When it comes after the end of one of the last episodes, the
-cost of that episode is sent again, void.
+taken is chance, and the episode is void. The same holds for two starts of an episode that ask for the
+same signature. When the other one comes after the end of one of the last episodes, the cost of that
+episode is sent again, void.
 
 Where the tuner asks for it (loop_interfaces.signature), the first action of a run says whether its
 controller signs. If so, only actions with the signature of their episode are taken; if not, a signed
@@ -44,6 +45,10 @@ class Episode:
     signature: float = NOT_SIGNED
     taken: list[int] = field(default_factory=list)
     cost: Frame | None = None
+
+    def started_otherwise(self, rows: np.ndarray, signature: float) -> bool:
+        """Whether a start with these rows could have been taken in place of its own."""
+        return signature == self.signature and not np.array_equal(rows, self.rows)
 
     def contradicted_by(self, action: Frame) -> bool:
         """Whether another action was taken at this step."""
@@ -109,16 +114,28 @@ class TakenActions:
     def retract(self, action: Frame) -> Frame | None:
         """The cost of an ended episode, void, if this action contradicts one of its own; once."""
         ended = self._ended.get(action.episode)
-        if ended is None or ended.cost is None or len(action.values) != len(ended.cost.values):
+        if ended is None or len(action.values) != len(ended.rows):
             return None
         if self.signs and signature_in(action.time) != ended.signature:
             return None  # it could never have been taken
         if not ended.contradicted_by(action):
             return None
-        del self._ended[action.episode]
+        return self._void(action.episode)
+
+    def retract_start(self, episode: int, rows: np.ndarray, signature: float) -> Frame | None:
+        """The cost of an ended episode, void, if it was started with other rows; once."""
+        ended = self._ended.get(episode)
+        if ended is None or not ended.started_otherwise(rows, signature):
+            return None
+        return self._void(episode)
+
+    def _void(self, episode: int) -> Frame:
+        ended = self._ended.pop(episode)
+        assert ended.cost is not None
         values = ended.cost.values.copy()
         values[:, CostColumn.ENDED] = VOID
-        return replace(ended.cost, values=values)
+        ended.cost = replace(ended.cost, values=values)
+        return ended.cost
 
 
 def two_actions(action: Frame) -> str:
@@ -127,3 +144,8 @@ def two_actions(action: Frame) -> str:
         f"two different actions came for step {action.step} of episode {action.episode}; "
         "expected one controller, which answers a repeated state with the same action"
     )
+
+
+def two_starts(start: Frame) -> str:
+    """That another start than this one was taken, in words."""
+    return f"two different starts came for episode {start.episode}; expected one tuner"

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +11,7 @@ import pytest
 import pdeloop
 from pdeloop.cli import main
 from pdeloop.interruption import Interruption
+from tests.interpreter import python
 from tests.small import SMALL, same_bits
 from tuner_node.seeds import Purpose, derive
 
@@ -37,7 +36,7 @@ def test_importing_it_is_cheap_and_needs_no_ros() -> None:
         "for name in pdeloop.__all__: assert getattr(pdeloop, name).__doc__, name\n"
         "pdeloop.problem('burgers', n_z=32, horizon=5).explore()\n"
     )
-    subprocess.run([sys.executable, "-c", program], check=True, timeout=600)
+    python("-c", program)
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         pdeloop.nothing  # noqa: B018
 

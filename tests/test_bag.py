@@ -8,7 +8,6 @@ import re
 import shutil
 import sqlite3
 import struct
-import subprocess
 import sys
 from collections import Counter
 from pathlib import Path
@@ -37,10 +36,10 @@ from pdeloop.identification import identify_bag
 from recorder_node.bag import BagError, definition
 from recorder_node.recording import Recording
 from recorder_node.sources import CLOCK, DIAGNOSTICS, ROSOUT, Source, sources
+from tests.interpreter import python
 from tests.small_disk import read_only_folder, small_disk
 
 RUN = 2**52 + 1
-ROOT = Path(__file__).resolve().parent.parent
 SECOND = 10**9
 WHAT = [*sources("/left"), CLOCK]
 BY_TOPIC = {source.array: source for source in WHAT if source.array}
@@ -301,13 +300,13 @@ def test_bags_of_another_storage_are_refused_with_what_converts_them(tmp_path):
 def test_what_rosbags_convert_makes_of_a_sqlite3_bag_is_read(tmp_path):
     """The command that the refusal names."""
     source, converted = tmp_path / "sqlite", tmp_path / "sqlite-mcap"
-    convert = [sys.executable, "-m", "rosbags.convert", "--src", written(tmp_path), "--dst", source]
-    subprocess.run([*convert, "--dst-storage", "sqlite3"], check=True, timeout=600)
+    convert = ("-m", "rosbags.convert")
+    python(*convert, "--src", written(tmp_path), "--dst", source, "--dst-storage", "sqlite3")
     with pytest.raises(BagError, match="sqlite3") as refused:
         Bag(source)
     words = str(refused.value).split("Convert it: ")[1].split()
     assert words[0] == "rosbags-convert"
-    subprocess.run([sys.executable, "-m", "rosbags.convert", *words[1:]], check=True, timeout=600)
+    python(*convert, *words[1:])
     assert [e.missing for e in Bag(converted).episodes()] == [[], []]
 
 
@@ -393,14 +392,7 @@ def test_a_small_file_that_becomes_gigabytes_is_refused_in_one_sentence(tmp_path
         crafted(tmp_path / str(size), record_bytes(chunk(content, size))) for size in (2**31, 1000)
     ]
     assert all((bag / "x.mcap").stat().st_size < 2**20 for bag in told)
-    ended = subprocess.run(
-        [sys.executable, "-c", MEMORY, *map(str, told)],
-        capture_output=True,
-        text=True,
-        timeout=600,
-        cwd=ROOT,
-    )
-    assert ended.returncode == 0, ended.stderr
+    ended = python("-c", MEMORY, *told)
     lines = ended.stderr.splitlines()
     assert len(lines) == 6
     assert all("decompresses to more than 100 times" in line for line in lines[:3])
@@ -431,23 +423,10 @@ def test_hostile_records_are_one_sentence_or_no_messages(tmp_path, length):
             assert "cannot be read, it is damaged" in str(error) and "\n" not in str(error)
 
 
-def test_every_flipped_byte_is_noticed_or_harmless(tmp_path):
+def test_a_damaged_chunk_is_noticed_by_its_checksum(tmp_path):
     path = written(tmp_path) / "bag.mcap"
-    whole, content = list(Bag(path.parent).messages()), path.read_bytes()
+    content = path.read_bytes()
     place = content.index(b"zstd") + 12
-    noticed = 0
-    for at in range(0, len(content), 61):
-        path.write_bytes(content[:at] + bytes([content[at] ^ 0x10]) + content[at + 1 :])
-        try:
-            found = list(Bag(path.parent).messages())
-            list(Bag(path.parent).episodes())
-        except BagError as error:
-            noticed += 1
-            assert "\n" not in str(error)
-        else:
-            same = [(m.when, m.data) for m in found] == [(m.when, m.data) for m in whole]
-            assert same or len(found) < len(whole), at
-    assert noticed > 10
     path.write_bytes(content[:place] + b"\0" + content[place + 1 :])
     with pytest.raises(BagError, match=r"checksum|damaged"):
         list(Bag(path.parent).messages())
@@ -510,8 +489,7 @@ def test_a_bag_is_written_without_ros(tmp_path):
         "from pathlib import Path\n"
         f"Recording(Path({str(tmp_path / 'bag')!r}), sources('/')).close()\n"
     )
-    root = Path(__file__).resolve().parent.parent
-    subprocess.run([sys.executable, "-c", program], cwd=root, check=True, timeout=600)
+    python("-c", program)
     assert Bag(tmp_path / "bag").finished
 
 

@@ -15,7 +15,6 @@ from pdeloop.in_process import LocalPair
 from tests.small import SMALL, parameters, same_bits, train_here
 from tuner_node import checkpoint
 from tuner_node.batch import BatchResult
-from tuner_node.budget import Budget
 from tuner_node.build import build_training
 from tuner_node.rollouts import CHECK
 from tuner_node.training import Training
@@ -179,8 +178,3 @@ def test_a_run_that_did_not_count_its_rollouts_is_read_but_not_continued(tmp_pat
     capsys.readouterr()
     assert main(["train", "--resume", str(out), "--in-process"]) == 1
     assert "is of an older version, which did not count its rollouts" in capsys.readouterr().err
-
-
-def test_counts_of_another_number_of_seeds_are_refused():
-    with pytest.raises(ValueError, match="shape"):
-        Budget(2, 80).restore(Budget(3, 80).state())

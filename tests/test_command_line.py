@@ -31,7 +31,7 @@ from pdeloop.cli import main
 from pdeloop.commands import problems
 from pdeloop.output import print_json
 from pdeloop.progress import Progress, duration
-from tests.loop_harness import ROOT
+from tests.interpreter import ROOT, python
 from tests.small import SMALL
 
 PDELOOP = [sys.executable, "-m", "pdeloop.cli"]
@@ -149,8 +149,7 @@ def test_the_exit_code_is_that_of_the_process() -> None:
 
 def test_ctrl_c_finds_little_to_interrupt_before_it_is_caught() -> None:
     code = "import sys, pdeloop.cli; print([m for m in ('numpy', 'yaml', 'email') if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    assert python("-c", code).stdout.strip() == "[]"
 
 
 def test_ctrl_c_during_imports_is_one_line(monkeypatch, capsys) -> None:
@@ -342,15 +341,7 @@ for words in (["monitor"], ["report", run], ["bag", "info", run],
         code = main(words)
     print("@", code, " ".join(words[:2]), "|", said.getvalue().replace(chr(10), "|"))
 """
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=LIMIT,
-    )
-    assert done.returncode == 0, done.stderr
+    done = python("-c", code)
     lines = [line for line in done.stdout.splitlines() if line.startswith("@")]
     assert len(lines) == 6, done.stdout
     said = r"@ 1 .*\| pdeloop: needs \w+: .*pip install 'pdeloop\[\w+\]'[^|]*\|"

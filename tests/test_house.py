@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import ast
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parent.parent
+from tests.interpreter import ROOT, python
+
 NODES = ("pde_sim_node", "controller_node", "tuner_node", "recorder_node", "viewer_node")
 WITH_ROS = {
     "node.py",
@@ -88,7 +87,5 @@ def test_the_loop_runs_in_one_process_without_ros():
         "from tests.small import parameters, train_here\n"
         "print(train_here(parameters(iterations=1)).policies().shape)\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=600
-    )
-    assert done.stdout.strip() == "(1, 4, 8)", done.stderr
+    done = python("-c", program)
+    assert done.stdout.strip() == "(1, 4, 8)"

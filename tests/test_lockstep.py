@@ -86,8 +86,8 @@ def test_foreign_late_repeated_and_malformed_messages_change_no_number():
             protocol.action(replace(wrong, values=wrong.values[:1]), now)
         with pytest.raises(FrameError, match="has this plant"):
             protocol.start(start(1, run=99), now)
-        with pytest.raises(FrameError, match="other seeds"):
-            protocol.start(start(1, seeds=(5, 6)), now)
+        with pytest.raises(FrameError, match="other seeds"):  # for another signature
+            protocol.start(replace(start(1, seeds=(5, 6)), plant=9), now)
         (again,) = protocol.start(start(1), now)
         assert again.frame.step == state.step
 
@@ -402,6 +402,39 @@ def test_an_action_that_contradicts_one_of_an_episode_that_ended_takes_its_cost_
     assert protocol.action(late, 1.0) == []
     run_episode(protocol, 9)
     assert protocol.contradiction == ""
+
+
+def test_two_different_starts_void_the_episode():
+    quiet = run_episode(plant_protocol(), 1)
+    protocol = plant_protocol()
+    (state,) = protocol.start(start(1, seeds=(5, 6)), 0.0)  # the first to come is the forged one
+    protocol.action(answer(state.frame), 0.0)
+    for _ in range(2):
+        (void,) = protocol.start(start(1), 0.0)
+        assert void.topic is COST
+        assert (void.frame.values[:, CostColumn.ENDED] == VOID).all()
+    assert protocol.contradiction.startswith("two different starts came for episode 1;")
+    assert outcome(run_episode(protocol, 2)) == outcome(quiet)
+
+
+@pytest.mark.parametrize("later", [0, 3])
+def test_a_start_that_contradicts_that_of_an_episode_that_ended_takes_its_cost_back(later):
+    protocol = plant_protocol()
+    cost = run_episode(protocol, 1)[-1]
+    for episode in range(2, 2 + later):
+        run_episode(protocol, episode)
+    other = start(1, seeds=(5, 6))
+    (send,) = protocol.start(other, 1.0)
+    assert send.topic is COST
+    assert (send.frame.run, send.frame.episode, send.frame.step) == (RUN, 1, cost.step)
+    assert (send.frame.values[:, CostColumn.ENDED] == VOID).all()
+    assert "two different starts came for episode 1" in protocol.contradiction
+    # Whoever asks again is told the same.
+    for asked in (start(1), other):
+        again = protocol.start(asked, 1.0)
+        assert [found.frame.values.tobytes() for found in again] == (
+            [] if later else [send.frame.values.tobytes()]
+        )
 
 
 def test_only_the_action_that_will_be_taken_is_awaited():

@@ -7,16 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from loop_interfaces.parameters import NODES, PROBLEM, table, taken_by
+from loop_interfaces.parameters import NODES, table, taken_by
 from loop_interfaces.problem import load_parameters, shipped_problems
 from loop_interfaces.spec import ParameterError as Refused
-from loop_interfaces.spec import (
-    Spec,
-    check,
-    check_names,
-    read_yaml,
-    yaml_text,
-)
+from loop_interfaces.spec import Spec, check_names
 from pde_sim_node.build import build_plant
 from pde_sim_node.equations import EQUATIONS
 
@@ -69,12 +63,6 @@ def test_shipped_problems_load_and_build(name):
     assert plant.n_z == values["n_z"]
     assert plant.supports.shape == (len(plant.x), values["n_a"])
     assert set(EQUATIONS) <= set(shipped_problems())
-
-
-def test_written_parameters_read_back(tmp_path):
-    values = check(PROBLEM, {}) | {"physical.viscosity": 1e-4}
-    (tmp_path / "p.yaml").write_text(yaml_text(values))
-    assert read_yaml(tmp_path / "p.yaml") == values
 
 
 @pytest.mark.parametrize(

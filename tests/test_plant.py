@@ -1,9 +1,6 @@
 """The plant: against controlgym, exact solutions, conservation laws, and itself to the last bit."""
 
 import hashlib
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +20,7 @@ from pde_sim_node.plant import DIVERGED_COST, Plant
 from pde_sim_node.solver import workers
 from pde_sim_node.solver.kernel import fine_length
 from pde_sim_node.solver.reference import ReferenceStep
+from tests.interpreter import python
 
 DATA = Path(__file__).parent / "data"
 
@@ -213,12 +211,7 @@ def digest() -> str:
 
 
 def test_another_process_gives_the_same_bits() -> None:
-    root = Path(__file__).parent.parent
-    done = subprocess.run(
-        [sys.executable, "-c", "from tests.test_plant import digest; print(digest())"],
-        capture_output=True, text=True, timeout=600, check=True,
-        cwd=root, env={**os.environ, "PYTHONPATH": str(root)},
-    )  # fmt: skip
+    done = python("-c", "from tests.test_plant import digest; print(digest())")
     assert done.stdout.split()[-1] == digest()
 
 
@@ -448,15 +441,10 @@ def test_a_users_equation_is_compiled_once_for_all_processes(tmp_path: Path) -> 
         "from pde_sim_node.solver.pointwise import pointwise_loop;"
         "pointwise_loop(load_equation(sys.argv[1]).nonlinearity); print(compilations() > 0)"
     )
-    root = str(Path(__file__).parent.parent)
 
     def compiles() -> str:
-        done = subprocess.run(
-            [sys.executable, "-c", program, f"{path}:Fisher"],
-            capture_output=True, text=True, timeout=600, check=True,
-            env={**os.environ, "PYTHONPATH": root, "NUMBA_CACHE_DIR": str(tmp_path / "cache")},
-        )  # fmt: skip
-        return done.stdout.strip()
+        cache = str(tmp_path / "cache")
+        return python("-c", program, f"{path}:Fisher", NUMBA_CACHE_DIR=cache).stdout.strip()
 
     path.write_text(FISHER)
     assert [compiles(), compiles()] == ["True", "False"]

@@ -71,6 +71,7 @@ def test_damaged_bytes_are_a_frame_error_or_a_sound_frame(frame, data):
         assert np.isfinite(read.values).all() and math.isfinite(read.time)
         assert all(0 <= i < MAX_ID for i in (read.run, read.episode, read.step, read.plant))
         assert 8 * (HEADER + read.values.size) <= len(bytes_)
+    assert same(codec.decode(codec.encode(frame)), frame)
 
 
 @tried

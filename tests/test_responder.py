@@ -18,14 +18,17 @@ from tests.small import parameters, same_bits
 from tuner_node.batch import Batch
 
 RUN = 5
-SETTINGS = DesignSettings(
-    n_a=4,
-    reduced_order=4,
-    state_weight=1.0,
-    action_weight=1.0,
-)
+SETTINGS = DesignSettings(n_a=4, reduced_order=4, state_weight=1.0, action_weight=1.0)
 PLANT = build_plant(parameters())
 TARGET = Frame(0, 0, 0, 0.0, PLANT.target)
+
+
+@pytest.fixture
+def responder() -> Responder:
+    """A controller that knows the target."""
+    made = Responder(SETTINGS)
+    made.target(TARGET)
+    return made
 
 
 def start(episode: int, *rows: tuple[float, ...], run: int = RUN) -> Frame:
@@ -53,9 +56,7 @@ def explore(responder: Responder, episode: int, excitation_seed: int = 2, lose: 
     return responder.cost(Frame(RUN, episode, PLANT.horizon, 1.0, costs))
 
 
-def test_exploration_gives_the_model_of_the_same_trajectory_in_process():
-    responder = Responder(SETTINGS)
-    responder.target(TARGET)
+def test_exploration_gives_the_model_of_the_same_trajectory_in_process(responder):
     (send,) = explore(responder, 1)
     assert send.topic is MODEL_IDENTIFIED
     assert same_bits(send.frame.values, models())
@@ -63,9 +64,7 @@ def test_exploration_gives_the_model_of_the_same_trajectory_in_process():
     assert same_bits(again.frame.values, send.frame.values)
 
 
-def test_a_lost_sample_asks_for_the_episode_again_and_the_repeat_gives_the_model():
-    responder = Responder(SETTINGS)
-    responder.target(TARGET)
+def test_a_lost_sample_asks_for_the_episode_again_and_the_repeat_gives_the_model(responder):
     (failure,) = explore(responder, 1, lose=7)
     assert isinstance(failure, ModelFailure)
     assert failure.retry
@@ -113,9 +112,7 @@ def test_the_law_is_answered_whatever_the_order_in_which_its_parts_arrive():
     assert (answers[0].values[1] == 0).all()
 
 
-def test_states_of_two_plants_are_not_mixed_into_one_model():
-    responder = Responder(SETTINGS)
-    responder.target(TARGET)
+def test_states_of_two_plants_are_not_mixed_into_one_model(responder):
     responder.target(Frame(0, 0, 0, 0.0, PLANT.target, plant=9))
     responder.start(start(1, (1, 2, 0.1, 0)))
     stranger = np.random.default_rng(0).standard_normal((1, 32))
@@ -126,9 +123,7 @@ def test_states_of_two_plants_are_not_mixed_into_one_model():
     assert same_bits(send.frame.values, models())
 
 
-def test_a_flood_of_strangers_does_not_push_out_the_run_that_is_served():
-    responder = Responder(SETTINGS)
-    responder.target(TARGET)
+def test_a_flood_of_strangers_does_not_push_out_the_run_that_is_served(responder):
     responder.start(start(1, (1, 9, 0.1, 0)))
     state = Frame(RUN, 1, 0, 0.0, PLANT.reset(np.array([1])).copy())
     (before,) = responder.state(state)
@@ -139,9 +134,7 @@ def test_a_flood_of_strangers_does_not_push_out_the_run_that_is_served():
     assert same_bits(after.frame.values, before.frame.values)
 
 
-def test_a_state_of_another_episode_or_run_is_not_answered():
-    responder = Responder(SETTINGS)
-    responder.target(TARGET)
+def test_a_state_of_another_episode_or_run_is_not_answered(responder):
     responder.start(start(1, (1, 9, 0.1, 0)))
     state = PLANT.reset(np.array([1]))
     assert responder.state(Frame(RUN, 2, 0, 0.0, state)) == []
@@ -166,9 +159,7 @@ def test_a_policy_waits_for_the_models_it_belongs_to():
     assert np.allclose(send.frame.values[0], expected, rtol=1e-12, atol=1e-13)
 
 
-def test_two_runs_are_answered_side_by_side_and_forgotten_when_released():
-    responder = Responder(SETTINGS)
-    responder.target(TARGET)
+def test_two_runs_are_answered_side_by_side_and_forgotten_when_released(responder):
     state = PLANT.reset(np.array([1])).copy()
     responder.start(start(1, (1, 9, 0.1, 0)))
     responder.start(start(1, (1, 10, 0.1, 0), run=6))
@@ -216,10 +207,8 @@ def test_a_policy_that_does_not_fit_the_episode_is_refused_and_a_good_one_serves
     assert len(responder.state(state)) == 1
 
 
-def test_a_run_of_a_stranger_fills_no_memory(monkeypatch):
+def test_a_run_of_a_stranger_fills_no_memory(responder, monkeypatch):
     monkeypatch.setattr("controller_node.responder.MAX_BYTES", 100_000)
-    responder = Responder(SETTINGS)
-    responder.target(TARGET)
     states = PLANT.reset(np.array([1]))
     for run in range(100, 120):
         responder.start(start(1, (1, 2, 0.1, 0), run=run))
@@ -236,9 +225,7 @@ def test_a_run_of_a_stranger_fills_no_memory(monkeypatch):
     assert model.topic is MODEL_IDENTIFIED
 
 
-def test_two_different_states_of_one_step_give_no_model_and_ask_for_the_episode_again():
-    responder = Responder(SETTINGS)
-    responder.target(TARGET)
+def test_two_different_states_of_one_step_give_no_model_and_ask_for_the_episode_again(responder):
     responder.start(start(1, (1, 2, 0.1, 0)))
     states = PLANT.reset(np.array([1]))
     responder.state(Frame(RUN, 1, 0, 0.0, states))
@@ -251,9 +238,7 @@ def test_two_different_states_of_one_step_give_no_model_and_ask_for_the_episode_
 
 
 @pytest.mark.parametrize("when", ["before", "after"])
-def test_an_episode_with_two_different_policies_is_not_answered(when):
-    responder = Responder(SETTINGS)
-    responder.target(TARGET)
+def test_an_episode_with_two_different_policies_is_not_answered(responder, when):
     responder.model(Frame(RUN, 0, 0, 0.0, models()))
     good, forged = (Frame(RUN, 4, 0, 0.0, np.full((1, 4, 8), gain)) for gain in (0.1, 0.2))
     state = Frame(RUN, 4, 0, 0.0, PLANT.reset(np.array([1])))

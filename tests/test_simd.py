@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).parent.parent
+from tests.interpreter import python
+
 PROGRAM = """
 import sys
 import numpy as np, numba
@@ -37,10 +35,7 @@ np.save(sys.argv[1], np.stack([x, y, z, plus, minus]))
 @pytest.mark.parametrize("cpu", ["", "generic"], ids=["this one", "without the instruction"])
 def test_a_fused_product_has_one_rounding_on_every_machine(cpu: str, tmp_path: Path) -> None:
     target = {"NUMBA_CPU_NAME": cpu, "NUMBA_CPU_FEATURES": ""} if cpu else {}
-    subprocess.run(
-        [sys.executable, "-c", PROGRAM, str(tmp_path / "found.npy")],
-        check=True, timeout=600, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT), **target},
-    )  # fmt: skip
+    python("-c", PROGRAM, tmp_path / "found.npy", **target)
     x, y, z, plus, minus = np.load(tmp_path / "found.npy")
     twice = 0
     for a, b, c, p, m in zip(x, y, z, plus, minus, strict=True):

@@ -17,6 +17,7 @@ from pde_sim_node.equations import Burgers
 from pde_sim_node.plant import Plant
 from pde_sim_node.solver import workers
 from pde_sim_node.solver.workers import SolverThreads, use_cores
+from tests.interpreter import ROOT, python
 
 several = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
 P1 = {
@@ -74,12 +75,8 @@ if child := os.fork():
 else:  # a fork has none of the threads, and starts others
     os._exit(rollout(plant, range(16)) != many)
 """
-    root = Path(__file__).parent.parent
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=600, cwd=root,
-        env={**os.environ, "PYTHONPATH": str(root)},
-    )  # fmt: skip
-    assert done.stdout.strip() == "0", done.stderr
+    done = python("-c", program)
+    assert done.stdout.strip() == "0"
 
 
 @several
@@ -99,10 +96,9 @@ rollout(plant, range(16))
 print("there", flush=True)
 sys.stdin.readline()
 """
-    root = Path(__file__).parent.parent
     process = subprocess.Popen(
         [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-        cwd=root, env={**os.environ, "PYTHONPATH": str(root)},
+        cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     assert process.stdin is not None
     assert process.stdout is not None

@@ -30,7 +30,10 @@ def undisturbed(iterations: int) -> Training:
 
 
 def audit(plan: Plan) -> str:
-    """'same bits', or 'error: ...' where the training ended with one.
+    """'same bits', 'error: ...' where the training ended with one, or 'forged'.
+
+    The last one is the limit that docs/security.md names: other bits, as a forged message came to a
+    process that the true one with its header never reached.
 
     Raises
     ------
@@ -39,19 +42,25 @@ def audit(plan: Plan) -> str:
     """
     expected = undisturbed(plan.iterations)
     with remembering():
-        end = History(plan).run()
+        history = History(plan)
+        end = history.run()
     if isinstance(end, DispatchError):
         assert CAUSES.search(str(end)), f"names no cause: {end}"
         assert plan.hostile or str(end).startswith(GAVE_UP), f"nobody else was there: {end}"
         return f"error: {end}"
-    assert same_bits(end.policies(), expected.policies()), "another policy"
     assert end.evaluation is not None and expected.evaluation is not None
-    assert same_bits(end.evaluation, expected.evaluation), "other costs"
+    for what, found, wanted in (
+        ("another policy", end.policies(), expected.policies()),
+        ("other costs", end.evaluation, expected.evaluation),
+    ):
+        if not same_bits(found, wanted):
+            assert history.unopposed, what
+            return "forged"
     return "same bits"
 
 
 def verdict(plan: Plan) -> tuple[str, str]:
-    """'same bits' or 'error' and nothing; or 'wrong', and why."""
+    """How `audit` begins, and nothing; or 'wrong', and why."""
     try:
         return audit(plan).split(":")[0], ""
     except Exception as error:  # whatever it is, it is the finding

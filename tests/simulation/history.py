@@ -79,6 +79,9 @@ class History:
         self._sent: deque[tuple[Topic, bytes, int]] = deque(maxlen=RECALLED)
         self._forged: dict[str, float] = {}
         """Topics on which messages are forged, and until when."""
+        self._forgeries: set[tuple[Any, ...]] = set()
+        self._heard: set[tuple[Any, ...]] = set()
+        """Readers and headers of the forged messages that came, and of the others."""
         self._cut: set[tuple[str, str]] = set()
         self._gone: dict[str, float] = {}
         self._rates = dict(zip(MAIN, plan.rates, strict=True))
@@ -103,6 +106,11 @@ class History:
                 if tuner.session.stopped:
                     self._end("tuner", self.rng.expovariate(1.0))
         raise TimeoutError(f"no end within {LIMIT:g} virtual seconds")
+
+    @property
+    def unopposed(self) -> bool:
+        """Whether a forged message came to a process that the one with its header never reached."""
+        return not self._forgeries <= self._heard
 
     def send(self, writer: Process, sent: Publication | ModelFailure, pair: int) -> None:
         """Bring a message to who reads its topic in the namespace of a pair, as the network at that
@@ -187,9 +195,13 @@ class History:
                 if topic.latched and process.alive:
                     self._at(self.time + 0.1, arrive)
                 return
-            self._handing(
-                process, lambda: process.take(topic, self._codecs[topic].decode(bytes(raw)), pair)
-            )
+            self._handing(process, take)
+
+        def take() -> None:
+            frame = self._codecs[topic].decode(bytes(raw))
+            header = topic, pair, frame.run, frame.episode, frame.step, frame.time, frame.plant
+            (self._forgeries if writer == "stranger" else self._heard).add((process, *header))
+            process.take(topic, frame, pair)
 
         self._later(arrive)
 

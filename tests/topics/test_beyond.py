@@ -10,7 +10,7 @@ import pytest
 from pdeloop.bags.verify import verify
 from tests.loop_harness import Processes, until
 from tests.small import SMALL, parameters, train_here
-from tests.topics.test_loop import LIMIT, adapted, assert_same_training, tuner_arguments
+from tests.small_loop import LIMIT, PARAMETERS, adapted, assert_same_training, start_tuner
 
 pytestmark = pytest.mark.topics
 INSTRUMENTS: dict[str, Any] = {
@@ -25,13 +25,13 @@ WORDS = [word for name, value in INSTRUMENTS.items() for word in ("-p", f"{name}
 
 def test_a_faulty_line_and_killed_nodes_change_no_noise(loop: Processes, tmp_path):
     out = tmp_path / "run"
-    start = ("--params-file", str(SMALL), *WORDS)
+    start = (*PARAMETERS, *WORDS)
     lines = {"pde_sim_node": "state:=state_sent", "controller_node": "action:=action_sent"}
     running = {name: loop.node(name, *start, "-r", line) for name, line in lines.items()}
     line = ("-p", "loss:=0.002", "-p", "duplicate:=0.2", "-p", "delay:=0.002")
     loop.start("-m", "tests.relay.node", "--ros-args", *line, name="relay")
     options = {"rollouts": 27, "optimizer": "gauss_newton"}
-    tuner = loop.node("tuner_node", *start, *tuner_arguments(out, **options, max_attempts=50))
+    tuner = start_tuner(loop, out, *WORDS, **options, max_attempts=50)
     for count, victim in ((3, "controller_node"), (6, "pde_sim_node")):
         until(lambda least=count: adapted(out) >= least, LIMIT, f"batch {count}")
         running[victim].send_signal(signal.SIGKILL)
@@ -40,9 +40,7 @@ def test_a_faulty_line_and_killed_nodes_change_no_noise(loop: Processes, tmp_pat
     until(lambda: adapted(out) >= 9, LIMIT, "batch 9")
     tuner.send_signal(signal.SIGKILL)
     tuner.wait()
-    arguments = tuner_arguments(out, **options, max_attempts=50, resume="true")
-    tuner = loop.node("tuner_node", *start, *arguments)
-    loop.wait(tuner, LIMIT)
+    loop.wait(start_tuner(loop, out, *WORDS, **options, max_attempts=50, resume="true"), LIMIT)
     assert_same_training(out, train_here(parameters(**options, **INSTRUMENTS)))
 
 

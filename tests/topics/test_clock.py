@@ -10,12 +10,13 @@ import pytest
 
 from tests.loop_harness import Processes, until
 from tests.operator_harness import SLOW, full_speed, operator
-from tests.topics.test_faults import start_pair, start_tuner
-from tests.topics.test_loop import (
+from tests.small_loop import (
     LIMIT,
+    adapted,
     assert_same_training,
     in_process,
-    iterations_done,
+    start_pair,
+    start_tuner,
 )
 
 pytestmark = pytest.mark.topics
@@ -77,7 +78,7 @@ def test_a_clock_that_jumps_forth_and_back_changes_nothing(loop: Processes, tmp_
         }
         start_pair(loop, real_time_factor=SLOW)  # until all jumps were seen
         tuner = start_tuner(loop, out, iterations=100)
-        until(lambda: iterations_done(out) >= 1, LIMIT, "iteration 1")
+        until(lambda: adapted(out) >= 1, LIMIT, "iteration 1")
         for days in (2, -3, 0):
             offset.write_text(f"{days:+d}d\n")
             wanted = 86400 * days

@@ -21,8 +21,8 @@ from pde_sim_node.build import build_plant
 from pde_sim_node.equations import ALLOWED, Equation, load_equation
 from pdeloop.cli import main
 from tests.loop_harness import ROOT, Processes, until
+from tests.small_loop import LIMIT
 from tests.topics.test_foreign import INTERFACES, code_block, documented_command
-from tests.topics.test_loop import LIMIT
 from tuner_node.seeds import Purpose, derive
 
 pytestmark = pytest.mark.topics

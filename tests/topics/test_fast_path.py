@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.loop_harness import Processes
-from tests.small import SMALL
-from tests.topics.test_loop import LIMIT, assert_same_training, in_process, tuner_arguments
+from tests.small_loop import LIMIT, PARAMETERS, assert_same_training, in_process, start_tuner
 
 pytestmark = pytest.mark.topics
 
@@ -51,13 +50,12 @@ def test_a_protocol_that_changes_hands_all_the_time_loses_nothing(
 ) -> None:
     """The node's own thread wakes up every 0.3 ms, in the middle of whatever the other does."""
     patience = ("-p", "action_timeout:=10.0")  # what is lost is repeated, and seen
-    arguments = ("--ros-args", "--params-file", str(SMALL), *patience)
+    arguments = ("--ros-args", *PARAMETERS, *patience)
     nodes = [
         loop.start("-c", RESTLESS.format(package), *arguments, name=package)
         for package in ("pde_sim_node", "controller_node")
     ]
-    own = tuner_arguments(tmp_path / "run", iterations=200)
-    loop.wait(loop.node("tuner_node", "--params-file", str(SMALL), *own), LIMIT)
+    loop.wait(start_tuner(loop, tmp_path / "run", iterations=200), LIMIT)
     assert_same_training(tmp_path / "run", in_process(iterations=200))
     for node in nodes:
         node.send_signal(signal.SIGTERM)

@@ -17,33 +17,22 @@ import pytest
 from pde_sim_node.build import fingerprint
 from pdeloop.cli import main
 from pdeloop.in_process import LocalPair
-from tests.loop_harness import Processes, until
+from tests.loop_harness import until
 from tests.operator_harness import SLOW, full_speed, held_training, operator
 from tests.small import SMALL, parameters
 from tests.small_disk import small_disk
-from tests.topics.test_loop import (
+from tests.small_loop import (
     LIMIT,
+    PARAMETERS,
+    adapted,
     assert_same_training,
     in_process,
-    iterations_done,
-    tuner_arguments,
+    start_pair,
+    start_tuner,
 )
 from tuner_node.batch import Batch, BatchResult
 
 pytestmark = pytest.mark.topics
-PARAMETERS = ("--params-file", str(SMALL))
-
-
-def start_pair(loop: Processes, **plant: object) -> dict[str, subprocess.Popen[bytes]]:
-    own = [word for name, value in plant.items() for word in ("-p", f"{name}:={value}")]
-    return {
-        "plant": loop.node("pde_sim_node", *PARAMETERS, *own),
-        "controller": loop.node("controller_node", *PARAMETERS),
-    }
-
-
-def start_tuner(loop: Processes, out: Path, **options: object) -> subprocess.Popen[bytes]:
-    return loop.node("tuner_node", *PARAMETERS, *tuner_arguments(out, **options))
 
 
 def test_lost_repeated_delayed_and_reordered_messages_change_nothing(loop, tmp_path):
@@ -67,7 +56,7 @@ def test_a_stopped_process_that_goes_on_later_changes_nothing(loop, tmp_path, vi
     running = start_pair(loop, max_repeats=20)
     out = tmp_path / "run"
     running["tuner"] = start_tuner(loop, out, iterations=100)
-    until(lambda: iterations_done(out) >= 20, LIMIT, "iteration 20")
+    until(lambda: adapted(out) >= 20, LIMIT, "iteration 20")
     running[victim].send_signal(signal.SIGSTOP)
     time.sleep(5.0)
     running[victim].send_signal(signal.SIGCONT)
@@ -79,7 +68,7 @@ def test_the_supervisor_restarts_what_dies_and_says_so(loop, tmp_path):
     out = tmp_path / "run"
     run = loop.pdeloop("train", str(SMALL), "--iterations", "150", "--out", str(out))
     for count, name in ((10, "pde_sim_node"), (40, "controller_node"), (70, "tuner_node")):
-        until(lambda n=count: iterations_done(out) >= n, LIMIT, f"iteration {count}")
+        until(lambda n=count: adapted(out) >= n, LIMIT, f"iteration {count}")
         (pid,) = loop.pids(name)
         os.kill(pid, signal.SIGKILL)
     text = loop.wait(run, LIMIT)
@@ -91,7 +80,7 @@ def test_the_supervisor_restarts_what_dies_and_says_so(loop, tmp_path):
 def test_everything_dies_at_once_and_the_run_continues(loop, tmp_path):
     out = tmp_path / "run"
     run = loop.pdeloop("train", str(SMALL), "--iterations", "150", "--out", str(out))
-    until(lambda: iterations_done(out) >= 20, LIMIT, "iteration 20")
+    until(lambda: adapted(out) >= 20, LIMIT, "iteration 20")
     os.kill(run.pid, signal.SIGKILL)  # its children die with it
     until(lambda: loop.left_behind() == [], LIMIT, "end of the killed supervisor's nodes")
     run.wait()
@@ -115,29 +104,12 @@ def test_a_node_that_keeps_dying_is_given_up(loop, tmp_path):
     assert len(killed) == 6
 
 
-def test_a_second_tuner_is_refused_and_the_first_one_unharmed(loop, tmp_path):
-    start_pair(loop, real_time_factor=SLOW)
-    out = tmp_path / "run"
-    with operator(loop) as desk:
-        first = start_tuner(loop, out, iterations=40)
-        until(lambda: iterations_done(out) >= 1, LIMIT, "iteration 1")
-        desk.call("/tuner_node/pause")  # so that it outlasts the other one's refusal
-        second = start_tuner(loop, tmp_path / "second", seed=9)
-        text = loop.wait(second, LIMIT, code=1)
-        full_speed(desk)
-        desk.call("/tuner_node/resume")
-    assert "another tuner publishes /episode/start" in text.strip().splitlines()[-1]
-    loop.wait(first, LIMIT)
-    assert_same_training(out, in_process(iterations=40))
-    assert iterations_done(tmp_path / "second") == 0
-
-
 def test_a_second_plant_with_other_parameters_never_mixes_in(loop, tmp_path):
     start_pair(loop, real_time_factor=SLOW)
     out = tmp_path / "run"
     with operator(loop) as desk:
         tuner = start_tuner(loop, out, iterations=60)
-        until(lambda: iterations_done(out) >= 1, LIMIT, "iteration 1")
+        until(lambda: adapted(out) >= 1, LIMIT, "iteration 1")
         desk.call("/tuner_node/pause")
         other = ("-r", "__node:=other_plant", "-p", "physical.viscosity:=0.02")
         loop.node("pde_sim_node", *PARAMETERS, *other)
@@ -165,7 +137,7 @@ def test_a_second_plant_with_the_same_parameters_is_harmless(loop, tmp_path):
     out = tmp_path / "run"
     with operator(loop) as desk:
         tuner = start_tuner(loop, out, iterations=40)
-        until(lambda: iterations_done(out) >= 1, LIMIT, "iteration 1")
+        until(lambda: adapted(out) >= 1, LIMIT, "iteration 1")
         with held_training(desk, "/pde_sim_node"):
             loop.node("pde_sim_node", *PARAMETERS)
     loop.wait(tuner, LIMIT)
@@ -175,7 +147,7 @@ def test_a_second_plant_with_the_same_parameters_is_harmless(loop, tmp_path):
 def test_a_new_run_is_not_disturbed_by_what_an_earlier_one_left_latched(loop, tmp_path):
     start_pair(loop, real_time_factor=20.0)
     first = start_tuner(loop, tmp_path / "first", iterations=100_000)
-    until(lambda: iterations_done(tmp_path / "first") >= 1, LIMIT, "iteration 1")
+    until(lambda: adapted(tmp_path / "first") >= 1, LIMIT, "iteration 1")
     first.send_signal(signal.SIGSTOP)  # its start, policy and model stay on the network
     time.sleep(0.2)
     first.send_signal(signal.SIGINT)
@@ -198,7 +170,7 @@ def test_a_full_disk_is_reported_and_the_training_goes_on(loop, tmp_path):
     with small_disk(tmp_path / "disk", megabytes=8) as disk:
         out = disk / "run"
         tuner = start_tuner(loop, out, iterations=300)
-        until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
+        until(lambda: adapted(out) >= 5, LIMIT, "iteration 5")
         fill(disk)
         until(lambda: "cannot write the checkpoint" in loop.output(tuner), LIMIT, "warning")
         (disk / "filler").unlink()
@@ -277,7 +249,7 @@ def test_a_strange_publisher_is_reported_by_name_and_changes_nothing(loop, tmp_p
     out = tmp_path / "run"
     with operator(loop) as desk:
         tuner = start_tuner(loop, out, iterations=40)
-        until(lambda: iterations_done(out) >= 1, LIMIT, "iteration 1")
+        until(lambda: adapted(out) >= 1, LIMIT, "iteration 1")
         with held_training(desk, "/stranger"):
             stranger = loop.start("-c", STRANGER, name="stranger")
             # Strangers are looked for from time to time, whether the training is paused or not.
@@ -323,7 +295,7 @@ def test_a_second_controller_that_answers_otherwise_never_mixes_in(loop, tmp_pat
     out = tmp_path / "run"
     with operator(loop) as desk:
         tuner = start_tuner(loop, out, iterations=100)
-        until(lambda: iterations_done(out) >= 1, LIMIT, "iteration 1")
+        until(lambda: adapted(out) >= 1, LIMIT, "iteration 1")
         desk.call("/tuner_node/pause")
         second = loop.start("-c", SECOND_CONTROLLER, name="second")
         until(lambda: "/second_controller" in desk.ask(nodes=None), LIMIT, "second controller")
@@ -368,7 +340,7 @@ def test_a_flood_of_garbage_on_every_topic_changes_nothing(loop, tmp_path):
     out = tmp_path / "run"
     with operator(loop) as desk:
         running["tuner"] = start_tuner(loop, out, iterations=200)
-        until(lambda: iterations_done(out) >= 1, LIMIT, "iteration 1")
+        until(lambda: adapted(out) >= 1, LIMIT, "iteration 1")
         before = {name: resident(process) for name, process in running.items()}
         flood = loop.start("-c", FLOOD, name="flood")
         sent = int(loop.wait(flood, LIMIT).strip().splitlines()[-1])

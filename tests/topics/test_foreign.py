@@ -13,7 +13,7 @@ from scipy.linalg import solve_discrete_are
 from loop_interfaces.model_rows import unpack
 from loop_interfaces.parameters import table
 from tests.loop_harness import ROOT, Processes
-from tests.topics.test_loop import LIMIT
+from tests.small_loop import LIMIT
 from tuner_node.seeds import Purpose, derive
 
 pytestmark = pytest.mark.topics

@@ -15,7 +15,7 @@ from loop_interfaces.isolation import NETWORK, PROFILE, loopback_environment, ou
 from loop_interfaces.problem import config_folder
 from pdeloop.domain import DomainError, own_domain
 from tests.loop_harness import ROOT, Processes, until
-from tests.topics.test_loop import LIMIT
+from tests.small_loop import LIMIT
 
 pytestmark = pytest.mark.topics
 

@@ -7,7 +7,6 @@ elsewhere a stand-in does (tests/launch_stand_in).
 from __future__ import annotations
 
 import importlib.util
-import json
 import os
 import signal
 from pathlib import Path
@@ -17,7 +16,7 @@ import pytest
 from tests.colcon_workspace import ROOT, Workspace
 from tests.loop_harness import Processes, until
 from tests.small import SMALL
-from tests.topics.test_loop import assert_same_training, in_process
+from tests.small_loop import adapted, assert_same_training, in_process
 
 LIMIT = 240.0
 """Seconds: a launch is seven processes that start at once, on a machine that has other things to do."""
@@ -67,8 +66,8 @@ def test_nodes_that_are_killed_in_a_launched_training_are_started_again(
     options |= {"pairs": 2, "record": "true", "out": run}
     started = launch(installed, workspace, "train.launch.py", **options)
     for name in ("pde_sim_node", "controller_node", "tuner_node"):
-        rows = progress(run)
-        until(lambda rows=rows: progress(run) > rows + 2, LIMIT, "progress")
+        rows = adapted(run)
+        until(lambda rows=rows: adapted(run) > rows + 2, LIMIT, "progress")
         os.kill(pids(installed, name)[0], signal.SIGKILL)
     said = installed.wait(started, LIMIT)
     assert said.count("exit code -9") == 3
@@ -93,15 +92,6 @@ def test_a_launched_loop_serves_a_tuner_and_ends_by_an_interrupt(
     said = installed.wait(started, LIMIT, code=0)
     assert "Traceback" not in said
     assert "escalating" not in said
-
-
-def progress(run: Path) -> int:
-    """Iterations so far."""
-    try:
-        rows = (run / "progress.jsonl").read_text().splitlines()
-    except OSError:
-        return 0
-    return sum(json.loads(row).get("event") == "adapted" for row in rows[:-1])
 
 
 def pids(processes: Processes, executable: str) -> list[int]:

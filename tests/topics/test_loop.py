@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import itertools
-import json
 import os
 import resource
 import signal
 import time
 from collections.abc import Iterable
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -18,34 +16,20 @@ import pytest
 from loop_interfaces.protocol import NO_CONTROLLER
 from loop_interfaces.topics import MAX_GAIN
 from tests.loop_harness import Processes, until
-from tests.small import SMALL, parameters, same_bits, train_here
-from tuner_node.training import Training
+from tests.small import SMALL, parameters, train_here
+from tests.small_loop import (
+    LIMIT,
+    PARAMETERS,
+    adapted,
+    assert_same_training,
+    in_process,
+    start_pair,
+    start_tuner,
+    tuner_arguments,
+)
 
 pytestmark = pytest.mark.topics
-LIMIT = 240.0
-"""Seconds after which a small training has failed, however busy the machine; an idle one needs 5."""
 NODES = ("pde_sim_node", "controller_node", "tuner_node")
-
-
-@cache
-def in_process(seed: int = 0, iterations: int = 20, seeds: int = 1) -> Training:
-    return train_here(parameters(seed=seed, iterations=iterations, seeds=seeds))
-
-
-def assert_same_training(folder: Path, expected: Training) -> None:
-    """The run in `folder` has the policy, the model and the costs of `expected`, bit for bit."""
-    with np.load(folder / "policy.npz") as arrays:
-        assert same_bits(arrays["model"], expected.models)
-        assert same_bits(arrays["policy"], expected.policies())
-    result = json.loads((folder / "result.json").read_text())
-    costs = np.array([result["costs_by_field"][name] for name in ("none", "lqt", "adapted")])
-    assert same_bits(costs.transpose(1, 0, 2).copy(), expected.evaluation)
-
-
-def tuner_arguments(out: Path, **options: object) -> list[str]:
-    budget = {} if "rollouts" in options else {"iterations": 20}
-    values = {**budget, "out": out, **options}
-    return [word for name, value in values.items() for word in ("-p", f"{name}:={value}")]
 
 
 @pytest.mark.parametrize("order", list(itertools.permutations(NODES))[::2], ids="-".join)
@@ -53,7 +37,7 @@ def test_nodes_started_in_any_order_find_each_other_and_train(loop: Processes, t
     started = {}
     for name in order:
         own = tuner_arguments(tmp_path / "run") if name == "tuner_node" else []
-        started[name] = loop.node(name, "--params-file", str(SMALL), *own)
+        started[name] = loop.node(name, *PARAMETERS, *own)
         time.sleep(0.3)
     loop.wait(started["tuner_node"], LIMIT)
     assert_same_training(tmp_path / "run", in_process())
@@ -74,11 +58,10 @@ def test_python_trains_over_topics_as_in_one_process(loop: Processes, tmp_path):
 def test_two_loops_in_two_namespaces_do_not_meet(loop: Processes, tmp_path):
     tuners = []
     for seed, namespace in enumerate(("/left", "/right/inner")):
-        where = ("-r", f"__ns:={namespace}", "--params-file", str(SMALL))
+        where = ("-r", f"__ns:={namespace}", *PARAMETERS)
         loop.node("pde_sim_node", *where, "-p", "publish_clock:=false")
         loop.node("controller_node", *where)
-        out = tuner_arguments(tmp_path / str(seed), seed=seed)
-        tuners.append(loop.node("tuner_node", *where, *out))
+        tuners.append(start_tuner(loop, tmp_path / str(seed), *where, seed=seed))
     for seed, tuner in enumerate(tuners):
         loop.wait(tuner, LIMIT)
         assert_same_training(tmp_path / str(seed), in_process(seed=seed))
@@ -86,55 +69,27 @@ def test_two_loops_in_two_namespaces_do_not_meet(loop: Processes, tmp_path):
 
 def test_one_tuner_is_served_by_several_pairs_with_the_same_result(loop: Processes, tmp_path):
     for pair in ("a", "b"):
-        where = ("-r", f"__ns:=/{pair}", "--params-file", str(SMALL))
+        where = ("-r", f"__ns:=/{pair}", *PARAMETERS)
         loop.node("pde_sim_node", *where, "-p", "publish_clock:=false")
         loop.node("controller_node", *where)
-    tuner = loop.node(
-        "tuner_node",
-        "--params-file",
-        str(SMALL),
-        *tuner_arguments(tmp_path / "run", seeds=2, max_batch=3, pairs="['a','b']"),
-    )
-    loop.wait(tuner, LIMIT)
+    loop.wait(start_tuner(loop, tmp_path / "run", seeds=2, max_batch=3, pairs="['a','b']"), LIMIT)
     assert_same_training(tmp_path / "run", in_process(seeds=2))
-
-
-def iterations_done(folder: Path) -> int:
-    path = folder / "progress.jsonl"
-    return path.read_text().count('"iteration":') if path.exists() else 0
-
-
-def adapted(folder: Path) -> int:
-    """Batches that the optimisers of the run in `folder` have been told."""
-    path = folder / "progress.jsonl"
-    return path.read_text().count('"event": "adapted"') if path.exists() else 0
 
 
 def test_nodes_restarted_between_and_within_episodes_change_nothing(loop: Processes, tmp_path):
     iterations = 150
-    running = {
-        name: loop.node(name, "--params-file", str(SMALL))
-        for name in ("pde_sim_node", "controller_node")
-    }
+    running = {name: loop.node(name, *PARAMETERS) for name in ("pde_sim_node", "controller_node")}
     out = tmp_path / "run"
-    tuner = loop.node(
-        "tuner_node", "--params-file", str(SMALL), *tuner_arguments(out, iterations=iterations)
-    )
+    tuner = start_tuner(loop, out, iterations=iterations)
     for count, name in ((15, "controller_node"), (45, "pde_sim_node"), (75, "controller_node")):
-        until(lambda n=count: iterations_done(out) >= n, LIMIT, f"iteration {count}")
+        until(lambda n=count: adapted(out) >= n, LIMIT, f"iteration {count}")
         running[name].send_signal(signal.SIGKILL)
         running[name].wait()
-        running[name] = loop.node(name, "--params-file", str(SMALL))
-    until(lambda: iterations_done(out) >= 105, LIMIT, "iteration 105")
+        running[name] = loop.node(name, *PARAMETERS)
+    until(lambda: adapted(out) >= 105, LIMIT, "iteration 105")
     tuner.send_signal(signal.SIGKILL)
     tuner.wait()
-    tuner = loop.node(
-        "tuner_node",
-        "--params-file",
-        str(SMALL),
-        *tuner_arguments(out, iterations=iterations, resume="true"),
-    )
-    loop.wait(tuner, LIMIT)
+    loop.wait(start_tuner(loop, out, iterations=iterations, resume="true"), LIMIT)
     assert_same_training(out, in_process(iterations=iterations))
 
 
@@ -157,7 +112,7 @@ def test_ctrl_c_ends_everything_and_says_how_to_go_on(loop: Processes, tmp_path)
     out = tmp_path / "run"
     children = children_seconds()
     run = loop.pdeloop("train", str(SMALL), "--iterations", "100000", "--out", str(out))
-    until(lambda: iterations_done(out) >= 10, LIMIT, "iteration 10")
+    until(lambda: adapted(out) >= 10, LIMIT, "iteration 10")
     before = processor_seconds(loop.left_behind())
     run.send_signal(signal.SIGINT)
     text = loop.wait(run, LIMIT, code=130)
@@ -168,10 +123,8 @@ def test_ctrl_c_ends_everything_and_says_how_to_go_on(loop: Processes, tmp_path)
 
 
 def test_gains_beyond_what_the_topics_take_end_the_same_as_in_one_process(loop, tmp_path):
-    loop.node("pde_sim_node", "--params-file", str(SMALL))
-    loop.node("controller_node", "--params-file", str(SMALL))
-    arguments = tuner_arguments(tmp_path / "run", iterations=3, learning_rate=1e13)
-    tuner = loop.node("tuner_node", "--params-file", str(SMALL), *arguments)
+    start_pair(loop)
+    tuner = start_tuner(loop, tmp_path / "run", iterations=3, learning_rate=1e13)
     loop.wait(tuner, LIMIT, code=NO_CONTROLLER)  # no law with such gains is stable
     training = train_here(parameters(iterations=3, learning_rate=1e13))
     assert np.abs(training.policies()).max() > MAX_GAIN

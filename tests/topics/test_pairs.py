@@ -17,7 +17,7 @@ from pdeloop.in_process import LocalPair, train
 from pdeloop.training_run import resolve
 from tests.loop_harness import Processes, until
 from tests.small import SMALL, parameters, train_here
-from tests.topics.test_loop import LIMIT, assert_same_training, iterations_done
+from tests.small_loop import LIMIT, adapted, assert_same_training
 from tuner_node.build import build_training
 
 pytestmark = pytest.mark.topics
@@ -58,7 +58,7 @@ def test_the_command_line_starts_pairs_and_directions(loop: Processes, tmp_path)
 def test_plant_and_controller_share_a_core(loop, tmp_path) -> None:
     options = ("--optimizer", "two_point", "--iterations", "100000", "--seeds", "5")
     run = loop.pdeloop("train", str(SMALL), *options, "--out", str(tmp_path / "a"))
-    until(lambda: iterations_done(tmp_path / "a") >= 3, LIMIT, "iteration 3")
+    until(lambda: adapted(tmp_path / "a") >= 3, LIMIT, "iteration 3")
     free = {frozenset(os.sched_getaffinity(0))}
 
     def places(node: str) -> set[frozenset[int]]:

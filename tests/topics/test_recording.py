@@ -25,11 +25,13 @@ from recorder_node.bag import BagWriter, Channel
 from tests.loop_harness import Processes, until
 from tests.small import RECORDED, SMALL, paced, same_bits
 from tests.small_disk import read_only_folder, small_disk
-from tests.topics.test_loop import (
+from tests.small_loop import (
     LIMIT,
+    adapted,
     assert_same_training,
     in_process,
-    iterations_done,
+    start_pair,
+    start_tuner,
     tuner_arguments,
 )
 
@@ -180,19 +182,13 @@ class Hand:
             "recorder_node",
             *(word for n, v in {"bag": bag, **more}.items() for word in ("-p", f"{n}:={v}")),
         )
-        factor = ("-p", f"real_time_factor:={pace}")
-        loop.node("pde_sim_node", "--params-file", str(SMALL), *factor)
-        loop.node("controller_node", "--params-file", str(SMALL))
-        self.tuner = loop.node(
-            "tuner_node",
-            *("--params-file", str(SMALL), "-p", f"recorder:={recorder}"),
-            *tuner_arguments(out, iterations=iterations),
-        )
+        start_pair(loop, real_time_factor=pace)
+        self.tuner = start_tuner(loop, out, iterations=iterations, recorder=recorder)
 
 
 def test_a_killed_recorder_loses_a_second_at_most_and_the_training_goes_on(loop, tmp_path):
     hand = Hand(loop, tmp_path / "bag", tmp_path / "run", "start", 250, pace=100.0)
-    until(lambda: iterations_done(hand.out) >= 20, LIMIT, "iteration 20")
+    until(lambda: adapted(hand.out) >= 20, LIMIT, "iteration 20")
     time.sleep(2.0)  # so that a second less leaves one
     hand.recorder.send_signal(signal.SIGKILL)
     killed = time.time()
@@ -211,11 +207,11 @@ def test_a_recorder_that_is_held_up_for_a_second_misses_nothing(loop, tmp_path):
     # 2000 steps of 0.8 kB a second, less than the 4 MB of the recorder's socket. On a fast machine this
     # loop sends several times as much, if it may.
     hand = Hand(loop, tmp_path / "bag", tmp_path / "run", "start", 250, pace=100.0)
-    until(lambda: iterations_done(hand.out) >= 20, LIMIT, "iteration 20")
+    until(lambda: adapted(hand.out) >= 20, LIMIT, "iteration 20")
     hand.recorder.send_signal(signal.SIGSTOP)
-    before = iterations_done(hand.out)
+    before = adapted(hand.out)
     time.sleep(1.0)
-    until(lambda: iterations_done(hand.out) > before + 5, LIMIT, "a loop that does not wait")
+    until(lambda: adapted(hand.out) > before + 5, LIMIT, "a loop that does not wait")
     hand.recorder.send_signal(signal.SIGCONT)
     loop.wait(hand.tuner, LIMIT)
     hand.recorder.send_signal(signal.SIGINT)
@@ -262,7 +258,7 @@ def test_what_came_after_a_moment_is_left_for_the_next_time(loop):
 
 def test_a_training_that_must_be_recorded_stops_when_the_recorder_does(loop, tmp_path):
     hand = Hand(loop, tmp_path / "bag", tmp_path / "run", "required", 100_000)
-    until(lambda: iterations_done(hand.out) >= 20, LIMIT, "iteration 20")
+    until(lambda: adapted(hand.out) >= 20, LIMIT, "iteration 20")
     hand.recorder.send_signal(signal.SIGTERM)
     loop.wait(hand.recorder, LIMIT)
     text = loop.wait(hand.tuner, LIMIT, code=1)
@@ -304,7 +300,7 @@ def test_a_second_recording_of_a_run_gets_a_bag_of_its_own(loop, tmp_path):
     out, iterations = tmp_path / "run", 40
     words = ("train", str(paced(tmp_path, 10.0)), "--iterations", str(iterations))
     run = loop.pdeloop(*words, "--out", str(out), "--record")
-    until(lambda: iterations_done(out) >= 5, LIMIT, "iteration 5")
+    until(lambda: adapted(out) >= 5, LIMIT, "iteration 5")
     run.send_signal(signal.SIGINT)
     loop.wait(run, LIMIT, code=130)
     loop.wait(loop.pdeloop("train", "--resume", str(out), "--record"), LIMIT)
@@ -342,7 +338,7 @@ def test_a_killed_recorder_is_started_again_and_goes_on_in_another_bag(loop, tmp
     out = tmp_path / "run"
     words = ("train", str(paced(tmp_path, 10.0)), "--iterations", "40", "--out", str(out))
     run = loop.pdeloop(*words, "--record")
-    until(lambda: iterations_done(out) >= 3, LIMIT, "iteration 3")
+    until(lambda: adapted(out) >= 3, LIMIT, "iteration 3")
     (pid,) = loop.pids("recorder_node")
     os.kill(pid, signal.SIGKILL)
     text = loop.wait(run, LIMIT)

@@ -9,7 +9,7 @@ import pytest
 
 from loop_interfaces.problem import config_folder
 from tests.loop_harness import Processes
-from tests.topics.test_loop import LIMIT
+from tests.small_loop import LIMIT
 
 pytestmark = pytest.mark.topics
 

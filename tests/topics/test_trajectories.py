@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from tests.loop_harness import Processes, until
-from tests.small import SMALL, parameters, train_here
-from tests.topics.test_loop import LIMIT, assert_same_training, tuner_arguments
+from tests.small import parameters, train_here
+from tests.small_loop import LIMIT, assert_same_training, start_pair, start_tuner
 
 pytestmark = pytest.mark.topics
 ROLLOUTS = 27
@@ -15,14 +15,11 @@ ROLLOUTS = 27
 def test_actions_of_a_wrong_shape_with_the_right_ids_change_nothing(loop: Processes, tmp_path):
     """Somebody who listens to the loop answers each state before, at and after its step."""
     out = tmp_path / "run"
-    start = ("--params-file", str(SMALL))
-    plant = loop.node("pde_sim_node", *start)
-    loop.node("controller_node", *start)
+    plant = start_pair(loop)["plant"]
     stranger = loop.start("-c", WRONG_SHAPES, name="stranger")
     until(lambda: "listening" in loop.output(stranger), LIMIT, "the stranger")
     options = {"rollouts": ROLLOUTS, "optimizer": "gauss_newton", "seeds": 2}
-    tuner = loop.node("tuner_node", *start, *tuner_arguments(out, **options, max_attempts=50))
-    loop.wait(tuner, LIMIT)
+    loop.wait(start_tuner(loop, out, **options, max_attempts=50), LIMIT)
     assert_same_training(out, train_here(parameters(**options)))
     until(lambda: "expected an action of shape" in loop.output(plant), LIMIT, "refusal")
     assert int(loop.output(stranger).split()[-1]) > 100  # it had its say

@@ -12,9 +12,16 @@ from loop_interfaces.topics import VIEW_NUMBERS
 from tests.loop_harness import Processes, until
 from tests.operator_harness import operator
 from tests.small import paced
+from tests.small_loop import (
+    LIMIT,
+    PARAMETERS,
+    adapted,
+    assert_same_training,
+    in_process,
+    start_pair,
+    start_tuner,
+)
 from tests.test_layouts import named_topics
-from tests.topics.test_faults import PARAMETERS, start_pair, start_tuner
-from tests.topics.test_loop import LIMIT, assert_same_training, in_process, iterations_done
 
 pytestmark = pytest.mark.topics
 ITERATIONS = 300
@@ -117,7 +124,7 @@ def test_a_viewer_is_throttled_and_shows_another_environment_when_told_to(
     loop.node("viewer_node", *PARAMETERS, "-p", "view_rate:=5.0")
     with operator(loop) as desk:
         tuner = start_tuner(loop, tmp_path / "run", iterations=100_000)
-        until(lambda: iterations_done(tmp_path / "run") >= 5, LIMIT, "iteration 5")
+        until(lambda: adapted(tmp_path / "run") >= 5, LIMIT, "iteration 5")
         assert desk.ask(set=["/viewer_node", "view_environment", 1])[0]
         until(lambda: desk.values("viewer_node").get("environment") == "1", LIMIT, "environment")
         watch = loop.start("-c", COUNT, name="count")
@@ -158,8 +165,8 @@ def test_the_command_line_starts_a_viewer_and_goes_on_when_it_dies(loop: Process
         until(lambda: news in loop.output(run), LIMIT, "news of it")
         until(lambda: loop.pids("viewer_node"), LIMIT, "another viewer")
         assert pid not in loop.pids("viewer_node")
-        done = iterations_done(out)
-        until(lambda: iterations_done(out) >= done + 20, LIMIT, "further iterations")
+        done = adapted(out)
+        until(lambda: adapted(out) >= done + 20, LIMIT, "further iterations")
     assert loop.output(run).count(news) == 1
     run.send_signal(signal.SIGINT)
     loop.wait(run, LIMIT, code=130)
