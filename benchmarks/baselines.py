@@ -61,7 +61,29 @@ def run(
     any_environment: bool = False,
     figure: Path | None = None,
 ) -> dict[str, Any]:
-    """A row for each problem, budget and method; the command line explains the parameters.
+    """A row for each problem, budget and method.
+
+    Parameters
+    ----------
+    studies
+        Of benchmarks/studies, or YAML files like those.
+    rollouts, seeds
+        Budgets, in all, and how many seeds, those of the study if not given.
+    methods
+        Only these; all of the file if not given.
+    settings
+        Words NAME=JSON: parameters of the problem for all methods, like sensors=16.
+    tune
+        Words NAME=JSON: compare values of constants or parameters on the validation split, like
+        sigma=[0.1,0.3].
+    folder
+        Of the runs; runs/baselines if not given.
+    processes
+        Trainings at the same time; one a core if not given.
+    any_environment
+        Go on with results of other versions or another processor, as `pdeloop study` does.
+    figure
+        Draw the costs against the rollouts to this file.
 
     Raises
     ------

@@ -21,7 +21,7 @@ LONG, SHORT = 1000, 100
 SHORT_FROM = 64
 
 
-def run(problem: str = "allen-cahn", turns: int = 3, batches: tuple[int, ...] = BATCHES) -> Any:
+def run(*, problem: str = "allen-cahn", turns: int = 3, batches: tuple[int, ...] = BATCHES) -> Any:
     """One row for each batch, and the fitted model."""
     samples: dict[tuple[int, str], list[float]] = {}
     for horizon in (LONG, SHORT):

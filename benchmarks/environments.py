@@ -20,7 +20,7 @@ import gymnasium
 
 import pdeloop
 from benchmarks.kernel import KEEP_MEMORY
-from benchmarks.processes import machine, markdown
+from benchmarks.processes import machine, table
 from pdeloop.environments import environment_id
 
 MODES = {"vector_entry_point": "batch", "sync": "sync", "async": "async"}
@@ -31,6 +31,7 @@ LIMIT = 1.0
 
 
 def run(
+    *,
     problem: str = "burgers",
     num_envs: Sequence[int] = (1, 4, 16),
     turns: int = 3,
@@ -38,7 +39,12 @@ def run(
 ) -> dict[str, Any]:
     """The rates for each number of environments; the modes take turns.
 
-    controlgym: an interpreter that can import controlgym 1.0.0; left out where not given.
+    Parameters
+    ----------
+    problem, num_envs, turns
+        What is measured, in batches of these sizes, and how often.
+    controlgym
+        An interpreter that can import controlgym 1.0.0, which is left out where not given.
     """
     rows = []
     for count in num_envs:
@@ -110,8 +116,5 @@ def _rates_of_controlgym(python: str, problem: str, count: int) -> dict[str, flo
 def text(result: dict[str, Any]) -> str:
     """A table of the rates."""
     names = [name for name in result["rows"][0] if name != "num_envs"]
-    head = ("environments", *(f"{name}, steps/s" for name in names))
-    rows = [
-        (str(row["num_envs"]), *(f"{row[name]:,.0f}" for name in names)) for row in result["rows"]
-    ]
-    return f"{result['problem']}\n{markdown(head, rows)}"
+    columns = {"num_envs": "environments", **{name: f"{name}, steps/s" for name in names}}
+    return f"{result['problem']}\n{table(result['rows'], columns)}"

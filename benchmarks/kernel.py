@@ -168,11 +168,7 @@ def measure_with(python: str, method: str, batches: Sequence[int]) -> list[dict[
     return rows
 
 
-def run(
-    batches: Sequence[int] = BATCHES,
-    *,
-    jax: str | None = None,
-) -> list[dict[str, Any]]:
+def run(*, batches: Sequence[int] = BATCHES, jax: str | None = None) -> list[dict[str, Any]]:
     """Measure the plant and its references, one after the other.
 
     Parameters

@@ -185,7 +185,27 @@ def run(
     from_zero: bool = False,
     save: Path | None = None,
 ) -> list[dict[str, Any]]:
-    """The limits of each problem, as JSON-able numbers; the command line explains the parameters."""
+    """The limits of each problem, as JSON-able numbers.
+
+    Parameters
+    ----------
+    problems
+        Shipped names or YAML files; none: the paper's.
+    seeds
+        Trainings whose basis U is used.
+    fields
+        Initial fields that a law is optimised on.
+    evaluation_seed, evaluation_fields
+        Draws of held-out fields to measure on, and how many in each.
+    tolerance
+        Converged when 20 iterations gain less than this share.
+    jobs
+        Processes; one a core if not given.
+    from_zero
+        Begin with zero gains and inputs instead of those of LQ tracking.
+    save
+        Folder to which the open-loop limits are written, as PROBLEM.json (benchmarks.limits).
+    """
     for name, number in (("seeds", seeds), ("fields", fields)):
         if number < 1:
             raise ValueError(f"--{name} must be at least 1, got {number}")

@@ -8,16 +8,15 @@ topics, the live page by a client that takes all that a browser would (benchmark
 from __future__ import annotations
 
 import itertools
-import json
 import re
 import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from benchmarks.processes import Bench, BenchProcess, bench
+from benchmarks.processes import Bench, BenchProcess, bench, progress
 from loop_interfaces.affinity import usable_cores
 from pdeloop.pairs import pair_cores, pair_nodes
 from pdeloop.supervisor import keep_on
@@ -63,15 +62,23 @@ COMPANY: dict[str, Callable[[Bench, str, Sequence[int]], list[BenchProcess]]] = 
 """What comes and goes, by name: starts it, off the cores of the pair where `pdeloop train` does so."""
 
 
-def run(what: str, problem: str = "burgers", windows: int = 6, seconds: float = 3.0) -> Any:
+def run(
+    what: Literal["recorder", "viewer", "monitor"],
+    *,
+    problem: str = "burgers",
+    windows: int = 6,
+    seconds: float = 3.0,
+) -> dict[str, Any]:
     """Time of an iteration, and processor time of plant and controller for one, without and beside.
 
     Parameters
     ----------
     what
-        One of `COMPANY`.
-    problem, windows, seconds
-        The loop's; how many windows of so many seconds without it, and with it.
+        Comes and goes.
+    problem
+        The loop's.
+    windows, seconds
+        How many windows of so many seconds without it, and with it.
     """
     times: tuple[list[float], list[float]] = ([], [])
     processor: tuple[list[float], list[float]] = ([], [])
@@ -86,15 +93,14 @@ def run(what: str, problem: str = "burgers", windows: int = 6, seconds: float = 
         # The tuner's own share of the processor is small.
         given = (f"out:={folder}", "iterations:=100000", "optimizer:=two_point")
         running.start("tuner_node", *given, problem=problem)
-        progress = folder / "progress.jsonl"
 
         def observe(side: int) -> None:
             before = _processor_time(nodes)
-            found = _iterations(progress, seconds)
+            found = _iterations(folder, seconds)
             times[side].extend(found)
             processor[side].append((_processor_time(nodes) - before) / (len(found) + 1))
 
-        while not (progress.exists() and '"adapted"' in progress.read_text()):
+        while not any(row["event"] == "adapted" for row in progress(folder)):
             time.sleep(0.1)
         for _ in range(windows):
             observe(0)
@@ -131,12 +137,9 @@ def _processor_time(nodes: Sequence[BenchProcess]) -> float:
     return sum(sum(node.processor_times().values()) for node in nodes)
 
 
-def _iterations(progress: Path, seconds: float) -> list[float]:
+def _iterations(folder: Path, seconds: float) -> list[float]:
     """Times of the iterations of the next `seconds`."""
-    position = progress.stat().st_size
+    before = len(progress(folder))
     time.sleep(seconds)
-    with progress.open() as file:
-        file.seek(position)
-        lines = [line for line in file.read().splitlines() if line.endswith("}")]
-    stamps = [json.loads(line)["time"] for line in lines[1:]]
+    stamps = [row["time"] for row in progress(folder)[before:]]
     return [b - a for a, b in itertools.pairwise(stamps)]

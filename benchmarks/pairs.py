@@ -8,7 +8,6 @@ of the training in one process.
 
 from __future__ import annotations
 
-import json
 import signal
 import time
 from collections.abc import Sequence
@@ -19,7 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.hosts import environment, hosts, on
-from benchmarks.processes import Bench, BenchError, BenchProcess, bench, machine, markdown
+from benchmarks.processes import (
+    Bench,
+    BenchError,
+    BenchProcess,
+    bench,
+    ended_well,
+    machine,
+    progress,
+    table,
+)
 from loop_interfaces.spec import yaml_text
 from pdeloop.in_process import LocalPair, train
 from pdeloop.pairs import namespaces
@@ -35,10 +43,7 @@ LIMIT = 600.0
 """Seconds after which a run is given up."""
 
 
-def run(
-    pairs: Sequence[int] = (1, 2, 4),
-    iterations: int = 20,
-) -> dict[str, Any]:
+def run(*, pairs: Sequence[int] = (1, 2, 4), iterations: int = 20) -> dict[str, Any]:
     """A row for each number of pairs, without and with faults, and one with a pair killed."""
     budget = {"iterations": iterations, "optimizer": "two_point"}
     values = resolve(PROBLEM, {**budget, "seeds": SEEDS, "evaluation_fields": 4})
@@ -90,27 +95,23 @@ def serve(
             prefix=on(names[0]),
             environment=environment(),
         )
-        taken_over = 0
         limit = time.monotonic() + LIMIT
         half = values["iterations"] * values["seeds"] // 2
-        while tuner.process.poll() is None:
+        while not ended_well(tuner):
             if time.monotonic() > limit:
                 raise BenchError(f"no end of a training over {count} pairs within {LIMIT:g} s")
-            if kill and _done(out, "adapted") >= half:
+            if kill and sum(row["event"] == "adapted" for row in progress(out)) >= half:
                 for node in nodes[0]:
                     node.process.send_signal(signal.SIGKILL)
                 kill = False
             time.sleep(0.05)
-        if tuner.process.returncode:
-            raise BenchError(f"the tuner ended: {tuner.log().strip().splitlines()[-1:]}")
-        taken_over = _done(out, "repeated")
-        rows = [json.loads(line) for line in (out / "progress.jsonl").read_text().splitlines()]
+        rows = progress(out)
         stamps = [row["time"] for row in rows if row["event"] in ("designed", "evaluated")]
         with np.load(out / "policy.npz") as arrays:
             same = arrays["policy"].tobytes() == expected.tobytes()
         return {
             "seconds": stamps[-1] - stamps[0],
-            "repeated_episodes": taken_over,
+            "repeated_episodes": sum(row["event"] == "repeated" for row in rows),
             "identical": same,
         }
 
@@ -139,27 +140,18 @@ def _pair(
     return nodes
 
 
-def _done(out: Path, event: str) -> int:
-    path = out / "progress.jsonl"
-    return path.read_text().count(f'"event": "{event}"') if path.exists() else 0
-
-
 def text(result: dict[str, Any]) -> str:
     """A table of `result`."""
-    head = ("pairs", "faults", "a pair killed", "s", "episodes repeated", "same bits")
-    rows = [
-        (
-            row["pairs"],
-            "yes" if row["faults"] else "no",
-            "yes" if row["killed"] else "no",
-            f"{row['seconds']:.1f}",
-            row["repeated_episodes"],
-            "yes" if row["identical"] else "NO",
-        )
-        for row in result["rows"]
-    ]
+    columns = {
+        "pairs": "pairs",
+        "faults": "faults",
+        "killed": "a pair killed",
+        "seconds": "s",
+        "repeated_episodes": "episodes repeated",
+        "identical": "same bits",
+    }
     return (
         f"{PROBLEM}, {result['iterations']} iterations of {SEEDS} seeds; faults: {LOSS:.0%} of the "
         f"messages lost, delayed by up to {1e3 * DELAY:g} ms; "
-        f"in one process {result['in_process_seconds']:.1f} s\n{markdown(head, rows)}"
+        f"in one process {result['in_process_seconds']:.1f} s\n{table(result['rows'], columns)}"
     )

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.processes import BenchError, BenchProcess, bench, machine, markdown
+from benchmarks.processes import BenchError, BenchProcess, bench, ended_well, machine, table
 from pdeloop.pairs import PAIR, namespaces, ros_value
 
 NODE_MEMORY = 0.12
@@ -26,8 +26,8 @@ REPORT = 6.0
 """Seconds between two lines of the tuner on who is missing, at the most."""
 
 
-def run(pairs: Sequence[int] = (1, 15, 30, 60), seconds: float = 20.0) -> dict[str, Any]:
-    """Memory and processor time with each number of pairs, and before there are any."""
+def run(*, pairs: Sequence[int] = (1, 15, 30, 60), seconds: float = 20.0) -> dict[str, Any]:
+    """Memory, and processor time over some seconds, with each number of pairs and before any."""
     names = namespaces(max(pairs))
     need, before = NODE_MEMORY * (2 * len(names) + 1), memory_available()
     if need > before:
@@ -70,8 +70,7 @@ def _wait_until_found(tuner: BenchProcess, nodes: Sequence[BenchProcess]) -> Non
         if time.monotonic() > limit:
             raise BenchError(f"not found within {LIMIT:.0f} s: {', '.join(missing)}")
         for node in nodes:
-            if node.process.poll() is not None:
-                raise BenchError(f"a node has ended: {node.log().strip().splitlines()[-1:]}")
+            ended_well(node)
         time.sleep(REPORT)
 
 
@@ -115,18 +114,15 @@ def _gigabytes(name: str, file: Path) -> float:
 
 def text(result: dict[str, Any]) -> str:
     """A table of `result`."""
-    head = (
-        *("pairs", "participants", "not found", "memory, GB", "cores busy: nodes"),
-        "cores busy: middleware",
-    )
-    rows = [
-        (
-            *(row["pairs"], row["participants"], row["lost"], f"{row['memory']:.1f}"),
-            *(f"{row[name]:.2f}" for name in ("own", "middleware")),
-        )
-        for row in result["rows"]
-    ]
+    columns = {
+        "pairs": "pairs",
+        "participants": "participants",
+        "lost": "not found",
+        "memory": "memory, GB",
+        "own": "cores busy: nodes",
+        "middleware": "cores busy: middleware",
+    }
     return (
         f"{result['machine']['cores']} cores, {result['available']:.1f} GB available before; means "
-        f"over {result['seconds']:.0f} s\n{markdown(head, rows)}"
+        f"over {result['seconds']:.0f} s\n{table(result['rows'], columns)}"
     )

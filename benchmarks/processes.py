@@ -166,6 +166,38 @@ def machine() -> dict[str, Any]:
     }
 
 
+def ended_well(process: BenchProcess) -> bool:
+    """Whether a process has ended. BenchError, with its last words, if it failed."""
+    code = process.process.poll()
+    if code:
+        words = process.log().strip().splitlines()[-1:]
+        raise BenchError(f"a process of the measurement ended with code {code}: {' '.join(words)}")
+    return code is not None
+
+
+def progress(folder: Path) -> list[dict[str, Any]]:
+    """What a run has written to its progress.jsonl so far."""
+    path = folder / "progress.jsonl"
+    lines = path.read_text().splitlines() if path.exists() else []
+    return [json.loads(line) for line in lines if line.endswith("}")]
+
+
+def table(rows: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> str:
+    """A Markdown table of these entries of the rows, by what stands above them."""
+    return markdown(
+        tuple(columns.values()), [[shown(row[name]) for name in columns] for row in rows]
+    )
+
+
+def shown(value: object) -> str:
+    """An entry of a table: numbers with three digits at least, truth as a word."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
+    return str(value)
+
+
 def markdown(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """A Markdown table."""
     lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]

@@ -7,9 +7,10 @@ how late its states were.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import Any
 
-from benchmarks.processes import BenchError, bench, machine, markdown
+from benchmarks.processes import BenchError, bench, machine, table
 from loop_interfaces.affinity import least_busy_cores
 from loop_interfaces.problem import load_parameters
 
@@ -22,8 +23,30 @@ _SUMMARY = re.compile(
 )
 
 
-def run(seconds: float = 10.0, pin: bool = False, rates: tuple[float, ...] = RATES) -> Any:
-    """One row for each rate."""
+COLUMNS = {
+    "rate": "Hz",
+    "real_time_factor": "real_time_factor",
+    "states": "states",
+    "missed": "missed",
+    "p50_us": "p50 µs",
+    "p99_us": "p99 µs",
+    "max_us": "max µs",
+}
+"""Entries of a row, and what stands above them."""
+
+
+def run(*, seconds: float = 10.0, pin: bool = False, rates: Sequence[float] = RATES) -> Any:
+    """One row for each rate.
+
+    Parameters
+    ----------
+    seconds
+        Of each rate.
+    pin
+        Both nodes on one core.
+    rates
+        States a second.
+    """
     sample_time = load_parameters(PROBLEM, {})["sample_time"]
     rows = []
     for rate in rates:
@@ -49,23 +72,10 @@ def run(seconds: float = 10.0, pin: bool = False, rates: tuple[float, ...] = RAT
         if len(found) < 2:
             last = said.strip().splitlines()[-1:]
             raise BenchError(f"the plant did not say how well it kept the wall clock: {last}")
-        states, missed, p50, p99, largest = map(int, found[-1])
-        rows.append(
-            {
-                "rate": rate,
-                "real_time_factor": factor,
-                "states": states,
-                "missed": missed,
-                "p50_us": p50,
-                "p99_us": p99,
-                "max_us": largest,
-            }
-        )
+        rows.append(dict(zip(COLUMNS, (rate, factor, *map(int, found[-1])), strict=True)))
     return {"problem": PROBLEM, "pin": pin, "machine": machine(), "rows": rows}
 
 
 def text(result: dict[str, Any]) -> str:
     """A table of `result`."""
-    head = ("Hz", "real_time_factor", "states", "missed", "p50 µs", "p99 µs", "max µs")
-    names = ("rate", "real_time_factor", "states", "missed", "p50_us", "p99_us", "max_us")
-    return markdown(head, [[f"{row[name]:g}" for name in names] for row in result["rows"]])
+    return table(result["rows"], COLUMNS)

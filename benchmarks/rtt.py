@@ -9,13 +9,14 @@ and the controller's own threads, and of the middleware's threads in both.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.processes import Bench, BenchProcess, bench, machine, markdown
+from benchmarks.processes import Bench, BenchProcess, bench, machine, table
 from loop_interfaces.affinity import least_busy_cores
 from loop_interfaces.problem import load_parameters
 from pdeloop.pairs import pair_cores, pair_nodes
@@ -23,25 +24,12 @@ from pdeloop.pairs import pair_cores, pair_nodes
 PROBLEM = "allen-cahn"
 """P2: of the paper's problems the one whose step is shortest."""
 BATCHES = (2, 64)
-CORES = ("any", "shared", "pinned")
-"""Where plant and controller are: wherever the scheduler puts them (nodes started by hand), on one
-core for both (as `pdeloop train` does it). The ping-pong is on any two, and with `pinned`, which is
-`shared` for the pair, on one each, polling."""
 PAYLOAD = 256
 """Numbers in a request of the bare ping-pong."""
 
 
-def measure(
-    batches: tuple[int, ...], turns: int, seconds: float, cores: str
-) -> list[dict[str, Any]]:
-    """One row for each batch. cores: one of CORES."""
-    with bench() as running:
-        return _measure(running, batches, turns, seconds, cores)
-
-
-def _measure(
-    running: Bench, batches: tuple[int, ...], turns: int, seconds: float, cores: str
-) -> list[dict[str, Any]]:
+def measure(running: Bench, turns: int, seconds: float, cores: str) -> list[dict[str, Any]]:
+    """One row for each batch, with plant and controller on these cores."""
     one, two = least_busy_cores(2) if cores == "pinned" else (-1, -1)
     ping = running.start("benchmarks.ping", f"pin:={one}")
     running.start("benchmarks.ping", "end:=pong", f"pin:={two}")
@@ -54,41 +42,36 @@ def _measure(
     )
     driver = running.start("benchmarks.driver", horizon, f"solver_pin:={one}", problem=PROBLEM)
     n_z = load_parameters(PROBLEM, {})["n_z"]
-    for batch in batches:  # compile, find each other, warm up
+    for batch in BATCHES:  # compile, find each other, warm up
         driver.ask(do="episodes", batch=batch, seconds=0.1)
         driver.ask(do="solver", batch=batch, seconds=0.1)
     ping.ask(seconds=0.1, numbers=PAYLOAD)
-    samples: dict[tuple[str, int], list[float]] = {}
-
-    def note(what: str, batch: int, value: float) -> None:
-        samples.setdefault((what, batch), []).append(value)
-
+    samples: dict[int, dict[str, list[float]]] = {m: defaultdict(list) for m in BATCHES}
     for _ in range(turns):
-        for batch in batches:
+        for batch, own in samples.items():
             for what, numbers in (("ping", PAYLOAD), ("ping_same", batch * n_z)):
                 got = ping.ask(seconds=seconds, numbers=numbers)
-                note(what, batch, got["seconds"] / got["rounds"])
+                own[what].append(got["seconds"] / got["rounds"])
             before = _processor_times(pair)
             got = driver.ask(do="episodes", batch=batch, seconds=seconds)
-            note("round", batch, got["seconds"] / got["rounds"])
+            own["round"].append(got["seconds"] / got["rounds"])
             for what, used in _processor_times(pair).items():
-                note(what, batch, (used - before[what]) / got["rounds"])
-            note(
-                "solver", batch, driver.ask(do="solver", batch=batch, seconds=seconds / 4)["median"]
-            )
+                own[what].append((used - before[what]) / got["rounds"])
+            solver = driver.ask(do="solver", batch=batch, seconds=seconds / 4)
+            own["solver"].append(solver["median"])
     rows = []
-    for batch in batches:
-        own = {what: np.array(found) for (what, size), found in samples.items() if size == batch}
-        overhead = own["round"] - own["solver"]
+    for batch, found in samples.items():
+        times = {what: np.array(values) for what, values in found.items()}
+        overhead = times["round"] - times["solver"]
         rows.append(
             {
                 "cores": cores,
                 "batch": batch,
-                "rounds_per_second": 1 / median(own["round"]),
+                "rounds_per_second": 1 / median(times["round"]),
                 "overhead_us": 1e6 * median(overhead),
-                "ratio": median(overhead / own["ping"]),
-                "ratio_same": median(overhead / own["ping_same"]),
-                **{f"{what}_us": 1e6 * median(times) for what, times in own.items()},
+                "ratio": median(overhead / times["ping"]),
+                "ratio_same": median(overhead / times["ping_same"]),
+                **{f"{what}_us": 1e6 * median(values) for what, values in times.items()},
             }
         )
     return rows
@@ -109,9 +92,27 @@ def _processor_times(pair: tuple[BenchProcess, BenchProcess]) -> dict[str, float
     }
 
 
-def run(turns: int = 7, seconds: float = 0.4, cores: Sequence[str] = CORES) -> dict[str, Any]:
-    """Everything, as JSON-able data."""
-    rows = [row for where in cores for row in measure(BATCHES, turns, seconds, where)]
+def run(
+    *,
+    turns: int = 7,
+    seconds: float = 0.4,
+    cores: Sequence[Literal["any", "shared", "pinned"]] = ("any", "shared", "pinned"),
+) -> dict[str, Any]:
+    """A row for each batch and place.
+
+    Parameters
+    ----------
+    turns, seconds
+        Turns of each, and how long one takes.
+    cores
+        Where plant and controller are: wherever the scheduler puts them (nodes started by hand), on
+        one core for both (as `pdeloop train` does it). The ping-pong is on any two, and with
+        `pinned`, which is `shared` for the pair, on one each, polling.
+    """
+    rows = []
+    for where in cores:
+        with bench() as running:
+            rows += measure(running, turns, seconds, where)
     return {"problem": PROBLEM, "machine": machine(), "rows": rows}
 
 
@@ -135,11 +136,4 @@ COLUMNS = {
 
 def text(result: dict[str, Any]) -> str:
     """A table of `result`."""
-
-    def shown(name: str, value: Any) -> str:
-        if isinstance(value, float):
-            return f"{value:.2f}" if name.startswith("ratio") else f"{value:.0f}"
-        return str(value)
-
-    rows = [[shown(name, row[name]) for name in COLUMNS] for row in result["rows"]]
-    return markdown(tuple(COLUMNS.values()), rows)
+    return table(result["rows"], COLUMNS)

@@ -8,7 +8,6 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -17,14 +16,22 @@ import rclpy
 from rclpy.qos import QoSProfile
 from std_srvs.srv import Trigger
 
-from benchmarks.processes import BenchError, BenchProcess, bench, machine, markdown
+from benchmarks.processes import (
+    BenchError,
+    BenchProcess,
+    bench,
+    ended_well,
+    machine,
+    progress,
+    table,
+)
 
 LIMIT = 300.0
 """Seconds that anything may take."""
 SERVICES = ("pde_sim_node/pause", "pde_sim_node/resume", "tuner_node/pause", "tuner_node/resume")
 
 
-def run(problem: str = "burgers", calls: int = 20, queued: int = 20) -> dict[str, Any]:
+def run(*, problem: str = "burgers", calls: int = 20, queued: int = 20) -> dict[str, Any]:
     """Seconds of each call, of `queued` ones that are sent at once, and of the end by Ctrl-C."""
     with bench() as running:
         os.environ |= running.environment
@@ -32,14 +39,19 @@ def run(problem: str = "burgers", calls: int = 20, queued: int = 20) -> dict[str
         command = [sys.executable, "-m", "pdeloop", "train", problem, "--record", "--out", str(out)]
         words = ["--optimizer", "two_point", "--iterations", "100000"]
         training = running.run("training", [*command, *words])
-        _until(lambda: "adapted" in _read(out / "progress.jsonl"), training)
+        limit = time.monotonic() + LIMIT
+        while not any(row["event"] == "adapted" for row in progress(out)):
+            if time.monotonic() > limit or ended_well(training):
+                raise BenchError(f"the training does not go on: {training.log()[-300:]}")
+            time.sleep(0.1)
         rclpy.init()
-        result = _call(calls, queued)
+        rows = _call(calls, queued)
         rclpy.shutdown()
-        return {"machine": machine(), **result, **_interrupt(training)}
+        return {"machine": machine(), "rows": rows, **_interrupt(training)}
 
 
-def _call(calls: int, queued: int) -> dict[str, Any]:
+def _call(calls: int, queued: int) -> list[dict[str, Any]]:
+    """Milliseconds of the calls of each service."""
     node = rclpy.create_node("operator")
     waiting = QoSProfile(depth=max(10, queued))  # all answers may come at once
     clients = {name: node.create_client(Trigger, name, qos_profile=waiting) for name in SERVICES}
@@ -63,11 +75,15 @@ def _call(calls: int, queued: int) -> dict[str, Any]:
         for name in SERVICES:
             single[name].append(seconds(name))
             time.sleep(0.3)
-    return {
-        "calls": single,
-        "queued": queued,
-        "queues": {name: seconds(name, queued) for name in SERVICES if name.endswith("resume")},
-    }
+    rows = [
+        {"request": name, "median": 1e3 * median(own), "longest": 1e3 * max(own)}
+        for name, own in single.items()
+    ]
+    for name in SERVICES:
+        if name.endswith("resume"):
+            took = 1e3 * seconds(name, queued)
+            rows.append({"request": f"{name}, {queued} at once", "median": took, "longest": took})
+    return rows
 
 
 def _interrupt(training: BenchProcess) -> dict[str, float]:
@@ -83,18 +99,6 @@ def _interrupt(training: BenchProcess) -> dict[str, float]:
     process.wait(LIMIT)
     ended = time.perf_counter() - began
     return {"told": told, "ended": ended, "processor": _reaped() - children - used}
-
-
-def _until(true: Callable[[], bool], training: BenchProcess) -> None:
-    limit = time.monotonic() + LIMIT
-    while not true():
-        if time.monotonic() > limit or training.process.poll() is not None:
-            raise BenchError(f"the training does not go on: {training.log()[-300:]}")
-        time.sleep(0.1)
-
-
-def _read(path: Path) -> str:
-    return path.read_text(errors="replace") if path.exists() else ""
 
 
 def _reaped() -> float:
@@ -116,20 +120,9 @@ def _processor_time(pid: int) -> float:
 
 def text(result: dict[str, Any]) -> str:
     """Tables of `result`."""
-    calls = [
-        (f"`~/{name.split('/')[1]}` of the {name.split('/')[0]}", _ms(median(own)), _ms(max(own)))
-        for name, own in result["calls"].items()
-    ]
-    queues = [
-        (f"{result['queued']} requests at once to the {name.split('/')[0]}", "", _ms(took))
-        for name, took in result["queues"].items()
-    ]
-    table = markdown(("service", "median, ms", "longest, ms"), [*calls, *queues])
+    columns = {"request": "service", "median": "median, ms", "longest": "longest, ms"}
     return (
-        f"{table}\n\nCtrl-C: told after {_ms(result['told'])} ms, ended after {result['ended']:.2f} s, "
-        f"{result['processor']:.2f} s of processor time (load {result['machine']['load']:.1f})"
+        f"{table(result['rows'], columns)}\n\nCtrl-C: told after {1e3 * result['told']:.0f} ms, ended "
+        f"after {result['ended']:.2f} s, {result['processor']:.2f} s of processor time "
+        f"(load {result['machine']['load']:.1f})"
     )
-
-
-def _ms(seconds: float) -> str:
-    return f"{1e3 * seconds:.0f}"

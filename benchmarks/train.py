@@ -7,32 +7,48 @@ of all nodes, one exploratory episode.
 
 from __future__ import annotations
 
-import json
 import os
-import subprocess
 import sys
-import tempfile
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-from benchmarks.processes import BenchError, machine, markdown
+import numpy as np
+
+from benchmarks.processes import (
+    Bench,
+    BenchError,
+    bench,
+    ended_well,
+    machine,
+    progress,
+    table,
+)
 
 LIMIT = 600.0
 """Seconds after which a training is given up."""
 
 
-def run(problem: str = "burgers", turns: int = 3, iterations: int = 40) -> dict[str, Any]:
-    """One row for each way to train."""
+def run(*, problem: str = "burgers", turns: int = 3, iterations: int = 40) -> dict[str, Any]:
+    """One row for each way to train.
+
+    Parameters
+    ----------
+    problem, iterations
+        Of a training.
+    turns
+        Trainings of each way.
+    """
     ways: dict[str, list[str]] = {"in-process": ["--in-process"], "topics": []}
     runs: dict[str, list[dict[str, Any]]] = {way: [] for way in ways}
-    with tempfile.TemporaryDirectory() as folder:
+    with bench() as running:
         for turn in range(turns):
             for way, words in ways.items():
-                out = Path(folder) / f"{turn}-{way.replace(' ', '')}"
-                runs[way].append(_train(problem, iterations, out, words))
+                out = running.folder / f"{turn}-{way}"
+                runs[way].append(_train(running, problem, iterations, out, words))
     ratios = {
         way: median(
             r["seconds"] / i["seconds"] for r, i in zip(own, runs["in-process"], strict=True)
@@ -62,50 +78,33 @@ def run(problem: str = "burgers", turns: int = 3, iterations: int = 40) -> dict[
     }
 
 
-def _train(problem: str, iterations: int, out: Path, words: list[str]) -> dict[str, Any]:
-    command = [sys.executable, "-m", "pdeloop.cli", "train", problem, "--out", str(out)]
-    command += ["--optimizer", "two_point"]  # always the same number of rollouts
+def _train(
+    running: Bench, problem: str, iterations: int, out: Path, words: Sequence[str]
+) -> dict[str, Any]:
+    """Seconds, memory and policy of one training."""
+    command = [sys.executable, "-m", "pdeloop.cli", "train", problem, "--out", str(out), *words]
+    # The optimiser that always has the same number of rollouts.
+    options = ("--optimizer", "two_point", "--iterations", str(iterations))
     began = time.time()
-    process = subprocess.Popen(
-        [*command, "--iterations", str(iterations), *words],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
+    training = running.run("training", [*command, *options])
     memory: dict[str, list[float]] = {}
-    try:
-        while process.poll() is None:
-            if time.time() - began > LIMIT:
-                raise BenchError(f"a training took more than {LIMIT:g} s")
-            for name, size in _memory(process.pid).items():
-                memory.setdefault(name, []).append(size)
-            time.sleep(0.2)
-    finally:
-        process.terminate()
-        said, _ = process.communicate()
-    if process.returncode != 0:
-        raise BenchError(f"a training failed: {said.strip().splitlines()[-1:]}")
-    rows = [json.loads(line) for line in (out / "progress.jsonl").read_text().splitlines()]
-    first, last = (
-        next(row["time"] for row in ordered if row["event"] == event)
-        for ordered, event in ((rows, "designed"), (rows[::-1], "evaluated"))
-    )
+    while not ended_well(training):
+        if time.time() - began > LIMIT:
+            raise BenchError(f"a training took more than {LIMIT:g} s")
+        for name, size in _memory(training.process.pid).items():
+            memory.setdefault(name, []).append(size)
+        time.sleep(0.2)
+    stamps = [row["time"] for row in progress(out) if row["event"] in ("designed", "evaluated")]
+    with np.load(out / "policy.npz") as arrays:
+        policy = arrays["policy"].tobytes()
     return {
-        "seconds": last - first,
-        "startup": first - began,
+        "seconds": stamps[-1] - stamps[0],
+        "startup": stamps[0] - began,
         "megabytes": {name: max(sizes) for name, sizes in memory.items()},
         # In the middle of its life a node has all it needs: what comes on top from there is growth.
         "growth": {name: sizes[-1] - sizes[len(sizes) // 2] for name, sizes in memory.items()},
-        "policy": _policy(out),
+        "policy": policy,
     }
-
-
-def _policy(out: Path) -> str:
-    import numpy as np
-
-    with np.load(out / "policy.npz") as arrays:
-        return bytes(arrays["policy"].tobytes()).hex()
 
 
 def _memory(pid: int) -> dict[str, float]:
@@ -125,24 +124,23 @@ def _memory(pid: int) -> dict[str, float]:
 
 def text(result: dict[str, Any]) -> str:
     """A table of `result`."""
-    head = ("way", "s without start-up", "ratio", "s to the first model", "MB at most", "growth MB")
+    columns = {
+        "way": "way",
+        "seconds": "s without start-up",
+        "ratio": "ratio",
+        "startup_seconds": "s to the first model",
+        "megabytes": "MB at most",
+        "growth": "growth MB",
+    }
 
     def sizes(values: dict[str, float]) -> str:
         return ", ".join(f"{k.removesuffix('_node')} {v:.0f}" for k, v in values.items())
 
     rows = [
-        (
-            row["way"],
-            f"{row['seconds']:.2f}",
-            f"{row['ratio']:.2f}",
-            f"{row['startup_seconds']:.2f}",
-            sizes(row["megabytes"]),
-            sizes(row["growth"]),
-        )
+        {**row, "megabytes": sizes(row["megabytes"]), "growth": sizes(row["growth"])}
         for row in result["rows"]
     ]
     same = "the same to the bit" if result["identical"] else "NOT the same"
-    return (
-        f"{result['problem']}, {result['iterations']} iterations; policies are {same}\n"
-        + markdown(head, rows)
+    return f"{result['problem']}, {result['iterations']} iterations; policies are {same}\n" + table(
+        rows, columns
     )

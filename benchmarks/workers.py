@@ -14,16 +14,16 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from benchmarks.processes import machine, markdown
+from benchmarks.processes import machine, table
 from pdeloop.study import Study
 from pdeloop.study import run as carry_out
 from pdeloop.study.executors import processes
 
 
 def run(
-    problem: str = "burgers", seeds: int = 8, workers: Sequence[int] = (1, 2)
+    *, problem: str = "burgers", seeds: int = 8, workers: Sequence[int] = (1, 2)
 ) -> dict[str, Any]:
-    """A row for each number of workers; the first is 1."""
+    """A row for each number of workers, 1 among them; `seeds` is that of the trainings."""
     content = {"problems": [problem], "seeds": seeds, "settings": {"rollouts": 20}}
     study, rows = Study.of(content), []
     for count in sorted({1, *workers}):
@@ -42,22 +42,22 @@ def run(
             # The first training also waits for the process; the others begin as the one before ends.
             lengths = [b - a for a, b in pairwise(ends)]
             total, longest = seconds, max(lengths)
-        rows.append({"workers": count, "seconds": seconds, "bound": max(longest, total / count)})
+        bound = max(longest, total / count)
+        rows.append(
+            {
+                "workers": count,
+                "seconds": seconds,
+                "speed_up": total / seconds,
+                "bound": total / bound,
+            }
+        )
     return {"problem": problem, "trainings": seeds, "machine": machine(), "rows": rows}
 
 
 def text(result: dict[str, Any]) -> str:
     """A table of `result`."""
-    alone = result["rows"][0]["seconds"]
-    rows = [
-        (
-            *(row["workers"], f"{row['seconds']:.1f}", f"{alone / row['seconds']:.2f}"),
-            f"{alone / row['bound']:.2f}",
-        )
-        for row in result["rows"]
-    ]
-    head = ("workers", "s", "speed-up", "at most")
+    columns = {"workers": "workers", "seconds": "s", "speed_up": "speed-up", "bound": "at most"}
     return (
         f"{result['trainings']} trainings of {result['problem']}, {result['machine']['cores']} cores\n"
-        + markdown(head, rows)
+        + table(result["rows"], columns)
     )

@@ -30,7 +30,7 @@ from pdeloop import cli
 from pdeloop.cli import main
 from pdeloop.commands import problems
 from pdeloop.output import print_json
-from pdeloop.progress import Progress, duration
+from pdeloop.progress import Progress
 from tests.interpreter import ROOT, python
 from tests.small import SMALL
 
@@ -349,45 +349,37 @@ for words in (["monitor"], ["report", run], ["bag", "info", run],
         assert re.fullmatch(said, line), line
 
 
-def test_progress_becomes_lines_with_the_time_left() -> None:
+def test_progress_becomes_lines() -> None:
     file = io.StringIO()
-    progress = Progress(Console(file=file, width=80), "soak")
-    for tenth in range(0, 101, 2):
-        progress.tell(tenth / 100, status=f"{tenth} faults")
+    progress = Progress(Console(file=file, width=80), "soak", "episodes")
+    for done in range(0, 101, 2):
+        progress.tell(done, 100, f"{done} faults")
     progress.close()
     lines = file.getvalue().splitlines()
     assert len(lines) == 9
-    assert re.fullmatch(r"soak: 50 %, 50 faults, \d+ s left", lines[4])
+    assert lines[4] == "soak: 50 of 100 episodes, 50 faults"
 
 
-def test_where_nothing_is_told_for_long_a_line_says_how_far_it_was() -> None:
+def test_news_after_long_silence_is_a_line(monkeypatch) -> None:
     file = io.StringIO()
-    progress = Progress(Console(file=file, width=80), "adapting", "rollouts", period=0.05)
-    progress.tell(9, 80)
-    progress.tell(12, 80, "cost 1.5")
-    deadline = time.monotonic() + LIMIT
-    while file.getvalue().count("\n") < 3 and time.monotonic() < deadline:
-        time.sleep(0.01)
+    progress = Progress(Console(file=file, width=80), "adapting", "rollouts")
+    monkeypatch.setattr("pdeloop.progress.PERIOD", -1.0)
+    for done in (9, 10, 11):
+        progress.tell(done, 80, "cost 1.5")
     progress.close()
-    assert "adapting: 12 of 80 rollouts, cost 1.5, " in file.getvalue().splitlines()[2]
+    said = [f"adapting: {done} of 80 rollouts, cost 1.5" for done in (10, 11)]
+    assert file.getvalue().splitlines() == said
 
 
 def test_progress_on_a_terminal_is_a_bar_that_leaves_nothing() -> None:
     file = io.StringIO()
-    progress = Progress(Console(file=file, width=80, force_terminal=True), "soak")
-    progress.tell(0.0)
-    progress.tell(0.5, status="3 faults")
+    progress = Progress(Console(file=file, width=80, force_terminal=True), "soak", "episodes")
+    progress.tell(0, 8)
+    progress.tell(4, 8, "3 faults")
     progress.close()
     text = CONTROL.sub("", file.getvalue())
-    assert re.search(r"soak [━╺]+ +50 % 3 faults", text)
+    assert re.search(r"soak [━╺]+ +4 of 8 episodes 3 faults", text)
     assert file.getvalue().rstrip().endswith("\x1b[2K")
-
-
-@pytest.mark.parametrize(
-    ("seconds", "words"), [(0.4, "0 s"), (99, "99 s"), (600, "10 min"), (7200, "2.0 h")]
-)
-def test_durations_are_in_words(seconds: float, words: str) -> None:
-    assert duration(seconds) == words
 
 
 SHELLS = {
