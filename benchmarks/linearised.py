@@ -14,27 +14,11 @@ from numpy.typing import NDArray
 
 from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
-from pde_sim_node.plant import Plant
 from pdeloop.episode import Law, rollout
+from pdeloop.problem_check import linearisation
 from tuner_node.seeds import Purpose, derive
 
-SMALL = 1e-6
-"""Size of the fields and actions whose answers are differenced."""
 FIELDS = 10
-
-
-def linearisation(plant: Plant) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A (n_z, n_z) and B (n_z, n_a) of z+ near z = z_r and a = 0, by central differences."""
-    n, n_a, target = plant.n_z, plant.n_a, plant.target
-    columns = []
-    for states, actions in (
-        (np.eye(n), np.zeros((n, n_a))),
-        (np.zeros((n_a, n)), np.eye(n_a)),
-    ):
-        plus, _ = plant.evaluate(target + SMALL * states, SMALL * actions)
-        minus, _ = plant.evaluate(target - SMALL * states, -SMALL * actions)
-        columns.append((plus - minus).T / (2 * SMALL))
-    return columns[0], columns[1]
 
 
 def linear(K: NDArray[np.float64], target: NDArray[np.float64]) -> Law:

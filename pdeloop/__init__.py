@@ -40,29 +40,23 @@ if TYPE_CHECKING:
     from pdeloop.plots import plot_spectrum as plot_spectrum
     from pdeloop.plots import plot_training as plot_training
 
-_MODULES = {
-    "FinishedRun": "pdeloop.finished_run",
-    "Gradients": "pdeloop.gradients",
-    "Plant": "pde_sim_node.plant",
-    "Problem": "pdeloop.api",
-    "ReducedModel": "controller_node.reduced_model",
-    "identify": "pdeloop.api",
-    "load_run": "pdeloop.api",
-    "plot_behaviour": "pdeloop.plots",
-    "plot_costs": "pdeloop.plots",
-    "plot_episode": "pdeloop.plots",
-    "plot_gains": "pdeloop.plots",
-    "plot_spectrum": "pdeloop.plots",
-    "plot_training": "pdeloop.plots",
-    "problem": "pdeloop.api",
-    "projected_law": "pdeloop.episode",
-    "read_measurements": "pdeloop.data_file",
-    "rollout": "pdeloop.episode",
-    "study_orders": "controller_node.order",
-    "track": "controller_node.lqt",
-    "train": "pdeloop.api",
+_NAMES = {
+    "controller_node.lqt": ("track",),
+    "controller_node.order": ("study_orders",),
+    "controller_node.reduced_model": ("ReducedModel",),
+    "pde_sim_node.plant": ("Plant",),
+    "pdeloop.api": ("Problem", "identify", "load_run", "problem", "train"),
+    "pdeloop.data_file": ("read_measurements",),
+    "pdeloop.episode": ("projected_law", "rollout"),
+    "pdeloop.finished_run": ("FinishedRun",),
+    "pdeloop.gradients": ("Gradients",),
+    "pdeloop.plots": (
+        *("plot_behaviour", "plot_costs", "plot_episode"),
+        *("plot_gains", "plot_spectrum", "plot_training"),
+    ),
 }
-__all__ = list(_MODULES)
+_MODULES = {name: module for module, names in _NAMES.items() for name in names}
+__all__ = sorted(_MODULES)
 
 
 if not TYPE_CHECKING:  # a type checker knows the names above, and that there are no others

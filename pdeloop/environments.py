@@ -38,7 +38,6 @@ from pde_sim_node.plant import DIVERGED_COST, Plant
 __all__ = ["Environment", "VectorEnvironment", "environment_id"]
 
 Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 
 class Environment(gymnasium.Env[Array, Array]):

@@ -15,6 +15,7 @@ from pde_sim_node.build import fingerprint
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.finished_run import FinishedRun
 from pdeloop.in_process import LocalPair
+from pdeloop.output import aligned
 from tuner_node.batch import Batch
 from tuner_node.results import RunFolderError
 from tuner_node.rollouts import CONTROLLERS
@@ -173,14 +174,10 @@ def all_diverged(costs: Mapping[str, Array]) -> list[str]:
 
 def as_text(costs: Mapping[str, Array]) -> str:
     """The costs as text: mean and standard deviation over fields and seeds."""
-    lines = [
-        f"{'controller':<12}{'mean cost':>12}{'std':>12}{'best':>12}{'worst':>12}{'diverged':>10}"
-    ]
+    rows = [["controller", "mean cost", "std", "best", "worst", "diverged"]]
     for name, table in costs.items():
         good = table[table < DIVERGED_COST]
-        shown = [f"{f(good):12.5g}" if len(good) else f"{'-':>12}" for f in _STATISTICS]
-        lines.append(f"{name:<12}{''.join(shown)}{table.size - good.size:>10}")
-    return "\n".join(lines)
-
-
-_STATISTICS = (np.mean, np.std, np.min, np.max)
+        statistics = (np.mean, np.std, np.min, np.max)
+        shown = [f"{statistic(good):.5g}" if len(good) else "-" for statistic in statistics]
+        rows.append([name, *shown, str(table.size - good.size)])
+    return "\n".join(aligned(rows))

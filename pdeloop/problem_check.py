@@ -24,7 +24,7 @@ from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD, Plant
 from pdeloop.episode import EpisodeRecord, mean_field_cost, projected_law, rollout
 from tuner_node.build import build_training
 
-__all__ = ["Finding", "Reach", "check", "draw", "reach"]
+__all__ = ["Finding", "Reach", "check", "draw", "linearisation", "reach"]
 
 Array = NDArray[np.float64]
 STEP_ERROR = 1e-2
@@ -116,18 +116,26 @@ class Reach:
     margins: Array
 
 
+def linearisation(plant: Plant) -> tuple[Array, Array]:
+    """A (n_z, n_z) and B (n_z, n_a) of z+ = f(z, a) at the target without action.
+
+    By central differences.
+    """
+    moves = SMALL * np.eye(plant.n_z + plant.n_a)
+    states, actions = np.split(moves, [plant.n_z], axis=1)
+    plus, _ = plant.evaluate(plant.field_target + states, actions)
+    minus, _ = plant.evaluate(plant.field_target - states, -actions)
+    A, B = np.split((plus - minus).T / (2 * SMALL), [plant.n_z], axis=1)
+    return A, B
+
+
 def reach(plant: Plant) -> Reach:
-    """Linearise z+ = f(z, a) at the target without action, by central differences; see `Reach`.
+    """What the actuators reach of the `linearisation`.
 
     Left invariant subspace of the unstable eigenvalues: W^T A = T W^T with W orthonormal, from an
     ordered real Schur form of A^T; mode by mode the test is then one of small matrices.
     """
-    n, n_a = plant.n_z, plant.n_a
-    moves = SMALL * np.eye(n + n_a)
-    states, actions = moves[:, :n], moves[:, n:]
-    plus, _ = plant.evaluate(plant.field_target + states, actions)
-    minus, _ = plant.evaluate(plant.field_target - states, -actions)
-    A, B = np.split((plus - minus).T / (2 * SMALL), [n], axis=1)
+    A, B = linearisation(plant)
     T, W, count = linalg.schur(A.T, sort=lambda re, im: np.hypot(re, im) > 1 + GROWS)
     if not count:
         return Reach(np.empty(0), np.empty(0, dtype=np.int64), np.empty(0))
@@ -232,12 +240,6 @@ def draw(values: Mapping[str, Any], path: Path) -> None:
         ax.set_ylabel(f"{name}(x)")
         ax.set_xlim(0, plant.equation.length)
     ax.set_xlabel("x (m)")
-    handles = dict(
-        zip(
-            *reversed(figure.axes[plant.equation.actuated].get_legend_handles_labels()), strict=True
-        )
-    )
-    figure.legend(
-        handles.values(), handles.keys(), loc="outside upper center", ncols=3, frameon=False
-    )
+    known = figure.axes[plant.equation.actuated].get_legend_handles_labels()
+    figure.legend(*known, loc="outside upper center", ncols=3, frameon=False)
     figure.savefig(path, dpi=150)

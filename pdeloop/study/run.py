@@ -2,7 +2,7 @@
 
 DIR/study.json                what was asked for
 DIR/PROBLEM/VARIANT/SEED/     parameters.yaml, policy.npz, result.json of a finished training, with
-                              `curves` also curve.npz (pdeloop.study.curve)
+                              `curves` also curve.npz (pdeloop.study.training.curve)
 """
 
 from __future__ import annotations

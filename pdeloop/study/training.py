@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Lock
 from typing import Any
 
 import llvmlite.binding
+import numpy as np
+from numpy.typing import NDArray
 
+from pdeloop.evaluation import mean_costs
 from pdeloop.in_process import LocalPair, train
-from pdeloop.study.curve import Curve
 from pdeloop.training_run import BUILT_IN
 from tuner_node.build import build_training
 from tuner_node.results import RunFolder, versions
@@ -19,7 +22,7 @@ from tuner_node.results import RunFolder, versions
 FILES = ("parameters.yaml", "policy.npz", "result.json")
 """The files of a run folder that a training of a study leaves, in the order of writing."""
 CURVE = "curve.npz"
-"""The file of `pdeloop.study.curve`, of a study with curves."""
+"""The file of `curve`, of a study with curves."""
 _ONE_AT_A_TIME = Lock()
 """A worker that runs tasks in threads: a training uses NumPy's and Numba's own threads."""
 
@@ -81,15 +84,43 @@ def train_one(
         folder.create(parameters)
         training = build_training(parameters)
         pair = LocalPair(parameters)
-        curve = Curve(training, pair, parameters)
-        train(
-            training,
-            pair,
-            lambda row: None,
-            max_batch=parameters["max_batch"],
-            after_batch=curve.update if curves else lambda: None,
-        )
+        policies: list[NDArray[np.float64]] = []
+        rollouts: list[float] = []
+
+        def note() -> None:
+            if training.optimizers and training.phase != "done":
+                policies.append(training.policies()[0])
+                rollouts.append(float(training.budget.paid[0]))
+
+        train(training, pair, lambda row: None, max_batch=parameters["max_batch"], after_batch=note)
         extra = {"transport": "in-process", "controller": BUILT_IN, "environment": here}
         folder.finish(training, extra)
         kept = {name: (folder.path / name).read_bytes() for name in FILES}
-        return {CURVE: curve.archive(), **kept} if curves else kept
+        if curves:
+            kept = {CURVE: curve(parameters, pair, policies, rollouts), **kept}
+        return kept
+
+
+def curve(
+    parameters: Mapping[str, Any],
+    pair: LocalPair,
+    policies: Sequence[NDArray[np.float64]],
+    rollouts: Sequence[float],
+) -> bytes:
+    """The costs of every policy that a training of one seed had, as in its closing evaluation.
+
+    These rollouts belong to no budget.
+
+    Returns
+    -------
+    bytes
+        An .npz file: `policies` (N, n_a, 2 n_s), at the start and after every batch of the
+        adaptation, their `costs` (N, fields), and the `rollouts` (N,) that were paid until then.
+    """
+    laws = np.stack(policies)
+    distinct, which = np.unique(laws, axis=0, return_inverse=True)
+    count, seed = parameters["evaluation_fields"], parameters["evaluation_seed"]
+    costs = mean_costs(pair, parameters, distinct, [0] * len(distinct), fields=count, seed=seed)
+    content = BytesIO()
+    np.savez(content, policies=laws, costs=costs[which.ravel()], rollouts=np.array(rollouts))
+    return content.getvalue()
