@@ -26,7 +26,7 @@ class Endpoint:
 
 
 @dataclass
-class LoopNode:
+class RoleState:
     """The node in one role."""
 
     role: str
@@ -39,7 +39,7 @@ class LoopNode:
 
 
 @dataclass
-class Report:
+class NodeReport:
     """The newest diagnostic_msgs/DiagnosticStatus of a node."""
 
     when: float
@@ -52,8 +52,8 @@ class LoopNodes:
     """What is known of the nodes of one loop."""
 
     def __init__(self) -> None:
-        self.by_role = {role: LoopNode(role) for role in ROLES}
-        self._reports: dict[str, Report] = {}
+        self.by_role = {role: RoleState(role) for role in ROLES}
+        self._reports: dict[str, NodeReport] = {}
 
     def update(self, found: Mapping[str, Iterable[Endpoint]]) -> None:
         """Take who publishes what, by role."""
@@ -81,7 +81,7 @@ class LoopNodes:
         node = name.split(":")[0].strip().strip("/")
         if node and (node in self._reports or len(self._reports) < 200):
             kept = [(k[:60], v[:120]) for k, v in list(values)[:MAX_VALUES]]
-            self._reports[node] = Report(now, level, message[:200], kept)
+            self._reports[node] = NodeReport(now, level, message[:200], kept)
 
     def message(self, now: float) -> list[dict[str, Any]]:
         """What a page is sent."""

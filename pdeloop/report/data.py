@@ -59,7 +59,7 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Steps:
+class JudgedSteps:
     """What became of the steps that one seed's optimiser tried, and of the models behind them.
 
     decided (N,): rollouts of the adaptation when each was decided; accepted (N,) bool; relative (N,):
@@ -123,7 +123,7 @@ class ProblemData:
         return self.first.models
 
     @property
-    def steps(self) -> dict[str, Steps]:
+    def steps(self) -> dict[str, JudgedSteps]:
         """By controller, where the optimiser judges its steps."""
         found = {name: _steps(run, self.shown) for name, run in self.runs.items()}
         return {name: steps for name, steps in found.items() if steps is not None}
@@ -271,7 +271,7 @@ def _behaviours(data: ProblemData) -> list[Behaviour]:
     return found
 
 
-def _steps(run: FinishedRun, shown: int) -> Steps | None:
+def _steps(run: FinishedRun, shown: int) -> JudgedSteps | None:
     """The judged steps of one seed; None for an optimiser that does not judge them."""
     own = [row for row in run.result["history"] if row["seed"] == run.seeds[shown]]
     decided = [row for row in own if "accepted" in row and "damping" in row]
@@ -286,7 +286,7 @@ def _steps(run: FinishedRun, shown: int) -> Steps | None:
     # The step that was decided is the last one proposed before.
     last = np.searchsorted(made, used, side="left") - 1
     predicted = 1 - numbers(proposed, "predicted_fall") / numbers(proposed, "cost")
-    return Steps(
+    return JudgedSteps(
         decided=used,
         accepted=np.array([bool(row["accepted"]) for row in decided]),
         relative=numbers(decided, "relative_cost"),

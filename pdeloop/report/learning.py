@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from pde_sim_node.plant import DIVERGED_COST
-from pdeloop.report.data import Curve, ProblemData, Steps
+from pdeloop.report.data import Curve, JudgedSteps, ProblemData
 from pdeloop.report.style import COLOURS, LINES, NAMES, panels, plain_log
 
 Array = NDArray[np.float64]
@@ -57,7 +57,7 @@ def _band(ax: Axes, curve: Curve) -> tuple[float, float]:
     return float(below.min()), float((mean + std).max())
 
 
-def steps(shown: Steps, controller: str) -> Figure:
+def steps(shown: JudgedSteps, controller: str) -> Figure:
     """Steps accepted and rejected, the damping, and the error of the model behind them."""
     figure = Figure(figsize=(6.4, 5.2))
     top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=(1.6, 1, 1))
@@ -80,7 +80,7 @@ def steps(shown: Steps, controller: str) -> Figure:
     return figure
 
 
-def _candidates(ax: Axes, shown: Steps, colour: str) -> None:
+def _candidates(ax: Axes, shown: JudgedSteps, colour: str) -> None:
     """Cost of each candidate over the incumbent's; those beyond the axis stand at its edge."""
     inside = ~shown.accepted & (shown.relative < EDGE)
     outside = ~shown.accepted & ~inside
