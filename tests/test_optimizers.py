@@ -45,7 +45,7 @@ def test_two_point_is_the_papers_iteration() -> None:
     optimizer = two_point(smoothing_radius=0.2)
     policy = POLICY.copy()
     for k in range(12):
-        theta, field = oracle.unit_direction(3, k, SHAPE), oracle.field_seed(3, k)
+        theta, field = oracle.orthonormal_directions(3, k, SHAPE, 1)[0], oracle.field_seed(3, k)
         plus, minus = policy + 0.2 * theta, policy - 0.2 * theta
         asked = optimizer.ask()
         assert np.array_equal(asked[0].policy, plus)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import repeat
 
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.topics import MAX_GAIN, START_COLUMNS
-from tuner_node.optimizers import Rollout, Trajectory
+from loop_interfaces.topics import COMPLETED, MAX_GAIN, START_COLUMNS, CostColumn
+from tuner_node.optimizers import Rollout, RolloutResult, Trajectory
 
 Array = NDArray[np.float64]
 UNKNOWN_PLANT = -1
@@ -60,6 +61,16 @@ class BatchResult:
     plant: int = UNKNOWN_PLANT
     trajectories: list[Trajectory] | None = None
     target: Array | None = None
+
+    def rollouts(self) -> list[RolloutResult]:
+        """As an optimiser is told them; of an exploration they mean nothing."""
+        seen = self.trajectories if self.trajectories is not None else repeat(None)
+        return [
+            RolloutResult(
+                float(cost[CostColumn.MEAN]), bool(cost[CostColumn.ENDED] != COMPLETED), trajectory
+            )
+            for cost, trajectory in zip(self.costs, seen, strict=False)
+        ]
 
 
 @dataclass(frozen=True)

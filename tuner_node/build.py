@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -46,8 +47,7 @@ def first_step(values: Mapping[str, Any]) -> int:
     """Rollouts that the optimiser needs to change the policy once."""
     # Gauss-Newton measures the policy it begins with, and then the first candidate.
     steps = {"two_point": 2, "directions": 2 * values["directions"], "gauss_newton": 2 * FIELDS}
-    step: int = steps[values["optimizer"]]
-    return step
+    return int(steps[values["optimizer"]])
 
 
 def check_budget(values: Mapping[str, Any], trajectories: bool, step: int) -> None:
@@ -79,16 +79,17 @@ def check_budget(values: Mapping[str, Any], trajectories: bool, step: int) -> No
 
 def build_training(values: Mapping[str, Any]) -> Training:
     """The training that the tuner's and the problem's parameters describe."""
-    from_zero = values["start"] == "zero"
-    rate = values["learning_rate_from_zero" if from_zero else "learning_rate"]
-
     order = model_order(values)
     if not order and values["seeds"] > 1:
         raise ParameterError(
             f"parameter 'reduced_order' is 0 and 'seeds' is {values['seeds']}; expected one seed, as "
             "the models of a batch have one order"
         )
-    options: dict[str, Any] = {}
+    from_zero = values["start"] == "zero"
+    options: dict[str, Any] = {
+        "learning_rate": values["learning_rate_from_zero" if from_zero else "learning_rate"],
+        "smoothing_radius": values["smoothing_radius"],
+    }
     if values["optimizer"] == "directions":
         most = 2 * values["n_a"] * order
         if order and values["directions"] > most:
@@ -101,47 +102,33 @@ def build_training(values: Mapping[str, Any]) -> Training:
     def make_optimizer(
         policy: NDArray[np.float64], seed: int, context: Context | None, rollouts: int
     ) -> Optimizer:
-        return OPTIMIZERS[values["optimizer"]](
-            policy,
-            seed=seed,
-            rollouts=rollouts,
-            learning_rate=rate,
-            smoothing_radius=values["smoothing_radius"],
-            context=context,
-            **options,
-        )
+        kind = OPTIMIZERS[values["optimizer"]]
+        return kind(policy, seed=seed, rollouts=rollouts, context=context, **options)
 
     trajectories = values["optimizer"] in NEED_TRAJECTORIES
     step = first_step(values)
     check_budget(values, trajectories, step)
+    given = {
+        item.name: values[item.name] for item in fields(TrainingSettings) if item.name in values
+    }
+    variance = least_variance(
+        noise=values["measurement_noise"],
+        steps=values["horizon"],
+        sample_time=values["sample_time"],
+        width=values["actuator_width"],
+        n_z=values["sensors"] or values["n_z"],
+    )
+    given |= {
+        "exploration_variance": max(values["exploration_variance"], variance),
+        "measurement_noise": 0.0 if values["sensors"] else values["measurement_noise"],
+        "model": read_model(Path(values["model"]), values["n_a"]) if values["model"] else None,
+    }
     settings = TrainingSettings(
-        n_a=values["n_a"],
-        seed=values["seed"],
-        seeds=values["seeds"],
-        evaluation_fields=values["evaluation_fields"],
-        evaluation_seed=values["evaluation_seed"],
-        start=values["start"],
-        exploration_variance=max(
-            values["exploration_variance"],
-            least_variance(
-                noise=values["measurement_noise"],
-                steps=values["horizon"],
-                sample_time=values["sample_time"],
-                width=values["actuator_width"],
-                n_z=values["sensors"] or values["n_z"],
-            ),
-        ),
-        identification_attempts=values["identification_attempts"],
-        rollouts=values["rollouts"],
+        **given,
         adaptation=2 * values["iterations"],
         step=step,
-        state_weight=values["state_weight"],
-        action_weight=values["action_weight"],
         trajectories=trajectories,
         noise=noisy(values),
-        action_limit=values["action_limit"],
-        measurement_noise=0.0 if values["sensors"] else values["measurement_noise"],
-        model=read_model(Path(values["model"]), values["n_a"]) if values["model"] else None,
     )
     return Training(settings, make_optimizer, plant=values["plant"] or UNKNOWN_PLANT)
 
@@ -150,15 +137,12 @@ def build_dispatcher(
     values: Mapping[str, Any], training: Training, identity: RunIdentity
 ) -> Dispatcher:
     """The dispatcher that serves a training with the pairs of the tuner's parameters."""
+    names = ("n_a", "max_batch", "episode_timeout", "max_attempts", "action_limit")
     return Dispatcher(
+        **{name: values[name] for name in names},
         run=identity.run,
-        n_a=values["n_a"],
         pairs=len(values["pairs"]),
         incarnation=identity.incarnation,
-        max_batch=values["max_batch"],
-        episode_timeout=values["episode_timeout"],
-        max_attempts=values["max_attempts"],
         plant=training.plant,
-        action_limit=values["action_limit"],
         design=design_digest(values),
     )

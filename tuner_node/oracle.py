@@ -1,4 +1,4 @@
-"""Perturbations of a policy, the two-point gradient estimate, and the policy update.
+"""Perturbations of a policy, and the two-point gradient estimate.
 
 For a policy pi = [K_a K_b] of shape (n_a, 2 n_s), a direction Theta with |Theta|_F = 1 and a
 smoothing radius r,
@@ -33,12 +33,6 @@ _DIRECTION_STREAM = 0x5448455441  # "THETA"
 _FIELD_STREAM = 0x4649454C44  # "FIELD"
 # Field seeds travel as float64, which holds every integer below 2^53.
 _SEED_LIMIT = 2**53
-
-
-def unit_direction(seed: int, iteration: int, shape: tuple[int, int]) -> Array:
-    """The direction Theta of an iteration: Gaussian, scaled to Frobenius norm 1."""
-    direction: Array = orthonormal_directions(seed, iteration, shape, 1)[0]
-    return direction
 
 
 def orthonormal_directions(seed: int, iteration: int, shape: tuple[int, int], count: int) -> Array:
@@ -85,8 +79,3 @@ def gradient(cost_plus: float, cost_minus: float, direction: Array, radius: floa
     n_a, columns = direction.shape
     estimate: Array = n_a * (columns // 2) / radius * (cost_plus - cost_minus) * direction
     return estimate
-
-
-def update(policy: Array, estimate: Array, learning_rate: float) -> Array:
-    """The policy after a step, pi - eta g."""
-    return policy - learning_rate * estimate

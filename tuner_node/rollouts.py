@@ -5,6 +5,7 @@ All of them are functions of the training's seeds and of how often a seed has ex
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,17 +14,21 @@ from numpy.typing import NDArray
 from loop_interfaces.topics import StartColumn
 from tuner_node.batch import TrainingSettings
 from tuner_node.optimizers import Rollout
-from tuner_node.seeds import NOISE, Purpose, derive, evaluation_noise, rollout_noise
+from tuner_node.seeds import Purpose, derive, evaluation_noise
 
 Array = NDArray[np.float64]
-CHECK_FIELDS = 1
-"""Sampled fields on which a warm start must beat no control."""
 EXPLORATION = 1
 """Rollouts of an exploration."""
-CHECK = 2 * CHECK_FIELDS
-"""Rollouts of a check: no control and the warm start."""
+CHECK = 2
+"""Rollouts of a check: no control and the warm start, on one sampled field."""
 CONTROLLERS = ("none", "lqt", "adapted")
 """The controllers of the closing evaluation, in the order of its rows."""
+NOISE = {
+    "identify": Purpose.EXPLORATORY_NOISE,
+    "check": Purpose.CHECK_NOISE,
+    "adapt": Purpose.ADAPT_NOISE,
+}
+"""Of the phases in which every rollout has noise of its own."""
 
 
 def explorations(
@@ -40,14 +45,13 @@ def explorations(
     attempts : sequence of int
         How often each of all seeds has explored before.
     """
-    seeds = settings.all_seeds
     rows = [
-        [
-            derive(seeds[m], Purpose.EXPLORATORY_FIELD, attempts[m]),
-            derive(seeds[m], Purpose.EXCITATION, attempts[m]),
+        (
+            derive(settings.all_seeds[m], Purpose.EXPLORATORY_FIELD, attempts[m]),
+            derive(settings.all_seeds[m], Purpose.EXCITATION, attempts[m]),
             settings.exploration_variance,
             m,
-        ]
+        )
         for m in pending
     ]
     return np.array(rows, dtype=np.float64)
@@ -56,15 +60,14 @@ def explorations(
 def checks(
     settings: TrainingSettings, pending: Sequence[int], warm: Array
 ) -> list[tuple[int, Rollout]]:
-    """No control and the warm start of each pending seed on the same fields.
+    """No control and the warm start of each pending seed on the same field.
 
     warm (S, n_a, 2 n_s): the warm starts of all seeds. Each rollout comes with the index of its seed.
     """
     return [
-        (m, Rollout(policy, derive(settings.all_seeds[m], Purpose.CHECK_FIELD, i)))
+        (m, Rollout(policy, derive(settings.all_seeds[m], Purpose.CHECK_FIELD)))
         for m in pending
         for policy in (np.zeros_like(warm[m]), warm[m])
-        for i in range(CHECK_FIELDS)
     ]
 
 
@@ -97,14 +100,20 @@ def noise_seeds(
     settings : TrainingSettings
         Of the training.
     phase : str
-        In which the batch is wanted.
+        In which the batch is wanted; in the evaluation all controllers share the noise.
     rows : (R, 4) array
         The rows of the batch.
     counts : sequence of int
-        As of seeds.rollout_noise; of no meaning in the evaluation, where all controllers share it.
+        For every training a number that is never the same again in this phase: its attempts, or how
+        many batches its optimiser has had.
     """
     if phase == "evaluate":
         fields = evaluation_noise(settings.evaluation_seed, settings.evaluation_fields)
         return fields * (settings.seeds * len(CONTROLLERS))
-    owners = rows[:, StartColumn.MODEL].astype(int).tolist()
-    return rollout_noise(NOISE[phase], settings.all_seeds, owners, counts)
+    rows_of: Counter[int] = Counter()
+    noise = []
+    for m in rows[:, StartColumn.MODEL].astype(int).tolist():
+        index = (counts[m] << 32) + rows_of[m]
+        noise.append(derive(settings.all_seeds[m], NOISE[phase], index))
+        rows_of[m] += 1
+    return noise

@@ -18,8 +18,9 @@ Source: Zhang, Mowlavi, Benosman, Basar, arXiv:2403.01005, section IV; the check
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -35,13 +36,11 @@ from tuner_node.optimizers import (
     Measured,
     Optimizer,
     Rollout,
-    RolloutResult,
     Trajectory,
 )
 from tuner_node.published_law import check_law
 from tuner_node.rollouts import (
     CHECK,
-    CHECK_FIELDS,
     CONTROLLERS,
     EXPLORATION,
     checks,
@@ -157,8 +156,7 @@ class Training:
         """The policies that the adaptation begins with, of the shape of the warm starts."""
         warm = self.warm_starts()
         zero = np.array(self.worse) | (self.settings.start == "zero")
-        starts: Array = np.where(zero[:, None, None], 0.0, warm)
-        return starts
+        return np.where(zero[:, None, None], 0.0, warm)
 
     @property
     def evaluation_shape(self) -> tuple[int, int, int]:
@@ -255,28 +253,29 @@ class Training:
         return checks(self.settings, self.pending, self.warm_starts())
 
     def _checked(self, result: BatchResult) -> list[dict[str, Any]]:
-        costs = result.costs.reshape(len(self.pending), 2, CHECK_FIELDS, len(CostColumn))
+        results = result.rollouts()
         self.budget.count("check", np.repeat(self.pending, CHECK))
-        self._keep_measured(result)
+        for (m, rollout), measured in zip(self._check_rollouts(), results, strict=True):
+            if measured.trajectory is not None and not measured.diverged:
+                kept = Measured(rollout.policy, measured.cost, measured.trajectory)
+                self.measured[m].append(kept)
         rows: list[dict[str, Any]] = []
         failed = []
-        for m, (none, lqt) in zip(self.pending, costs, strict=True):
-            none_cost, lqt_cost = (c[:, CostColumn.MEAN].mean() for c in (none, lqt))
-            lost = [int((c[:, CostColumn.ENDED] != COMPLETED).sum()) for c in (none, lqt)]
-            good = bool(not lost[1] and lqt_cost < none_cost)
+        for m, none, lqt in zip(self.pending, results[::CHECK], results[1::CHECK], strict=True):
+            good = not lqt.diverged and lqt.cost < none.cost
+            again = not good and self._can_explore_again(m)
             rows.append(
                 {
                     "event": "checked",
                     "seed": self.settings.all_seeds[m],
-                    "none": float(none_cost),
-                    "lqt": float(lqt_cost),
-                    "diverged": dict(zip(CONTROLLERS, lost, strict=False)),
+                    "none": none.cost,
+                    "lqt": lqt.cost,
+                    "diverged": {"none": int(none.diverged), "lqt": int(lqt.diverged)},
                     "accepted": good,
+                    "again": again,
                 }
             )
             self.worse[m] = not good
-            again = not good and self._can_explore_again(m)
-            rows[-1]["again"] = again
             if again:
                 self.attempts[m] += 1
                 # Laws of the basis that is given up mean nothing on the next one.
@@ -288,18 +287,6 @@ class Training:
         else:
             self._start_adapting()
         return rows
-
-    def _keep_measured(self, result: BatchResult) -> None:
-        """Keep the trajectories of a check's completed rollouts."""
-        if result.trajectories is None:
-            return
-        asked = self._check_rollouts()
-        for (m, rollout), cost, trajectory in zip(
-            asked, result.costs, result.trajectories, strict=True
-        ):
-            if cost[CostColumn.ENDED] == COMPLETED:
-                kept = Measured(rollout.policy, float(cost[CostColumn.MEAN]), trajectory)
-                self.measured[m].append(kept)
 
     def _can_explore_again(self, m: int) -> bool:
         """Whether there are attempts left, and rollouts for another one and a step afterwards."""
@@ -344,28 +331,17 @@ class Training:
 
     def _tell(self, result: BatchResult) -> list[dict[str, Any]]:
         assert self.models is not None
-        rows, first, limit = [], 0, self.settings.action_limit
+        rows, results = [], iter(result.rollouts())
         for m, (optimizer, asked) in enumerate(zip(self.optimizers, self._asked(), strict=True)):
             if not asked:
                 continue
-            own = result.costs[first : first + len(asked)]
-            seen: Sequence[Trajectory | None] = [None] * len(asked)
+            own = list(islice(results, len(asked)))
             if result.trajectories is not None:
-                seen = result.trajectories[first : first + len(asked)]
                 model = model_rows.unpack(self.models[m], self.settings.n_a)
-                check_law(asked, model, result.trajectories[first : first + len(asked)], limit)
+                seen = [measured.trajectory for measured in own]
+                check_law(asked, model, seen, self.settings.action_limit)
                 self.law_seen = True
-            first += len(asked)
-            report = optimizer.tell(
-                [
-                    RolloutResult(
-                        cost=float(cost[CostColumn.MEAN]),
-                        diverged=bool(cost[CostColumn.ENDED] != COMPLETED),
-                        trajectory=trajectory,
-                    )
-                    for cost, trajectory in zip(own, seen, strict=True)
-                ]
-            )
+            report = optimizer.tell(own)
             self.budget.count("adapt", [m] * len(asked))
             paid = int(self.budget.paid[m])
             rows.append(

@@ -18,11 +18,12 @@ scalable policy optimization", ICML 2018 (orthogonal directions).
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tuner_node.optimizers.base import Array, Context, State, checked_policy, require_positive
+from tuner_node.optimizers.base import Array, State, checked_policy
 from tuner_node.optimizers.zeroth_order import ZerothOrder
 
 __all__ = ["Directions"]
@@ -32,46 +33,12 @@ _TOLERANCE = 1.5
 
 
 class Directions(ZerothOrder):
-    """Zeroth-order policy gradient along orthonormal directions.
-
-    Parameters
-    ----------
-    policy0, seed, rollouts, learning_rate, smoothing_radius
-        See `ZerothOrder`.
-    directions : int
-        D, at most rollouts / 2 and 2 n_a n_s.
-    context : Context, optional
-        Not used; every optimiser takes it.
-    """
+    """`ZerothOrder` along several directions; its policy is the best iterate that was measured."""
 
     name = "directions"
 
-    def __init__(
-        self,
-        policy0: ArrayLike,
-        *,
-        seed: int,
-        rollouts: int,
-        learning_rate: float,
-        smoothing_radius: float = 0.1,
-        directions: int = 4,
-        context: Context | None = None,
-    ) -> None:
-        require_positive(rollouts=rollouts)
-        most = min(rollouts // 2, checked_policy(policy0).size)
-        if not 1 <= directions <= most:
-            raise ValueError(
-                f"directions must lie in 1 .. {most} (half the rollouts and the entries of the policy "
-                f"allow no more), but it is {directions}."
-            )
-        super().__init__(
-            policy0,
-            seed=seed,
-            rollouts=rollouts,
-            learning_rate=learning_rate,
-            smoothing_radius=smoothing_radius,
-            directions=directions,
-        )
+    def __init__(self, policy0: ArrayLike, **settings: Any) -> None:
+        super().__init__(policy0, **settings)
         self._best_policy = self._policy.copy()
         self._best_cost = np.inf
 

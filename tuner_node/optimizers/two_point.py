@@ -1,56 +1,32 @@
-"""The paper's optimiser: stochastic descent along two-point gradient estimates.
+"""Two-point zeroth-order policy gradient: one direction a step.
 
-One direction a step, an iteration. What happens to one with a diverged rollout is not in the paper.
-
-References
-----------
-Zhang, Mowlavi, Benosman, Basar, "Policy Optimization for PDE Control with a Warm Start",
-arXiv:2403.01005.
+Source: Zhang, Mowlavi, Benosman, Basar, "Policy Optimization for PDE Control with a Warm Start",
+arXiv:2403.01005, section IV.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from numpy.typing import ArrayLike
 
-from tuner_node.optimizers.base import Context, RolloutResult, Row
+from tuner_node.optimizers.base import RolloutResult, Row
 from tuner_node.optimizers.zeroth_order import ZerothOrder
 
 __all__ = ["TwoPoint"]
 
 
 class TwoPoint(ZerothOrder):
-    """Two-point zeroth-order policy gradient; its policy is the last one, as in the paper.
+    """`ZerothOrder` along one direction; its policy is the last one, as in the paper.
 
-    Parameters
-    ----------
-    policy0, seed, rollouts, learning_rate, smoothing_radius
-        See `ZerothOrder`; an iteration takes two rollouts.
-    context : Context, optional
-        Not used; every optimiser takes it.
+    An iteration takes two rollouts. Parameters: those of `ZerothOrder`, but `directions`.
     """
 
     name = "two_point"
 
-    def __init__(
-        self,
-        policy0: ArrayLike,
-        *,
-        seed: int,
-        rollouts: int,
-        learning_rate: float,
-        smoothing_radius: float = 0.1,
-        context: Context | None = None,
-    ) -> None:
-        super().__init__(
-            policy0,
-            seed=seed,
-            rollouts=rollouts,
-            learning_rate=learning_rate,
-            smoothing_radius=smoothing_radius,
-            directions=1,
-        )
+    def __init__(self, policy0: ArrayLike, **settings: Any) -> None:
+        super().__init__(policy0, directions=1, **settings)
 
     def tell(self, results: Sequence[RolloutResult]) -> Row:
         """Step along the estimate, or halve the learning rate; the row has both costs."""

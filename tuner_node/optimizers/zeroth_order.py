@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from tuner_node import oracle
 from tuner_node.optimizers.base import (
     Array,
+    Context,
     Rollout,
     RolloutResult,
     Row,
@@ -48,7 +49,9 @@ class ZerothOrder:
     smoothing_radius : float
         r. Too large: the estimate is that of a smoother cost, and rollouts diverge.
     directions : int
-        D.
+        D, at most rollouts / 2 and 2 n_a n_s.
+    context : Context, optional
+        Not used; every optimiser takes it.
     """
 
     needs_trajectories = False
@@ -60,13 +63,20 @@ class ZerothOrder:
         seed: int,
         rollouts: int,
         learning_rate: float,
-        smoothing_radius: float,
-        directions: int,
+        smoothing_radius: float = 0.1,
+        directions: int = 4,
+        context: Context | None = None,
     ) -> None:
         require_positive(
             rollouts=rollouts, learning_rate=learning_rate, smoothing_radius=smoothing_radius
         )
         self._policy = checked_policy(policy0)
+        most = max(min(rollouts // 2, self._policy.size), 1)
+        if not 1 <= directions <= most:
+            raise ValueError(
+                f"directions must lie in 1 .. {most} (half the rollouts and the entries of the policy "
+                f"allow no more), but it is {directions}."
+            )
         self._seed = seed
         self._steps = rollouts // (2 * directions)
         self._learning_rate = learning_rate
@@ -121,7 +131,7 @@ class ZerothOrder:
                 ):
                     estimate += oracle.gradient(plus.cost, minus.cost, direction, self._radius)
                 estimate /= self._count
-                policy = oracle.update(self._policy, estimate, self._learning_rate)
+                policy = self._policy - self._learning_rate * estimate
                 norm = float(np.sqrt(np.sum(estimate * estimate)))
             if np.isfinite(cost):
                 row["cost"] = cost
