@@ -111,9 +111,7 @@ class ControllerNode:
         self._diagnostics.plant_paused = bool(frame.values.any())
 
     def run(self) -> int:
-        self._loop.run(
-            tick=lambda now: None, deadline=lambda: None, housekeeping=self._housekeeping
-        )
+        self._loop.run(self._housekeeping)
         return 0
 
     def _housekeeping(self, now: float) -> None:

@@ -119,9 +119,9 @@ class PlantNode:
     def run(self) -> int:
         lockstep = self._lockstep
         self._loop.run(
+            self._housekeeping,
             tick=lambda now: self._send(lockstep.tick(now)),
             deadline=lambda: lockstep.deadline,
-            housekeeping=self._housekeeping,
         )
         if not self._loop.suspended:
             self._report_pace()

@@ -40,7 +40,6 @@ from loop_interfaces.topics import (
     POLICY,
     RECORDER_STATUS,
     START,
-    STATE,
     TARGET,
 )
 from tuner_node import narration
@@ -99,9 +98,7 @@ class TunerNode:
     def run(self) -> int:
         """Train to the end; 0 when done, 130 when interrupted, STOPPED on request."""
         self._guarded(self._session.begin)
-        reason = self._loop.run(
-            tick=lambda now: None, deadline=lambda: None, housekeeping=self._housekeeping
-        )
+        reason = self._loop.run(self._housekeeping)
         if self._loop.suspended:
             return 0
         try:
@@ -141,8 +138,8 @@ class TunerNode:
             if session.training.settings.trajectories:
                 # Before the costs: what has come in with one is then taken before it.
                 loop.receive(TARGET, self._handler(dispatcher.target, number), namespace)
-                loop.observe(STATE, partial(self._on_state, number), namespace)
-                loop.observe(ACTION, partial(dispatcher.action, number), namespace)
+                on_state = partial(self._on_state, number)
+                loop.observe(namespace, on_state, partial(dispatcher.action, number))
             cost = loop.receive(COST, self._handler(dispatcher.cost, number), namespace)
             model = loop.receive(
                 MODEL_IDENTIFIED, self._handler(dispatcher.model, number), namespace

@@ -1,23 +1,21 @@
 """The event loop of a node: raw array topics on a WaitSet, everything else on an executor.
 
-The hot path takes serialised bytes from the middleware, decodes them with one `frombuffer`, and
-publishes bytes; it is driven by a WaitSet of the node's array subscriptions alone. Within an episode
-the messages of one topic can be answered where they arrive, while this thread waits
-(`answer_fast`). Parameter services, timers and whatever else the node has are served by an ordinary
-executor now and then (`HOUSEKEEPING`), off the critical path. Array subscriptions sit in a callback
-group that the executor never runs, so both can share one node and ROS tools see one node.
+A message of an array topic is taken as bytes, after a wait for the array subscriptions alone: by
+rclpy's executor it would take ten times the processor time. Within an episode the messages of one
+topic can be answered where they arrive, while this thread waits (`answer_fast`). Parameter services,
+timers and whatever else the node has are served by an ordinary executor now and then
+(`HOUSEKEEPING`). Array subscriptions are in a callback group that it never runs, so both share one
+node.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from rclpy.executors import Executor, ShutdownException, TimeoutException
+from rclpy.executors import ShutdownException, TimeoutException
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
@@ -37,25 +35,15 @@ if TYPE_CHECKING:  # not every node needs the compiler
 HOUSEKEEPING = 0.05
 """Seconds between two rounds of the executor and of the node's slow duties."""
 IDLE_HOUSEKEEPING = 0.5
-"""The same, at most, in a node that has waited for long; whatever comes in begins a round at once."""
-IMPATIENCE = 0.05
-"""Share of the time it has waited after which a node looks around again."""
+"""The longest such period, in an idle node; a message or a request begins a round at once."""
+IDLE_BACKOFF = 0.05
+"""The period grows with the time since the last message or request, to this share of it."""
 BUSY_HOUSEKEEPING = 0.15
 """The same while messages stream through: a round of the executor costs as much as ten of them."""
 BUSY = 20
 """Messages since the last round that make a stream."""
 SERVING = 0.02
 """Seconds in which a round begins callbacks of the executor: queued requests are answered together."""
-
-
-@dataclass
-class _Watched:
-    """A pair whose samples are read: how its messages are decoded, and who is called with them."""
-
-    samples: SampleSubscription
-    callbacks: dict[int, tuple[Callable[[bytes], Frame], Callable[[Frame], None]]] = field(
-        default_factory=dict
-    )
 
 
 class _Fast(NamedTuple):
@@ -66,45 +54,32 @@ class _Fast(NamedTuple):
     path: FastPath
 
 
-class _Sources:
-    """What a node waits for: subscriptions, of which `takes` says how their messages are handled.
-
-    executor: whose services and subscriptions end a wait, too; they are many, so only of an idle node.
-    """
+class _WaitSet:
+    """What ends a wait: a guard condition, subscriptions and services, by their handles."""
 
     def __init__(
-        self,
-        node: Node,
-        guard: Any,
-        takes: dict[Any, Callable[[], int]],
-        executor: Executor | None = None,
+        self, node: Node, guard: Any, subscriptions: Sequence[Any], services: Sequence[Any]
     ) -> None:
-        self.idle = executor is not None
-        self._guard, self._handles, self._services = guard, list(takes), []
-        self._takes = {handle.pointer: take for handle, take in takes.items()}
-        if executor is not None:
-            self._handles += [s.handle for s in node.subscriptions if executor.can_execute(s)]
-            self._services = [s.handle for s in node.services if executor.can_execute(s)]
-        self._set = _rclpy.WaitSet(
-            len(self._handles), 1, 0, 0, len(self._services), 0, node.context.handle
-        )
+        self._guard, self._subscriptions, self._services = guard, subscriptions, services
+        sizes = len(subscriptions), 1, 0, 0, len(services), 0
+        self._set = _rclpy.WaitSet(*sizes, node.context.handle)
 
     def wait(self, seconds: float) -> list[int]:
-        """Wait for so long at most; pointers of those that have something."""
+        """Wait for so long at most; pointers of the subscriptions and services that are ready."""
         wait_set = self._set
         wait_set.clear_entities()
         wait_set.add_guard_condition(self._guard)
-        for handle in self._handles:
+        for handle in self._subscriptions:
             wait_set.add_subscription(handle)
         for service in self._services:
             wait_set.add_service(service)
         wait_set.wait(int(seconds * 1e9))
         ready: list[int] = wait_set.get_ready_entities("subscription")
-        return ready + wait_set.get_ready_entities("service") if self.idle else ready
+        return ready + wait_set.get_ready_entities("service") if self._services else ready
 
-    def handle(self, ready: list[int]) -> int:
-        """Handle messages of those subscriptions; how many."""
-        return sum(self._takes[pointer]() for pointer in ready)
+
+Handler = tuple[Topic, Callable[[bytes], Frame], Callable[[Frame], None]]
+"""Of samples: their topic, what decodes them, and who is called with them."""
 
 
 class NodeLoop(EventLoop):
@@ -114,10 +89,14 @@ class NodeLoop(EventLoop):
         super().__init__(node)
         self._receivers: list[Receiver] = []
         self._batcher: SampleBatcher | None = None
-        self._watched: dict[str, _Watched] = {}
+        self._observed: list[tuple[SampleSubscription, dict[int, Handler]]] = []
         self._fast: _Fast | None = None
         self._guard = _rclpy.GuardCondition(node.context.handle)
-        """Ends a wait: see `_look_after`, and RclChannel."""
+        """Ends a wait: see `_end_long_wait`, and RclChannel."""
+        self._takes: dict[Any, Callable[[], int]] = {}
+        """What handles the messages of a subscription, by its handle, and returns how many."""
+        self._handled, self._active, self._idle = 0, 0.0, False
+        """Messages since the last round; when something last happened; whether that is long ago."""
 
     def sender(self, topic: Topic, namespace: str = "", *, sampled: bool = False) -> Sender:
         """A publisher of frames on `topic`; sampled: they go out on `samples`, too."""
@@ -140,17 +119,22 @@ class NodeLoop(EventLoop):
         """
         self._fast = _Fast(receiver, sender, path)
 
-    def observe(self, topic: Topic, callback: Callable[[Frame], None], namespace: str = "") -> None:
-        """Call `callback` with every state or action, without taking part in the loop.
+    def observe(
+        self,
+        namespace: str,
+        on_state: Callable[[Frame], None],
+        on_action: Callable[[Frame], None],
+    ) -> None:
+        """Call back with every state and action of a pair, without taking part in its loop.
 
         The loop neither waits for an observer nor repeats for it
         (loop_interfaces.ros.sample_subscription).
         """
-        watched = self._watched.get(namespace)
-        if watched is None:
-            watched = self._watched[namespace] = _Watched(SampleSubscription(self.node, namespace))
-        kind = {STATE: STATE_KIND, ACTION: ACTION_KIND}[topic]
-        watched.callbacks[kind] = (ArrayCodec(topic.labels).decode, callback)
+        handlers: dict[int, Handler] = {
+            STATE_KIND: (STATE, ArrayCodec(STATE.labels).decode, on_state),
+            ACTION_KIND: (ACTION, ArrayCodec(ACTION.labels).decode, on_action),
+        }
+        self._observed.append((SampleSubscription(self.node, namespace), handlers))
 
     @property
     def batcher(self) -> SampleBatcher:
@@ -170,19 +154,73 @@ class NodeLoop(EventLoop):
 
     def run(
         self,
-        *,
-        tick: Callable[[float], None],
-        deadline: Callable[[], float | None],
         housekeeping: Callable[[float], None],
+        *,
+        tick: Callable[[float], None] = lambda now: None,
+        deadline: Callable[[], float | None] = lambda: None,
     ) -> str:
         """Handle events until `stop` or a signal; returns the reason.
 
-        tick(now) is called when `deadline()` (monotonic s, or None) has passed; housekeeping(now)
-        every HOUSEKEEPING seconds, BUSY_HOUSEKEEPING, or less often while nothing happens.
+        housekeeping(now) is called every HOUSEKEEPING seconds, BUSY_HOUSEKEEPING, or less often while
+        nothing happens; tick(now) when `deadline()` (monotonic s, or None) has passed.
         """
-        self._turned = self.now()
-        with SuspendWatchdog(self._look_after) as watchdog, self._fast_path_open() as fast:
-            return self._handle_events(watchdog, fast, tick, deadline, housekeeping)
+        self._turned = self._active = next_round = self.now()
+        with SuspendWatchdog(self._end_long_wait) as watchdog, self._fast_path_open() as fast:
+            self._takes = self._subscriptions(fast)
+            while self._stop_reason is None:
+                self._turned = now = self.now()
+                if now >= next_round:
+                    if not self.node.context.ok():
+                        break
+                    if watchdog.longest() > SUSPENDED:
+                        self.suspended = True
+                        return "suspended"
+                    next_round = now + self._round(now, fast, housekeeping)
+                    continue
+                due = deadline()
+                if due is not None and now >= due:
+                    tick(now)
+                    continue
+                wake = min(next_round, now + WAIT)
+                if due is not None:
+                    wake = min(wake, due)
+                if fast is not None and not fast.path.arm():
+                    self._handled += self._take_waiting(fast)
+                    continue
+                ready = self._wait_set.wait(wake - now)
+                if fast is not None:
+                    self._handled += fast.path.disarm()
+                if self._idle:  # first a round: who is there may have changed
+                    if ready or self._handled:
+                        self._active = next_round = now
+                    continue
+                takes = [take for handle, take in self._takes.items() if handle.pointer in ready]
+                self._handled += sum(take() for take in takes)
+        return self._stop_reason or "shutdown"
+
+    def _round(
+        self, now: float, fast: _Fast | None, housekeeping: Callable[[float], None]
+    ) -> float:
+        """Serve the executor and all slow duties; seconds until the next round."""
+        if self._serve(now) or self._handled:
+            self._active = now
+        if self._batcher is not None:
+            self._batcher.poll(now)
+        changed = [samples.poll() for samples, _ in self._observed]
+        if any(changed):
+            self._takes = self._subscriptions(fast)
+        housekeeping(now)
+        self.introspection.round(now)
+        period = BUSY_HOUSEKEEPING if self._handled > BUSY else HOUSEKEEPING
+        backoff = min(IDLE_BACKOFF * (now - self._active), IDLE_HOUSEKEEPING)
+        self._handled, self._idle = 0, backoff > period
+        subscriptions, services = list(self._takes), []
+        if self._idle:  # what the executor serves is much, and ends the waits of an idle node only
+            able = self._executor.can_execute
+            subscriptions += [s.handle for s in self.node.subscriptions if able(s)]
+            services = [s.handle for s in self.node.services if able(s)]
+        self._wait_set = _WaitSet(self.node, self._guard, subscriptions, services)
+        return max(period, backoff)
 
     @contextmanager
     def _fast_path_open(self) -> Iterator[_Fast | None]:
@@ -201,64 +239,6 @@ class NodeLoop(EventLoop):
         finally:
             channel.close()
 
-    def _handle_events(
-        self,
-        watchdog: SuspendWatchdog,
-        fast: _Fast | None,
-        tick: Callable[[float], None],
-        deadline: Callable[[], float | None],
-        housekeeping: Callable[[float], None],
-    ) -> str:
-        context = self.node.context
-        clock = time.monotonic
-        takes = self._takes(fast)
-        sources = _Sources(self.node, self._guard, takes)
-        next_round = active = clock()
-        handled = 0
-        while self._stop_reason is None:
-            self._turned = now = clock()
-            if now >= next_round:
-                if not context.ok():
-                    break
-                if watchdog.longest() > SUSPENDED:
-                    self.suspended = True
-                    return "suspended"
-                if self._serve(now) or handled:
-                    active = now
-                if self._batcher is not None:
-                    self._batcher.poll(now)
-                changed = [watched.samples.poll() for watched in self._watched.values()]
-                if any(changed):
-                    takes = self._takes(fast)
-                housekeeping(now)
-                self.introspection.round(now)
-                period = BUSY_HOUSEKEEPING if handled > BUSY else HOUSEKEEPING
-                idle = min(IMPATIENCE * (now - active), IDLE_HOUSEKEEPING)
-                next_round = now + max(period, idle)
-                executor = self._executor if idle > period else None
-                sources = _Sources(self.node, self._guard, takes, executor)
-                handled = 0
-                continue
-            due = deadline()
-            if due is not None and now >= due:
-                tick(now)
-                continue
-            wake = min(next_round, now + WAIT)
-            if due is not None:
-                wake = min(wake, due)
-            if fast is not None and not fast.path.arm():
-                handled += self._take_waiting(fast)
-                continue
-            ready = sources.wait(wake - now)
-            if fast is not None:
-                handled += fast.path.disarm()
-            if sources.idle:  # first a round: who is there may have changed
-                if ready or handled:
-                    active = next_round = now
-                continue
-            handled += sources.handle(ready)
-        return self._stop_reason or "shutdown"
-
     def _serve(self, now: float) -> bool:
         """Call the executor's callbacks that are ready; whether there were any."""
         served, any_served = True, False
@@ -272,7 +252,7 @@ class NodeLoop(EventLoop):
                     served = any_served = True
         return any_served
 
-    def _look_after(self) -> None:
+    def _end_long_wait(self) -> None:
         """In another thread: report a long computation, and end a wait that takes too long.
 
         Fast DDS waits until a point of the machine's clock where it was built with an old C++
@@ -283,15 +263,13 @@ class NodeLoop(EventLoop):
             self.introspection.round_while_working(now)
             self._guard.trigger_guard_condition()
 
-    def _takes(self, fast: _Fast | None) -> dict[Any, Callable[[], int]]:
-        """What to wait for, and what takes from it, the watched subscriptions first.
-
-        A cost comes after the samples of its episode, and is to be handled after them.
+    def _subscriptions(self, fast: _Fast | None) -> dict[Any, Callable[[], int]]:
+        """What takes from each subscription, by its handle; samples come first: a cost is to be
+        handled after the samples of its episode.
         """
         found: dict[Any, Callable[[], int]] = {}
-        for watched in self._watched.values():
-            for handle in watched.samples.handles:
-                found[handle] = partial(self._drain, watched)
+        for samples, handlers in self._observed:
+            found |= dict.fromkeys(samples.handles, partial(self._drain, samples, handlers))
         for receiver in self._receivers:
             if fast is None or receiver is not fast.receiver:
                 found[receiver.handle] = partial(self._take, receiver)
@@ -319,19 +297,17 @@ class NodeLoop(EventLoop):
         raw = channel.next_message()
         return 0 if raw is None else self._handle(fast.receiver, raw)
 
-    def _drain(self, watched: _Watched) -> int:
+    def _drain(self, samples: SampleSubscription, handlers: dict[int, Handler]) -> int:
         """Handle all samples that have come in; how many."""
         count = 0
         try:
-            for kind, _, raw in watched.samples.drain():
+            for kind, _, raw in samples.drain():
                 count += 1
-                if kind in watched.callbacks:
-                    decode, callback = watched.callbacks[kind]
-                    try:
-                        callback(decode(raw))
-                    except ValueError as error:
-                        name = "state" if kind == STATE_KIND else "action"
-                        self.introspection.refuse(name, error)
+                topic, decode, callback = handlers[kind]
+                try:
+                    callback(decode(raw))
+                except ValueError as error:
+                    self.introspection.refuse(topic.name, error)
         except ValueError as error:
             self.introspection.refuse(SAMPLES, error)
         return count

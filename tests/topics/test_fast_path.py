@@ -26,11 +26,11 @@ from loop_interfaces.protocol import Counters
 from loop_interfaces.ros.node_loop import NodeLoop
 from {0}.node import main
 interrupted, disarm, run = [], FastPath.disarm, NodeLoop.run
-def restless(self, *, deadline, **others):
+def restless(self, housekeeping, *, deadline=lambda: None, **others):
     def soon():
         due = deadline()
         return min(math.inf if due is None else due, time.monotonic() + 0.0003)
-    return run(self, deadline=soon, **others)
+    return run(self, housekeeping, deadline=soon, **others)
 def counted(self):
     count = disarm(self)
     if count:

@@ -192,7 +192,7 @@ def count(now):
 loop.run(tick=lambda now: None, deadline=lambda: None, housekeeping=count)
 groups = len({*rounds})
 # Idle as one that has waited for long, but for a minute.
-node_loop.IMPATIENCE, node_loop.IDLE_HOUSEKEEPING = 1e9, 60.0
+node_loop.IDLE_BACKOFF, node_loop.IDLE_HOUSEKEEPING = 1e9, 60.0
 answered.clear(), rounds.clear(), loop.resume()
 threading.Timer(1.0, client.call_async, [Trigger.Request()]).start()
 def look(now):
