@@ -19,6 +19,7 @@ from controller_node.diagnostics import ControllerDiagnostics
 from controller_node.fast_path import ControllerFastPath, load_compiled
 from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
+from loop_interfaces import topics
 from loop_interfaces.diagnostics import Status
 from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
@@ -28,19 +29,7 @@ from loop_interfaces.ros.endpoints import writer_qos
 from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.node_main import node_main
 from loop_interfaces.ros.parameters import declare, given_parameters
-from loop_interfaces.topics import (
-    ACTION,
-    COST,
-    MODEL,
-    MODEL_FAILED,
-    MODEL_IDENTIFIED,
-    PAUSED,
-    POLICY,
-    START,
-    STATE,
-    TARGET,
-    Topic,
-)
+from loop_interfaces.topics import Topic
 
 Handler = Callable[[Frame], Sequence[Publication | ModelFailure]]
 
@@ -67,21 +56,23 @@ class ControllerNode:
     def _wire(self, node: Node, loop: NodeLoop) -> None:
         responder = self._responder
         self._node, self._loop = node, loop
-        self._senders = {topic: loop.sender(topic) for topic in (ACTION, MODEL_IDENTIFIED)}
-        self._failed = node.create_publisher(String, MODEL_FAILED, writer_qos(MODEL))
-        handlers: dict[Topic, Handler] = {
-            TARGET: responder.target,
-            START: responder.start,
-            POLICY: responder.policy,
-            MODEL: responder.model,
-            COST: responder.cost,
+        self._senders = {
+            topic: loop.sender(topic) for topic in (topics.ACTION, topics.MODEL_IDENTIFIED)
         }
-        states = loop.receive(STATE, self._on_state)
+        self._failed = node.create_publisher(String, topics.MODEL_FAILED, writer_qos(topics.MODEL))
+        handlers: dict[Topic, Handler] = {
+            topics.TARGET: responder.target,
+            topics.START: responder.start,
+            topics.POLICY: responder.policy,
+            topics.MODEL: responder.model,
+            topics.COST: responder.cost,
+        }
+        states = loop.receive(topics.STATE, self._on_state)
         self._fast_path = ControllerFastPath(responder, states.codec)
-        loop.answer_fast(states, self._senders[ACTION], self._fast_path)
+        loop.answer_fast(states, self._senders[topics.ACTION], self._fast_path)
         for topic, handler in handlers.items():
             loop.receive(topic, partial(self._on_other, handler))
-        loop.receive(PAUSED, self._on_paused)
+        loop.receive(topics.PAUSED, self._on_paused)
         loop.introspection.report("responder", self._report)
 
     def _on_state(self, frame: Frame) -> None:
@@ -103,7 +94,7 @@ class ControllerNode:
 
     def _report(self, now: float) -> Status:
         self._diagnostics.plants = self._node.count_publishers(
-            self._node.resolve_topic_name(STATE.name)
+            self._node.resolve_topic_name(topics.STATE.name)
         )
         return self._diagnostics.report(now)
 

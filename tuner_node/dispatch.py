@@ -27,20 +27,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from loop_interfaces import topics
 from loop_interfaces.frames import Frame, FrameError, digest
 from loop_interfaces.protocol import Counters, ModelFailure, Publication
 from loop_interfaces.signature import NOT_SIGNED, digest_of, signature, signature_in
-from loop_interfaces.topics import (
-    COST,
-    MODEL,
-    MODEL_IDENTIFIED,
-    POLICY,
-    START,
-    START_COLUMNS,
-    VOID,
-    CostColumn,
-    Topic,
-)
+from loop_interfaces.topics import START_COLUMNS, VOID, CostColumn, Topic
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult
 from tuner_node.dispatch_state import Chunk, Pair
 from tuner_node.trajectory_collector import TrajectoryCollector
@@ -141,12 +132,12 @@ class Dispatcher:
         """
         frame = self._models = Frame(self.run, 0, generation, self.sim_time, models.copy())
         self._models_digest = digest_of(models)
-        return [(pair, Publication(MODEL, frame)) for pair in range(len(self.pairs))]
+        return [(pair, Publication(topics.MODEL, frame)) for pair in range(len(self.pairs))]
 
     def release(self) -> list[PairPublication]:
         """Tell every pair that the run is over."""
         frame = Frame(self.run, 0, 0, self.sim_time, np.empty((0, START_COLUMNS)))
-        return [(pair, Publication(START, frame)) for pair in range(len(self.pairs))]
+        return [(pair, Publication(topics.START, frame)) for pair in range(len(self.pairs))]
 
     def presence(self, pair: int, missing: Sequence[str], now: float) -> list[PairPublication]:
         """Take which nodes of a pair are not on the network."""
@@ -158,7 +149,7 @@ class Dispatcher:
 
     def cost(self, pair: int, frame: Frame, now: float) -> list[PairPublication]:
         """Take an episode's costs. Raises FrameError when their shape is not the episode's."""
-        known = self._answering(pair, frame, COST)
+        known = self._answering(pair, frame, topics.COST)
         if known is None or known.chunk is None or self._batch is None:
             return []
         count = known.chunk.size
@@ -187,7 +178,7 @@ class Dispatcher:
                 f"the plant declared episode {known.episode} void: no action came, or different ones",
             )
         else:
-            known.remember(COST.name, frame)
+            known.remember(topics.COST.name, frame)
             known.chunk.costs = frame.values.copy()
             self.last_costs = known.chunk.costs[:, CostColumn.MEAN]
             if self._batch.trajectories:
@@ -281,7 +272,7 @@ class Dispatcher:
                 "expected a model identified with the parameters of this run's tuner; stop the other "
                 "controller, or start both with the same parameters"
             )
-        known = self._answering(pair, frame, MODEL_IDENTIFIED)
+        known = self._answering(pair, frame, topics.MODEL_IDENTIFIED)
         if known is None or known.chunk is None or self._batch is None:
             return []
         count = known.chunk.size
@@ -290,7 +281,7 @@ class Dispatcher:
         if self.plant not in (UNKNOWN_PLANT, frame.plant):
             raise FrameError(f"expected a model of plant {self.plant}, got one of {frame.plant}")
         known.last_heard = now
-        known.remember(MODEL_IDENTIFIED.name, frame)
+        known.remember(topics.MODEL_IDENTIFIED.name, frame)
         known.chunk.models = frame.values.copy()
         self._release_if_done(known)
         return self._begin_episodes(now)
@@ -386,7 +377,7 @@ class Dispatcher:
             self.counters["answers of another run"] += 1
             return None
         taken = known.answers.get(topic.name, {}).get(frame.episode)
-        void = topic is COST and bool((frame.values[:, -1:] == VOID).any())
+        void = topic is topics.COST and bool((frame.values[:, -1:] == VOID).any())
         same_plant = self.plant in (UNKNOWN_PLANT, frame.plant)
         if taken is not None and same_plant and not void and digest(frame.values) != taken:
             raise DispatchError(
@@ -502,14 +493,16 @@ class Dispatcher:
             return Frame(self.run, pair.episode, generation, self.sim_time, values, plant)
 
         # The policy first: it is then mostly there when the first state arrives.
-        sends = [Publication(MODEL, self._models)] if again and self._models is not None else []
+        sends = (
+            [Publication(topics.MODEL, self._models)] if again and self._models is not None else []
+        )
         rows = self._batch.rows[chunk.rows]
         signed: list[ArrayLike] = [rows, self.action_limit]
         if self._batch.policies is not None:
             policies = self._batch.policies[chunk.rows]
-            sends.append(Publication(POLICY, frame(policies)))
+            sends.append(Publication(topics.POLICY, frame(policies)))
             signed += [policies, self._models_digest]
-        start = Publication(START, frame(rows, digest_of(*signed)))
+        start = Publication(topics.START, frame(rows, digest_of(*signed)))
         pair.begin(start)
         sends.append(start)
         return [(number, send) for send in sends]

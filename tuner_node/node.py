@@ -19,6 +19,7 @@ from typing import Any
 from rclpy.node import Node
 from std_msgs.msg import String
 
+from loop_interfaces import topics
 from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.parameters import TUNER, taken_by, with_budget
@@ -29,19 +30,6 @@ from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.node_main import ConfigurationError, node_main
 from loop_interfaces.ros.parameters import declare, given_parameters, on_change
 from loop_interfaces.ros.suspend_watchdog import sleep_for
-from loop_interfaces.topics import (
-    ACTION,
-    ARRAYS,
-    COST,
-    MODEL,
-    MODEL_FAILED,
-    MODEL_IDENTIFIED,
-    PAUSED,
-    POLICY,
-    RECORDER_STATUS,
-    START,
-    TARGET,
-)
 from tuner_node import narration
 from tuner_node.build import build_dispatcher, build_training
 from tuner_node.diagnostics import TunerDiagnostics
@@ -133,27 +121,30 @@ class TunerNode:
         session, dispatcher = self._session, self._session.dispatcher
         for number, namespace in enumerate(self._pairs):
             self._senders.append(
-                {t.name: loop.sender(t, namespace) for t in (POLICY, START, MODEL)}
+                {
+                    t.name: loop.sender(t, namespace)
+                    for t in (topics.POLICY, topics.START, topics.MODEL)
+                }
             )
             if session.training.settings.trajectories:
                 # Before the costs: what has come in with one is then taken before it.
-                loop.receive(TARGET, self._handler(dispatcher.target, number), namespace)
+                loop.receive(topics.TARGET, self._handler(dispatcher.target, number), namespace)
                 on_state = partial(self._on_state, number)
                 loop.observe(namespace, on_state, partial(dispatcher.action, number))
-            cost = loop.receive(COST, self._handler(dispatcher.cost, number), namespace)
+            cost = loop.receive(topics.COST, self._handler(dispatcher.cost, number), namespace)
             model = loop.receive(
-                MODEL_IDENTIFIED, self._handler(dispatcher.model, number), namespace
+                topics.MODEL_IDENTIFIED, self._handler(dispatcher.model, number), namespace
             )
             self._costs.append(cost.name)
             self._models.append(model.name)
             node.create_subscription(
                 String,
-                scoped(namespace, MODEL_FAILED),
+                scoped(namespace, topics.MODEL_FAILED),
                 partial(self._on_failure, number),
-                reader_qos(MODEL),
+                reader_qos(topics.MODEL),
             )
-            loop.receive(PAUSED, self._handler(dispatcher.plant_paused, number), namespace)
-            for topic in ARRAYS:
+            loop.receive(topics.PAUSED, self._handler(dispatcher.plant_paused, number), namespace)
+            for topic in topics.ARRAYS:
                 name = scoped(namespace, topic.name)
                 loop.introspection.supervise(node.resolve_topic_name(name), topic)
         loop.introspection.report("training", self._diagnostics.report)
@@ -242,12 +233,12 @@ class TunerNode:
 
     def _publishers(self) -> Publishers:
         count, resolve = self._node.count_publishers, self._node.resolve_topic_name
-        starts = [senders[START.name].publisher.topic_name for senders in self._senders]
+        starts = [senders[topics.START.name].publisher.topic_name for senders in self._senders]
         return Publishers(
             plants=[count(topic) for topic in self._costs],
             controllers=[count(topic) for topic in self._models],
             tuners={topic: count(topic) for topic in starts},
-            recorders=count(resolve(RECORDER_STATUS)),
+            recorders=count(resolve(topics.RECORDER_STATUS)),
         )
 
     def _report(self, row: Mapping[str, Any]) -> None:
@@ -267,7 +258,7 @@ class TunerNode:
             full_name(there)
             for namespace in self._pairs
             for there in self._node.get_publishers_info_by_topic(
-                self._node.resolve_topic_name(scoped(namespace, ACTION.name))
+                self._node.resolve_topic_name(scoped(namespace, topics.ACTION.name))
             )
         }
         seen = self._session.training.law_seen
