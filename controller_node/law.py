@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.jit import cache, simd
-from loop_interfaces.jit.cache import cached_njit, fingerprint, jit
+from loop_interfaces.jit.cache import cached_njit, jit
 from loop_interfaces.jit.simd import (
     fma,
     load,
@@ -113,18 +113,9 @@ def act(law: Any, states: int, actions: int, batch: int) -> None:
             answer(law, m, law.scratch + 8 * width * (m - first), actions + 8 * law.n_a * m)
 
 
-def compile_control(sources: str) -> Any:
-    """The compiled `act` on arrays; `sources` is part of its key in the cache on disk."""
-
-    @cached_njit
-    def control(
-        laws: NDArray[np.void], states: NDArray[np.float64], actions: NDArray[np.float64]
-    ) -> None:
-        """Write the actions (M, n_a) that answer the states (M, n_z)."""
-        sources  # noqa: B018  # closed over to be part of the key on disk
-        act(laws[0], states.ctypes.data, actions.ctypes.data, len(states))
-
-    return control
-
-
-control = compile_control(fingerprint(cache, simd))
+@cached_njit(cache, simd)
+def control(
+    laws: NDArray[np.void], states: NDArray[np.float64], actions: NDArray[np.float64]
+) -> None:
+    """Write the actions (M, n_a) that answer the states (M, n_z)."""
+    act(laws[0], states.ctypes.data, actions.ctypes.data, len(states))

@@ -36,21 +36,21 @@ from __future__ import annotations
 import ctypes
 from typing import Any
 
-import numba
 import numpy as np
 from numba import carray, types  # type: ignore[attr-defined, unused-ignore]
 from numpy.typing import NDArray
 
 from loop_interfaces.jit import atomics, cache, native, simd
 from loop_interfaces.jit.atomics import load_acquire, store_release
-from loop_interfaces.jit.cache import cached_njit, fingerprint, jit
+from loop_interfaces.jit.cache import cached_njit, jit
 from loop_interfaces.jit.native import (
     CLOCK,
-    MachineCode,
     MonotonicClock,
     address_of,
     call_c,
+    machine_code,
     monotonic_ns,
+    pointer_to,
 )
 from loop_interfaces.jit.simd import read_word
 
@@ -83,6 +83,7 @@ CHANNEL = np.dtype(
         ("answered_at", np.int64),  # the last one; ns on the monotonic clock
     ]
 )
+SOURCES = cache, simd, atomics, native
 CAPACITY = 16
 """Messages that the mailbox holds: twice what the middleware keeps for a reader of its own."""
 SLOTS = CAPACITY + 1
@@ -175,70 +176,55 @@ def on_message(channel: Any) -> bool:
     return bool(found)
 
 
-def compile_on_new_message() -> Any:
-    """The compiled callback of the middleware: `on_message` for each message that arrived."""
-    channels_at = types.CPointer(numba.from_dtype(CHANNEL))  # type: ignore[no-untyped-call]
-
-    @numba.cfunc(types.void(channels_at, types.intp), cache=True)
-    def on_new_message(channels: Any, count: int) -> None:
-        SOURCES  # noqa: B018  # part of the key on disk
-        channel = carray(channels, 1)[0]
-        while on_message(channel):
-            pass
-
-    return on_new_message
+@machine_code(types.void(pointer_to(CHANNEL), types.intp), *SOURCES)
+def on_new_message(channels: Any, count: int) -> None:
+    channel = carray(channels, 1)[0]
+    while on_message(channel):
+        pass
 
 
-def compile_for_node(sources: str) -> tuple[Any, Any, Any, Any]:
-    """What the node's own thread calls."""
+# What the node's own thread calls.
 
-    @cached_njit
-    def disarm(channels: NDArray[np.void]) -> None:
-        sources  # noqa: B018  # closed over to be part of the key on disk
-        channel = channels[0]
-        store_release(channel.armed, 0)  # no answer is begun from here on
-        lock(channel)  # the one under way has been given
-        unlock(channel)
 
-    @cached_njit
-    def arm(channels: NDArray[np.void]) -> bool:
-        """Answer what waits already; whether that was all, and it is armed."""
-        sources  # noqa: B018
-        channel = channels[0]
-        lock(channel)
-        channel.answered = 0
-        while channel.waiting > 0 and answered(channel, slot_after(channel, 0)):
-            remove_oldest(channel)
-        empty = channel.waiting == 0
-        store_release(channel.armed, 1 if empty else 0)
-        unlock(channel)
-        return bool(empty)
+@cached_njit(*SOURCES)
+def disarm(channels: NDArray[np.void]) -> None:
+    channel = channels[0]
+    store_release(channel.armed, 0)  # no answer is begun from here on
+    lock(channel)  # the one under way has been given
+    unlock(channel)
 
-    @cached_njit
-    def oldest(channels: NDArray[np.void]) -> int:
-        """Address of the message that has waited longest; 0 if none waits."""
-        sources  # noqa: B018
-        channel = channels[0]
-        lock(channel)
-        message = slot_after(channel, 0) if channel.waiting > 0 else 0
-        unlock(channel)
-        return message
 
-    @cached_njit
-    def pop(channels: NDArray[np.void]) -> None:
-        """The oldest message has been read."""
-        sources  # noqa: B018
-        channel = channels[0]
-        lock(channel)
+@cached_njit(*SOURCES)
+def arm(channels: NDArray[np.void]) -> bool:
+    """Answer what waits already; whether that was all, and it is armed."""
+    channel = channels[0]
+    lock(channel)
+    channel.answered = 0
+    while channel.waiting > 0 and answered(channel, slot_after(channel, 0)):
         remove_oldest(channel)
-        unlock(channel)
+    empty = channel.waiting == 0
+    store_release(channel.armed, 1 if empty else 0)
+    unlock(channel)
+    return bool(empty)
 
-    return disarm, arm, oldest, pop
+
+@cached_njit(*SOURCES)
+def oldest(channels: NDArray[np.void]) -> int:
+    """Address of the message that has waited longest; 0 if none waits."""
+    channel = channels[0]
+    lock(channel)
+    message: int = slot_after(channel, 0) if channel.waiting > 0 else 0
+    unlock(channel)
+    return message
 
 
-SOURCES = fingerprint(cache, simd, atomics, native)
-on_new_message = MachineCode(compile_on_new_message)
-disarm, arm, oldest, pop = compile_for_node(SOURCES)
+@cached_njit(*SOURCES)
+def pop(channels: NDArray[np.void]) -> None:
+    """The oldest message has been read."""
+    channel = channels[0]
+    lock(channel)
+    remove_oldest(channel)
+    unlock(channel)
 
 
 def load_compiled() -> None:

@@ -14,21 +14,15 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
-import numba
 import numpy as np
 from numba import carray, types  # type: ignore[attr-defined, unused-ignore]
 
 from loop_interfaces.fast_path import messages
 from loop_interfaces.fast_path.channel import RclChannel
-from loop_interfaces.fast_path.messages import (
-    EXPECTED,
-    OwnMessage,
-    expected_header,
-)
+from loop_interfaces.fast_path.messages import EXPECTED, OwnMessage, expected_header
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.jit import atomics, cache, native, simd
-from loop_interfaces.jit.cache import fingerprint
-from loop_interfaces.jit.native import MachineCode
+from loop_interfaces.jit.native import MachineCode, pointer_to
 from loop_interfaces.topics import Topic
 
 
@@ -57,27 +51,14 @@ def fast_handler(
     sources
         The modules that `answer` calls: when one of them changes, it is compiled anew.
     """
-    shared = atomics, cache, native, simd, messages
-    return MachineCode(
-        lambda: compile_handler(plan, answer, fingerprint(answer, *shared, *sources))
-    )
 
-
-def compile_handler(plan: np.dtype[np.void], answer: Callable[..., bool], sources: str) -> Any:
-    """The compiled handler of a channel, which answers with `answer`.
-
-    The fingerprint `sources` is part of its key in the cache on disk.
-    """
-    plans_at = types.CPointer(numba.from_dtype(plan))  # type: ignore[no-untyped-call]
-
-    @numba.cfunc(types.int32(plans_at, types.intp, types.intp), cache=True)
     def handle(plans: Any, message: int, length: int) -> int:
-        sources  # noqa: B018  # closed over to be part of the key on disk
         plan = carray(plans, 1)[0]
         head = expected_header(message, length, plan.expected)
         return 1 if head != 0 and answer(plan, head, message, length) else 0
 
-    return handle
+    signature = types.int32(pointer_to(plan), types.intp, types.intp)
+    return MachineCode(handle, signature, answer, atomics, cache, native, simd, messages, *sources)
 
 
 class FastPath(ABC):

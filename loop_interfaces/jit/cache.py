@@ -2,8 +2,8 @@
 
 Numba keeps compiled functions beside the source (or in the user's cache folder where that cannot be
 written) and takes them for current while the file that holds the function is unchanged. What the
-function calls from other files does not count. So what is kept on disk here closes over a
-`fingerprint` of all the sources it is made of: closed-over values are part of Numba's key.
+function calls from other files does not count. So the name of what is kept on disk here, which is also
+that of its file, has a `fingerprint` of all the sources it is made of.
 """
 
 import hashlib
@@ -33,10 +33,20 @@ CACHED: list[Any] = []
 """All functions that `cached_njit` has made."""
 
 
-def cached_njit(function: F) -> F:
-    """Compile, keep on disk, and run without the interpreter's lock."""
-    compiled: F = numba.njit(function, cache=True, nogil=True)
-    CACHED.append(compiled)
+def named_by_sources(function: F, *sources: ModuleType | Callable[..., Any]) -> F:
+    """The function, with a name on disk that belongs to it and to what it is made of."""
+    function.__qualname__ += f"-{fingerprint(function, *sources)}"
+    return function
+
+
+def cached_njit(*sources: ModuleType | Callable[..., Any]) -> Callable[[F], F]:
+    """Compile, keep on disk, and run without the interpreter's lock; sources: what it calls."""
+
+    def compiled(function: F) -> F:
+        made: F = numba.njit(named_by_sources(function, *sources), cache=True, nogil=True)
+        CACHED.append(made)
+        return made
+
     return compiled
 
 
@@ -52,4 +62,4 @@ def fingerprint(*sources: ModuleType | Callable[..., Any]) -> str:
                 repr(source.__code__.co_code) if isinstance(source, FunctionType) else repr(source)
             )
         digest.update(text.encode())
-    return digest.hexdigest()
+    return digest.hexdigest()[:16]

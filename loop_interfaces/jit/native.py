@@ -2,13 +2,15 @@
 
 import ctypes
 from collections.abc import Callable
+from types import ModuleType
 from typing import Any
 
+import numba
 import numpy as np
 from llvmlite import ir
 from numba import types
 
-from loop_interfaces.jit.cache import CACHED, jit
+from loop_interfaces.jit.cache import CACHED, jit, named_by_sources
 from loop_interfaces.jit.simd import intrinsic, read_word
 
 CLOCK = np.dtype(
@@ -41,22 +43,48 @@ def call_c(typing_context: Any, address: Any, arguments: Any) -> Any:
 
 
 class MachineCode:
-    """One of Numba's cfuncs that is loaded, or compiled, when it is first asked for."""
+    """A C function that is loaded from disk, or compiled, when its address is first asked for.
+
+    Parameters
+    ----------
+    function
+        What to compile.
+    signature
+        Its types, for numba.cfunc.
+    sources
+        The modules, or functions of them, that it calls: when one of them changes, it is compiled anew.
+    """
 
     compiled = 0
     """How many of them were compiled in this process."""
 
-    def __init__(self, compile_it: Callable[[], Any]) -> None:
-        self._compile = compile_it
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        signature: Any,
+        *sources: ModuleType | Callable[..., Any],
+    ) -> None:
+        self._function, self._signature, self._sources = function, signature, sources
         self._code: Any = None
 
     def __call__(self) -> int:
         """Its address."""
         if self._code is None:
-            self._code = self._compile()
+            function = named_by_sources(self._function, *self._sources)
+            self._code = numba.cfunc(self._signature, cache=True)(function)
             MachineCode.compiled += not self._code.cache_hits
         address: int = self._code.address
         return address
+
+
+def machine_code(signature: Any, *sources: ModuleType) -> Callable[..., MachineCode]:
+    """A decorator that makes MachineCode of a function."""
+    return lambda function: MachineCode(function, signature, *sources)
+
+
+def pointer_to(record: np.dtype[Any]) -> Any:
+    """The type of the address of such a record in a signature."""
+    return types.CPointer(numba.from_dtype(record))  # type: ignore[no-untyped-call]
 
 
 def compilations() -> int:

@@ -35,7 +35,7 @@ from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from loop_interfaces.jit import cache, native, simd
-from loop_interfaces.jit.cache import cached_njit, fingerprint, jit
+from loop_interfaces.jit.cache import cached_njit, jit
 from loop_interfaces.jit.native import call_c
 from loop_interfaces.jit.simd import load, read, splat, write
 from pde_sim_node.equations import Equation, LinearEquation
@@ -158,58 +158,51 @@ def pull_back_internal(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> 
         put(w, on_v + k, d, plus(get(w, on_v + k, d), rfft_pack(w, z, d, m, factors, k, c, e)))
 
 
-def compile_pull_back(sources: str) -> Any:
-    """The compiled `pull_back` of many states; `sources` is part of its key in the cache on disk."""
-
-    @cached_njit
-    def pull_back(
-        states: Array,
-        actions: Array,
-        covectors: Array,
-        after: Array,
-        on_states: Array,
-        on_actions: Array,
-        plans: NDArray[np.void],
-    ) -> None:
-        """Write `after`, f(z, a), and `on_states` and `on_actions`, the transposed products."""
-        sources  # noqa: B018  # closed over to be part of the key on disk
-        plan = plans[0]
-        w, d, c, e = plan.scratch, plan.scratch_apart, plan.constants, plan.constants_apart
-        last, block = plan.n_z // 2, 4 * plan.fine.m
-        for i in range(len(states)):
-            state = states.ctypes.data + 8 * plan.n_z * i
-            record(state, actions.ctypes.data + 8 * plan.n_a * i, w, d, plan, c, e)
-            synthesise(after.ctypes.data + 8 * plan.n_z * i, w, d, plan, c, e)
-            # Synthesis transposed is analysis, but for the last mode, of weight 1 on the published
-            # grid and 2 on the fine one.
-            analyse(covectors.ctypes.data + 8 * plan.n_z * i, w, d, plan, c, e)
-            for k in range(0, plan.modes, 8):
-                put(w, plan.covector + k, d, get(w, plan.x + k, d))
-                put(w, plan.on_force + k, d, (splat(0.0), splat(0.0)))
-            write(w, plan.covector + last, 0.5 * read(w, plan.covector + last))
-            write(w, plan.covector + d + last, 0.0)
-            for n in range(plan.steps - 1, -1, -1):
-                pull_back_internal(w, d, plan, c, e, plan.tape + n * block)
-            for j in range(plan.n_a):
-                at, total = plan.supports + j * plan.modes, 0.0
-                for k in range(last + 1):
-                    own = read(w, plan.on_force + k) * read(c, at + k)
-                    own += read(w, plan.on_force + d + k) * read(c, at + e + k)
-                    total += own if k == 0 else 2.0 * own
-                on_actions[i, j] = plan.n_z * total
+@cached_njit(cache, native, simd, fft, spectra, kernel)
+def pull_back(
+    states: Array,
+    actions: Array,
+    covectors: Array,
+    after: Array,
+    on_states: Array,
+    on_actions: Array,
+    plans: NDArray[np.void],
+) -> None:
+    """Write f(z, a) and the two products with its transposed derivatives: after, on_states and
+    on_actions.
+    """
+    plan = plans[0]
+    w, d, c, e = plan.scratch, plan.scratch_apart, plan.constants, plan.constants_apart
+    last, block = plan.n_z // 2, 4 * plan.fine.m
+    for i in range(len(states)):
+        state = states.ctypes.data + 8 * plan.n_z * i
+        record(state, actions.ctypes.data + 8 * plan.n_a * i, w, d, plan, c, e)
+        synthesise(after.ctypes.data + 8 * plan.n_z * i, w, d, plan, c, e)
+        # Synthesis transposed is analysis, but for the last mode, of weight 1 on the published
+        # grid and 2 on the fine one.
+        analyse(covectors.ctypes.data + 8 * plan.n_z * i, w, d, plan, c, e)
+        for k in range(0, plan.modes, 8):
+            put(w, plan.covector + k, d, get(w, plan.x + k, d))
+            put(w, plan.on_force + k, d, (splat(0.0), splat(0.0)))
+        write(w, plan.covector + last, 0.5 * read(w, plan.covector + last))
+        write(w, plan.covector + d + last, 0.0)
+        for n in range(plan.steps - 1, -1, -1):
+            pull_back_internal(w, d, plan, c, e, plan.tape + n * block)
+        for j in range(plan.n_a):
+            at, total = plan.supports + j * plan.modes, 0.0
             for k in range(last + 1):
-                write(w, plan.x + k, read(w, plan.covector + k))
-                write(w, plan.x + d + k, read(w, plan.covector + d + k))
-            for k in range(last + 1, plan.modes):
-                write(w, plan.x + k, 0.0)
-                write(w, plan.x + d + k, 0.0)
-            write(w, plan.x + last, 2.0 * read(w, plan.x + last))
-            synthesise(on_states.ctypes.data + 8 * plan.n_z * i, w, d, plan, c, e)
-
-    return pull_back
-
-
-_pull_back = compile_pull_back(fingerprint(cache, native, simd, fft, spectra, kernel))
+                own = read(w, plan.on_force + k) * read(c, at + k)
+                own += read(w, plan.on_force + d + k) * read(c, at + e + k)
+                total += own if k == 0 else 2.0 * own
+            on_actions[i, j] = plan.n_z * total
+        for k in range(last + 1):
+            write(w, plan.x + k, read(w, plan.covector + k))
+            write(w, plan.x + d + k, read(w, plan.covector + d + k))
+        for k in range(last + 1, plan.modes):
+            write(w, plan.x + k, 0.0)
+            write(w, plan.x + d + k, 0.0)
+        write(w, plan.x + last, 2.0 * read(w, plan.x + last))
+        synthesise(on_states.ctypes.data + 8 * plan.n_z * i, w, d, plan, c, e)
 
 
 class Adjoint:
@@ -289,7 +282,7 @@ class Adjoint:
         if y.shape != z.shape:
             raise ValueError(f"covectors must have the states' shape {z.shape}, got {y.shape}")
         after, on_states, on_actions = np.empty_like(z), np.empty_like(z), np.empty_like(a)
-        _pull_back(z, a, y, after, on_states, on_actions, self._plans)
+        pull_back(z, a, y, after, on_states, on_actions, self._plans)
         return after, on_states, on_actions
 
 

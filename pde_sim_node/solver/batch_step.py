@@ -9,11 +9,10 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
-import numba
 from numba import carray, types  # type: ignore[attr-defined, unused-ignore]
 
-from loop_interfaces.jit.cache import fingerprint, jit
-from loop_interfaces.jit.native import MachineCode
+from loop_interfaces.jit.cache import jit
+from loop_interfaces.jit.native import MachineCode, pointer_to
 from loop_interfaces.jit.simd import fma, load, read, read_word, splat, store, write, write_word
 
 
@@ -55,14 +54,7 @@ def environments_of(plan: Any, advance: Callable[..., None], *sources: ModuleTyp
     plan: the dtype of the plan. advance(state, action, w, d, plan, c, e): puts the state a sampling
     time later into the scratch; it can be compiled. sources: all it is made of.
     """
-    return MachineCode(lambda: compile_environments(plan, advance, fingerprint(advance, *sources)))
 
-
-def compile_environments(plan_type: Any, advance: Callable[..., None], sources: str) -> Any:
-    """The compiled loop over environments, each advanced by `advance`."""
-    plan_at = types.CPointer(numba.from_dtype(plan_type))  # type: ignore[no-untyped-call]
-
-    @numba.cfunc(types.void(plan_at, *[types.intp] * 7), cache=True)
     def environments(
         plans: Any,
         states: int,
@@ -78,7 +70,6 @@ def compile_environments(plan_type: Any, advance: Callable[..., None], sources: 
         Adds the stage cost to `totals`. An environment whose new state is not within the bound
         keeps its state and gets k in `diverged_step`; one that has an entry there is left alone.
         """
-        sources  # noqa: B018  # closed over to be part of the key on disk
         plan = carray(plans, 1)[0]
         w, d, c, e = plan.scratch, plan.scratch_apart, plan.constants, plan.constants_apart
         for i in range(first, last):
@@ -91,4 +82,5 @@ def compile_environments(plan_type: Any, advance: Callable[..., None], sources: 
             if not accept(total, state, w, plan):
                 write_word(diverged_step, i, k)
 
-    return environments
+    signature = types.void(pointer_to(plan), *[types.intp] * 7)
+    return MachineCode(environments, signature, advance, *sources)

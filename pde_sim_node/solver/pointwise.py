@@ -12,13 +12,13 @@ from numba.core.errors import NumbaError
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from loop_interfaces.jit.cache import cached_njit, fingerprint
+from loop_interfaces.jit.cache import cached_njit
 from loop_interfaces.jit.native import MachineCode
 
 LOOPS: dict[Callable[[float], float], MachineCode] = {}
 
 
-@cached_njit
+@cached_njit()
 def all_finite(values: NDArray[np.float64]) -> bool:
     """Whether an array holds neither NaN nor infinity."""
     finite = True
@@ -40,7 +40,13 @@ def pointwise_loop(function: Callable[[float], float]) -> int:
     # A plain function in the closure keeps the key on disk the same in every process; a dispatcher
     # would not.
     scalar = register_jitable(error_model="numpy")(function)
-    code = MachineCode(lambda: compile_loop(scalar, fingerprint(function)))
+
+    def loop(data: Any, count: int) -> None:
+        u = carray(data, count)
+        for i in range(count):
+            u[i] = scalar(u[i])
+
+    code = MachineCode(loop, types.void(types.CPointer(types.float64), types.intp), function)  # type: ignore[no-untyped-call]
     try:
         return LOOPS.setdefault(function, code)()
     except NumbaError as error:
@@ -63,17 +69,3 @@ def reason(function: Callable[[float], float]) -> str:
         return f"{code.co_filename}, line {line}: {' '.join(words)}"
     (signature,) = alone.nopython_signatures
     return f"it returns {signature.return_type}, expected a float64"
-
-
-def compile_loop(scalar: Callable[[float], float], sources: str) -> Any:
-    """The compiled function that applies a scalar function to an array in place."""
-    signature = types.void(types.CPointer(types.float64), types.intp)  # type: ignore[no-untyped-call]
-
-    @numba.cfunc(signature, cache=True)
-    def loop(data: Any, count: int) -> None:
-        sources  # noqa: B018  # closed over to be part of the key on disk
-        u = carray(data, count)
-        for i in range(count):
-            u[i] = scalar(u[i])
-
-    return loop

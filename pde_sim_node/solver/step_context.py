@@ -2,13 +2,12 @@
 
 from typing import Any
 
-import numba
 import numpy as np
 from numba import carray, types  # type: ignore[attr-defined, unused-ignore]
 
 from loop_interfaces.jit import native
-from loop_interfaces.jit.cache import fingerprint, jit
-from loop_interfaces.jit.native import MachineCode, call_c
+from loop_interfaces.jit.cache import jit
+from loop_interfaces.jit.native import call_c, machine_code, pointer_to
 
 STEP_CONTEXT = np.dtype(
     [
@@ -33,20 +32,9 @@ def advance(context: Any, plan: int, first: int, last: int) -> None:
     call_c(context.code, (plan, z, a, c, ended, first, last, context.step))
 
 
-def compile_step() -> Any:
-    """The compiled `advance` of a whole batch, at an address that other compiled code calls."""
-    contexts_at = types.CPointer(numba.from_dtype(STEP_CONTEXT))  # type: ignore[no-untyped-call]
-    sources = fingerprint(native)
-
-    @numba.cfunc(types.void(contexts_at), cache=True)
-    def step(contexts: Any) -> None:
-        sources  # noqa: B018  # closed over to be part of the key on disk
-        context = carray(contexts, 1)[0]
-        advance(context, context.plan, 0, context.batch)
-        context.step += 1
-
-    return step
-
-
-step_code = MachineCode(compile_step)
-"""A step of all environments as a C function of the address of a STEP_CONTEXT."""
+@machine_code(types.void(pointer_to(STEP_CONTEXT)), native)
+def step_code(contexts: Any) -> None:
+    """Advance all environments of a STEP_CONTEXT."""
+    context = carray(contexts, 1)[0]
+    advance(context, context.plan, 0, context.batch)
+    context.step += 1

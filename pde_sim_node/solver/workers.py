@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from loop_interfaces.affinity import join_solver, usable_cores
 from loop_interfaces.jit import native
-from loop_interfaces.jit.cache import cached_njit, fingerprint
+from loop_interfaces.jit.cache import cached_njit
 from pde_sim_node.solver import step_context
 from pde_sim_node.solver.memory import Constants, aligned
 from pde_sim_node.solver.step_context import STEP_CONTEXT, advance, step_code
@@ -22,19 +22,10 @@ COMPILED_POINTS = 120_000
 """Below this a step is compiled code alone where that saves the way through the interpreter."""
 
 
-def compile_part(sources: str) -> Any:
-    """The compiled step of a part of a batch; `sources` is part of its key in the cache on disk."""
-
-    @cached_njit
-    def advance_part(contexts: NDArray[np.void], plan: int, first: int, last: int) -> None:
-        """Advance the environments first, ..., last - 1 of the STEP_CONTEXT in an array."""
-        sources  # noqa: B018  # closed over to be part of the key on disk
-        advance(contexts[0], plan, first, last)
-
-    return advance_part
-
-
-advance_part = compile_part(fingerprint(step_context, native))
+@cached_njit(step_context, native)
+def advance_part(contexts: NDArray[np.void], plan: int, first: int, last: int) -> None:
+    """Advance the environments first, ..., last - 1 of the STEP_CONTEXT in an array."""
+    advance(contexts[0], plan, first, last)
 
 
 class ParallelStep:
@@ -131,7 +122,8 @@ class SolverThreads:
     Attributes
     ----------
     cores : collection of int
-        Where they may be. There are as many threads, with the one that asks for a step.
+        Where they may be: those that the process was started on, as this is read at import, before a
+        node is pinned. There are as many threads, with the one that asks for a step.
     """
 
     def __init__(self) -> None:
