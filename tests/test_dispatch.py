@@ -11,7 +11,8 @@ from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import ModelFailure
 from loop_interfaces.topics import COMPLETED, POLICY, START, VOID
 from tuner_node.batch import Batch
-from tuner_node.dispatch import Dispatcher, DispatchError
+from tuner_node.dispatch import Dispatcher
+from tuner_node.pair import DispatchError
 
 RUN = 42
 

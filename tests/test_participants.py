@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from loop_interfaces.frames import Frame
-from tuner_node.dispatch import PAUSE_LEASE, Dispatcher, DispatchError
+from tuner_node.dispatch import PAUSE_LEASE, Dispatcher
+from tuner_node.pair import DispatchError
 from tuner_node.participants import SECOND_TUNER_GRACE, Participants, Publishers
 
 

@@ -15,7 +15,8 @@ from loop_interfaces.signature import design_digest
 from loop_interfaces.topics import COST, MODEL, POLICY, START, TARGET, VOID, CostColumn, Topic
 from tests.test_lockstep import plant_protocol
 from tuner_node.batch import Batch
-from tuner_node.dispatch import Dispatcher, DispatchError
+from tuner_node.dispatch import Dispatcher
+from tuner_node.pair import DispatchError
 
 N_Z, N_A, N_S = 32, 4, 3
 RNG = np.random.default_rng(0)

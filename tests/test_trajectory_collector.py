@@ -12,7 +12,7 @@ from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.topics import COMPLETED
 from tests.test_dispatch import RUN, batch, costs_of, dispatcher, starts
 from tuner_node.batch import Batch
-from tuner_node.dispatch import DispatchError
+from tuner_node.pair import DispatchError
 from tuner_node.trajectory_collector import TrajectoryCollector
 
 STEPS = 30
@@ -87,10 +87,10 @@ def test_samples_of_other_runs_episodes_and_plants_are_not_mixed_in():
             replace(frame, episode=4),
             replace(frame, plant=2),
         ):
-            observer.state(replace(stranger, values=frame.values + 9))
-            observer.action(replace(stranger, values=actions + 9))
-        observer.state(frame)
-        observer.action(replace(frame, values=actions))
+            observer.take("states", replace(stranger, values=frame.values + 9))
+            observer.take("actions", replace(stranger, values=actions + 9))
+        observer.take("states", frame)
+        observer.take("actions", replace(frame, values=actions))
     assert observer.lost(1, STEPS, 2) == 0
     (trajectory,) = observer.trajectories(1, STEPS, np.array([COMPLETED]))
     assert trajectory.states[:, 0].tolist() == list(range(STEPS + 1))

@@ -28,20 +28,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from loop_interfaces import topics
-from loop_interfaces.frames import Frame, FrameError, digest
+from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import Counters, ModelFailure, Publication
 from loop_interfaces.signature import NOT_SIGNED, digest_of, signature, signature_in
 from loop_interfaces.topics import START_COLUMNS, VOID, CostColumn, Topic
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult
-from tuner_node.dispatch_state import Chunk, Pair
-from tuner_node.trajectory_collector import TrajectoryCollector
+from tuner_node.pair import Chunk, DispatchError, Pair, PairPublication
 
 Array = NDArray[np.float64]
-PairPublication = tuple[int, Publication]
-"""(pair, message): publish the message in that pair's namespace."""
 EPISODES_PER_INCARNATION = 2**32
-FOREIGN_PLANT_GRACE = 20.0
-"""Seconds with costs of another plant only, after which the run stops."""
 SAMPLE_GRACE = 0.5
 """Seconds after its cost within which the last samples of an episode must have come in."""
 MAX_TARGETS = 64
@@ -50,10 +45,6 @@ REQUEST_PERIOD = 2.0
 """Seconds without an answer after which an episode's policy and start are sent once more."""
 PAUSE_LEASE = 10.0
 """Seconds for which a plant's report that it is paused holds; it comes once a second."""
-
-
-class DispatchError(RuntimeError):
-    """An episode that cannot be run: attempts used up, or a model that cannot be designed."""
 
 
 class Dispatcher:
@@ -97,7 +88,7 @@ class Dispatcher:
         self.max_batch, self.episode_timeout = max_batch, episode_timeout
         self.max_attempts = max_attempts
         self.plant, self.action_limit, self.design = plant, action_limit, design
-        self.pairs = [Pair() for _ in range(pairs)]
+        self.pairs = [Pair(number) for number in range(pairs)]
         self.counters = Counters()
         self.notes: list[str] = []
         """Why episodes were started again, in words."""
@@ -159,32 +150,22 @@ class Dispatcher:
             )
         if self.plant == UNKNOWN_PLANT:
             self.plant = frame.plant
-        if frame.plant != self.plant:
-            known.foreign_since = min(known.foreign_since, now)
-            if now - known.foreign_since > FOREIGN_PLANT_GRACE:
-                raise DispatchError(
-                    f"the plant has other parameters (fingerprint {frame.plant}) than the one this "
-                    f"run began with ({self.plant}); continue it with that one, or start a new run"
-                )
-            raise FrameError(
-                f"the cost of episode {frame.episode} comes from a plant with other parameters "
-                f"(fingerprint {frame.plant}) than this run's ({self.plant}); stop that plant"
-            )
+        known.check_plant(frame, self.plant, now)
         self.sim_time = max(self.sim_time, frame.time)
-        known.last_heard, known.foreign_since = now, math.inf
+        known.last_heard = now
         if (frame.values[:, CostColumn.ENDED] == VOID).any():
             self._retry(
                 known,
                 f"the plant declared episode {known.episode} void: no action came, or different ones",
             )
         else:
-            known.remember(topics.COST.name, frame)
+            known.take_answer(topics.COST.name, frame)
             known.chunk.costs = frame.values.copy()
             self.last_costs = known.chunk.costs[:, CostColumn.MEAN]
             if self._batch.trajectories:
                 known.pending_cost, known.pending_since = frame, now
                 self._collect(known)
-            self._release_if_done(known)
+            known.release_if_done(self._batch)
         return self._begin_episodes(now)
 
     def pause(self) -> None:
@@ -210,7 +191,7 @@ class Dispatcher:
 
     def paused_pairs(self, now: float) -> list[int]:
         """The pairs whose plants are paused."""
-        return [number for number, pair in enumerate(self.pairs) if now < pair.paused_until]
+        return [pair.number for pair in self.pairs if now < pair.paused_until]
 
     def episodes(self) -> list[int]:
         """Numbers of the episodes under way."""
@@ -241,21 +222,13 @@ class Dispatcher:
         True if it is the last one and the cost is there: `tick` then handles them in their order.
         Raises FrameError for a sample of another shape.
         """
-        known = self.pairs[pair]
-        for late in known.used_samples():
-            late.state(frame)
-        target = self._targets.get(frame.plant)
-        if self._is_sample(known, frame, frame.values.shape[1] if target is None else len(target)):
-            known.samples.state(frame)
+        known, target = self.pairs[pair], self._targets.get(frame.plant)
+        known.sample("states", frame, frame.values.shape[1] if target is None else len(target))
         return known.pending_cost is not None and frame.step == known.pending_cost.step
 
     def action(self, pair: int, frame: Frame) -> None:
         """Take a sample a_k of a pair's episode. Raises FrameError for one of another shape."""
-        known = self.pairs[pair]
-        for late in known.used_samples():
-            late.action(frame)
-        if self._is_sample(known, frame, self.n_a):
-            known.samples.action(frame)
+        self.pairs[pair].sample("actions", frame, self.n_a)
 
     def model(self, pair: int, frame: Frame, now: float) -> list[PairPublication]:
         """Take the reduced models of an exploratory episode.
@@ -281,9 +254,9 @@ class Dispatcher:
         if self.plant not in (UNKNOWN_PLANT, frame.plant):
             raise FrameError(f"expected a model of plant {self.plant}, got one of {frame.plant}")
         known.last_heard = now
-        known.remember(topics.MODEL_IDENTIFIED.name, frame)
+        known.take_answer(topics.MODEL_IDENTIFIED.name, frame)
         known.chunk.models = frame.values.copy()
-        self._release_if_done(known)
+        known.release_if_done(self._batch)
         return self._begin_episodes(now)
 
     def failure(self, pair: int, failure: ModelFailure, now: float) -> list[PairPublication]:
@@ -302,41 +275,38 @@ class Dispatcher:
         A pair that is at work ignores being asked again, one that was done answers again.
         """
         publications: list[PairPublication] = []
-        for number, pair in enumerate(self.pairs):
+        for pair in self.pairs:
             due = now - pair.last_sent > REQUEST_PERIOD
             if pair.chunk is None:
                 if self.paused and pair.last_start is not None and due:
                     pair.last_sent = now
-                    publications.append((number, pair.last_start))
-                continue
-            if pair.pending_cost is not None:
+                    publications.append((pair.number, pair.last_start))
+            elif pair.pending_cost is not None:
                 self._collect(pair)
                 if pair.pending_cost is not None and now - pair.pending_since > SAMPLE_GRACE:
-                    width = len(self._targets.get(pair.pending_cost.plant, ()))
-                    lost = pair.samples.lost(pair.pending_cost.plant, pair.pending_cost.step, width)
+                    lost = pair.lost_samples(len(self._targets.get(pair.pending_cost.plant, ())))
                     self._retry(pair, f"the tuner missed {lost} samples of episode {pair.episode}")
-                else:
-                    self._release_if_done(pair)
+                elif self._batch is not None:
+                    pair.release_if_done(self._batch)
             elif pair.missing:  # not silent: the latched topics serve it when it is back
                 pair.last_heard = now
-            elif now < pair.paused_until:  # not silent either
-                pair.last_heard = now
-                if due:  # keeps the plant for this run
-                    publications += self._request(number, pair, now)
-            elif now - pair.last_heard > self.episode_timeout:
+            elif now >= pair.paused_until and now - pair.last_heard > self.episode_timeout:
                 self._retry(
                     pair,
-                    f"pair {number} was silent for {self.episode_timeout:g} s "
+                    f"pair {pair.number} was silent for {self.episode_timeout:g} s "
                     f"in episode {pair.episode}",
                 )
-            elif due:
-                publications += self._request(number, pair, now)
+            else:
+                if now < pair.paused_until:  # not silent either
+                    pair.last_heard = now
+                if due:  # of a paused plant it keeps it for this run
+                    publications += self._request(pair, now)
         return publications + self._begin_episodes(now)
 
     def resend(self, now: float) -> list[PairPublication]:
         """Everything that is under way, once more."""
-        busy = [(number, pair) for number, pair in enumerate(self.pairs) if pair.chunk]
-        return [message for number, pair in busy for message in self._request(number, pair, now)]
+        busy = [pair for pair in self.pairs if pair.chunk]
+        return [message for pair in busy for message in self._request(pair, now)]
 
     def result(self) -> BatchResult | None:
         """The batch's result once every row has one, in the batch's order."""
@@ -358,8 +328,8 @@ class Dispatcher:
     def missing(self) -> list[str]:
         """Which nodes are not on the network, in words."""
         return [
-            f"{node} of pair {number}" if len(self.pairs) > 1 else node
-            for number, pair in enumerate(self.pairs)
+            f"{node} of pair {pair.number}" if len(self.pairs) > 1 else node
+            for pair in self.pairs
             for node in pair.missing
         ]
 
@@ -367,75 +337,37 @@ class Dispatcher:
         return [pair for pair in self.pairs if not pair.missing]
 
     def _answering(self, pair: int, frame: Frame, topic: Topic) -> Pair | None:
-        """The pair, if this answers its episode.
-
-        Raises DispatchError if that was answered already, and otherwise: then it is chance which
-        answer was taken.
-        """
+        """The pair, if this answers its episode; a DispatchError if it contradicts another answer."""
         known = self.pairs[pair]
         if frame.run != self.run:
             self.counters["answers of another run"] += 1
             return None
-        taken = known.answers.get(topic.name, {}).get(frame.episode)
-        void = topic is topics.COST and bool((frame.values[:, -1:] == VOID).any())
-        same_plant = self.plant in (UNKNOWN_PLANT, frame.plant)
-        if taken is not None and same_plant and not void and digest(frame.values) != taken:
-            raise DispatchError(
-                f"two different messages on {topic.name} answer episode {frame.episode}; expected one "
-                "plant and one controller in this namespace: stop the other and start a new run"
-            )
-        used = known.chunk is None or frame.episode != known.episode
-        if taken is not None and same_plant and void and used and not self.paused:
-            raise DispatchError(
-                f"the plant took back the cost of episode {frame.episode}, which this run has used, "
-                "because different actions came for one step: stop the second controller and start "
-                "a new run"
-            )
-        if known.chunk is None or frame.episode != known.episode:
+        if self.plant not in (UNKNOWN_PLANT, frame.plant):
+            under_way = known.chunk is not None and frame.episode == known.episode
+        else:
+            under_way = known.awaits(frame, topic.name, paused=self.paused)
+        if not under_way:
             self.counters["answers of another episode"] += 1
             return None
         return known
 
-    def _is_sample(self, pair: Pair, frame: Frame, width: int) -> bool:
-        """Whether this is a sample of the pair's episode; a FrameError if it has another shape."""
-        if pair.chunk is None or (frame.run, frame.episode) != (self.run, pair.episode):
-            return False
-        expected = (pair.chunk.size, width)
-        if frame.values.shape != expected:
-            raise FrameError(
-                f"expected a sample of shape {expected} for step {frame.step}, "
-                f"got {frame.values.shape}"
-            )
-        return True
-
-    def _release_if_done(self, pair: Pair) -> None:
-        assert self._batch is not None
-        if pair.chunk is not None and pair.chunk.done(self._batch):
-            pair.chunk = None
-
     def _collect(self, pair: Pair) -> None:
-        """Take the episode's trajectories, if all samples and the target are there."""
-        cost, chunk = pair.pending_cost, pair.chunk
-        assert cost is not None and chunk is not None
+        """Take the trajectories of a pair's episode, if all samples and the target are there."""
+        assert pair.pending_cost is not None
         if pair.samples.contradiction:
             self._retry(pair, pair.samples.contradiction)
             return
-        target = self._targets.get(cost.plant)
-        if target is not None and not pair.samples.lost(cost.plant, cost.step, len(target)):
-            ended = cost.values[:, CostColumn.ENDED]
-            chunk.trajectories = pair.samples.trajectories(cost.plant, cost.step, ended)
-            pair.pending_cost = None
+        target = self._targets.get(pair.pending_cost.plant)
+        if target is not None and not pair.lost_samples(len(target)):
+            pair.take_trajectories()
 
     def _retry(self, pair: Pair, reason: str) -> None:
-        chunk = pair.chunk
-        assert chunk is not None
+        chunk = pair.drop()
         self.notes.append(f"{reason}; starting it again with the same seeds")
         self.counters["episodes repeated"] += 1
         chunk.attempts += 1
         if chunk.attempts >= self.max_attempts:
             raise DispatchError(f"gave up after {chunk.attempts} attempts: {reason}")
-        chunk.clear()
-        pair.chunk = pair.pending_cost = None
         self._waiting.append(chunk)
 
     def _begin_episodes(self, now: float) -> list[PairPublication]:
@@ -449,44 +381,34 @@ class Dispatcher:
         if self.paused:
             return publications
         others = any(now >= pair.paused_until for pair in self._present())
-        for number, pair in enumerate(self.pairs):
+        for pair in self.pairs:
             if pair.chunk is not None or pair.missing or (others and now < pair.paused_until):
                 continue
             if not self._waiting:
                 self._reclaim_from_absent()
             if self._waiting:
-                publications += self._begin(number, pair, self._waiting.pop(0), now)
+                self._issued += 1
+                episode = self.incarnation * EPISODES_PER_INCARNATION + self._issued
+                pair.begin(self._waiting.pop(0), self.run, episode, now)
+                publications += self._request(pair, now, again=False)
         return publications
 
     def _reclaim_from_absent(self) -> None:
         """Take an absent pair's episode back, for a pair that is free to run it."""
-        for number, pair in enumerate(self.pairs):
+        for pair in self.pairs:
             if pair.missing and pair.chunk is not None:
                 self.notes.append(
-                    f"pair {number} lost its {' and '.join(pair.missing)} in episode "
+                    f"pair {pair.number} lost its {' and '.join(pair.missing)} in episode "
                     f"{pair.episode}; another pair starts it again with the same seeds"
                 )
                 self.counters["episodes taken over"] += 1
-                pair.chunk.clear()
-                self._waiting.append(pair.chunk)
-                pair.chunk = pair.pending_cost = None
+                self._waiting.append(pair.drop())
                 return
 
-    def _begin(self, number: int, pair: Pair, chunk: Chunk, now: float) -> list[PairPublication]:
-        self._issued += 1
-        pair.chunk, pair.last_heard = chunk, now
-        pair.episode = self.incarnation * EPISODES_PER_INCARNATION + self._issued
-        pair.former_samples = pair.samples
-        pair.samples = TrajectoryCollector(self.run, pair.episode)
-        return self._request(number, pair, now, again=False)
-
-    def _request(
-        self, number: int, pair: Pair, now: float, *, again: bool = True
-    ) -> list[PairPublication]:
+    def _request(self, pair: Pair, now: float, *, again: bool = True) -> list[PairPublication]:
         chunk = pair.chunk
         assert self._batch is not None and chunk is not None
         pair.last_sent = now
-
         generation = self._models.step if self._models is not None else 0
 
         def frame(values: Array, plant: int = 0) -> Frame:
@@ -503,6 +425,6 @@ class Dispatcher:
             sends.append(Publication(topics.POLICY, frame(policies)))
             signed += [policies, self._models_digest]
         start = Publication(topics.START, frame(rows, digest_of(*signed)))
-        pair.begin(start)
+        pair.started(start)
         sends.append(start)
-        return [(number, send) for send in sends]
+        return [(pair.number, send) for send in sends]

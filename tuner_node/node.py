@@ -33,8 +33,8 @@ from loop_interfaces.ros.suspend_watchdog import sleep_for
 from tuner_node import narration
 from tuner_node.build import build_dispatcher, build_training
 from tuner_node.diagnostics import TunerDiagnostics
-from tuner_node.dispatch import DispatchError, PairPublication
 from tuner_node.narration import Narration
+from tuner_node.pair import DispatchError, PairPublication
 from tuner_node.participants import Participants, Publishers
 from tuner_node.results import summarise
 from tuner_node.run_store import open_run

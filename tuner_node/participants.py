@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from loop_interfaces.diagnostics import ConditionTimer
-from tuner_node.dispatch import DispatchError, PairPublication
+from tuner_node.pair import DispatchError, PairPublication
 from tuner_node.session import Session
 
 SECOND_TUNER_GRACE = 6.0

@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from tuner_node.dispatch import Dispatcher, DispatchError, PairPublication
+from tuner_node.dispatch import Dispatcher
+from tuner_node.pair import DispatchError, PairPublication
 from tuner_node.training import Training
 
 Report = Callable[[Mapping[str, Any]], None]

@@ -28,21 +28,15 @@ class TrajectoryCollector:
     """Why the episode cannot be used, if two different samples came for one step."""
     used: bool = False
     """Whether the trajectories were taken: what comes now is only compared."""
-    _states: dict[tuple[int, int], Array] = field(default_factory=dict)
-    _actions: dict[tuple[int, int], Array] = field(default_factory=dict)
+    _samples: dict[str, dict[tuple[int, int], Array]] = field(
+        default_factory=lambda: {"states": {}, "actions": {}}
+    )
 
-    def state(self, frame: Frame) -> None:
-        """Take z_k; repeated ones are equal."""
-        self._take(self._states, frame, "states")
-
-    def action(self, frame: Frame) -> None:
-        """Take a_k."""
-        self._take(self._actions, frame, "actions")
-
-    def _take(self, known: dict[tuple[int, int], Array], frame: Frame, what: str) -> None:
+    def take(self, what: str, frame: Frame) -> None:
+        """Take a sample z_k ("states") or a_k ("actions"); repeated ones are equal."""
         if (frame.run, frame.episode) != (self.run, self.episode):
             return
-        key = frame.plant, frame.step
+        known, key = self._samples[what], (frame.plant, frame.step)
         if key not in known:
             if not self.used:
                 known[key] = frame.values.copy()
@@ -55,9 +49,9 @@ class TrajectoryCollector:
         """How many of the samples z_0..z_T, of n_z numbers each, and a_0..a_{T-1} are missing."""
         states: int = sum(
             p == plant and k <= steps and values.shape[1] == n_z
-            for (p, k), values in self._states.items()
+            for (p, k), values in self._samples["states"].items()
         )
-        actions = sum(p == plant and k < steps for p, k in self._actions)
+        actions = sum(p == plant and k < steps for p, k in self._samples["actions"])
         return 2 * steps + 1 - states - actions
 
     def trajectories(self, plant: int, steps: int, ended: Array) -> list[Trajectory]:
@@ -66,8 +60,8 @@ class TrajectoryCollector:
         ended (M,): as in CostColumn.ENDED. Only when `lost` says that nothing is missing.
         """
         self.used = True
-        states = np.stack([self._states[plant, k] for k in range(steps + 1)])
-        actions = np.stack([self._actions[plant, k] for k in range(steps)])
+        states = np.stack([self._samples["states"][plant, k] for k in range(steps + 1)])
+        actions = np.stack([self._samples["actions"][plant, k] for k in range(steps)])
         return cut(states, actions, ended)
 
 

@@ -12,7 +12,7 @@ from tests.simulation.history import History
 from tests.simulation.plan import Plan, draw
 from tests.simulation.processes import remembering, values
 from tests.small import same_bits, train_here
-from tuner_node.dispatch import DispatchError
+from tuner_node.pair import DispatchError
 from tuner_node.training import Training
 
 GAVE_UP = "gave up after"

@@ -1,0 +1,193 @@
+"""A pair of plant and controller as the dispatcher knows it, and what contradicts that. Pure."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loop_interfaces.frames import Frame, FrameError, digest
+from loop_interfaces.protocol import Publication
+from loop_interfaces.topics import COST, VOID, CostColumn
+from tuner_node.batch import Batch
+from tuner_node.optimizers import Trajectory
+from tuner_node.trajectory_collector import TrajectoryCollector
+
+Array = NDArray[np.float64]
+PairPublication = tuple[int, Publication]
+"""(pair, message): publish the message in that pair's namespace."""
+REMEMBERED = 16
+"""Episodes of a pair whose answers can still be contradicted."""
+
+
+FOREIGN_PLANT_GRACE = 20.0
+"""Seconds with costs of another plant only, after which the run stops."""
+
+
+class DispatchError(RuntimeError):
+    """An episode that cannot be run: attempts used up, or a model that cannot be designed."""
+
+
+@dataclass
+class Chunk:
+    """A part of the batch: `rows` of it, how often they were started, and their results."""
+
+    rows: slice
+    attempts: int = 0
+    costs: Array | None = None
+    models: Array | None = None
+    trajectories: list[Trajectory] | None = None
+
+    @property
+    def size(self) -> int:
+        """How many rows it has."""
+        return int(self.rows.stop - self.rows.start)
+
+    def done(self, batch: Batch) -> bool:
+        """Whether all results are there that the batch asks for."""
+        return (
+            self.costs is not None
+            and (self.models is not None or not batch.exploratory)
+            and (self.trajectories is not None or not batch.trajectories)
+        )
+
+    def clear(self) -> None:
+        """Forget the results."""
+        self.costs = self.models = self.trajectories = None
+
+
+@dataclass
+class Pair:
+    """One plant and its controller: what they work on, and whether they are there."""
+
+    number: int
+    missing: tuple[str, ...] = ("plant", "controller")
+    chunk: Chunk | None = None
+    """What it works on; None while it is free."""
+    run: int = -1
+    episode: int = -1
+    last_heard: float = 0.0
+    last_sent: float = 0.0
+    samples: TrajectoryCollector = field(default_factory=TrajectoryCollector)
+    former_samples: TrajectoryCollector = field(default_factory=TrajectoryCollector)
+    """Of the episode before: one that comes late can still contradict them."""
+    pending_cost: Frame | None = None
+    """The cost of the episode, while the last samples of its trajectories are missing."""
+    pending_since: float = 0.0
+    foreign_since: float = math.inf
+    """Since when only another plant's costs come."""
+    paused_until: float = -math.inf
+    """How long the plant's report that it is paused holds."""
+    answers: dict[tuple[str, int], int] = field(default_factory=dict)
+    """By topic and episode: a digest of the answer that was taken."""
+    signed: dict[int, int] = field(default_factory=dict)
+    """D of the last episodes, see loop_interfaces.signature."""
+    last_start: Publication | None = None
+    """Sent again while nothing new is begun, to keep the plant for this run."""
+
+    def begin(self, chunk: Chunk, run: int, episode: int, now: float) -> None:
+        """It works on a chunk from now on."""
+        self.chunk, self.run, self.episode, self.last_heard = chunk, run, episode, now
+        self.former_samples, self.samples = self.samples, TrajectoryCollector(run, episode)
+
+    def drop(self) -> Chunk:
+        """It does not work on its chunk any more, whose results are forgotten."""
+        chunk = self.chunk
+        assert chunk is not None
+        chunk.clear()
+        self.chunk = self.pending_cost = None
+        return chunk
+
+    def release_if_done(self, batch: Batch) -> None:
+        """It is free if its chunk has all results."""
+        if self.chunk is not None and self.chunk.done(batch):
+            self.chunk = None
+
+    def started(self, start: Publication) -> None:
+        """A start is published."""
+        self.last_start = start
+        self.signed[start.frame.episode] = start.frame.plant
+        if len(self.signed) > REMEMBERED:
+            oldest = min(self.signed)
+            del self.signed[oldest]
+            self.answers = {key: known for key, known in self.answers.items() if key[1] > oldest}
+
+    def take_answer(self, topic: str, answer: Frame) -> None:
+        """An answer is used: another one for its episode contradicts it."""
+        self.answers[topic, answer.episode] = digest(answer.values)
+
+    def awaits(self, answer: Frame, topic: str, *, paused: bool) -> bool:
+        """Whether this answers the episode under way.
+
+        Raises
+        ------
+        DispatchError
+            Its episode was answered already, and otherwise: then it is chance which answer was taken.
+        """
+        under_way = self.chunk is not None and answer.episode == self.episode
+        taken = self.answers.get((topic, answer.episode))
+        void = topic == COST.name and bool((answer.values[:, -1:] == VOID).any())
+        if taken is not None and not void and digest(answer.values) != taken:
+            raise DispatchError(
+                f"two different messages on {topic} answer episode {answer.episode}; expected one "
+                "plant and one controller in this namespace: stop the other and start a new run"
+            )
+        if taken is not None and void and not under_way and not paused:
+            raise DispatchError(
+                f"the plant took back the cost of episode {answer.episode}, which this run has used, "
+                "because different actions came for one step: stop the second controller and start "
+                "a new run"
+            )
+        return under_way
+
+    def check_plant(self, cost: Frame, plant: int, now: float) -> None:
+        """A FrameError unless a cost is of this plant; a DispatchError after FOREIGN_PLANT_GRACE."""
+        self.foreign_since = min(self.foreign_since, now) if cost.plant != plant else math.inf
+        if now - self.foreign_since > FOREIGN_PLANT_GRACE:
+            raise DispatchError(
+                f"the plant has other parameters (fingerprint {cost.plant}) than the one this "
+                f"run began with ({plant}); continue it with that one, or start a new run"
+            )
+        if cost.plant != plant:
+            raise FrameError(
+                f"the cost of episode {cost.episode} comes from a plant with other parameters "
+                f"(fingerprint {cost.plant}) than this run's ({plant}); stop that plant"
+            )
+
+    def sample(self, what: str, frame: Frame, width: int) -> None:
+        """Take a sample of its episode: "states" or "actions", of so many numbers.
+
+        Raises
+        ------
+        FrameError
+            It has another shape.
+        """
+        for late in self.used_samples():
+            late.take(what, frame)
+        if self.chunk is None or (frame.run, frame.episode) != (self.run, self.episode):
+            return
+        if frame.values.shape != (expected := (self.chunk.size, width)):
+            raise FrameError(
+                f"expected a sample of shape {expected} for step {frame.step}, "
+                f"got {frame.values.shape}"
+            )
+        self.samples.take(what, frame)
+
+    def used_samples(self) -> list[TrajectoryCollector]:
+        """Of the last two episodes, if they were used."""
+        return [known for known in (self.samples, self.former_samples) if known.used]
+
+    def lost_samples(self, n_z: int) -> int:
+        """How many samples of the episode that has its cost are missing."""
+        cost = self.pending_cost
+        return self.samples.lost(cost.plant, cost.step, n_z) if cost is not None else 0
+
+    def take_trajectories(self) -> None:
+        """The samples are all there: they become trajectories of the chunk."""
+        cost, chunk = self.pending_cost, self.chunk
+        assert cost is not None and chunk is not None
+        ended = cost.values[:, CostColumn.ENDED]
+        chunk.trajectories = self.samples.trajectories(cost.plant, cost.step, ended)
+        self.pending_cost = None
