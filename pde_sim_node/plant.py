@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from loop_interfaces.jit.native import compilations
+from loop_interfaces.topics import COMPLETED
 from pde_sim_node.equations import Equation, LinearEquation
 from pde_sim_node.solver.exact import exact_step
 from pde_sim_node.solver.kernel import etdrk4_step
@@ -40,6 +41,11 @@ class EpisodeCosts:
     mean: NDArray[np.float64]
     total: NDArray[np.float64]
     diverged_step: NDArray[np.int64]
+
+    def rows(self) -> NDArray[np.float64]:
+        """As `episode/cost` has them, (M, 3), see CostColumn."""
+        ended = np.where(self.diverged_step >= 0, self.diverged_step, COMPLETED)
+        return np.column_stack([self.mean, self.total, ended.astype(np.float64)])
 
 
 class Plant:

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from controller_node.identification import DesignSettings, design
 from controller_node.policy import ProjectedLaw, excitation
 from loop_interfaces import model_rows
-from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn, noise_seeds
+from loop_interfaces.topics import CostColumn, StartColumn, noise_seeds
 from pde_sim_node.build import build_plant, fingerprint
-from pde_sim_node.plant import EpisodeCosts, Plant
+from pde_sim_node.plant import Plant
 from pdeloop.episode import EpisodeRecord, Law, rollout
 from tuner_node.batch import Batch, BatchResult
 from tuner_node.training import Training
@@ -85,7 +85,7 @@ class LocalPair:
 
     def _episode(self, batch: Batch) -> BatchResult:
         episode = self.roll_out(batch)
-        table, seen = cost_table(episode.costs), None
+        table, seen = episode.costs.rows(), None
         if batch.trajectories:
             seen = cut(episode.states, episode.actions, table[:, CostColumn.ENDED])
         if not batch.exploratory:
@@ -110,12 +110,6 @@ class LocalPair:
         columns = batch.rows[:, [StartColumn.EXCITATION, StartColumn.VARIANCE]]
         drawn = [(int(seed), float(variance)) for seed, variance in columns]
         return lambda k, states: np.stack([excitation(s, k, n_a, v, limit) for s, v in drawn])
-
-
-def cost_table(costs: EpisodeCosts) -> Array:
-    """The costs of M environments as `episode/cost` has them: mean, total, ended, (M, 3)."""
-    ended = np.where(costs.diverged_step >= 0, costs.diverged_step, COMPLETED)
-    return np.column_stack([costs.mean, costs.total, ended.astype(np.float64)])
 
 
 def train(

@@ -75,7 +75,7 @@ class RunFolder:
         self.path = path
         self.checkpoint = path / "checkpoint"
 
-    def create(self, parameters: Mapping[str, Any]) -> RunIdentity:
+    def create(self, parameters: Mapping[str, Any]) -> None:
         """Begin a new training here. RunFolderError if the folder holds one or cannot be written."""
         if (self.path / "parameters.yaml").exists():
             raise RunFolderError(
@@ -86,11 +86,9 @@ class RunFolder:
             make_folder(self.path)
             kept = {k: v for k, v in parameters.items() if k not in ("out", "resume")}
             # parameters.yaml comes last and whole: where it is, there is a run.
-            identity = RunIdentity(1 + secrets.randbelow(MAX_ID - 1), 0)
-            self._identify(identity, parameters)
+            self._identify(RunIdentity(1 + secrets.randbelow(MAX_ID - 1), 0), parameters)
             text = yaml_text(kept, "resolved parameters of this run")
             write_atomically(self.path / "parameters.yaml", text.encode())
-            return identity
         except OSError as error:
             raise RunFolderError(f"cannot write to {self.path}: {error.strerror}") from error
 
@@ -111,7 +109,7 @@ class RunFolder:
             LookupError,
             TypeError,
             ValueError,
-            OverflowError,
+            ArithmeticError,
             AttributeError,
         ) as error:
             raise RunFolderError(f"{self.path}/run.json cannot be used: {error}") from error

@@ -29,8 +29,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-__all__ = ["ConvolutionModel", "fit_convolutions"]
-
 Array = NDArray[np.float64]
 
 # Of the inputs and the constant, on the scaled variables.

@@ -27,8 +27,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["DifferentialModel", "fit_differential"]
-
 Array = NDArray[np.float64]
 Spectrum = NDArray[np.complex128]
 

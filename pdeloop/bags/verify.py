@@ -26,7 +26,7 @@ from pde_sim_node.build import fingerprint
 from pdeloop.bags.episodes import RecordedEpisode
 from pdeloop.bags.reader import bags_of
 from pdeloop.episode import rollout
-from pdeloop.in_process import LocalPair, cost_table
+from pdeloop.in_process import LocalPair
 from tuner_node.batch import Batch
 from tuner_node.build import build_training
 
@@ -254,7 +254,7 @@ class _Run:
                 text = f"{name}_{k + first} of {where}"
                 if not report.compare(what, text, recorded[k], computed[k]):
                     break
-        costs = cost_table(again.costs)
+        costs = again.costs.rows()
         report.compare("costs", f"cost of {where}", episode.cost.values, costs)
         if episode.model is not None and (costs[:, CostColumn.ENDED] == COMPLETED).all():
             assert self._values is not None

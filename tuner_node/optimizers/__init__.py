@@ -2,35 +2,16 @@
 
 from collections.abc import Callable
 
-from tuner_node.optimizers.base import (
-    Context,
-    Measured,
-    Optimizer,
-    Rollout,
-    RolloutResult,
-    Row,
-    State,
-    Trajectory,
-)
-from tuner_node.optimizers.directions import Directions
-from tuner_node.optimizers.gauss_newton import GaussNewton
-from tuner_node.optimizers.two_point import TwoPoint
-
-__all__ = [
-    "NEED_TRAJECTORIES",
-    "OPTIMIZERS",
-    "Context",
-    "Directions",
-    "GaussNewton",
-    "Measured",
-    "Optimizer",
-    "Rollout",
-    "RolloutResult",
-    "Row",
-    "State",
-    "Trajectory",
-    "TwoPoint",
-]
+from tuner_node.optimizers.base import Context as Context
+from tuner_node.optimizers.base import Measured as Measured
+from tuner_node.optimizers.base import Optimizer as Optimizer
+from tuner_node.optimizers.base import Rollout as Rollout
+from tuner_node.optimizers.base import RolloutResult as RolloutResult
+from tuner_node.optimizers.base import State as State
+from tuner_node.optimizers.base import Trajectory as Trajectory
+from tuner_node.optimizers.directions import Directions as Directions
+from tuner_node.optimizers.gauss_newton import GaussNewton as GaussNewton
+from tuner_node.optimizers.two_point import TwoPoint as TwoPoint
 
 # The names that parameters and the command line use.
 OPTIMIZERS: dict[str, Callable[..., Optimizer]] = {

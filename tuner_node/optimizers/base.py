@@ -18,17 +18,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = [
-    "Context",
-    "Measured",
-    "Optimizer",
-    "Rollout",
-    "RolloutResult",
-    "Row",
-    "State",
-    "Trajectory",
-]
-
 Array = NDArray[np.float64]
 Row = dict[str, float | int | bool | str]
 State = dict[str, NDArray[np.generic]]

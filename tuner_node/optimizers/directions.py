@@ -26,8 +26,6 @@ from numpy.typing import ArrayLike, NDArray
 from tuner_node.optimizers.base import Array, State, checked_policy
 from tuner_node.optimizers.zeroth_order import ZerothOrder
 
-__all__ = ["Directions"]
-
 # Initial fields differ in cost, so near 1 a good iterate is undone by an unlucky field.
 _TOLERANCE = 1.5
 

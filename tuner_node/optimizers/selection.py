@@ -22,8 +22,6 @@ from tuner_node.optimizers.base import Array
 from tuner_node.optimizers.fit import LocalModel
 from tuner_node.optimizers.sensitivity import Path, predict_difference
 
-__all__ = ["KAPPAS", "LOCAL", "RIDGES", "Pair", "choices", "mismatches"]
-
 # Ridges of the quadratic part.
 RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
 # Forgetting over an episode: gamma = exp(-kappa / T).

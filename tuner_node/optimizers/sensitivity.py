@@ -33,8 +33,6 @@ from scipy import linalg
 
 from tuner_node.optimizers.fit import LocalModel
 
-__all__ = ["ISOTROPY", "Expansion", "Path", "damped_step", "expand", "predict_difference"]
-
 Array = NDArray[np.float64]
 
 # Share of the trust region that bounds all gains alike, relative to the one in input energy.

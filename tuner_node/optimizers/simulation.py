@@ -28,8 +28,6 @@ from loop_interfaces.field_models import FieldModel
 from tuner_node.optimizers.base import Array
 from tuner_node.optimizers.sensitivity import ISOTROPY, Path, expand
 
-__all__ = ["Improvement", "Loop", "Simulation", "improve", "mismatch"]
-
 # Inner steps, and the share of the objective below which a further one is not worth its time.
 _STEPS = 10
 _LEAST_GAIN = 1e-3

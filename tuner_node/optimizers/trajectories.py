@@ -11,9 +11,6 @@ from numpy.typing import NDArray
 
 from tuner_node.optimizers.base import Array, RolloutResult, State
 
-__all__ = ["Record", "Records", "denoised"]
-
-
 GROWING = (
     *("record_stamps", "record_costs", "record_policies", "record_lengths"),
     *("record_states", "record_actions"),

@@ -14,8 +14,6 @@ from numpy.typing import ArrayLike
 from tuner_node.optimizers.base import RolloutResult, Row
 from tuner_node.optimizers.zeroth_order import ZerothOrder
 
-__all__ = ["TwoPoint"]
-
 
 class TwoPoint(ZerothOrder):
     """`ZerothOrder` along one direction; its policy is the last one, as in the paper.

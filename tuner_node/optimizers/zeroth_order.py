@@ -30,8 +30,6 @@ from tuner_node.optimizers.base import (
     require_state,
 )
 
-__all__ = ["ZerothOrder"]
-
 
 class ZerothOrder:
     """What the optimisers that learn from costs have in common.
