@@ -1,6 +1,4 @@
-"""A reduced linear model of the plant from exploratory trajectories, by DMD with control (DMDc).
-
-    z_{k+1} = f(z_k, a_k)    is approximated on s = U^T z by    s_{k+1} = A s_k + B a_k
+"""A reduced linear model of the plant (`reduced_model`) by DMD with control (DMDc).
 
 With Z = [z_0 .. z_{N-1}], Z' = [z_1 .. z_N] and Y = [a_0 .. a_{N-1}] (one column per step), the
 p-truncated SVD [Z; Y] ~ Psi Xi Lambda^T and the n_s-truncated SVD Z' ~ U Gamma V^T give

@@ -111,13 +111,11 @@ def design(
         n_s=own or settings.reduced_order,
         p=settings.dmdc_rank,
     )
-    gains = lqt.track(
-        model, state_weight=settings.state_weight, action_weight=settings.action_weight
-    )
+    weights = {"state_weight": settings.state_weight, "action_weight": settings.action_weight}
+    gains = lqt.track(model, **weights)
     s_r = ProjectedLaw([model.U], target).reduced_targets[0]
     rows = ModelRows(A=model.A, B=model.B, U=model.U, K_a=gains.K_a, K_b=gains.K_b, s_r=s_r)
     if settings.identification != "field":
         return rows
-    weights = {"state_weight": settings.state_weight, "action_weight": settings.action_weight}
     with threadpool_limits(limits=1):  # as in the identification itself
         return field_law(trajectories, target, rows, **weights) or rows

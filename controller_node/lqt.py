@@ -123,8 +123,8 @@ def track(model: ReducedModel, *, state_weight: float, action_weight: float) -> 
         except (linalg.LinAlgError, ValueError) as error:
             raise DesignError(
                 f"the Riccati equation of the reduced model has no stabilising solution ({error}); "
-                f"its spectral radius is {_spectral_radius(A):.6g}, so identify with another seed "
-                "or another n_s."
+                f"its spectral radius is {np.abs(linalg.eigvals(A)).max():.6g}, so identify with "
+                "another seed or another n_s."
             ) from error
         S = R + B.T @ P @ B
         K_a = -linalg.solve(S, B.T @ P @ A, assume_a="pos")
@@ -139,10 +139,6 @@ def track(model: ReducedModel, *, state_weight: float, action_weight: float) -> 
             )
         K_b = linalg.solve(S, B.T @ _steady_state_map(closed_loop) @ Q, assume_a="pos")
     return Gains(K_a=K_a, K_b=K_b, P=P, poles=poles)
-
-
-def _spectral_radius(matrix: Array) -> float:
-    return float(np.abs(linalg.eigvals(matrix)).max())
 
 
 def _require_stabilisable(A: Array, B: Array) -> None:
@@ -166,10 +162,7 @@ def _require_stabilisable(A: Array, B: Array) -> None:
 def _steady_state_map(closed_loop: Array) -> Array:
     """(I - (A + B K_a)^T)^{-1}."""
     matrix = np.eye(len(closed_loop)) - closed_loop.T
-    singular_values = linalg.svdvals(matrix)
-    reciprocal = (
-        float(singular_values[-1] / singular_values[0]) if singular_values[0] > 0.0 else 0.0
-    )
+    reciprocal = 1.0 / float(np.linalg.cond(matrix))
     if reciprocal < _RECIPROCAL_CONDITION:
         raise DesignError(
             f"I - (A + B K_a)^T is singular (reciprocal condition number {reciprocal:.1e}): the "

@@ -2,10 +2,7 @@
 
     a = K_a U^T z + K_b U^T z_r,        policy = [K_a K_b], shape (n_a, 2 n_s)
 
-saturated at +- action_limit if there is one.
-
-An environment's action does not depend on how many environments are in the batch, nor on its place
-in it, to the last bit: see `controller_node.law`.
+saturated at +- action_limit if there is one. It is computed by `controller_node.law`.
 """
 
 from __future__ import annotations

@@ -91,7 +91,11 @@ class _Run:
 
 
 class Responder:
-    """One controller. It answers whichever run the plant serves; runs never share anything."""
+    """One controller. It answers whichever run the plant serves; runs never share anything.
+
+    Every event returns what is to be published: above all the answer to a state, also to one that
+    waited for what the event brings. A FrameError, or another ValueError, refuses a message.
+    """
 
     def __init__(self, settings: DesignSettings) -> None:
         self._settings = settings
@@ -129,7 +133,7 @@ class Responder:
         return run is not None and run.exploration is not None
 
     def target(self, frame: Frame) -> list[Publication]:
-        """Take the target z_r of a plant, (n_z,); returns the answer to a state that waited for it."""
+        """Take the target z_r of a plant, (n_z,)."""
         self._targets[frame.plant] = frame.values.copy()
         _forget(self._targets, frame.plant, self._served[1])
         for run in self._runs.values():
@@ -139,10 +143,7 @@ class Responder:
     def start(self, frame: Frame) -> Sequence[Publication | ModelFailure]:
         """Take the start of an episode: whether it explores, and which model each environment uses.
 
-        Returns
-        -------
-        sequence of Publication or ModelFailure
-            The answer to a state that waited for it, or again what came out of an exploration.
+        Repeated, it is answered with what came out of an exploration.
 
         Raises
         ------
@@ -165,11 +166,6 @@ class Responder:
 
     def policy(self, frame: Frame) -> list[Publication]:
         """Take the policies [K_a K_b] of an episode's environments, (M, n_a, 2 n_s).
-
-        Returns
-        -------
-        list of Publication
-            The answer to a state that waited for them.
 
         Raises
         ------
@@ -197,13 +193,7 @@ class Responder:
         return self._answer_pending()
 
     def model(self, frame: Frame) -> list[Publication]:
-        """Take a run's reduced models, as in model_rows; returns the answer to a state that waited.
-
-        Raises
-        ------
-        ValueError
-            Their rows leave no room for U.
-        """
+        """Take a run's reduced models, as in model_rows. ValueError if they leave no room for U."""
         run = self._run(frame.run, 2 * frame.values.nbytes)
         run.models = [model_rows.unpack(rows.copy(), self._settings.n_a) for rows in frame.values]
         run.models_digest = digest_of(frame.values)
@@ -211,12 +201,8 @@ class Responder:
         return self._answer_pending()
 
     def state(self, frame: Frame) -> list[Publication]:
-        """Answer the states of an episode's environments, (M, n_z).
-
-        Returns
-        -------
-        list of Publication
-            The action; none while something is missing that it needs: then the state is kept.
+        """Answer the states of an episode's environments, (M, n_z); or keep them, if something that the
+        answer needs has not come yet.
 
         Raises
         ------
@@ -235,13 +221,10 @@ class Responder:
             assert exploration is not None
             self._keep_sample(exploration, frame)
             actions = exploration.actions(frame.step)
-        self._pending = None
-        self._served = (frame.run, frame.plant)
-        self.episode = frame.episode
+        self._pending, self._served, self.episode = None, (frame.run, frame.plant), frame.episode
         self.advance_counters(1, frame.step)
         time = answering.signature or frame.time
-        answer = Frame(frame.run, frame.episode, frame.step, time, actions, frame.plant)
-        return [Publication(ACTION, answer)]
+        return [Publication(ACTION, replace(frame, time=time, values=actions))]
 
     def advance_counters(self, answers: int, step: int) -> None:
         """Account for states of the present episode, up to `step`, that were answered."""
@@ -264,12 +247,7 @@ class Responder:
         return known if same else None
 
     def cost(self, frame: Frame) -> list[Publication | ModelFailure]:
-        """At the end of an exploratory episode: reduce and design.
-
-        Returns
-        -------
-        list of Publication or ModelFailure
-            The models, or why there are none; empty after any other episode.
+        """Take the end of an episode; of an exploratory one give the models, or why there are none.
 
         Raises
         ------
@@ -293,9 +271,8 @@ class Responder:
         if frame.plant not in outcomes and len(outcomes) < MAX_RUNS:
             found = run.exploration.identify(frame, self._targets.get(frame.plant))
             outcomes[frame.plant] = found
-            failed = isinstance(found, ModelFailure)
             self.failure = found.reason if isinstance(found, ModelFailure) else ""
-            self.counters["identifications failed" if failed else "models identified"] += 1
+            self.counters["identifications failed" if self.failure else "models identified"] += 1
         return [outcomes[frame.plant]] if frame.plant in outcomes else []
 
     def waits_for(self) -> list[str]:
@@ -338,12 +315,12 @@ class Responder:
             return
         if self._has_room(state.run, state.values.nbytes):
             exploration.keep(state)
-            return
-        reason = (
-            f"the states of the exploratory episode take more than {MAX_BYTES} bytes; "
-            "explore fewer seeds at once (max_batch)"
-        )
-        exploration.give_up(reason, retry=False)
+        else:
+            exploration.give_up(
+                f"the states of the exploratory episode take more than {MAX_BYTES} bytes; "
+                "explore fewer seeds at once (max_batch)",
+                retry=False,
+            )
 
     def _answering(self, frame: Frame) -> Answering | None:
         """What answers a state; None while something has not arrived yet."""

@@ -1,17 +1,7 @@
 """The time step in plain NumPy: what the compiled one of `kernel` computes, to be read.
 
-With v the real FFT of the state, N(v) = m F[g(u)] + F_a the nonlinear part on the dealiased grid with
-the forcing of the held action, and the coefficients of `etdrk4`, one internal step is
-
-    a = E2 v + Q N(v)
-    b = E2 v + Q N(a)
-    c = E2 a + Q (2 N(b) - N(v))
-    v' = E v + f1 N(v) + 2 f2 (N(a) + N(b)) + f3 N(c).
-
-References
-----------
-Cox, Matthews, "Exponential time differencing for stiff systems", J. Comput. Phys. 176, 2002.
-Kassam, Trefethen, "Fourth-order time-stepping for stiff PDEs", SIAM J. Sci. Comput. 26, 2005.
+It is the step of `etdrk4` (equations and sources there) for the real FFT v of the state, with the
+nonlinear part on the dealiased grid and the forcing of the held action, N(v) = m F[g(u)] + F_a.
 """
 
 from __future__ import annotations
