@@ -1,7 +1,5 @@
 """How the controller is, as its /diagnostics show it. Pure."""
 
-from __future__ import annotations
-
 from controller_node.responder import Responder
 from loop_interfaces.diagnostics import ConditionTimer, Level, Rate, Status
 

@@ -15,8 +15,6 @@ Proctor, Brunton, Kutz, "Dynamic Mode Decomposition with Control", SIAM J. Appl.
 2016.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

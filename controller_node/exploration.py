@@ -1,7 +1,5 @@
 """An exploratory episode: its random actions, its states, and the model from them. Pure."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, replace
 
 import numpy as np

@@ -3,8 +3,6 @@
 It answers the states of an episode that a law answers as `responder` does, to the bit.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -20,8 +20,6 @@ arXiv:2403.01005.
 Anderson, Moore, "Optimal Control: Linear Quadratic Methods", chapter 4.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

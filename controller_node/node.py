@@ -6,8 +6,6 @@ Publishes   action, model/identified, model/failed
 Messages, order and parameters: docs/interfaces.md. The protocol is controller_node.responder.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial

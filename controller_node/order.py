@@ -16,8 +16,6 @@ References
 Ljung, "System Identification: Theory for the User", 2nd ed., chapter 16 (cross-validation).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@
 saturated at +- action_limit if there is one. It is computed by `controller_node.law`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -6,8 +6,6 @@ Trajectories of the plant give the columns of Z = [z_0 .. z_{N-1}], Z' = [z_1 ..
 Y = [a_0 .. a_{N-1}]; U holds the leading left singular vectors of Z'.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise

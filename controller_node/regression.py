@@ -18,8 +18,6 @@ Peherstorfer, Willcox, "Data-driven operator inference for nonintrusive projecti
 reduction", CMAME 306, 2016 (least squares on projected states).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -6,8 +6,6 @@ keeps nothing that the latched topics do not give it back after a restart, excep
 exploratory episode: if it missed some, it says so and the episode is run again.
 """
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Which cores a process runs on. No ROS import."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import random

@@ -1,7 +1,5 @@
 """NumPy's .npz files, read without trusting them. No ROS import."""
 
-from __future__ import annotations
-
 import zipfile
 from pathlib import Path
 from typing import Any, BinaryIO

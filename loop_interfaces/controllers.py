@@ -5,8 +5,6 @@ of Okabe and Ito (*Color Universal Design*, 2008) with a darker grey, which diff
 vision; on a dark background lighter ones of the same hues stand for them.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 

@@ -3,8 +3,6 @@
 No symbolic link is followed.
 """
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -14,8 +14,6 @@ thing; encoding them here once, with a prefix that depends only on the shape, ke
 Python out of the hot path.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Where a run's messages may go: by default nowhere but the loopback interface."""
 
-from __future__ import annotations
-
 import ipaddress
 import os
 import re

@@ -13,8 +13,6 @@ Every part has n_s columns (or is transposed to have), so the parts stack:
 n_s is the number of columns, n_a that of the axis `actuator`; n_z follows from the row count.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -7,8 +7,6 @@ validates by it and docs/interfaces.md lists it. A parameter says itself which n
 one is an entry here and its use. No ROS import.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any

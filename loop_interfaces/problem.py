@@ -1,7 +1,5 @@
 """Where the problems are, and a problem's resolved parameters. No ROS import."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from pathlib import Path

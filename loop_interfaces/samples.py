@@ -14,8 +14,6 @@ is the simulated time in s that the plant tells on /clock with a state, whether 
 listens there; NO_TIME of an action and of a plant that tells none.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Iterator

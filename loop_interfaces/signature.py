@@ -13,8 +13,6 @@ echoes the state's time, or sends 0, differs from one that signs. It is no prote
 who reads the wire and copies the number.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from hashlib import blake2b
 from typing import Any

@@ -4,8 +4,6 @@ Names are relative, so a namespace makes a second loop. docs/interfaces.md descr
 somebody who writes a node of their own; this is the same table for our nodes.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import IntEnum
 

@@ -1,7 +1,5 @@
 """A plant from a problem's resolved parameters."""
 
-from __future__ import annotations
-
 import hashlib
 import inspect
 import json

@@ -1,7 +1,5 @@
 """How the plant is, as its /diagnostics show it. Pure."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from loop_interfaces.diagnostics import Level, Rate, Status

@@ -23,8 +23,6 @@ state. Nothing is sent again and nothing is given up meanwhile; `episode/paused`
 wait for the plant.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

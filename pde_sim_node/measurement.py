@@ -35,8 +35,6 @@ Appl. Dyn. Syst. 16(4), 2017 (Hankel DMD).
 Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011 (Philox).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from enum import IntEnum

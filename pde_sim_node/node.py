@@ -6,8 +6,6 @@ Serves      ~/pause, ~/resume, ~/step (std_srvs/Trigger)
 Messages, order and parameters: docs/interfaces.md. The protocol is pde_sim_node.lockstep.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Mapping
 from dataclasses import fields

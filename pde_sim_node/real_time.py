@@ -5,8 +5,6 @@ A state that is not ready at its instant is a missed deadline: it goes out as so
 moves the grid, so that the plant never hurries to make up for lost time.
 """
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np

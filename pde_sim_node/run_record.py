@@ -4,8 +4,6 @@ A plant that is killed while it is paused must not run on, and one whose control
 actions that are not signed. The file names the runs; in any other run it means nothing.
 """
 
-from __future__ import annotations
-
 import os
 import tempfile
 from pathlib import Path

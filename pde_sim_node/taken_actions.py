@@ -11,8 +11,6 @@ controller signs. If so, only actions with the signature of their episode are ta
 one comes from a second controller, and contradicts.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a training asks for and gets: batches of rollouts and their results; and what defines it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import repeat

@@ -3,8 +3,6 @@
 A rollout counts once, when its result is used: what a fault makes a plant repeat is not counted again.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A training from resolved parameters."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path

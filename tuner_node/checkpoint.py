@@ -6,8 +6,6 @@ that a file damaged later can be passed over. Where none is usable, a training b
 start, and comes to the same result.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import io

@@ -1,7 +1,5 @@
 """How the training is, as the tuner's /diagnostics show it. Pure."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from loop_interfaces.diagnostics import ConditionTimer, Level, Rate, Status

@@ -18,8 +18,6 @@ part): an answer to an earlier tuner's episode is recognised.
     BUSY        its nodes are gone, a pair is free  FREE        the chunk is started again, there
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """How strongly to explore a plant whose measurements are noisy."""
 
-from __future__ import annotations
-
 ACCURACY = 0.045
 """Standard error of an entry of B, relative to the norm of its column, that exploration aims at."""
 

@@ -3,8 +3,6 @@
 The tuner logs these lines, and `pdeloop train` shows them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -7,8 +7,6 @@ Serves      ~/pause, ~/resume, ~/stop (std_srvs/Trigger)
 Messages, order and parameters: docs/interfaces.md. What it does is in tuner_node.session.
 """
 
-from __future__ import annotations
-
 import contextlib
 import sys
 from collections import deque

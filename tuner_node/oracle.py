@@ -20,8 +20,6 @@ arXiv:2403.01005.
 Spall, "Introduction to Stochastic Search and Optimization", chapter 7.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """A pair of plant and controller as the dispatcher knows it, and what contradicts that. Pure."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 

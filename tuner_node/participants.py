@@ -1,7 +1,5 @@
 """Who else is on the network, and what follows for a session. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Whether the actions of a rollout are those of the law that the tuner publishes the gains of."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

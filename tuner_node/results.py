@@ -10,8 +10,6 @@ result.json        costs, reductions, history, seeds, versions, timing, the plan
 logs/              one file a node, when the command line started them
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import json

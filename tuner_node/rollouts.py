@@ -3,8 +3,6 @@
 All of them are functions of the training's seeds and of how often a seed has explored.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 

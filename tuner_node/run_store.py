@@ -1,7 +1,5 @@
 """Keeps a training's folder up to date: progress lines, checkpoints, results."""
 
-from __future__ import annotations
-
 import secrets
 import time
 from collections.abc import Callable, Mapping

@@ -7,8 +7,6 @@ an optimiser from one field share the field and not the noise. In the closing ev
 have the same noise on a field, so that they compare.
 """
 
-from __future__ import annotations
-
 from enum import IntEnum
 
 import numpy as np

@@ -4,8 +4,6 @@ Events of the pairs go to the dispatcher; `advance` takes what it answers, finis
 results are all there, and assigns the next one. What happens is given to `report` as JSON-able rows.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

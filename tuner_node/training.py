@@ -16,8 +16,6 @@ process it is the same training, to the bit.
 Source: Zhang, Mowlavi, Benosman, Basar, arXiv:2403.01005, section IV; the check is ours.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import islice

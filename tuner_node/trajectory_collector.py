@@ -4,8 +4,6 @@ A sample that was lost is never interpolated: the episode has no trajectories th
 it is when a sample comes twice with different content: which of them was the plant's would be chance.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -31,8 +31,6 @@ explores all interleavings.
 The mailbox is bounded. What it cannot hold is dropped and counted; lock-step sends it again.
 """
 
-from __future__ import annotations
-
 import ctypes
 from typing import Any
 

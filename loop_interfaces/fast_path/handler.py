@@ -6,8 +6,6 @@ the answer. Every message that is not the expected one is left to the node's own
 that of the node's protocol, to the bit.
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable

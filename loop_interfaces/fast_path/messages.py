@@ -5,8 +5,6 @@ They are compared with the bytes and numbers that are expected. Whatever differs
 `frames.ArrayCodec`.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 from typing import Any

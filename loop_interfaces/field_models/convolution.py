@@ -19,8 +19,6 @@ discovery of partial differential equations", Science Advances 3, 2017 (PDEs by 
 derivatives of the field).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -19,8 +19,6 @@ Brunton, Proctor, Kutz, "Data-driven discovery of partial differential equations
 2017.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ They hand serialised bytes to the middleware and take them from it, so that no p
 on the hot path. The receivers are driven by loop_interfaces.ros.node_loop.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -4,8 +4,6 @@ All of it runs in the node's housekeeping, off the hot path: nothing here is cal
 the loop.
 """
 
-from __future__ import annotations
-
 import socket
 import threading
 import time

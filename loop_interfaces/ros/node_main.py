@@ -1,7 +1,5 @@
 """The `main` of a node: its ROS context, its signals, its exit code."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

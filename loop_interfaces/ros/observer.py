@@ -6,8 +6,6 @@ serves whatever the node has on rclpy's executor, ordinary timers and subscripti
 its peers have forgotten it.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 

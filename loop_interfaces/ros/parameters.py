@@ -3,8 +3,6 @@
 All are read-only but the live ones, which no result depends on.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable
 from typing import Any

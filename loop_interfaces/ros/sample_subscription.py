@@ -4,8 +4,6 @@ The plant of this project publishes them together on `samples` (loop_interfaces.
 costs the loop next to nothing. Of a plant that does not, each state and action is read by itself.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

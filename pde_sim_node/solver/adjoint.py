@@ -22,8 +22,6 @@ Source: Griewank & Walther, Evaluating Derivatives, SIAM 2008, chapter 3 (revers
 Trapp, SIAM Review 40 (1998) (the complex step for g').
 """
 
-from __future__ import annotations
-
 import ctypes
 from typing import Any
 

@@ -4,8 +4,6 @@ It is the step of `etdrk4` (equations and sources there) for the real FFT v of t
 nonlinear part on the dealiased grid and the forcing of the held action, N(v) = m F[g(u)] + F_a.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

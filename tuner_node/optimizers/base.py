@@ -9,8 +9,6 @@ loop in one process. Its randomness is a pure function of (seed, tells), and `st
 everything that `restore` needs to go on as if nothing had happened, to the last bit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -127,48 +125,38 @@ class Optimizer(Protocol):
     @property
     def name(self) -> str:
         """The name that selects this optimiser."""
-        ...
 
     @property
     def needs_trajectories(self) -> bool:
         """Whether results must carry their trajectory."""
-        ...
 
     @property
     def policy(self) -> Array:
         """The current policy, of the shape it began with; always finite."""
-        ...
 
     @property
     def best_policy(self) -> Array:
         """The policy to use when the training is over."""
-        ...
 
     @property
     def tells(self) -> int:
         """How many times `tell` was called."""
-        ...
 
     @property
     def done(self) -> bool:
         """Whether there is nothing more to ask."""
-        ...
 
     def ask(self) -> list[Rollout]:
         """The rollouts needed next; the same ones on every call until `tell`, none when done."""
-        ...
 
     def tell(self, results: Sequence[RolloutResult]) -> Row:
         """Take the results of all rollouts of `ask`, in its order; returns a row of the history."""
-        ...
 
     def state(self) -> State:
         """Everything a checkpoint needs: arrays without objects, as `numpy.savez` stores them."""
-        ...
 
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
         """Go on from a `state` of an optimiser that was constructed with the same arguments."""
-        ...
 
 
 def checked_policy(policy: ArrayLike) -> Array:

@@ -15,8 +15,6 @@ learning", NeurIPS 2018. Choromanski et al., "Structured evolution with compact 
 scalable policy optimization", ICML 2018 (orthogonal directions).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -11,8 +11,6 @@ with the law's features phi(s) = [s; 1, ...], and compare:
 E = mean over pairs of min(2, sum_k |error_k|^2 / sum_k |delta_k|^2). No prediction at all has E = 1.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -22,8 +22,6 @@ control) and Abbeel, Quigley, Ng, "Using inaccurate models in reinforcement lear
 (measured trajectory, modelled derivative).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

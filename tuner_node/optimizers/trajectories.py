@@ -1,7 +1,5 @@
 """The trajectories an optimiser remembers, and how they survive a checkpoint."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

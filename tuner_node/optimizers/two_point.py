@@ -4,8 +4,6 @@ Source: Zhang, Mowlavi, Benosman, Basar, "Policy Optimization for PDE Control wi
 arXiv:2403.01005, section IV.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -9,8 +9,6 @@ measures the 2 D rollouts pi +- r Theta_i on it, and steps along the mean of the
 A step with a diverged rollout, or that would not be finite, is not taken and halves eta from then on.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np
