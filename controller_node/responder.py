@@ -199,8 +199,9 @@ class Responder:
         return self._answer_pending()
 
     def state(self, frame: Frame) -> list[Publication]:
-        """Answer the states of an episode's environments, (M, n_z); or keep them, if something that the
-        answer needs has not come yet.
+        """Answer the states of an episode's environments, (M, n_z).
+
+        They are kept while something that the answer needs has not come.
 
         Raises
         ------

@@ -176,6 +176,7 @@ def on_message(channel: Any) -> bool:
 
 @machine_code(types.void(pointer_to(CHANNEL), types.intp), *SOURCES)
 def on_new_message(channels: Any, count: int) -> None:
+    """The middleware's callback: `on_message` for each message that arrived."""
     channel = carray(channels, 1)[0]
     while on_message(channel):
         pass
@@ -186,6 +187,7 @@ def on_new_message(channels: Any, count: int) -> None:
 
 @cached_njit(*SOURCES)
 def disarm(channels: NDArray[np.void]) -> None:
+    """Let every message wait from now on."""
     channel = channels[0]
     store_release(channel.armed, 0)  # no answer is begun from here on
     lock(channel)  # the one under way has been given

@@ -264,8 +264,9 @@ class NodeLoop(EventLoop):
             self._guard.trigger_guard_condition()
 
     def _subscriptions(self, fast: _Fast | None) -> dict[Any, Callable[[], int]]:
-        """What takes from each subscription, by its handle; samples come first: a cost is to be
-        handled after the samples of its episode.
+        """What takes from each subscription, by its handle, those of samples first.
+
+        A cost comes after the samples of its episode, and is to be handled after them.
         """
         found: dict[Any, Callable[[], int]] = {}
         for samples, handlers in self._observed:

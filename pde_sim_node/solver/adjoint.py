@@ -166,9 +166,7 @@ def pull_back(
     on_actions: Array,
     plans: NDArray[np.void],
 ) -> None:
-    """Write f(z, a) and the two products with its transposed derivatives: after, on_states and
-    on_actions.
-    """
+    """Write `after`, f(z, a), and `on_states` and `on_actions`, the transposed products."""
     plan = plans[0]
     w, d, c, e = plan.scratch, plan.scratch_apart, plan.constants, plan.constants_apart
     last, block = plan.n_z // 2, 4 * plan.fine.m
