@@ -9,9 +9,9 @@ from tuner_node.optimizers.base import Rollout as Rollout
 from tuner_node.optimizers.base import RolloutResult as RolloutResult
 from tuner_node.optimizers.base import State as State
 from tuner_node.optimizers.base import Trajectory as Trajectory
-from tuner_node.optimizers.directions import Directions as Directions
 from tuner_node.optimizers.gauss_newton import GaussNewton as GaussNewton
-from tuner_node.optimizers.two_point import TwoPoint as TwoPoint
+from tuner_node.optimizers.zeroth_order import Directions as Directions
+from tuner_node.optimizers.zeroth_order import TwoPoint as TwoPoint
 
 # The names that parameters and the command line use.
 OPTIMIZERS: dict[str, Callable[..., Optimizer]] = {

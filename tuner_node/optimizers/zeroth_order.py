@@ -7,9 +7,21 @@ measures the 2 D rollouts pi +- r Theta_i on it, and steps along the mean of the
     pi <- pi - eta g.
 
 A step with a diverged rollout, or that would not be finite, is not taken and halves eta from then on.
+
+Every direction alone is uniform on the sphere, so the mean of the D estimates has the mean of the
+two-point estimate; orthogonal directions measure no component twice, and D = 2 n_a n_s of them give the
+central difference gradient itself.
+
+References
+----------
+Zhang, Mowlavi, Benosman, Basar, "Policy Optimization for PDE Control with a Warm Start",
+arXiv:2403.01005, section IV (D = 1). Mania, Guy, Recht, "Simple random search of static linear policies
+is competitive for reinforcement learning", NeurIPS 2018. Choromanski et al., "Structured evolution with
+compact architectures for scalable policy optimization", ICML 2018 (orthogonal directions).
 """
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,6 +39,10 @@ from tuner_node.optimizers.base import (
     require_results,
     require_state,
 )
+
+
+# Initial fields differ in cost, so near 1 a good iterate is undone by an unlucky field.
+_TOLERANCE = 1.5
 
 
 class ZerothOrder:
@@ -172,3 +188,57 @@ class ZerothOrder:
     def _directions(self) -> Array:
         n_a, columns = self._policy.shape
         return oracle.orthonormal_directions(self._seed, self._tells, (n_a, columns), self._count)
+
+
+class TwoPoint(ZerothOrder):
+    """Along one direction a step, and with the last policy, as in the paper (`ZerothOrder`)."""
+
+    name = "two_point"
+
+    def __init__(self, policy0: ArrayLike, **settings: Any) -> None:
+        super().__init__(policy0, directions=1, **settings)
+
+    def tell(self, results: Sequence[RolloutResult]) -> Row:
+        """Step along the estimate, or halve the learning rate; the row has both costs."""
+        row = super().tell(results) | {"iteration": self.tells}
+        for key, result in zip(("cost_plus", "cost_minus"), results, strict=True):
+            if result.usable:
+                row[key] = float(result.cost)
+        return row
+
+
+class Directions(ZerothOrder):
+    """Along several directions a step, and with the best iterate that was measured (`ZerothOrder`).
+
+    The mean of a step's 2 D costs estimates J(pi) + O(r^2). It judges the iterates: one that costs more
+    than 1.5 times the best, or any diverged rollout, sends the policy back to the best with half the
+    learning rate.
+    """
+
+    name = "directions"
+
+    def __init__(self, policy0: ArrayLike, **settings: Any) -> None:
+        super().__init__(policy0, **settings)
+        self._best_policy = self._policy.copy()
+        self._best_cost = np.inf
+
+    @property
+    def best_policy(self) -> Array:
+        """The measured iterate with the lowest mean cost, which leaves out the last step."""
+        return self._best_policy.copy()
+
+    def _good(self, cost: float) -> bool:
+        if cost < self._best_cost:
+            self._best_cost, self._best_policy = cost, self._policy.copy()
+        return cost <= _TOLERANCE * self._best_cost
+
+    def state(self) -> State:
+        """Those of a zeroth-order optimiser, and the best iterate."""
+        best = {"best_policy": self.best_policy, "best_cost": np.array(self._best_cost)}
+        return super().state() | best
+
+    def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
+        """Continue from a checkpoint with the same seed, radius and directions."""
+        best = checked_policy(state.get("best_policy", self._best_policy))
+        super().restore(state)
+        self._best_policy, self._best_cost = best, float(state["best_cost"].item())
