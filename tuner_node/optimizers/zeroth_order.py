@@ -40,7 +40,6 @@ from tuner_node.optimizers.base import (
     require_state,
 )
 
-
 # Initial fields differ in cost, so near 1 a good iterate is undone by an unlucky field.
 _TOLERANCE = 1.5
 
