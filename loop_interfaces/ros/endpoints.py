@@ -129,7 +129,7 @@ class SampleBatcher:
 
     Make it before the publisher of the states: a process that has discovered the states has
     then discovered the samples.
-    timed: whether the time of each state goes on /clock; wanted: whether `add` is to be called.
+    timed: whether the time of each state goes on /clock.
     """
 
     def __init__(self, node: Node) -> None:
@@ -139,19 +139,22 @@ class SampleBatcher:
         self._rate = TokenBucket()
         self._viewers = False
         """Whether `samples_throttled` has subscribers."""
-        self.wanted = self.timed = False
+        self.timed = False
+
+    @property
+    def wanted(self) -> bool:
+        """Whether anybody takes samples of the present episode."""
+        return self._full.open or self._throttled.open
 
     def begin(self, now: float) -> None:
         """An episode begins."""
         self._throttled.open = self._viewers and self._rate.admits(now)
-        self._update()
 
     def show(self, raw: bytes | None) -> None:
         """From now on give viewers this episode in any case, beginning with the state `raw`."""
         if raw is not None and self._viewers and not self._throttled.open:
             self._throttled.batch.add(STATE_KIND, time.monotonic_ns(), raw, NO_TIME)
         self._throttled.open = self._viewers
-        self._update()
 
     def add(self, kind: int, raw: bytes, simulated: float = NO_TIME) -> None:
         """Add a message to the next batch; simulated: the time of a state in s."""
@@ -191,10 +194,6 @@ class SampleBatcher:
         before = self._viewers
         self._full.open, self._viewers = (publisher.poll(now) for publisher in self._publishers)
         self._throttled.open = self._viewers and (self._throttled.open or not before)
-        self._update()
-
-    def _update(self) -> None:
-        self.wanted = self._full.open or self._throttled.open
 
 
 class Sender:
