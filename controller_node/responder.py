@@ -20,14 +20,7 @@ from loop_interfaces import model_rows
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import Counters, ModelFailure, Publication
 from loop_interfaces.signature import NOT_SIGNED, digest_of, signature
-from loop_interfaces.topics import (
-    ACTION,
-    COMPLETED,
-    MAX_GAIN,
-    CostColumn,
-    StartColumn,
-    start_rows,
-)
+from loop_interfaces.topics import ACTION, COMPLETED, MAX_GAIN, CostColumn, StartColumn, start_rows
 
 MAX_RUNS = 8
 """Runs, and plants, that are remembered. The longest unheard one is forgotten first, but never the one

@@ -6,12 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from loop_interfaces.parameters import table, with_budget, with_identification
-from loop_interfaces.spec import (
-    ParameterError,
-    check,
-    check_names,
-    read_yaml,
-)
+from loop_interfaces.spec import ParameterError, check, check_names, read_yaml
 
 
 def config_folder() -> Path:

@@ -146,19 +146,20 @@ class Plant:
         self.supports = shapes
         self.field_target = self._checked("target", equation.target(self.x))
         self.target = self.field_target
-        settings = StepSettings(
-            equation=equation,
-            supports=self.supports,
-            target=self.field_target,
-            integration_time=self.integration_time,
-            steps=internal_steps(self.sample_time, self.integration_time),
-            state_weight=self.state_weight,
-            action_weight=self.action_weight,
-            bound=self.divergence_bound,
-        )
         make_step = exact_step if isinstance(equation, LinearEquation) else etdrk4_step
         began, before = time.perf_counter(), compilations()
-        self.parallel: ParallelStep = make_step(settings)
+        self.parallel: ParallelStep = make_step(
+            StepSettings(
+                equation=equation,
+                supports=self.supports,
+                target=self.field_target,
+                integration_time=self.integration_time,
+                steps=internal_steps(self.sample_time, self.integration_time),
+                state_weight=self.state_weight,
+                action_weight=self.action_weight,
+                bound=self.divergence_bound,
+            )
+        )
         self._allocate(1)
         all_finite(self.actions)
         self.parallel.step()
@@ -258,12 +259,12 @@ class Plant:
             raise ValueError(
                 f"seeds must be 0 or more, or -1 for the mean field, got {seeds.min()}"
             )
-        fields = {seed: self._initial_field(seed) for seed in set(seeds.tolist())}
+        fields = {}
+        for seed in set(seeds.tolist()):
+            rng = None if seed == MEAN_FIELD else np.random.default_rng(seed)
+            field = self.equation.initial_field(self.x, rng)
+            fields[seed] = self._checked("initial_field", field)
         return np.stack([fields[seed] for seed in seeds.tolist()])
-
-    def _initial_field(self, seed: int) -> NDArray[np.float64]:
-        rng = None if seed == MEAN_FIELD else np.random.default_rng(seed)
-        return self._checked("initial_field", self.equation.initial_field(self.x, rng))
 
     def _checked(self, what: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """A field of the equation as a state: one component after the other."""
@@ -301,12 +302,6 @@ class Plant:
             raise RuntimeError("no episode has begun: call reset(seeds) before step(actions)")
         if self.step_index >= self.horizon:
             raise RuntimeError(f"the episode is over after {self.horizon} steps: call reset(seeds)")
-        self._hold(actions)
-        self.parallel.step()
-        self.step_index += 1
-        return self.states
-
-    def _hold(self, actions: NDArray[np.float64]) -> None:
         if np.shape(actions) != (self.batch, self.n_a):
             raise ValueError(
                 f"actions must have shape {(self.batch, self.n_a)}, got {np.shape(actions)}"
@@ -314,6 +309,9 @@ class Plant:
         self.actions[:] = actions
         if not all_finite(self.actions):
             raise ValueError("actions must be finite, got NaN or infinity")
+        self.parallel.step()
+        self.step_index += 1
+        return self.states
 
     def evaluate(
         self, states: NDArray[np.float64], actions: NDArray[np.float64]

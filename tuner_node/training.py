@@ -26,26 +26,12 @@ from numpy.typing import NDArray
 
 from loop_interfaces import model_rows
 from loop_interfaces.topics import COMPLETED, CostColumn
-from tuner_node import training_state
+from tuner_node import rollouts, training_state
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, TrainingSettings, batch_of
 from tuner_node.budget import Budget
-from tuner_node.optimizers import (
-    Context,
-    Measured,
-    Optimizer,
-    Rollout,
-    Trajectory,
-)
+from tuner_node.optimizers import Context, Measured, Optimizer, Rollout, Trajectory
 from tuner_node.published_law import check_law
-from tuner_node.rollouts import (
-    CHECK,
-    CONTROLLERS,
-    EXPLORATION,
-    checks,
-    evaluations,
-    explorations,
-    noise_seeds,
-)
+from tuner_node.rollouts import CHECK, CONTROLLERS, EXPLORATION
 
 Array = NDArray[np.float64]
 
@@ -100,7 +86,7 @@ class Training:
     def next_batch(self) -> Batch | None:
         """The rollouts wanted now; the same at every call until `finish`. None: all is done."""
         if self.phase == "identify":
-            rows = explorations(self.settings, self.pending, self.attempts)
+            rows = rollouts.explorations(self.settings, self.pending, self.attempts)
             batch = Batch(rows, None, self.settings.trajectories)
         elif self.phase == "check":
             batch = batch_of(self._check_rollouts(), self.settings.trajectories)
@@ -108,14 +94,16 @@ class Training:
             wanted = [(m, rollout) for m, asked in enumerate(self._asked()) for rollout in asked]
             batch = batch_of(wanted, self.settings.trajectories)
         elif self.phase == "evaluate":
-            batch = batch_of(evaluations(self.settings, self.warm_starts(), self.policies()))
+            batch = batch_of(
+                rollouts.evaluations(self.settings, self.warm_starts(), self.policies())
+            )
         else:
             return None
         if not self.settings.noise:
             return batch
         adapts = self.phase == "adapt"
         counts = [optimizer.tells for optimizer in self.optimizers] if adapts else self.attempts
-        noise = noise_seeds(self.settings, self.phase, batch.rows, counts)
+        noise = rollouts.noise_seeds(self.settings, self.phase, batch.rows, counts)
         return replace(batch, rows=np.column_stack([batch.rows, noise]))
 
     def finish(self, result: BatchResult) -> list[dict[str, Any]]:
@@ -248,7 +236,7 @@ class Training:
         self._start_adapting()
 
     def _check_rollouts(self) -> list[tuple[int, Rollout]]:
-        return checks(self.settings, self.pending, self.warm_starts())
+        return rollouts.checks(self.settings, self.pending, self.warm_starts())
 
     def _checked(self, result: BatchResult) -> list[dict[str, Any]]:
         results = result.rollouts()
@@ -302,8 +290,8 @@ class Training:
         """Make the optimiser of every seed, with its start and what is left of its budget."""
         budgets = self.budget.adaptation.tolist()
         self.optimizers = [
-            self.make_optimizer(start, seed, self._context(m), rollouts)
-            for m, (start, seed, rollouts) in enumerate(
+            self.make_optimizer(start, seed, self._context(m), budget)
+            for m, (start, seed, budget) in enumerate(
                 zip(self.starts(), self.settings.all_seeds, budgets, strict=True)
             )
         ]

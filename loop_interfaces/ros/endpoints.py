@@ -18,13 +18,7 @@ from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.samples import AGE, NO_TIME, STATE_KIND, SampleBatch, TokenBucket
-from loop_interfaces.topics import (
-    READER_DEPTH,
-    SAMPLES,
-    SAMPLES_THROTTLED,
-    WRITER_DEPTH,
-    Topic,
-)
+from loop_interfaces.topics import READER_DEPTH, SAMPLES, SAMPLES_THROTTLED, WRITER_DEPTH, Topic
 
 BATCH_HISTORY = 16
 """Batches of samples that their publisher stores for a subscriber which lost one."""
