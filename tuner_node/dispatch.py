@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from loop_interfaces import topics
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import Counters, ModelFailure, Publication
-from loop_interfaces.signature import NOT_SIGNED, digest_of, signature, signature_in
+from loop_interfaces.signature import digest_of
 from loop_interfaces.topics import START_COLUMNS, VOID, CostColumn, Topic
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult
 from tuner_node.pair import Chunk, DispatchError, Pair, PairPublication
@@ -50,14 +50,10 @@ class Dispatcher:
 
     Parameters
     ----------
-    run : int
-        Id of the run, in every message.
-    n_a : int
-        Actuators.
-    pairs : int
-        How many pairs there are.
-    incarnation : int
-        Starts of this run's tuner so far.
+    run, incarnation : int
+        Id of the run, in every message; starts of its tuner so far.
+    n_a, pairs : int
+        Numbers of actuators and of pairs.
     max_batch, episode_timeout, max_attempts
         See loop_interfaces.parameters.TUNER; they may be set later.
     plant : int
@@ -141,21 +137,16 @@ class Dispatcher:
         known = self._answering(pair, frame, topics.COST)
         if known is None or known.chunk is None or self._batch is None:
             return []
-        count = known.chunk.size
-        if frame.values.shape != (count, len(CostColumn)):
-            raise FrameError(
-                f"expected costs of shape {(count, len(CostColumn))}, got {frame.values.shape}"
-            )
+        if frame.values.shape != (shape := (known.chunk.size, len(CostColumn))):
+            raise FrameError(f"expected costs of shape {shape}, got {frame.values.shape}")
         if self.plant == UNKNOWN_PLANT:
             self.plant = frame.plant
         known.check_plant(frame, self.plant, now)
         self.sim_time = max(self.sim_time, frame.time)
         known.last_heard = now
         if (frame.values[:, CostColumn.ENDED] == VOID).any():
-            self._retry(
-                known,
-                f"the plant declared episode {known.episode} void: no action came, or different ones",
-            )
+            void = f"the plant declared episode {known.episode} void"
+            self._retry(known, f"{void}: no action came, or different ones")
         else:
             known.take_answer(topics.COST.name, frame)
             known.chunk.costs = frame.values.copy()
@@ -236,13 +227,8 @@ class Dispatcher:
         FrameError
             They are of another shape or plant, or signed by a controller with other parameters.
         """
-        signed = self.pairs[pair].signed.get(frame.episode, 0) if frame.run == self.run else 0
-        expected = NOT_SIGNED, signature(signed, self.design)
-        if signed and self.design and signature_in(frame.time) not in expected:
-            raise FrameError(
-                "expected a model identified with the parameters of this run's tuner; stop the other "
-                "controller, or start both with the same parameters"
-            )
+        if frame.run == self.run and self.design:
+            self.pairs[pair].check_signature(frame, self.design)
         known = self._answering(pair, frame, topics.MODEL_IDENTIFIED)
         if known is None or known.chunk is None or self._batch is None:
             return []
@@ -289,11 +275,8 @@ class Dispatcher:
             elif pair.missing:  # not silent: the latched topics serve it when it is back
                 pair.last_heard = now
             elif now >= pair.paused_until and now - pair.last_heard > self.episode_timeout:
-                self._retry(
-                    pair,
-                    f"pair {pair.number} was silent for {self.episode_timeout:g} s "
-                    f"in episode {pair.episode}",
-                )
+                silent = f"pair {pair.number} was silent for {self.episode_timeout:g} s"
+                self._retry(pair, f"{silent} in episode {pair.episode}")
             else:
                 if now < pair.paused_until:  # not silent either
                     pair.last_heard = now
@@ -340,11 +323,9 @@ class Dispatcher:
         if frame.run != self.run:
             self.counters["answers of another run"] += 1
             return None
-        if self.plant not in (UNKNOWN_PLANT, frame.plant):
-            under_way = known.chunk is not None and frame.episode == known.episode
-        else:
-            under_way = known.awaits(frame, topic.name, paused=self.paused)
-        if not under_way:
+        if self.plant in (UNKNOWN_PLANT, frame.plant):
+            known.check_answer(frame, topic.name, paused=self.paused)
+        if not known.runs(frame.episode):
             self.counters["answers of another episode"] += 1
             return None
         return known

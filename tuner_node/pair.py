@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from loop_interfaces.frames import Frame, FrameError, digest
 from loop_interfaces.protocol import Publication
+from loop_interfaces.signature import NOT_SIGNED, signature, signature_in
 from loop_interfaces.topics import COST, VOID, CostColumn
 from tuner_node.batch import Batch
 from tuner_node.optimizers import Trajectory
@@ -116,15 +117,15 @@ class Pair:
         """An answer is used: another one for its episode contradicts it."""
         self.answers[topic, answer.episode] = digest(answer.values)
 
-    def awaits(self, answer: Frame, topic: str, *, paused: bool) -> bool:
-        """Whether this answers the episode under way.
+    def runs(self, episode: int) -> bool:
+        """Whether this episode is under way."""
+        return self.chunk is not None and self.episode == episode
 
-        Raises
-        ------
-        DispatchError
-            Its episode was answered already, and otherwise: then it is chance which answer was taken.
+    def check_answer(self, answer: Frame, topic: str, *, paused: bool) -> None:
+        """Raise DispatchError if its episode was answered already, and otherwise.
+
+        It is then chance which of the two answers was taken.
         """
-        under_way = self.chunk is not None and answer.episode == self.episode
         taken = self.answers.get((topic, answer.episode))
         void = topic == COST.name and bool((answer.values[:, -1:] == VOID).any())
         if taken is not None and not void and digest(answer.values) != taken:
@@ -132,13 +133,21 @@ class Pair:
                 f"two different messages on {topic} answer episode {answer.episode}; expected one "
                 "plant and one controller in this namespace: stop the other and start a new run"
             )
-        if taken is not None and void and not under_way and not paused:
+        if taken is not None and void and not self.runs(answer.episode) and not paused:
             raise DispatchError(
                 f"the plant took back the cost of episode {answer.episode}, which this run has used, "
                 "because different actions came for one step: stop the second controller and start "
                 "a new run"
             )
-        return under_way
+
+    def check_signature(self, model: Frame, design: int) -> None:
+        """Raise FrameError if a model is signed for other parameters than these (design: a digest)."""
+        signed = self.signed.get(model.episode, 0)
+        if signed and signature_in(model.time) not in (NOT_SIGNED, signature(signed, design)):
+            raise FrameError(
+                "expected a model identified with the parameters of this run's tuner; stop the other "
+                "controller, or start both with the same parameters"
+            )
 
     def check_plant(self, cost: Frame, plant: int, now: float) -> None:
         """A FrameError unless a cost is of this plant; a DispatchError after FOREIGN_PLANT_GRACE."""
@@ -164,7 +173,7 @@ class Pair:
         """
         for late in self.used_samples():
             late.take(what, frame)
-        if self.chunk is None or (frame.run, frame.episode) != (self.run, self.episode):
+        if self.chunk is None or frame.run != self.run or not self.runs(frame.episode):
             return
         if frame.values.shape != (expected := (self.chunk.size, width)):
             raise FrameError(
