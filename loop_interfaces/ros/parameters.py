@@ -4,7 +4,7 @@ All are read-only but the live ones, which no result depends on.
 """
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Generator, Iterable, Iterator
 from typing import Any
 
 from rcl_interfaces.msg import (
@@ -110,38 +110,35 @@ class RemoteParameters:
         self._list = node.create_client(ListParameters, f"{name}/list_parameters")
         self._get = node.create_client(GetParameters, f"{name}/get_parameters")
         self._clients = [self._list, self._get]
-        self._future: Any = None
-        self._asked: Any = None
-        self._again_at = 0.0
-        self._names: list[str] | None = None
+        self._asking: Iterator[None] = self._ask()
 
     def poll(self) -> None:
         """Go on with what can be gone on with; never waits."""
-        if self.values is not None:
-            return
-        if self._future is None:
-            if self._names is None:
-                self._ask(self._list, ListParameters.Request())
-            else:
-                self._ask(self._get, GetParameters.Request(names=self._names))
-        elif self._future.done():
-            answer, self._future = self._future.result(), None
-            if self._names is None:
-                self._names = list(answer.result.names)
-                return
-            values = [parameter_value_to_python(value) for value in answer.values]
-            self.values = dict(zip(self._names, values, strict=True))
-            self.close()
-        elif time.monotonic() > self._again_at:
-            self._asked.remove_pending_request(self._future)
-            self._future = None
+        next(self._asking, None)
 
-    def _ask(self, client: Any, request: Any) -> None:
-        if client.service_is_ready():
-            self._future, self._asked = client.call_async(request), client
-            self._again_at = time.monotonic() + UNANSWERED
+    def _ask(self) -> Iterator[None]:
+        """Ask for the names, then for the values; yields wherever it has to wait."""
+        listed = yield from self._call(self._list, ListParameters.Request())
+        names = list(listed.result.names)
+        answer = yield from self._call(self._get, GetParameters.Request(names=names))
+        values = [parameter_value_to_python(value) for value in answer.values]
+        self.values = dict(zip(names, values, strict=True))
+        self.close()
+
+    def _call(self, client: Any, request: Any) -> Generator[None, None, Any]:
+        """The answer to a request, which is made again when it stays out."""
+        while True:
+            while not client.service_is_ready():
+                yield
+            future, again_at = client.call_async(request), time.monotonic() + UNANSWERED
+            while not future.done() and time.monotonic() <= again_at:
+                yield
+            if future.done():
+                return future.result()
+            client.remove_pending_request(future)
 
     def close(self) -> None:
-        """Drop the clients."""
+        """Drop the clients; nothing is asked any more."""
+        self._asking = iter(())
         while self._clients:
             self._node.destroy_client(self._clients.pop())
