@@ -19,13 +19,6 @@ Array = NDArray[np.float64]
 class Exploration:
     """The exploratory episode that a start begins.
 
-    Parameters
-    ----------
-    start : Frame
-        Its start.
-    settings : DesignSettings
-        How to identify, and what to design for.
-
     Attributes
     ----------
     outcomes : dict
@@ -71,12 +64,7 @@ class Exploration:
     def identify(self, cost: Frame, target: Array | None) -> Publication | ModelFailure:
         """The models of all environments, or why there are none, once the episode has its cost.
 
-        Parameters
-        ----------
-        cost : Frame
-            Of the episode, one row for each environment.
-        target : (n_z,) array
-            z_r; None where the plant's has not arrived.
+        target (n_z,): z_r; None where the plant's has not arrived.
         """
         ended = cost.values[:, CostColumn.ENDED]
         if (ended == VOID).any() or not cost.step:

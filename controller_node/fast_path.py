@@ -57,12 +57,7 @@ def load_compiled() -> None:
 class ControllerFastPath(FastPath):
     """Answers states of the episode whose state the responder was given last.
 
-    Parameters
-    ----------
-    responder
-        The protocol.
-    states
-        The codec of the messages that come in.
+    states: the codec of the messages that come in.
     """
 
     def __init__(self, responder: Responder, states: ArrayCodec) -> None:

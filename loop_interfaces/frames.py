@@ -106,22 +106,13 @@ class ArrayCodec:
     def prefix_of(self, shape: tuple[int, ...]) -> bytes | None:
         """What stands in front of the header in the messages of the peer that was decoded last.
 
-        Returns
-        -------
-        bytes or None
-            None if their values had another shape, or their numbers another byte order.
+        None if their values had another shape, or their numbers another byte order.
         """
         last = self._last
         return last.prefix if last and last.shape == shape and not last.swapped else None
 
     def encode(self, frame: Frame) -> bytes:
-        """CDR bytes of `frame`, little-endian.
-
-        Raises
-        ------
-        FrameError
-            It has another number of axes.
-        """
+        """CDR bytes of `frame`, little-endian. FrameError if it has another number of axes."""
         return bytes(self.encode_into_own(frame))
 
     def encode_into_own(self, frame: Frame) -> bytearray:

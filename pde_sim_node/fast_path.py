@@ -103,14 +103,7 @@ def load_compiled() -> None:
 class PlantFastPath(FastPath):
     """Advances the plant of a lock-step within an episode.
 
-    Parameters
-    ----------
-    lockstep
-        The protocol.
-    actions
-        The codec of the messages that come in.
-    batcher
-        Takes the samples.
+    actions: the codec of the messages that come in; batcher: takes the samples.
     """
 
     def __init__(self, lockstep: Lockstep, actions: ArrayCodec, batcher: SampleBatcher) -> None:

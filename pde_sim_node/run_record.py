@@ -30,15 +30,7 @@ class RunRecord:
         self.paused, self.signed = self._read()
 
     def keep(self, paused: int, signed: int) -> None:
-        """Remember both.
-
-        Raises
-        ------
-        FileError
-            The folder belongs to another user.
-        OSError
-            The record cannot be written.
-        """
+        """Remember both, or raise OSError, or FileError where the folder is not this user's."""
         if (paused, signed) == (self.paused, self.signed):
             return
         private_folder(self._path.parent)

@@ -32,16 +32,9 @@ NOISE = {
 def explorations(
     settings: TrainingSettings, pending: Sequence[int], attempts: Sequence[int]
 ) -> Array:
-    """The rows of `episode/start` of an exploration for each of the pending seeds, (m, 4).
+    """The rows of `episode/start` of an exploration for each of the m pending seeds, (m, 4).
 
-    Parameters
-    ----------
-    settings : TrainingSettings
-        Of the training.
-    pending : sequence of int
-        Indices of the m seeds.
-    attempts : sequence of int
-        How often each of all seeds has explored before.
+    pending: their indices; attempts: how often each of all seeds has explored before.
     """
     rows = [
         (
@@ -91,19 +84,10 @@ def evaluations(
 def noise_seeds(
     settings: TrainingSettings, phase: str, rows: Array, counts: Sequence[int]
 ) -> list[int]:
-    """The seed of the noise of every row of a batch.
+    """The seed of the noise of every row (R, 4) of a batch of that phase.
 
-    Parameters
-    ----------
-    settings : TrainingSettings
-        Of the training.
-    phase : str
-        In which the batch is wanted; in the evaluation all controllers share the noise.
-    rows : (R, 4) array
-        The rows of the batch.
-    counts : sequence of int
-        For every training a number that is never the same again in this phase: its attempts, or how
-        many batches its optimiser has had.
+    counts: for every training a number that is never the same again in the phase, its attempts or how
+    many batches its optimiser has had. In the evaluation all controllers share the noise.
     """
     if phase == "evaluate":
         fields = evaluation_noise(settings.evaluation_seed, settings.evaluation_fields)

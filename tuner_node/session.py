@@ -56,19 +56,9 @@ class Session:
         return self._end() if self.dispatcher.paused else []
 
     def advance(self, publications: list[PairPublication], now: float) -> list[PairPublication]:
-        """What is to be sent after an event: `publications` of the dispatcher, and what follows.
+        """What is to be sent after an event, which the dispatcher has answered with `publications`.
 
-        Parameters
-        ----------
-        publications
-            What the dispatcher answered the event with.
-        now
-            Monotonic time in s.
-
-        Raises
-        ------
-        DispatchError
-            The training cannot use the result of a batch.
+        now: monotonic time in s. Raises DispatchError if the training cannot use a batch's result.
         """
         for note in self.dispatcher.notes:
             self._report({"event": "repeated", "reason": note})

@@ -65,16 +65,8 @@ class FastPath(ABC):
     Before the node's thread waits it calls `arm`, and afterwards `disarm`. In between the protocol
     belongs to the other thread.
 
-    Parameters
-    ----------
-    handler
-        Made by `fast_handler`.
-    plan
-        The type of its record.
-    incoming
-        The codec that decodes what comes in.
-    outgoing
-        The topic of the answers.
+    handler: made by `fast_handler`; plan: the type of its record; incoming: the codec that decodes what
+    comes in; outgoing: the topic of the answers.
     """
 
     def __init__(
@@ -101,19 +93,10 @@ class FastPath(ABC):
         """Bring the protocol up to date: so many messages were answered, the last one at a time (s)."""
 
     def expect(self, like: Frame, shape: tuple[int, ...], answer: tuple[int, ...]) -> bool:
-        """Expect messages with the run, episode and plant of `like`.
+        """Expect messages with the run, episode and plant of `like`, a message of the episode.
 
-        Parameters
-        ----------
-        like
-            A message of the episode.
-        shape, answer
-            Shapes of the values that are expected, and of those of the answer.
-
-        Returns
-        -------
-        bool
-            False if nothing is expected, as the peer that was decoded last sends other messages.
+        shape, answer: of the values that are expected, and of those of the answer. False if nothing is
+        expected, as the peer that was decoded last sends other messages.
         """
         prefix = self._incoming.prefix_of(shape)
         if prefix is None:
