@@ -23,11 +23,10 @@ from loop_interfaces.signature import NOT_SIGNED, digest_of, signature
 from loop_interfaces.topics import ACTION, COMPLETED, MAX_GAIN, CostColumn, StartColumn, start_rows
 
 MAX_RUNS = 8
-"""Runs, and plants, that are remembered. The longest unheard one is forgotten first, but never the one
-that was answered last: a flood of strangers cannot push it out."""
+"""Runs, and plants, that are remembered. The least recently used is dropped first, but never the one
+that was answered last, whatever else comes in."""
 MAX_BYTES = 2**29
-"""Bytes that are kept of all runs together. Runs that were heard longer ago are forgotten for a newer
-one; a run that has no room alone is refused, and an exploratory episode without room gives no model."""
+"""Bytes that are kept of all runs together. Less recently used runs are dropped for a newer one; a run that has no room alone is refused, and an exploratory episode without room gives no model."""
 
 
 @dataclass(frozen=True)
@@ -293,7 +292,7 @@ class Responder:
         return run
 
     def _has_room(self, number: int, more: int) -> bool:
-        """Forget runs that were heard longer ago than this one, until `more` bytes have room."""
+        """Drop less recently used runs than this one, until `more` bytes have room."""
         others = [key for key in self._runs if key not in (number, self._served[0])]
         while sum(run.nbytes for run in self._runs.values()) + more > MAX_BYTES:
             if not others:
@@ -362,7 +361,7 @@ class Responder:
 
 
 def _forget(known: OrderedDict[int, Any], newest: int, protected: int) -> None:
-    """Keep MAX_RUNS entries: `newest`, `protected`, and the most recently heard others."""
+    """Keep MAX_RUNS entries: `newest`, `protected`, and the most recently used others."""
     known.move_to_end(newest)
     if len(known) > MAX_RUNS:
         del known[next(key for key in known if key not in (newest, protected))]

@@ -54,7 +54,7 @@ PLAN = plan_type(
     ("clock", CLOCK),
 )
 LOG = 50_000
-"""Numbers in actions that are applied before the lock-step hears of it."""
+"""Numbers in actions that are applied before the lock-step is synchronised."""
 
 
 @jit

@@ -1,4 +1,4 @@
-"""The loop of a compiled step over the environments: each is advanced, charged and looked after.
+"""The loop of a compiled step over the environments: each is advanced, costed and checked.
 
 An environment is computed alone and by the same instructions whatever stands beside it, so its
 result does not depend on the batch, nor on which thread computes it.
