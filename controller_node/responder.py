@@ -26,7 +26,8 @@ MAX_RUNS = 8
 """Runs, and plants, that are remembered. The least recently used is dropped first, but never the one
 that was answered last, whatever else comes in."""
 MAX_BYTES = 2**29
-"""Bytes that are kept of all runs together. Less recently used runs are dropped for a newer one; a run that has no room alone is refused, and an exploratory episode without room gives no model."""
+"""Bytes that are kept of all runs together. Less recently used runs are dropped for a newer one;
+a run that has no room alone is refused, and an exploratory episode without room gives no model."""
 
 
 @dataclass(frozen=True)
