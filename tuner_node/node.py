@@ -114,42 +114,34 @@ class TunerNode:
     def _wire(self, node: Node, loop: NodeLoop) -> None:
         self._node, self._loop, self._log = node, loop, node.get_logger()
         self._senders: list[dict[str, Sender]] = []
-        self._costs: list[str] = []
-        self._models: list[str] = []
         session, dispatcher = self._session, self._session.dispatcher
+        published = topics.POLICY, topics.START, topics.MODEL
         for number, namespace in enumerate(self._pairs):
-            self._senders.append(
-                {
-                    t.name: loop.sender(t, namespace)
-                    for t in (topics.POLICY, topics.START, topics.MODEL)
-                }
-            )
+            self._senders.append({t.name: loop.sender(t, namespace) for t in published})
+            handlers = {
+                topics.COST: dispatcher.cost,
+                topics.MODEL_IDENTIFIED: dispatcher.model,
+                topics.PAUSED: dispatcher.plant_paused,
+            }
             if session.training.settings.trajectories:
                 # Before the costs: what has come in with one is then taken before it.
-                loop.receive(topics.TARGET, self._handler(dispatcher.target, number), namespace)
+                handlers = {topics.TARGET: dispatcher.target, **handlers}
                 on_state = partial(self._on_state, number)
                 loop.observe(namespace, on_state, partial(dispatcher.action, number))
-            cost = loop.receive(topics.COST, self._handler(dispatcher.cost, number), namespace)
-            model = loop.receive(
-                topics.MODEL_IDENTIFIED, self._handler(dispatcher.model, number), namespace
-            )
-            self._costs.append(cost.name)
-            self._models.append(model.name)
-            node.create_subscription(
-                String,
-                scoped(namespace, topics.MODEL_FAILED),
-                partial(self._on_failure, number),
-                reader_qos(topics.MODEL),
-            )
-            loop.receive(topics.PAUSED, self._handler(dispatcher.plant_paused, number), namespace)
+            for topic, handle in handlers.items():
+                loop.receive(topic, self._handler(handle, number), namespace)
+            failed, qos = scoped(namespace, topics.MODEL_FAILED), reader_qos(topics.MODEL)
+            node.create_subscription(String, failed, partial(self._on_failure, number), qos)
             for topic in topics.ARRAYS:
-                name = scoped(namespace, topic.name)
-                loop.introspection.supervise(node.resolve_topic_name(name), topic)
+                loop.introspection.supervise(self._full_name(namespace, topic.name), topic)
         loop.introspection.report("training", self._diagnostics.report)
         loop.introspection.offer("~/pause", self._pause)
         loop.introspection.offer("~/resume", self._resume)
         loop.introspection.offer("~/stop", self._stop)
         on_change(node, TUNER, self._adjust)
+
+    def _full_name(self, namespace: str, topic: str) -> str:
+        return self._node.resolve_topic_name(scoped(namespace, topic))
 
     def _pause(self) -> str:
         self._session.dispatcher.pause()
@@ -230,13 +222,15 @@ class TunerNode:
             self._log.info(text)
 
     def _publishers(self) -> Publishers:
-        count, resolve = self._node.count_publishers, self._node.resolve_topic_name
-        starts = [senders[topics.START.name].publisher.topic_name for senders in self._senders]
+        def count(topic: str) -> list[tuple[str, int]]:
+            names = [self._full_name(namespace, topic) for namespace in self._pairs]
+            return [(name, self._node.count_publishers(name)) for name in names]
+
         return Publishers(
-            plants=[count(topic) for topic in self._costs],
-            controllers=[count(topic) for topic in self._models],
-            tuners={topic: count(topic) for topic in starts},
-            recorders=count(resolve(topics.RECORDER_STATUS)),
+            plants=[there for _, there in count(topics.COST.name)],
+            controllers=[there for _, there in count(topics.MODEL_IDENTIFIED.name)],
+            tuners=dict(count(topics.START.name)),
+            recorders=self._node.count_publishers(self._full_name("", topics.RECORDER_STATUS)),
         )
 
     def _report(self, row: Mapping[str, Any]) -> None:
@@ -256,7 +250,7 @@ class TunerNode:
             full_name(there)
             for namespace in self._pairs
             for there in self._node.get_publishers_info_by_topic(
-                self._node.resolve_topic_name(scoped(namespace, topics.ACTION.name))
+                self._full_name(namespace, topics.ACTION.name)
             )
         }
         seen = self._session.training.law_seen
