@@ -38,17 +38,18 @@ import numpy as np
 from numba import carray, types  # type: ignore[attr-defined, unused-ignore]
 from numpy.typing import NDArray
 
-from loop_interfaces.jit import atomics, cache, native, simd
-from loop_interfaces.jit.atomics import load_acquire, store_release
+from loop_interfaces.jit import cache, native, simd
 from loop_interfaces.jit.cache import cached_njit, jit
 from loop_interfaces.jit.native import (
     CLOCK,
     MonotonicClock,
     address_of,
     call_c,
+    load_acquire,
     machine_code,
     monotonic_ns,
     pointer_to,
+    store_release,
 )
 from loop_interfaces.jit.simd import read_word
 
@@ -81,7 +82,7 @@ CHANNEL = np.dtype(
         ("answered_at", np.int64),  # the last one; ns on the monotonic clock
     ]
 )
-SOURCES = cache, simd, atomics, native
+SOURCES = cache, simd, native
 CAPACITY = 16
 """Messages that the mailbox holds: twice what the middleware keeps for a reader of its own."""
 SLOTS = CAPACITY + 1

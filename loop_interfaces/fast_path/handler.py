@@ -19,7 +19,7 @@ from loop_interfaces.fast_path import messages
 from loop_interfaces.fast_path.channel import RclChannel
 from loop_interfaces.fast_path.messages import EXPECTED, OwnMessage, expected_header
 from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.jit import atomics, cache, native, simd
+from loop_interfaces.jit import cache, native, simd
 from loop_interfaces.jit.native import MachineCode, pointer_to
 from loop_interfaces.topics import Topic
 
@@ -56,7 +56,7 @@ def fast_handler(
         return 1 if head != 0 and answer(plan, head, message, length) else 0
 
     signature = types.int32(pointer_to(plan), types.intp, types.intp)
-    return MachineCode(handle, signature, answer, atomics, cache, native, simd, messages, *sources)
+    return MachineCode(handle, signature, answer, cache, native, simd, messages, *sources)
 
 
 class FastPath(ABC):

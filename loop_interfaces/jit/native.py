@@ -1,4 +1,7 @@
-"""Machine code by its address, inside compiled functions: what a C library or Numba's cfunc offers."""
+"""Machine code by its address, inside compiled functions, and words that threads share.
+
+The machine code is what a C library or Numba's cfunc offers.
+"""
 
 import ctypes
 from collections.abc import Callable
@@ -40,6 +43,27 @@ def call_c(typing_context: Any, address: Any, arguments: Any) -> Any:
         return builder.sext(status, WORD)
 
     return types.int64(types.intp, types.UniTuple(types.intp, len(arguments))), build  # type: ignore[no-untyped-call]
+
+
+@intrinsic
+def load_acquire(typing_context: Any, address: Any) -> Any:
+    """The word at an address; what was written before it was is seen, too."""
+
+    def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.load_atomic(builder.inttoptr(args[0], WORD.as_pointer()), "acquire", 8)
+
+    return types.intp(types.intp), build
+
+
+@intrinsic
+def store_release(typing_context: Any, address: Any, word: Any) -> Any:
+    """Write the word at an address; who sees it sees what was written before."""
+
+    def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        builder.store_atomic(args[1], builder.inttoptr(args[0], WORD.as_pointer()), "release", 8)
+        return context.get_dummy_value()
+
+    return types.void(types.intp, types.intp), build
 
 
 class MachineCode:
