@@ -30,22 +30,12 @@ from enum import Enum, auto
 
 import numpy as np
 
+from loop_interfaces import topics
 from loop_interfaces.frames import MAX_VALUES, Frame, FrameError, digest
 from loop_interfaces.protocol import Counters, Publication
 from loop_interfaces.samples import MAX_TIME
 from loop_interfaces.signature import signature
-from loop_interfaces.topics import (
-    COMPLETED,
-    COST,
-    PAUSED,
-    STATE,
-    TARGET,
-    VOID,
-    StartColumn,
-    Topic,
-    noise_seeds,
-    start_rows,
-)
+from loop_interfaces.topics import VOID, CostColumn, StartColumn, Topic, noise_seeds, start_rows
 from pde_sim_node.plant import Plant
 from pde_sim_node.real_time import RealTimePacer
 from pde_sim_node.taken_actions import Episode, TakenActions, two_actions, two_starts
@@ -149,7 +139,7 @@ class Lockstep:
     @property
     def last_state(self) -> Frame | None:
         """The state of the episode under way, whether it was sent or is ready."""
-        return self._stamped(STATE, self._state).frame if self.active else None
+        return self._stamped(topics.STATE, self._state).frame if self.active else None
 
     @property
     def awaiting(self) -> Frame | None:
@@ -177,15 +167,11 @@ class Lockstep:
 
     def announcement(self) -> Publication:
         """The target z_r, sent once at the start and latched."""
-        return Publication(TARGET, Frame(0, 0, 0, 0.0, self.plant.target, self._fingerprint))
+        return Publication(topics.TARGET, Frame(0, 0, 0, 0.0, self.plant.target, self._fingerprint))
 
     def paused_report(self) -> Publication:
         """Whether the plant is paused, latched."""
-        episode = max(self.episode, 0)  # -1 before the first
-        paused = np.array([float(self.paused)])
-        return Publication(
-            PAUSED, Frame(self.run, episode, self.step, self.time, paused, self._fingerprint)
-        )
+        return self._stamped(topics.PAUSED, np.array([float(self.paused)]))
 
     def pause(self, now: float) -> list[Publication]:
         """Send no further state."""
@@ -199,12 +185,9 @@ class Lockstep:
         if not self.paused:
             return []
         self.paused, self._stepping, self.deadline = False, False, None
-        report = [self.paused_report()]
-        if not self.active:
-            return report
         if self.pacer:
             self.pacer.begin(now)
-        return report + self._send_state(now)
+        return [self.paused_report(), *(self._send_state(now) if self.active else [])]
 
     def adjust(self, now: float, timing: Timing) -> list[Publication]:
         """Take other times from now on."""
@@ -214,9 +197,8 @@ class Lockstep:
         self.pacer = self._make_pacer()
         if self.pacer:
             self.pacer.begin(now)
-        if self.paused or self._phase is not Phase.READY:
-            return []
-        return self._send_state(now)  # it waited for an instant of the former pace
+        waited = self._phase is Phase.READY and not self.paused  # for an instant of the former pace
+        return self._send_state(now) if waited else []
 
     def step_once(self, now: float) -> list[Publication]:
         """Send one state although the plant is paused, and take its action.
@@ -262,9 +244,8 @@ class Lockstep:
         signed = signature(frame.plant, self.plant.target)
         if frame.episode <= self.episode:
             return self._start_again(frame, rows, signed, now)
-        self._state = self.plant.reset(
-            rows[:, StartColumn.SEED].astype(np.int64), noise_seeds(rows)
-        )
+        seeds = rows[:, StartColumn.SEED].astype(np.int64)
+        self._state = self.plant.reset(seeds, noise_seeds(rows))
         self._actions.episode = Episode(rows.copy(), signed)
         self.episode, self.contradiction, self._stepping = frame.episode, "", False
         self.time = max(self.time, frame.time) + self.plant.sample_time
@@ -287,14 +268,14 @@ class Lockstep:
         awaited = frame.step == plant.step_index
         if not awaited:
             self.counters["actions of another step"] += 1
-        expected = (plant.batch, plant.n_a)
-        if frame.values.shape != expected:  # it could never have been taken: nothing is in doubt
-            if not awaited:
-                return []
+        fits = frame.values.shape == plant.actions.shape
+        if awaited and not fits:
             raise FrameError(
-                f"expected an action of shape {expected} (env, actuator), got {frame.values.shape}"
+                f"expected an action of shape {plant.actions.shape} (env, actuator), "
+                f"got {frame.values.shape}"
             )
-        if contradiction := self._actions.contradiction(frame):
+        # One that does not fit could never have been taken: nothing is in doubt.
+        if fits and (contradiction := self._actions.contradiction(frame)):
             return [self._finish(now, void=True, contradiction=contradiction)]
         if not awaited:
             return []
@@ -319,7 +300,7 @@ class Lockstep:
         return (
             self._phase is Phase.AWAITING
             and (frame.run, frame.episode, frame.step, frame.plant) == ids
-            and frame.values.shape == (self.plant.batch, self.plant.n_a)
+            and frame.values.shape == self.plant.actions.shape
             and self._actions.is_signed(frame)
         )
 
@@ -357,7 +338,7 @@ class Lockstep:
         self._repeats += 1
         self.counters["states repeated"] += 1
         self.deadline = now + self._timing.action_timeout
-        state = self._stamped(STATE, self._state)
+        state = self._stamped(topics.STATE, self._state)
         return [state, self.paused_report()] if self.paused else [state]
 
     def _make_pacer(self) -> RealTimePacer | None:
@@ -389,19 +370,14 @@ class Lockstep:
                 "a new episode needs a new number"
             )
         self.counters["starts repeated"] += 1
-        return self._answer_again()
+        if self._phase is Phase.AWAITING:
+            return [self._stamped(topics.STATE, self._state)]
+        return [Publication(topics.COST, episode.cost)] if episode.cost else []
 
     def _take_back(self, cost: Frame, contradiction: str) -> Publication:
         self.contradiction = contradiction
         self.counters["costs taken back"] += 1
-        return Publication(COST, cost)
-
-    def _answer_again(self) -> list[Publication]:
-        """The state that is not answered, or the cost."""
-        if self._phase is Phase.AWAITING:
-            return [self._stamped(STATE, self._state)]
-        cost = self._actions.episode.cost
-        return [Publication(COST, cost)] if cost else []
+        return Publication(topics.COST, cost)
 
     def _check_late_action(self, frame: Frame) -> list[Publication]:
         """Take the cost of an ended episode back, if this action contradicts one of its own."""
@@ -420,7 +396,7 @@ class Lockstep:
     def _send_state(self, now: float) -> list[Publication]:
         self._phase, self._repeats = Phase.AWAITING, 0
         self.deadline = now + self._timing.action_timeout
-        return [self._stamped(STATE, self._state)]
+        return [self._stamped(topics.STATE, self._state)]
 
     def _end_episode(self, now: float) -> None:
         """No episode is under way; a pause outlasts it."""
@@ -429,19 +405,16 @@ class Lockstep:
 
     def _finish(self, now: float, *, void: bool, contradiction: str = "") -> Publication:
         self.contradiction = contradiction
-        costs = self.plant.episode_costs()
-        ended = np.where(costs.diverged_step >= 0, costs.diverged_step, COMPLETED)
+        values = self.last_cost = self.plant.episode_costs().rows()
         if void:
-            ended = np.full(self.plant.batch, VOID)
+            values[:, CostColumn.ENDED] = VOID
             self.counters["episodes void"] += 1
-        values = np.column_stack([costs.mean, costs.total, ended.astype(np.float64)])
-        self.last_cost = values
-        publication = self._stamped(COST, values)
+        publication = self._stamped(topics.COST, values)
         self._actions.end(publication.frame, void=void)
         self._end_episode(now)
         self.episodes_total += not void
         return publication
 
     def _stamped(self, topic: Topic, values: np.ndarray) -> Publication:
-        ids = self.run, self.episode, self.step
+        ids = self.run, max(self.episode, 0), self.step  # the episode is -1 before the first
         return Publication(topic, Frame(*ids, self.time, values, self._fingerprint))
