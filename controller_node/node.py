@@ -18,6 +18,7 @@ from controller_node.fast_path import ControllerFastPath, load_compiled
 from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
 from loop_interfaces import topics
+from loop_interfaces.affinity import pin_process
 from loop_interfaces.diagnostics import Status
 from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
@@ -38,7 +39,7 @@ class ControllerNode:
     def __init__(self, node: Node, loop: NodeLoop) -> None:
         values = declare(node, taken_by("controller_node"), given_parameters(node))
         settings = {k: v for k, v in values.items() if k not in ("problem", "pin")}
-        loop.pin(values["pin"])
+        pin_process(values["pin"])
         responder = Responder(DesignSettings(**settings))
         self._responder = responder
         self._diagnostics = ControllerDiagnostics(responder)

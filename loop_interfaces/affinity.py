@@ -36,11 +36,13 @@ def join_solver(cores: Collection[int]) -> None:
 
 
 def pin_process(core: int) -> None:
-    """Keep every thread of this process on one core; threads made later stay there, too.
+    """Keep every thread of this process on one core; threads made later stay there, too. -1: on any.
 
     All of them, because the middleware has its own already, and it is their wake-ups that count.
     Raises ValueError when this process may not use that core.
     """
+    if core < 0:
+        return
     if not hasattr(os, "sched_setaffinity"):
         raise ValueError(
             "parameter 'pin': this system cannot keep a process on a core; expected -1"

@@ -14,6 +14,7 @@ from typing import Any
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
+from loop_interfaces.affinity import pin_process
 from loop_interfaces.files import FileError
 from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
@@ -61,7 +62,7 @@ class PlantNode:
 
     def __init__(self, node: Node, loop: NodeLoop) -> None:
         values = declare_parameters(node)
-        loop.pin(values["pin"])
+        pin_process(values["pin"])
         plant = build_plant(values)
         if plant.compiled_in_seconds > 0.0:
             node.get_logger().info(f"compiled the kernel in {plant.compiled_in_seconds:.1f} s")

@@ -52,12 +52,11 @@ class Narration:
     def lines(self, row: Row) -> list[str]:
         """What is to be said when this row has come."""
         event = row.get("event")
-        if event in _TOGETHER and self._seeds > 1:
-            lines = (
-                [] if not self._together or event == self._together[0]["event"] else self._flush()
-            )
+        if event in _TOGETHER:
+            others = self._together and event != self._together[0]["event"]
+            lines = self._flush() if others else []
             self._together.append(row)
-            return lines
+            return lines + (self._flush() if self._seeds == 1 else [])
         lines = self._flush()
         if event == "phase":
             if self._phase == "adapt" and self._costs:
@@ -72,9 +71,6 @@ class Narration:
             self._costs[seed] = row.get("cost")
         elif event == "repeated":
             lines.append(f"  {row['reason']}")
-        elif event in _TOGETHER:
-            self._together.append(row)
-            lines += self._flush()
         return lines
 
     def _flush(self) -> list[str]:

@@ -44,8 +44,7 @@ class PingNode:
     def __init__(self, node: Node, loop: NodeLoop) -> None:
         given = {name: value.value for name, value in node._parameter_overrides.items()}
         values = declare(node, PARAMETERS, given)
-        if values["pin"] >= 0:
-            pin_process(values["pin"])
+        pin_process(values["pin"])
         self._poll = POLL if values["pin"] >= 0 else 0.0
         self._end = values["end"]
         self.join(node, loop)

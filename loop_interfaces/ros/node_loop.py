@@ -20,7 +20,6 @@ from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 
-from loop_interfaces.affinity import pin_process
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.ros.endpoints import Receiver, SampleBatcher, Sender
 from loop_interfaces.ros.observer import STUCK, SUSPENDED, WAIT, EventLoop
@@ -142,11 +141,6 @@ class NodeLoop(EventLoop):
         if self._batcher is None:
             self._batcher = SampleBatcher(self.node)
         return self._batcher
-
-    def pin(self, core: int) -> None:
-        """Stay on one core; -1: on any. ValueError for a core not allowed."""
-        if core >= 0:
-            pin_process(core)
 
     def resume(self) -> None:
         """Make `run` possible again after `stop`."""
