@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loop_interfaces.affinity import SOLVER
+from loop_interfaces.affinity import helps_solver
 from pde_sim_node.equations import Burgers
 from pde_sim_node.plant import Plant
 from pde_sim_node.solver import workers
@@ -108,8 +108,7 @@ sys.stdin.readline()
         found: dict[bool, set[int]] = {True: set(), False: set()}
         for thread in Path(f"/proc/{process.pid}/task").iterdir():
             number = int(thread.name)
-            helps = (thread / "comm").read_text().strip() == SOLVER
-            found[helps] |= os.sched_getaffinity(number)
+            found[helps_solver(process.pid, number)] |= os.sched_getaffinity(number)
         return found
 
     with process:
