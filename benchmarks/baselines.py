@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from benchmarks.limits import find
 from benchmarks.methods import LIBRARIES, METHODS, measure
+from loop_interfaces.controllers import CONTROLLERS
 from loop_interfaces.files import read_json
 from loop_interfaces.parameters import table as parameters
 from loop_interfaces.problem import load_parameters
@@ -46,6 +47,21 @@ TEST, VALIDATION = 0, 2024
 """Evaluation seeds, which draw the initial fields of the tables, and those that choose constants."""
 TUNING_SEEDS = (100, 101, 102, 103)
 BUDGETS = (20, 40, 80)
+LOOKS = {
+    "gauss-newton": (CONTROLLERS["gauss_newton"].colour, "-o"),
+    "two-point": (CONTROLLERS["lqt_po"].colour, "-o"),
+    "directions": (CONTROLLERS["lqt_po"].colour, "--s"),
+    "lqt": (CONTROLLERS["lqt"].colour, "--o"),
+    "lqt-again": (CONTROLLERS["lqt"].colour, "-s"),
+    "mpc": (CONTROLLERS["lqt"].colour, ":^"),
+    "lqg": (CONTROLLERS["lqt"].colour, "-.v"),
+    "cma-es": ("#009e73", "-o"),
+    "ppo": ("#cc79a7", "-o"),
+    "sac": ("#cc79a7", "--s"),
+    "no-control": (CONTROLLERS["none"].colour, "-"),
+}
+"""Colour and line of a method in the figure: methods of one kind share the colour of its controller,
+those of others have the two colours of Okabe and Ito that are left."""
 
 
 def run(
@@ -304,15 +320,18 @@ def plot(result: Mapping[str, Any], path: Path) -> None:
     with rc_context(STYLE):
         figure, axes = panels(len(result["limits"]), 3.2, 3.0, 4.6)
         for ax, (problem, bound) in zip(axes, result["limits"].items(), strict=True):
-            for place, method in enumerate(methods):
+            for method in methods:
                 own = [r for r in shown if (r["problem"], r["method"]) == (problem, method)]
                 ends = np.array([r["interval"] or (r["cost"],) * 2 for r in own]).reshape(-1, 2)
-                x, color = [r["budget"] for r in own], f"C{place % 10}"
-                line = ("-o", "--s", ":^")[place % 3]  # two methods may lie upon each other
+                color, line = LOOKS.get(method.partition("+")[0], ("black", ":x"))
+                x = [r["budget"] for r in own]
                 ax.plot(x, [r["cost"] for r in own], line, ms=4, lw=1, color=color, label=method)
                 ax.fill_between(x, *ends.T, alpha=0.15, lw=0, color=color)
             if bound is not None:
-                ax.axhline(bound, color="0.4", ls="--", lw=1, label="limit of any controller")
+                ax.axhline(
+                    bound, color="0", ls=":", lw=1, zorder=0, label="limit of any controller"
+                )
+                ax.set_ylim(bottom=0.93 * bound)
             low, high = ax.get_ylim()
             plain_log(ax, high / max(low, 1e-9))
             ax.set_xscale("log", base=2)
@@ -322,5 +341,4 @@ def plot(result: Mapping[str, Any], path: Path) -> None:
             ax.set_title(problem)
         axes[0].set_ylabel("mean stage cost, test fields")
         axes[-1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
-        undated = {"Date": None} if path.suffix == ".svg" else None
-        figure.savefig(path, bbox_inches="tight", metadata=undated)
+        figure.savefig(path, bbox_inches="tight")

@@ -4,6 +4,9 @@ A round of M environments takes t(M) = c + w M + s(M): what a message costs what
 it costs for each environment (copies, the control law), and the solver. The batch pays as long as c
 is the larger part; the knee is where it is half: M = c / (w + s). Beyond it the rate is that of
 solver and copies, 1 / (w + s) environment-steps a second, however large the batch.
+
+The processor time of a round, in the threads of the plant and of the controller, hardly depends on
+what else the machine does.
 """
 
 from __future__ import annotations
@@ -13,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.processes import bench, machine, markdown
+from benchmarks.processes import BenchProcess, bench, machine, markdown
 
 BATCHES = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
 LONG, SHORT = 1000, 100
@@ -26,22 +29,32 @@ def run(*, problem: str = "allen-cahn", turns: int = 3, batches: tuple[int, ...]
     samples: dict[tuple[int, str], list[float]] = {}
     for horizon in (LONG, SHORT):
         own = [m for m in batches if (m < SHORT_FROM) == (horizon == LONG)]
+        if not own:
+            continue
         with bench() as running:
             length = f"horizon:={horizon}"
-            running.start("pde_sim_node", length, problem=problem)
-            running.start("controller_node", problem=problem)
+            nodes = {
+                "plant": running.start("pde_sim_node", length, problem=problem),
+                "controller": running.start("controller_node", problem=problem),
+            }
             driver = running.start("benchmarks.driver", length, problem=problem)
             for turn in range(-1, turns):  # the first one is to warm up
                 for batch in own:
+                    before = _processor_times(nodes)
                     got = driver.ask(do="episodes", batch=batch, seconds=0.3 if turn >= 0 else 0.0)
+                    after = _processor_times(nodes)
                     solver = driver.ask(do="solver", batch=batch, seconds=0.1)["median"]
                     if turn >= 0:
-                        round_time = got["seconds"] / got["rounds"]
-                        samples.setdefault((batch, "round"), []).append(round_time)
-                        samples.setdefault((batch, "solver"), []).append(solver)
+                        spent = {name: after[name] - before[name] for name in nodes}
+                        spent["round"] = got["seconds"]
+                        found = {what: value / got["rounds"] for what, value in spent.items()}
+                        for what, value in {**found, "solver": solver}.items():
+                            samples.setdefault((batch, what), []).append(value)
     rows = []
     for batch in batches:
-        round_time, solver = (median(samples[batch, what]) for what in ("round", "solver"))
+        round_time, solver, plant, controller = (
+            median(samples[batch, what]) for what in ("round", "solver", "plant", "controller")
+        )
         rows.append(
             {
                 "batch": batch,
@@ -50,9 +63,15 @@ def run(*, problem: str = "allen-cahn", turns: int = 3, batches: tuple[int, ...]
                 "round_us": 1e6 * round_time,
                 "solver_us": 1e6 * solver,
                 "overhead_us": 1e6 * (round_time - solver),
+                "plant_processor_us": 1e6 * plant,
+                "controller_processor_us": 1e6 * controller,
             }
         )
     return {"problem": problem, "machine": machine(), "rows": rows, "model": fit(rows)}
+
+
+def _processor_times(nodes: dict[str, BenchProcess]) -> dict[str, float]:
+    return {name: sum(node.processor_times().values()) for name, node in nodes.items()}
 
 
 def fit(rows: list[dict[str, Any]]) -> dict[str, float]:
@@ -83,6 +102,8 @@ def text(result: dict[str, Any]) -> str:
         "round_us": "round µs",
         "solver_us": "solver µs",
         "overhead_us": "overhead µs",
+        "plant_processor_us": "plant, processor µs",
+        "controller_processor_us": "controller, processor µs",
     }
     rows = [[f"{row[name]:.0f}" for name in columns] for row in result["rows"]]
     model = result["model"]

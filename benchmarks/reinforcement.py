@@ -207,10 +207,10 @@ def batch_of_episodes(
             return [getattr(source, attr_name, None)] * self.num_envs
 
         def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-            raise NotImplementedError("a batch has no single environments to set anything of")
+            raise AttributeError(f"a batch has no single environments to set {attr_name} of")
 
         def env_method(self, method_name: str, *args: Any, indices: Any = None, **kw: Any) -> Any:
-            raise NotImplementedError("a batch has no single environments to call")
+            raise AttributeError(f"a batch has no single environments to call {method_name} of")
 
         def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
             return [False] * self.num_envs
