@@ -25,13 +25,13 @@ if TYPE_CHECKING:
     from pde_sim_node.plant import Plant as Plant
     from pdeloop.api import Problem as Problem
     from pdeloop.api import identify as identify
-    from pdeloop.api import load_run as load_run
     from pdeloop.api import problem as problem
     from pdeloop.api import train as train
     from pdeloop.data_file import read_measurements as read_measurements
     from pdeloop.episode import projected_law as projected_law
     from pdeloop.episode import rollout as rollout
     from pdeloop.finished_run import FinishedRun as FinishedRun
+    from pdeloop.finished_run import load_run as load_run
     from pdeloop.gradients import Gradients as Gradients
     from pdeloop.plots import plot_behaviour as plot_behaviour
     from pdeloop.plots import plot_costs as plot_costs
@@ -45,10 +45,10 @@ _NAMES = {
     "controller_node.order": ("study_orders",),
     "controller_node.reduced_model": ("ReducedModel",),
     "pde_sim_node.plant": ("Plant",),
-    "pdeloop.api": ("Problem", "identify", "load_run", "problem", "train"),
+    "pdeloop.api": ("Problem", "identify", "problem", "train"),
     "pdeloop.data_file": ("read_measurements",),
     "pdeloop.episode": ("projected_law", "rollout"),
-    "pdeloop.finished_run": ("FinishedRun",),
+    "pdeloop.finished_run": ("FinishedRun", "load_run"),
     "pdeloop.gradients": ("Gradients",),
     "pdeloop.plots": (
         *("plot_behaviour", "plot_costs", "plot_episode"),

@@ -19,14 +19,14 @@ from pde_sim_node.build import build_equation, build_plant
 from pde_sim_node.equations import allow
 from pde_sim_node.plant import Plant
 from pdeloop.display import Display
-from pdeloop.finished_run import FinishedRun, load
+from pdeloop.finished_run import FinishedRun, load_run
 from pdeloop.in_process import LocalPair
 from pdeloop.interruption import Interruption
 from pdeloop.pairs import Transport
 from pdeloop.training_run import begin, carry_out
 from tuner_node.build import build_training
 
-__all__ = ["Problem", "identify", "load_run", "problem", "train"]
+__all__ = ["Problem", "identify", "problem", "train"]
 
 Array = NDArray[np.float64]
 
@@ -232,15 +232,4 @@ def train(
             ) from None
         finally:
             display.close()
-        return load(folder)
-
-
-def load_run(folder: str | Path) -> FinishedRun:
-    """A finished run from its folder: costs, policies, models and trajectories as arrays.
-
-    Raises
-    ------
-    ValueError
-        There is no run, or it is not finished; the message says how to go on.
-    """
-    return load(Path(folder))
+        return load_run(folder)

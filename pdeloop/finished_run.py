@@ -98,12 +98,18 @@ class FinishedRun:
                 yield EpisodeRecord(states, states, actions, EpisodeCosts(mean, total, lost))
 
 
-def load(folder: Path) -> FinishedRun:
-    """The run in `folder`. RunFolderError if there is none, or it is not finished."""
-    run = RunFolder(folder)
+def load_run(folder: str | Path) -> FinishedRun:
+    """A finished run from its folder: costs, policies, models and trajectories as arrays.
+
+    Raises
+    ------
+    ValueError
+        There is no run, or it is not finished; the message says how to go on.
+    """
+    run = RunFolder(Path(folder))
     values, arrays, result = run.values(), run.policies(), run.result()
     return FinishedRun(
-        folder,
+        run.path,
         values,
         result,
         policies=arrays["policy"],

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pdeloop.finished_run import FinishedRun, load, merged
+from pdeloop.finished_run import FinishedRun, load_run, merged
 from pdeloop.study.description import Study
 from pdeloop.study.run import ASKED, kept
 
@@ -69,7 +69,7 @@ def reproduction_in(folder: Path) -> Study | None:
 def runs_of(study: Study, folder: Path, problem: str) -> dict[str, FinishedRun]:
     """The finished runs of a problem over all seeds, by adapted controller."""
     return {
-        name: merged([load(folder / problem / name / str(seed)) for seed in study.seeds])
+        name: merged([load_run(folder / problem / name / str(seed)) for seed in study.seeds])
         for name in LEARNED
     }
 

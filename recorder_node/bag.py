@@ -117,6 +117,11 @@ class BagWriter:
         number = self._mcap.register_channel(channel.topic, "cdr", self._schemas[kind], metadata)
         self._numbers[channel.topic], self._channels[channel.topic] = number, channel
 
+    @property
+    def messages(self) -> int:
+        """How many were written."""
+        return self._counts.total()
+
     def write(self, topic: str, when: int, data: bytes) -> None:
         """Append a serialised message; when: time of its arrival, ns since the epoch."""
         try:
@@ -163,7 +168,7 @@ class BagWriter:
         extent = {
             "duration": {"nanoseconds": last - first},
             "starting_time": {"nanoseconds_since_epoch": first},
-            "message_count": self._counts.total(),
+            "message_count": self.messages,
         }
         topics = [
             {

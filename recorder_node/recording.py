@@ -20,8 +20,8 @@ from recorder_node.sources import Source
 PARAMETERS = "parameters.json"
 
 
-class Recording:
-    """Writes the messages that `take` is given into a bag.
+class Recording(BagWriter):
+    """A bag of the messages that `take` is given, with the nodes' parameters beside it.
 
     Parameters
     ----------
@@ -37,41 +37,24 @@ class Recording:
     """
 
     def __init__(self, path: Path, what: Sequence[Source]) -> None:
-        self.path = path
-        self.messages = 0
+        super().__init__(path, [source.channel for source in what])
         self.run = 0
         """That of the newest episode; 0 before the first."""
         self._notes: dict[str, Any] = {}
-        self._bag = BagWriter(path, [source.channel for source in what])
 
     def take(self, source: Source, when: int, raw: bytes) -> None:
         """Record one message that arrived at `when` (ns since the epoch)."""
-        self.messages += 1
         if source.array is START:
             with contextlib.suppress(FrameError):
                 self.run = source.codec.decode(raw).run
-        self._bag.write(source.channel.topic, when, raw)
+        self.write(source.channel.topic, when, raw)
 
     def note(self, run: int, parameters: Mapping[str, Any]) -> None:
         """Keep the parameters of a run, beside what is already known of them."""
         self._notes[str(run)] = self._notes.get(str(run), {}) | dict(parameters)
         try:
-            part = (
-                self.path / f"{PARAMETERS}.part"
-            )  # not synchronised: that could hold the recorder up
+            part = self.path / f"{PARAMETERS}.part"  # not synchronised, as that could take long
             part.write_text(json.dumps(self._notes, indent=1))
             part.replace(self.path / PARAMETERS)
         except OSError as error:
             raise BagError(f"cannot write to {self.path}: {error.strerror}") from error
-
-    def pause(self) -> None:
-        """All that arrived up to some moment was taken."""
-        self._bag.pause()
-
-    def flush(self) -> None:
-        """Make everything so far survive a crash."""
-        self._bag.flush()
-
-    def close(self) -> None:
-        """Finish the bag."""
-        self._bag.close()

@@ -45,12 +45,12 @@ def add(commands: Commands) -> None:
 
 def _evaluate(options: argparse.Namespace) -> int:
     from pdeloop.evaluation import all_diverged, another_plant, as_text, evaluate
-    from pdeloop.finished_run import load
+    from pdeloop.finished_run import load_run
 
     allow_equation(options)
     DEFAULTS["evaluation_fields"].check(options.fields)
     DEFAULTS["evaluation_seed"].check(options.seed)
-    run = load(options.folder)
+    run = load_run(options.folder)
     costs = evaluate(run, fields=options.fields, seed=options.seed, mean_field=options.mean_field)
     if note := another_plant(run):
         print(f"WARNING: {note}; these are costs of the built-in one", file=sys.stderr)

@@ -26,8 +26,7 @@ from loop_interfaces.ros.parameters import RemoteParameters
 from pdeloop.display import ProgressFile
 from pdeloop.live import Live
 from pdeloop.monitor.finder import Finder, run_id
-from pdeloop.monitor.names import component_names, short
-from pdeloop.monitor.replay import REFRESH, stop_event
+from pdeloop.monitor.replay import REFRESH, component_names, short, stop_event
 from pdeloop.monitor.service_call import ServiceCall
 from viewer_node.learning_curve import LearningCurve
 from viewer_node.loop_nodes import ROLES, Endpoint

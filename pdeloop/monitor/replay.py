@@ -10,13 +10,14 @@ import queue
 import signal
 import threading
 import time
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from loop_interfaces.frames import Frame
+from pde_sim_node.equations import EQUATIONS
 from pdeloop.display import ProgressFile
 from pdeloop.monitor.finder import Finder, run_id
-from pdeloop.monitor.names import component_names, short
 from tuner_node.results import RunFolder
 from viewer_node.loop_view import LoopView
 from viewer_node.web.page import Page, Recorded, ShowEpisode
@@ -112,6 +113,22 @@ def _label(episode: RecordedEpisode) -> str:
     words += [episode.key[0]] if episode.key[0] != "/" else []
     words += [f"incomplete: {', '.join(episode.missing)}"] if episode.missing else []
     return ", ".join(words)
+
+
+def component_names(values: Mapping[str, Any]) -> list[str]:
+    """Names of the components that make up a state, from a plant's parameters."""
+    if values.get("sensors"):
+        count = int(values.get("sensor_delays") or 1)
+        return ["y", *(f"y {k} ago" for k in range(1, count))]
+    equation = EQUATIONS.get(str(values.get("equation")))
+    return ["u"] if equation is None else list(equation.components)
+
+
+def short(folder: Path) -> str:
+    """The folder as a person in the working directory writes it."""
+    with contextlib.suppress(ValueError):
+        return str(folder.resolve().relative_to(Path.cwd()))
+    return str(folder)
 
 
 def stop_event() -> threading.Event:

@@ -18,7 +18,7 @@ from pde_sim_node.build import build_plant
 from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD, Plant
 from pdeloop.episode import rollout
 from pdeloop.evaluation import another_loop, another_plant
-from pdeloop.finished_run import FinishedRun, field_means, load
+from pdeloop.finished_run import FinishedRun, field_means, load_run
 from pdeloop.in_process import LocalPair
 from pdeloop.reproduction import reproduction_in, runs_of
 from pdeloop.study.description import Study
@@ -154,7 +154,7 @@ def gather(folder: Path) -> ReportData:
         problems = [_reproduced(study, folder, name) for name in study.problems]
         return ReportData(folder, problems, study)
     if (folder / "parameters.yaml").exists():
-        return ReportData(folder, [of_run(load(folder))])
+        return ReportData(folder, [of_run(load_run(folder))])
     raise RunFolderError(f"{folder} holds neither a run nor a reproduction")
 
 

@@ -16,7 +16,7 @@ from pdeloop.finished_run import (
     FinishedRun,
     field_means,
     interval,
-    load,
+    load_run,
     merged,
     reduction,
 )
@@ -38,7 +38,7 @@ def rows(study: Study, folder: Path) -> list[dict[str, Any]]:
     for problem in study.problems:
         for variant in study.variants:
             places = [folder / problem / variant / str(seed) for seed in study.seeds]
-            runs = [load(place) for place in places if (place / "result.json").exists()]
+            runs = [load_run(place) for place in places if (place / "result.json").exists()]
             if runs:
                 found.append({"problem": problem, "variant": variant, **figures(merged(runs))})
     return found
