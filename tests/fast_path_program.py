@@ -18,13 +18,21 @@ from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.sample_subscription import SerializedSubscription
 from loop_interfaces.samples import ACTION_KIND, NO_TIME, STATE_KIND, unpack
 from loop_interfaces.topics import ACTION, COST, STATE, VOID, CostColumn
+from tests.loop_harness import until
 from tests.test_fast_path import Controller, Plant, with_number
+
+LIMIT = 60.0
+"""Seconds for each wait, on a busy machine."""
 
 
 class Peer:
-    """Publishes messages of one kind, and reads those of the other."""
+    """Publishes messages of one kind, and reads those of the other.
 
-    def __init__(self, sends: str, reads: str) -> None:
+    channel: of the fast path that its messages come to.
+    """
+
+    def __init__(self, sends: str, reads: str, channel: Any) -> None:
+        self._channel = channel
         self.node = rclpy.create_node("peer")
         self._publisher = self.node.create_publisher(Float64MultiArray, sends, 10)
         self._intake = self._reader(Float64MultiArray, reads, 10)
@@ -38,21 +46,33 @@ class Peer:
 
     def meet(self, *topics: str) -> None:
         """Wait until everybody knows of everybody."""
-        deadline = time.monotonic() + 20.0
-        while self._publisher.get_subscription_count() < 1 or not all(
-            self.node.count_publishers(topic) for topic in topics
-        ):
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
+        until(
+            lambda: (
+                self._publisher.get_subscription_count()
+                and all(self.node.count_publishers(topic) for topic in topics)
+            ),
+            LIMIT,
+            "peer",
+        )
         time.sleep(0.3)
 
     def say(self, *messages: bytes) -> None:
+        """Publish, and wait until all have come to the channel."""
+        before = self._arrived()
         for raw in messages:
             self._publisher.publish(raw)
-        time.sleep(0.05)  # until they are there
+        until(lambda: self._arrived() == before + len(messages), LIMIT, "arrival of the messages")
+
+    def say_to_nobody(self, raw: bytes) -> None:
+        self._publisher.publish(raw)
+        time.sleep(0.2)
+
+    def _arrived(self) -> int:
+        record = self._channel.record[0]
+        return sum(int(record[name]) for name in ("answered", "waiting", "dropped"))
 
     def heard(self, count: int, intake: SerializedSubscription | None = None) -> list[bytes]:
-        deadline, got = time.monotonic() + 5.0, []
+        deadline, got = time.monotonic() + LIMIT, []
         while len(got) < count and time.monotonic() < deadline:
             got += [bytes(raw) for raw, _ in (intake or self._intake).take()]
             time.sleep(0.002)
@@ -90,10 +110,11 @@ def answer_for(path: Any, seconds: float = 0.0, messages: int = 0) -> bytes | No
 
 def plant_on_topics(*, timed: bool = False) -> None:
     node = rclpy.create_node("plant")
-    loop, peer = NodeLoop(node), Peer("action", "state")
+    loop = NodeLoop(node)
     loop.batcher.timed = timed
     plant = Plant(loop.batcher, horizon=14)
     path = plant.path
+    peer = Peer("action", "state", path.channel)
     receiver = loop.receive(ACTION, lambda frame: None)
     sender = loop.sender(STATE, sampled=True)
     with opened(loop, receiver, sender, path):
@@ -223,8 +244,9 @@ def plant_on_topics(*, timed: bool = False) -> None:
 
 def controller_on_topics() -> None:
     node = rclpy.create_node("controller")
-    loop, controller, peer = NodeLoop(node), Controller(3), Peer("state", "action")
+    loop, controller = NodeLoop(node), Controller(3)
     path, responder = controller.path, controller.responder
+    peer = Peer("state", "action", path.channel)
     receiver = loop.receive(STATE, lambda frame: None)
     with opened(loop, receiver, loop.sender(ACTION), path):
         peer.meet("action")
@@ -244,7 +266,7 @@ def controller_on_topics() -> None:
         assert peer.heard(1) == [controller.expected(states[2])]
         assert (responder.answered, responder.step) == (7, 3)
     # Closed, it hears nothing any more.
-    peer.say(controller.state(4, 6))
+    peer.say_to_nobody(controller.state(4, 6))
     assert path.arm()
     assert path.disarm() == 0
     assert not path.channel.waits

@@ -78,8 +78,9 @@ def report(folder: Path, out: Path | None) -> tuple[Path, list[str]]:
 
 
 def _save(target: Path, name: str, heading: str, caption: str, figure: Figure) -> Picture:
-    figure.savefig(target / f"{name}.svg", metadata={"Date": None})
     figure.savefig(target / f"{name}.png")
+    figure.set_layout_engine("none")  # it is laid out, which takes as long as a drawing
+    figure.savefig(target / f"{name}.svg", metadata={"Date": None})
     width = round(PIXELS_PER_INCH * figure.get_figwidth())
     png = base64.b64encode((target / f"{name}.png").read_bytes()).decode()
     return Picture(name, heading, caption, width, png)

@@ -16,7 +16,8 @@ LIMIT = 240.0
 
 
 def pdeloop(loop: Processes, *words: object) -> str:
-    loop.forks = False  # as a user starts them: the libraries they load, and when, decide on bits
+    # As a user starts them, where the libraries they load, and when, decide on bits.
+    loop.forks = words[0] in ("identify", "report")
     return loop.wait(loop.pdeloop(*map(str, words)), LIMIT)
 
 
