@@ -1,15 +1,16 @@
 """How often a test fails that should not: the tests over topics again and again, on a busy machine.
 
-    python -m tests.flakes --runs 10 --load 4 [-k EXPRESSION]
+    python -m tests.flakes --runs 10 --load 4 [-n WORKERS] [-k EXPRESSION]
 
-Runs them `runs` times beside `load` processes that do nothing but compute, and prints each failure and
-how many there were.
+Runs them `runs` times beside `load` processes that do nothing but compute, and prints each failure, the
+machine's load average over the last minute of each run, and how many failures there were.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import os
 import re
 import subprocess
 import sys
@@ -33,9 +34,10 @@ def busy(load: int) -> Iterator[None]:
             process.wait()
 
 
-def run(expression: str) -> tuple[int, list[str]]:
+def run(expression: str, workers: int) -> tuple[int, list[str]]:
     """How many tests ran once each, and the names of those that failed."""
     command = [sys.executable, "-m", "pytest", "-q", "-rfE", "-m", "topics", "-k", expression]
+    command += ["-n", str(workers), "--dist", "worksteal"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     *lines, last = done.stdout.strip().splitlines()
     if done.returncode not in (0, 1):
@@ -49,15 +51,20 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.flakes", description=__doc__)
     parser.add_argument("--runs", type=int, default=10, metavar="N", help="[10]")
     parser.add_argument("--load", type=int, default=4, metavar="N", help="processes beside it [4]")
+    parser.add_argument("-n", type=int, default=0, metavar="N", help="workers; 0: none [0]")
     parser.add_argument("-k", default="", metavar="EXPRESSION", help="only these tests")
     options = parser.parse_args()
     ran, failed = 0, Counter[str]()
     with busy(options.load):
         for number in range(1, options.runs + 1):
-            tests, names = run(options.k)
+            tests, names = run(options.k, options.n)
             ran += tests
             failed.update(names)
-            print(f"run {number}: {len(names)} of {tests} failed {' '.join(names)}", flush=True)
+            load = f"load average {os.getloadavg()[0]:.0f}"
+            print(
+                f"run {number}: {len(names)} of {tests} failed, {load} {' '.join(names)}",
+                flush=True,
+            )
     print(f"{failed.total()} failures in {ran} tests of {options.runs} runs")
     for name, count in failed.most_common():
         print(f"{count:4} {name}")

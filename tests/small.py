@@ -10,6 +10,7 @@ import numpy as np
 from pdeloop.in_process import LocalPair, train
 from pdeloop.training_run import resolve
 from tuner_node.build import build_training
+from tuner_node.dispatch import Dispatcher
 from tuner_node.training import Training
 
 _OWN = ("optimizer", "seed", "seeds", "rollouts", "iterations", "start")
@@ -42,6 +43,13 @@ def train_here(values: dict[str, Any], **how: Any) -> Training:
     training = build_training(values)
     train(training, LocalPair(values), lambda row: None, **how)
     return training
+
+
+def dispatcher_of(**settings: Any) -> Dispatcher:
+    """A dispatcher of one pair with two actuators, which has not been seen yet, unless said so."""
+    ids = {"run": 7, "n_a": 2, "pairs": 1, "incarnation": 0}
+    limits = {"max_batch": 3, "episode_timeout": 10.0, "max_attempts": 3}
+    return Dispatcher(**(ids | limits | settings))
 
 
 def same_bits(a: np.ndarray, b: np.ndarray) -> bool:

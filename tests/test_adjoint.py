@@ -12,11 +12,12 @@ from pde_sim_node.plant import Plant
 from pde_sim_node.solver.adjoint import Adjoint
 from pdeloop.episode import projected_law, rollout
 from pdeloop.gradients import Gradients
+from tests.plants import Advection, plant_of
 
 PROBLEMS = ("burgers", "allen-cahn", "kdv")
 
 
-def plant_of(problem: str, **changes: object) -> Plant:
+def shipped(problem: str, **changes: object) -> Plant:
     return build_plant({**load_parameters(problem, {}), **changes})
 
 
@@ -39,7 +40,7 @@ def somewhere(plant: Plant, batch: int = 3) -> tuple[np.ndarray, np.ndarray, np.
 @pytest.mark.parametrize("problem", PROBLEMS)
 @pytest.mark.parametrize("n_z", [None, 100])
 def test_the_transposed_step_agrees_with_finite_differences_of_the_plant(problem, n_z):
-    plant = plant_of(problem, **({} if n_z is None else {"n_z": n_z}))
+    plant = shipped(problem, **({} if n_z is None else {"n_z": n_z}))
     states, actions, rng = somewhere(plant)
     y, dz = rng.standard_normal((2, *states.shape))
     da = rng.standard_normal(actions.shape)
@@ -58,7 +59,7 @@ def test_the_transposed_step_agrees_with_finite_differences_of_the_plant(problem
 @pytest.mark.parametrize("problem", PROBLEMS)
 @pytest.mark.parametrize("n_z", [None, 100])
 def test_its_way_forward_is_the_step_of_the_plant_to_the_bit(problem, n_z):
-    plant = plant_of(problem, **({} if n_z is None else {"n_z": n_z}))
+    plant = shipped(problem, **({} if n_z is None else {"n_z": n_z}))
     states, actions, _ = somewhere(plant)
     expected = plant.evaluate(states, actions)[0]
     assert Adjoint(plant).step(states, actions).tobytes() == expected.tobytes()
@@ -66,28 +67,8 @@ def test_its_way_forward_is_the_step_of_the_plant_to_the_bit(problem, n_z):
 
 def test_of_a_linear_plant_it_is_the_transposed_matrix():
     """With g = 0, f is affine: its matrix, column by column, transposed to rounding."""
-
-    @dataclass(frozen=True, kw_only=True)
-    class Advection(Burgers):
-        name = "advection"
-
-        def linear_operator(self, k):
-            return -0.05 * k**2 - 0.7j * k
-
-        def multiplier(self, k):
-            return np.zeros_like(k)
-
-    plant = Plant(
-        Advection(),
-        n_z=16,
-        n_a=3,
-        width=0.2,
-        sample_time=0.1,
-        integration_time=0.05,
-        horizon=1,
-        state_weight=1.0,
-        action_weight=1.0,
-    )
+    grid = {"n_z": 16, "n_a": 3, "width": 0.2, "horizon": 1}
+    plant = plant_of(Advection(), **grid, sample_time=0.1, integration_time=0.05)
     columns = plant.evaluate(np.eye(16), np.zeros((16, 3)))[0].T
     inputs = plant.evaluate(np.zeros((3, 16)), np.eye(3))[0].T
     rows, on_actions = Adjoint(plant).pull_back(np.zeros((16, 16)), np.zeros((16, 3)), np.eye(16))
@@ -96,7 +77,7 @@ def test_of_a_linear_plant_it_is_the_transposed_matrix():
 
 
 def test_it_is_linear_in_the_covector_and_does_not_depend_on_batch():
-    plant = plant_of("burgers")
+    plant = shipped("burgers")
     states, actions, rng = somewhere(plant, 5)
     y1, y2 = rng.standard_normal((2, *states.shape))
     one = Adjoint(plant)
@@ -126,19 +107,9 @@ def test_a_nonlinearity_without_a_derivative_is_refused_with_the_reason():
         def nonlinearity(u: float) -> float:
             return u * u if u > 0 else 0.0
 
-    values = load_parameters("burgers", {})
+    grid = {"n_z": 32, "n_a": 2, "width": 0.2, "horizon": 5}
     for kind in (Kinked, Branching):
-        plant = Plant(
-            kind(),
-            n_z=32,
-            n_a=2,
-            width=0.2,
-            sample_time=0.05,
-            integration_time=0.0025,
-            horizon=5,
-            state_weight=values["state_weight"],
-            action_weight=values["action_weight"],
-        )
+        plant = plant_of(kind(), **grid, sample_time=0.05, integration_time=0.0025)
         with pytest.raises(ValueError, match="complex"):
             Adjoint(plant)
 
@@ -146,7 +117,7 @@ def test_a_nonlinearity_without_a_derivative_is_refused_with_the_reason():
 @pytest.mark.parametrize("problem", [*PROBLEMS, "wave"])
 def test_gradients_of_whole_episodes_agree_with_finite_differences(problem):
     """By the law, the policy, the actions and the initial fields; of a linear plant, too."""
-    plant = plant_of(problem, horizon=25)
+    plant = shipped(problem, horizon=25)
     rng = np.random.default_rng(2)
     gradients = Gradients(plant)
     U = np.linalg.qr(rng.standard_normal((plant.n_z, 4)))[0]
@@ -174,7 +145,7 @@ def test_gradients_of_whole_episodes_agree_with_finite_differences(problem):
 
 def test_the_law_of_a_policy_costs_what_the_controller_makes_it_cost():
     """theta = [K_a, K_b s_r] is the projected law that runs in the loop."""
-    plant = plant_of("burgers", horizon=40)
+    plant = shipped("burgers", horizon=40)
     rng = np.random.default_rng(3)
     U = np.linalg.qr(rng.standard_normal((plant.n_z, 3)))[0]
     policy = 0.2 * rng.standard_normal((plant.n_a, 6))
@@ -185,7 +156,7 @@ def test_the_law_of_a_policy_costs_what_the_controller_makes_it_cost():
 
 
 def test_a_rollout_that_diverges_costs_infinity():
-    plant = plant_of("kdv", horizon=30)
+    plant = shipped("kdv", horizon=30)
     theta = np.full((plant.n_a, 5), 1e3)
     U = np.linalg.qr(np.random.default_rng(0).standard_normal((plant.n_z, 4)))[0]
     cost, gradient, _ = Gradients(plant).of_law(U, theta, [0])

@@ -10,6 +10,7 @@ import pytest
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import ModelFailure
 from loop_interfaces.topics import COMPLETED, POLICY, START, VOID
+from tests.small import dispatcher_of
 from tuner_node.batch import Batch
 from tuner_node.dispatch import Dispatcher
 from tuner_node.pair import DispatchError
@@ -18,8 +19,9 @@ RUN = 42
 
 
 def dispatcher(pairs: int = 1, **settings) -> Dispatcher:
-    defaults = {"max_batch": 4, "episode_timeout": 10.0, "max_attempts": 3, "incarnation": 1}
-    made = Dispatcher(run=RUN, n_a=2, pairs=pairs, **{**defaults, **settings})
+    made = dispatcher_of(
+        **({"run": RUN, "pairs": pairs, "max_batch": 4, "incarnation": 1} | settings)
+    )
     for pair in range(pairs):
         made.presence(pair, (), 0.0)
     return made
@@ -183,15 +185,7 @@ def test_a_void_episode_is_repeated_under_a_new_number_and_given_up_at_last():
 
 
 def test_nothing_is_handed_to_an_absent_pair_and_a_silent_one_is_repeated():
-    served = Dispatcher(
-        run=RUN,
-        n_a=2,
-        pairs=1,
-        incarnation=0,
-        max_batch=4,
-        episode_timeout=10.0,
-        max_attempts=3,
-    )
+    served = dispatcher_of(run=RUN)
     assert served.assign(batch(1), 0.0) == []
     assert served.missing() == ["plant", "controller"]
     assert served.presence(0, ("controller",), 1.0) == []

@@ -10,6 +10,7 @@ import pytest
 from pde_sim_node.equations import AllenCahn, Burgers, Equation, KortewegDeVries
 from pde_sim_node.plant import Plant
 from pde_sim_node.solver.etdrk4 import etdrk4_coefficients
+from tests.plants import plant_of
 
 MAGNITUDES = np.array([0.0, 1e-12, 1e-6, 1e-3, 0.1, 0.5, 0.99, 1.0, 1.01, 1.5, 2.0, 5.0, 30.0])
 
@@ -82,17 +83,8 @@ class Linear(Equation):
 
 
 def small_plant(equation: Equation, n_z: int, sample_time: float, steps: int) -> Plant:
-    return Plant(
-        equation,
-        n_z=n_z,
-        n_a=1,
-        width=0.5,
-        sample_time=sample_time,
-        integration_time=sample_time / steps,
-        horizon=10,
-        state_weight=1.0,
-        action_weight=1.0,
-    )
+    times = {"sample_time": sample_time, "integration_time": sample_time / steps, "horizon": 10}
+    return plant_of(equation, n_z=n_z, n_a=1, width=0.5, **times)
 
 
 def test_the_linear_part_is_integrated_exactly() -> None:

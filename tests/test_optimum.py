@@ -1,7 +1,6 @@
 """The limits of `python -m benchmarks optimum`: against known optima; for whom they hold."""
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,41 +12,18 @@ from benchmarks.descent import descend
 from benchmarks.limits import FOLDER, find
 from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
-from pde_sim_node.equations import Burgers
-from pde_sim_node.plant import Plant
 from pdeloop.cli import run
 from pdeloop.gradients import Gradients
+from tests.plants import Advection, plant_of
 from tests.small import SMALL
 
 FIELDS = 3
 GIVEN = {"fields": 4, "tolerance": 1e-6, "jobs": 1}
 
 
-@dataclass(frozen=True, kw_only=True)
-class Linear(Burgers):
-    """Advection and diffusion, a linear plant: the cost of open inputs is a quadratic function."""
-
-    name = "linear"
-
-    def linear_operator(self, k):
-        return -0.05 * k**2 - 0.7j * k
-
-    def multiplier(self, k):
-        return np.zeros_like(k)
-
-
 def test_open_inputs_of_a_linear_plant_are_those_of_the_least_squares_problem():
-    plant = Plant(
-        Linear(),
-        n_z=16,
-        n_a=2,
-        width=0.3,
-        sample_time=0.1,
-        integration_time=0.05,
-        horizon=8,
-        state_weight=1.0,
-        action_weight=0.1,
-    )
+    grid = {"n_z": 16, "n_a": 2, "width": 0.3, "horizon": 8}
+    plant = plant_of(Advection(), **grid, sample_time=0.1, integration_time=0.05, action_weight=0.1)
     T, n_a, n_z = plant.horizon, plant.n_a, plant.n_z
     A = plant.evaluate(np.eye(n_z), np.zeros((n_z, n_a)))[0].T
     B = plant.evaluate(np.zeros((n_a, n_z)), np.eye(n_a))[0].T

@@ -10,22 +10,15 @@ import numpy as np
 import pytest
 
 from loop_interfaces.frames import Frame
-from tuner_node.dispatch import PAUSE_LEASE, Dispatcher
+from tests.small import dispatcher_of
+from tuner_node.dispatch import PAUSE_LEASE
 from tuner_node.pair import DispatchError
 from tuner_node.participants import SECOND_TUNER_GRACE, Participants, Publishers
 
 
 def participants(recorder: str = "none", *, pairs: int = 1, established: bool = False) -> Any:
     """Participants of a session that has begun nothing yet, and its dispatcher."""
-    dispatcher = Dispatcher(
-        run=7,
-        n_a=1,
-        pairs=pairs,
-        incarnation=0,
-        max_batch=3,
-        episode_timeout=10.0,
-        max_attempts=3,
-    )
+    dispatcher = dispatcher_of(n_a=1, pairs=pairs)
     session = SimpleNamespace(dispatcher=dispatcher, established=established)
     return Participants(session, recorder), dispatcher  # type: ignore[arg-type]
 

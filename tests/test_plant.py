@@ -21,6 +21,7 @@ from pde_sim_node.solver import workers
 from pde_sim_node.solver.kernel import fine_length
 from pde_sim_node.solver.reference import ReferenceStep
 from tests.interpreter import python
+from tests.plants import plant_of
 
 DATA = Path(__file__).parent / "data"
 
@@ -43,8 +44,7 @@ PROBLEMS = pytest.mark.parametrize(
 
 
 def make(equation: Equation, **values: Any) -> Plant:
-    weights = {"horizon": 50, "state_weight": 1.0, "action_weight": 1.0}
-    return Plant(equation, **(weights | values))
+    return plant_of(equation, **({"horizon": 50} | values))
 
 
 def unforced(plant: Plant, steps: int) -> np.ndarray:

@@ -17,6 +17,7 @@ from pde_sim_node.equations import LinearEquation
 from pde_sim_node.plant import Plant
 from pdeloop.cli import FAILED, main
 from pdeloop.problem_check import check, reach
+from tests.plants import plant_of
 from tests.small import parameters
 
 
@@ -39,10 +40,7 @@ class Growing(LinearEquation):
 
 
 def plant(n_a: int, width: float) -> Plant:
-    return Plant(
-        Growing(), n_z=32, n_a=n_a, width=width, sample_time=0.1, integration_time=0.1, horizon=5,
-        state_weight=1.0, action_weight=1.0,
-    )  # fmt: skip
+    return plant_of(Growing(), n_z=32, n_a=n_a, width=width, sample_time=0.1, horizon=5)
 
 
 def test_the_unstable_modes_are_those_of_the_operator_and_enough_actuators_reach_them() -> None:

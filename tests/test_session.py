@@ -9,10 +9,9 @@ import pytest
 from loop_interfaces.frames import Frame
 from loop_interfaces.topics import MODEL, POLICY, START, StartColumn
 from pdeloop.in_process import LocalPair
-from tests.small import parameters, same_bits, train_here
+from tests.small import dispatcher_of, parameters, same_bits, train_here
 from tuner_node.batch import Batch
 from tuner_node.build import build_training
-from tuner_node.dispatch import Dispatcher
 from tuner_node.session import Session
 from tuner_node.training import Training
 
@@ -33,15 +32,7 @@ class Loop:
     """A session and a plant and controller that answer its publications, one episode a call."""
 
     def __init__(self, training: Training, incarnation: int = 0) -> None:
-        dispatcher = Dispatcher(
-            run=7,
-            n_a=values()["n_a"],
-            pairs=1,
-            incarnation=incarnation,
-            max_batch=3,
-            episode_timeout=10.0,
-            max_attempts=3,
-        )
+        dispatcher = dispatcher_of(n_a=values()["n_a"], incarnation=incarnation)
         self.rows: list = []
         self.now = 0.0
         self.session = Session(training, dispatcher, self.rows.append)

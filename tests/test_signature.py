@@ -13,9 +13,9 @@ from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.model_rows import ModelRows, pack
 from loop_interfaces.signature import design_digest
 from loop_interfaces.topics import COST, MODEL, POLICY, START, TARGET, VOID, CostColumn, Topic
+from tests.small import dispatcher_of
 from tests.test_lockstep import plant_protocol
 from tuner_node.batch import Batch
-from tuner_node.dispatch import Dispatcher
 from tuner_node.pair import DispatchError
 
 N_Z, N_A, N_S = 32, 4, 3
@@ -46,10 +46,8 @@ class Loop:
 
     def __init__(self, rows: np.ndarray = ROWS) -> None:
         self.plant, self.rows = plant_protocol(), rows
-        self.tuner = Dispatcher(
-            run=5, n_a=N_A, pairs=1, incarnation=1, max_batch=4, episode_timeout=9.0, max_attempts=3,
-            design=design_digest(asdict(DesignSettings(N_A, N_S, 1.0, 1.0))),
-        )  # fmt: skip
+        design = design_digest(asdict(DesignSettings(N_A, N_S, 1.0, 1.0)))
+        self.tuner = dispatcher_of(run=5, n_a=N_A, incarnation=1, design=design)
         self.tuner.presence(0, (), 0.0)
         self.told: dict[Topic, Frame] = {TARGET: self.plant.announcement().frame}
         self.take(self.tuner.models(MODELS, 1))

@@ -19,13 +19,12 @@ from pde_sim_node.equations import (
 )
 from pde_sim_node.plant import Plant
 from pde_sim_node.solver.exact import exact_propagator
+from tests.plants import plant_of
 
 
 def make(equation: Equation, **values: Any) -> Plant:
     grid = {"n_z": 128, "n_a": 1, "width": 1.0, "sample_time": 0.1, "horizon": 1000}
-    grid |= {"state_weight": 1.0, "action_weight": 1.0}
-    grid["integration_time"] = values.get("sample_time", 0.1)
-    return Plant(equation, **(grid | values))
+    return plant_of(equation, **(grid | values))
 
 
 def held(plant: Plant, z: np.ndarray, steps: int, action: float = 0.0) -> np.ndarray:
