@@ -5,9 +5,8 @@ from dataclasses import asdict, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from controller_node.identification import DesignSettings, design
+from controller_node.identification import DesignSettings, design_each
 from controller_node.policy import excitation
-from loop_interfaces import model_rows
 from loop_interfaces.frames import Frame
 from loop_interfaces.protocol import ModelFailure, Publication
 from loop_interfaces.signature import design_digest, digest_of, signature
@@ -39,7 +38,8 @@ class Exploration:
 
     def actions(self, step: int) -> Array:
         """The actions of all environments in a step, (M, n_a)."""
-        return np.stack([self._draw(seed, variance, step) for seed, variance in self._draws])
+        n_a, limit = self._settings.n_a, self._settings.action_limit
+        return np.stack([excitation(s, step, n_a, v, limit) for s, v in self._draws])
 
     def lacks(self, state: Frame) -> bool:
         """Whether the state is to be kept. Two different ones of a step make the episode unusable."""
@@ -87,14 +87,11 @@ class Exploration:
         if target is None:  # as none of its states was answered, somebody else did
             return self._failure("the plant's target has not arrived", retry=True)
         states = np.stack([known[k] for k in range(cost.step + 1)])
+        actions = np.stack([self.actions(k) for k in range(cost.step)])
         try:
-            models = []
-            for env, draw in enumerate(self._draws):
-                actions = np.stack([self._draw(*draw, k) for k in range(cost.step)])
-                models.append(design([(states[:, env], actions)], target, self._settings))
+            rows = design_each(states, actions, target, self._settings)
         except ValueError as error:
             return self._failure(str(error), retry=False)
-        rows = np.stack([model_rows.pack(model) for model in models])
         time = self._signature() or cost.time
         return Publication(MODEL_IDENTIFIED, replace(cost, step=0, time=time, values=rows))
 
@@ -102,10 +99,6 @@ class Exploration:
         start, settings = self._start, self._settings
         digest = digest_of(start.values, settings.action_limit) if start.plant else 0
         return signature(digest, design_digest(asdict(settings)))
-
-    def _draw(self, seed: int, variance: float, step: int) -> Array:
-        settings = self._settings
-        return excitation(seed, step, settings.n_a, variance, settings.action_limit)
 
     def _failure(self, reason: str, *, retry: bool) -> ModelFailure:
         return ModelFailure(self._start.run, self._start.episode, retry, reason)

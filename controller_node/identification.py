@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,8 @@ from controller_node.field_law import field_law
 from controller_node.order import study_orders
 from controller_node.policy import ProjectedLaw
 from controller_node.reduced_model import ReducedModel
-from loop_interfaces.model_rows import ModelRows
+from loop_interfaces.model_rows import ModelRows, pack
+from loop_interfaces.parameters import model_order
 
 
 @dataclass(frozen=True)
@@ -104,11 +105,10 @@ def design(
     ValueError
         The data allow no model of this order, or the model no stabilising gains.
     """
-    own = settings.dmdc_order if settings.identification == "dmdc" else 0
     model = identify(
         trajectories,
         method=settings.identification,
-        n_s=own or settings.reduced_order,
+        n_s=model_order(asdict(settings)),
         p=settings.dmdc_rank,
     )
     weights = {"state_weight": settings.state_weight, "action_weight": settings.action_weight}
@@ -119,3 +119,19 @@ def design(
         return rows
     with threadpool_limits(limits=1):  # as in the identification itself
         return field_law(trajectories, target, rows, **weights) or rows
+
+
+def design_each(
+    states: NDArray[np.float64],
+    actions: NDArray[np.float64],
+    target: NDArray[np.float64],
+    settings: DesignSettings,
+) -> NDArray[np.float64]:
+    """A design for each environment of an exploratory episode, as rows (M, rows, n_s); see `design`.
+
+    states (T + 1, M, n_z), actions (T, M, n_a), target (n_z,).
+    """
+    environments = range(actions.shape[1])
+    return np.stack(
+        [pack(design([(states[:, m], actions[:, m])], target, settings)) for m in environments]
+    )

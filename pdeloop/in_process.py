@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from controller_node.identification import DesignSettings, design
+from controller_node.identification import DesignSettings, design_each
 from controller_node.policy import ProjectedLaw, excitation
 from loop_interfaces import model_rows
 from loop_interfaces.topics import CostColumn, StartColumn, noise_seeds
@@ -90,14 +90,8 @@ class LocalPair:
             seen = cut(episode.states, episode.actions, table[:, CostColumn.ENDED])
         if not batch.exploratory:
             return BatchResult(table, trajectories=seen)
-        states, actions = episode.states, episode.actions
-        models = [
-            model_rows.pack(
-                design([(states[:, m], actions[:, m])], self.plant.target, self._settings)
-            )
-            for m in range(len(table))
-        ]
-        return BatchResult(table, np.stack(models), trajectories=seen)
+        models = design_each(episode.states, episode.actions, self.plant.target, self._settings)
+        return BatchResult(table, models, trajectories=seen)
 
     def law(self, batch: Batch) -> Law:
         """Every environment's policy on the model that it belongs to, or its excitation."""
