@@ -13,8 +13,8 @@ def print_json(value: Any) -> None:
     print(json.dumps(_strict(value), allow_nan=False))
 
 
-def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """The rows of a table as lines, the columns beside each other.
+def aligned(rows: Sequence[Sequence[str]], names: int = 1) -> list[str]:
+    """The rows of a table as lines, the columns beside each other; the first `names` are words.
 
     Examples
     --------
@@ -24,7 +24,7 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
         "  ".join(
-            cell.rjust(width) if place else cell.ljust(width)
+            cell.ljust(width) if place < names else cell.rjust(width)
             for place, (cell, width) in enumerate(zip(row, widths, strict=True))
         ).rstrip()
         for row in rows

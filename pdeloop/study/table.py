@@ -89,7 +89,9 @@ def text(table: Sequence[Mapping[str, Any]]) -> str:
     lost = "lost: seeds with a rollout that diverged, which are left out." * any(
         row["diverged"] for row in table
     )
-    return "\n".join([*aligned(costs), "", *aligned(below), CAVEAT, *([lost] if lost else [])])
+    return "\n".join(
+        [*aligned(costs, 2), "", *aligned(below, 2), CAVEAT, *([lost] if lost else [])]
+    )
 
 
 def cost_text(mean: float | None, between: Sequence[float] | None = None) -> str:
