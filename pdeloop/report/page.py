@@ -217,7 +217,7 @@ def _facts(data: ReportData) -> list[tuple[str, str]]:
 def _results(problems: Sequence[ProblemData]) -> Table:
     """Costs, and how far they lie below LQT's."""
     paper = ("the paper",) * any("lqt_po" in p.runs and p.name in PAPER for p in problems)
-    below = (f"% below LQT: {average}" for average in AVERAGES)
+    below = (f"{average}, %" for average in AVERAGES)
     head = ("problem", "controller", "mean stage cost", "worst seed", *below, *paper)
     found = []
     for problem in problems:
