@@ -15,8 +15,8 @@ PERIOD = 5.0
 class Progress:
     """Shows how much of a task is done.
 
-    On a terminal a bar, which leaves no trace. Elsewhere a line for every tenth of the work, and for the
-    first news after some seconds without one.
+    On a terminal a bar, which leaves no trace. Elsewhere a line for every tenth of the work, and for
+    the first news after some seconds without one.
 
     Parameters
     ----------
