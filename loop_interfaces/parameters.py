@@ -53,7 +53,11 @@ INSTRUMENTS = _section(
 """What stands between the field and its controller (docs/robustness.md)."""
 
 IDENTIFICATION = Spec(
-    "identification", "regression", choices=("field", "regression", "dmdc"), nodes="CT"
+    "identification",
+    "regression",
+    choices=("field", "regression", "dmdc"),
+    nodes="CT",
+    group="budget and method",
 ).means(
     "how the reduced model is identified. regression: least squares in reduced coordinates with the "
     "inputs whole; field: a linearised model of the whole field, where its law is better; dmdc: the "
