@@ -13,7 +13,7 @@ from unittest import mock
 
 import numpy as np
 
-from controller_node import exploration
+from controller_node import identification
 from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
 from loop_interfaces.frames import Frame
@@ -76,7 +76,7 @@ def remembering() -> Iterator[None]:
 
     Nearly all histories compute the same, and it is not what they are about.
     """
-    own_design, own_propose = exploration.design, Proposer.propose
+    own_design, own_propose = identification.design, Proposer.propose
 
     def design(*args: Any) -> Any:
         return _once(lambda: own_design(*args), args)
@@ -85,7 +85,7 @@ def remembering() -> Iterator[None]:
         return _once(lambda: own_propose(self, *args, **how), (self._U, self._before, args, how))
 
     with (
-        mock.patch.object(exploration, "design", design),
+        mock.patch.object(identification, "design", design),
         mock.patch.object(Proposer, "propose", propose),
     ):
         yield
