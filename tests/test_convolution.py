@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from loop_interfaces.field_models.convolution import ConvolutionModel, fit_convolutions
-from tuner_node.optimizers.simulation import Loop, improve, mismatch
+from tuner_node.optimizers.simulation import Loop, improve, mismatch, mismatch_of_pieces
 
 Array = np.ndarray
 N_Z, N_A, STEPS = 16, 3, 60
@@ -155,3 +155,19 @@ def test_a_model_that_is_known_to_be_too_far_off_is_not_simulated_further(
     assert len(simulated) == 1
     assert mismatch(closed, unstable, measured, 9.0) == 2.0
     assert len(simulated) == 1 + len(measured)
+
+
+def test_a_model_of_a_chaotic_plant_reproduces_pieces_alone() -> None:
+    def logistic(rate: float) -> ConvolutionModel:
+        """z+ = rate z (1 - z) at every point."""
+        symbols = rate * np.array([1.0, -1.0])[:, None, None, None] * np.ones(N_Z // 2 + 1)
+        return ConvolutionModel(symbols.astype(complex), np.zeros((N_Z, N_A)), np.zeros(N_Z))
+
+    closed, theta = loop(), np.zeros((N_A, 5))
+    field = np.random.default_rng(11).uniform(0.1, 0.9, (1, N_Z))
+    measured = [(theta, closed.simulate(logistic(3.9), theta, field).states[:, 0])]
+    near, far = logistic(3.9001), logistic(3.0)
+    assert mismatch(closed, near, measured, 9.0) > 0.1
+    assert 0.0 < mismatch_of_pieces(closed, near, measured, 6) < 1e-4
+    assert mismatch_of_pieces(closed, far, measured, 6) > 0.1
+    assert mismatch_of_pieces(closed, logistic(30.0), measured, 20) == np.inf

@@ -11,9 +11,11 @@ import pytest
 
 from controller_node.lqt import track
 from controller_node.reduced_model import ReducedModel
+from loop_interfaces.field_models.convolution import fit_convolutions
 from tests.small import parameters, same_bits, train_here
 from tuner_node.optimizers import Context, GaussNewton, Rollout, RolloutResult, Trajectory
 from tuner_node.optimizers.proposal import Proposer
+from tuner_node.optimizers.trajectories import Records
 
 N_Z, N_S, N_A, T = 7, 4, 2, 80
 Q, R = 1.0, 0.2
@@ -318,3 +320,34 @@ def test_a_reduced_model_larger_than_the_default_number_of_modes_is_adapted() ->
     assert training.policies().shape == (1, 2, 68)
     _, lqt, adapted = training.evaluation.mean(axis=2)[0]
     assert adapted < lqt
+
+
+def test_a_plant_that_forgets_is_improved_from_many_states_until_it_gains_nothing() -> None:
+    """And not from the few initial fields, whose costs say nothing about others."""
+    plant = Plant()
+    proposer = Proposer(plant.context(), plant.best)
+    policy, seeds = 0.6 * plant.best, range(4)
+    records = Records(40, 1e9)
+    for seed in seeds:
+        records.add(policy, plant.run(policy, seed), set())
+    data = records.all()
+    states = [record.states for record in data]
+    z, then = (np.concatenate([s[i : T + i] for s in states]) for i in (0, 1))
+    a = np.concatenate([record.actions for record in data])
+    (model,) = fit_convolutions(z, a, then, np.ones(len(z)), degrees=(1,), ridges=(1e-9,))
+    falls = []
+    for _ in range(20):
+        proposal = proposer._from_states(model, 0.01, data, policy, 1e-3)
+        if proposal is None:
+            break
+        falls.append(proposal.fall)
+        policy = proposal.policy
+    assert proposal is None
+    assert falls
+    other = plant.run(data[0].policy, 99).trajectory
+    assert other is not None
+    before, after = (
+        proposer._loop.simulate(model, proposer.theta(p), other.states).cost
+        for p in (data[0].policy, policy)
+    )
+    assert after < 0.95 * before

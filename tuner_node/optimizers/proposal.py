@@ -6,7 +6,7 @@ method.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from weakref import WeakKeyDictionary
 
@@ -19,7 +19,7 @@ from tuner_node.optimizers.base import Array, Context, Row
 from tuner_node.optimizers.fit import LocalModel, extended_basis, fit
 from tuner_node.optimizers.selection import KAPPAS, LOCAL, RIDGES, Pair, choices, mismatches
 from tuner_node.optimizers.sensitivity import Path, damped_step
-from tuner_node.optimizers.simulation import Loop, improve, mismatch
+from tuner_node.optimizers.simulation import Loop, improve, mismatch, mismatch_of_pieces
 from tuner_node.optimizers.trajectories import Record, denoised
 
 __all__ = ["Proposal", "Proposer"]
@@ -46,6 +46,12 @@ _COMPARED = 8
 _FIELDS = 8
 _BEYOND = 1.5
 _SENSITIVITY_MODES = 48
+# No model reproduces the rollouts of a chaotic plant, but one may reproduce so many pieces of each.
+# Then a law is improved from so many measured states, one of three, and chosen by what it costs from
+# the two others.
+_PIECES = 8
+_STARTS = 80
+_HELD_OUT = 3
 # Trust region of a law that is improved on a model, relative to that of a single step.
 _TRUST = 1e-2
 
@@ -192,12 +198,15 @@ class Proposer:
         rejected = (
             [] if accepted else [(i, o) for i, o in zip(incumbents, others, strict=True) if o]
         )
-        simulated = self._simulated(data, incumbents, rejected, damping)
-        if simulated is not None:
-            return simulated
+        measured = [self._closed_loop(r) for r in data if r.usable][-_COMPARED:]
+        policy = incumbents[0].policy
+        model, error, whole = self._reproducing(self._steps(data, incumbents), measured)
+        if model is not None and self._forgets(model, data):
+            return self._from_states(model, error, data, policy, damping)
+        if model is not None and whole and (not rejected or self._ranks(model, rejected)):
+            return self._from_fields(model, error, data, policy, damping)
         V = extended_basis(self._U, [record.states for record in data], self._modes)
         models = self._fit(data, V, incumbents)
-        policy = incumbents[0].policy
         pairs = self._pairs(V, incumbents, others)
         errors = mismatches(models, pairs, self._horizon)
         paths = [self._path(record, V) for record in incumbents if len(record.actions)]
@@ -224,6 +233,10 @@ class Proposer:
                 break
         return proposal
 
+    def _closed_loop(self, record: Record) -> tuple[Array, Array]:
+        """theta, and the states from which it acted."""
+        return self.theta(record.policy), record.states[: len(record.actions)]
+
     def _clean(self, record: Record) -> Record:
         """The rollout without what of its noise can be told from the fields."""
         if not self._noise:
@@ -233,18 +246,8 @@ class Proposer:
             self._cleaned[record] = replace(record, states=states)
         return self._cleaned[record]
 
-    def _simulated(
-        self,
-        data: Sequence[Record],
-        incumbents: Sequence[Record],
-        rejected: Sequence[tuple[Record, Record]],
-        damping: float,
-    ) -> Proposal | None:
-        """A law that was improved on a model of the whole field.
-
-        None if none reproduces the rollouts, or if it takes a candidate for better that was rejected:
-        rejected has rollouts of the incumbent and of that candidate on the same fields.
-        """
+    def _steps(self, data: Sequence[Record], incumbents: Sequence[Record]) -> list[Array]:
+        """z, a, z after, and weights of all steps."""
         level = self._level(incumbents)
         z, a, after, weights = [], [], [], []
         for record in data:
@@ -254,14 +257,17 @@ class Proposer:
             a.append(record.actions[:length])
             after.append(record.states[1 : length + 1])
             weights.append(np.full(length, max(weight, _LEAST_WEIGHT)))
-        usable = [record for record in data if record.usable][-_COMPARED:]
-        measured = [(self.theta(r.policy), r.states[: len(r.actions)]) for r in usable]
-        model, error = self._reproducing(
-            [np.concatenate(parts) for parts in (z, a, after, weights)], measured
-        )
-        if model is None or (rejected and not self._ranks(model, rejected)):
-            return None
-        policy = incumbents[0].policy
+        return [np.concatenate(parts) for parts in (z, a, after, weights)]
+
+    def _from_fields(
+        self,
+        model: FieldModel,
+        error: float,
+        data: Sequence[Record],
+        policy: Array,
+        damping: float,
+    ) -> Proposal:
+        """A law that was improved on a model that reproduces the rollouts."""
         fields = list({record.states[0].tobytes(): record.states[0] for record in data}.values())
         modes = max(self._modes, min(model.components * _SENSITIVITY_MODES, self.n_z))
         improved = improve(
@@ -276,13 +282,13 @@ class Proposer:
         return Proposal(candidate, improved.fall, 1, 0.0, error, model.name)
 
     def _reproducing(
-        self, data: Sequence[Array], measured: Sequence[tuple[Array, Array]]
-    ) -> tuple[FieldModel | None, float]:
-        """A model that reproduces the measured rollouts, and how well.
+        self, steps: Sequence[Array], measured: Sequence[tuple[Array, Array]]
+    ) -> tuple[FieldModel | None, float, bool]:
+        """A model that reproduces the measured rollouts, how well, and whether it does as a whole.
 
-        data: z, a, z after, and weights of all steps. The simpler kind of model comes first.
+        Else in pieces, if there is one. The simpler kind of model comes first.
         """
-        z, a, after, weights = data
+        z, a, after, weights = steps
 
         def convolutions(degrees: Sequence[int], components: int) -> Sequence[FieldModel]:
             return fit_convolutions(
@@ -297,15 +303,75 @@ class Proposer:
             lambda: [fit_differential(z, a, after)],
             lambda: [] if self.n_z % 2 else convolutions((1,), 2),
         )
-        for fitted in kinds if measured else ():
-            judged: list[tuple[float, FieldModel | None]] = [
-                (mismatch(self._loop, model, measured, self._reproduced), model)
-                for model in fitted()
-            ]
-            error, best = min(judged, key=lambda pair: pair[0], default=(np.inf, None))
+        fitted: list[FieldModel] = []
+        for kind in kinds:
+            models = kind()
+            fitted += models
+            error, best = self._best(
+                models, lambda m: mismatch(self._loop, m, measured, self._reproduced)
+            )
             if error <= self._reproduced:
-                return best, error
-        return None, np.inf
+                return best, error, True
+        length = max(self._horizon // _PIECES, 1)
+        error, best = self._best(
+            fitted, lambda m: mismatch_of_pieces(self._loop, m, measured, length)
+        )
+        return (best if error <= self._reproduced else None), error, False
+
+    @staticmethod
+    def _best(
+        models: Sequence[FieldModel], error_of: Callable[[FieldModel], float]
+    ) -> tuple[float, FieldModel | None]:
+        """The least error, and the first model that has it."""
+        judged: list[tuple[float, FieldModel | None]] = [(error_of(m), m) for m in models]
+        return min(judged, key=lambda pair: pair[0], default=(np.inf, None))
+
+    def _forgets(self, model: FieldModel, data: Sequence[Record]) -> bool:
+        """Whether the plant forgets where it began, as a chaotic one does, also under a law.
+
+        Then the model does not reproduce what it does without control, nor every controlled rollout.
+        """
+
+        def lost(records: Iterable[Record]) -> bool:
+            measured = (self._closed_loop(record) for record in records if record.usable)
+            most = self._reproduced
+            return any(mismatch(self._loop, model, [own], most) > most for own in measured)
+
+        return lost(r for r in data if not r.policy.any()) and lost(
+            r for r in data if r.policy.any()
+        )
+
+    def _from_states(
+        self,
+        model: FieldModel,
+        error: float,
+        data: Sequence[Record],
+        policy: Array,
+        damping: float,
+    ) -> Proposal | None:
+        """A law that was improved on a model of a plant that forgets where it began.
+
+        There a cost depends on the initial field as if by chance, and a law that is better from a few
+        of them is not from others. So it is improved from many of the measured states, and chosen by
+        its cost from others. None if it does not gain from those.
+        """
+        states = np.concatenate([record.states for record in data])
+        chosen = np.linspace(0, len(states) - 1, _STARTS * _HELD_OUT).astype(int)
+        held_out = np.arange(len(chosen)) % _HELD_OUT > 0
+        path = improve(
+            self._loop,
+            model,
+            self.theta(policy),
+            states[chosen[~held_out]],
+            extended_basis(self._U, [record.states for record in data], self._modes),
+            _TRUST * damping,
+        ).path
+        costs = [self._loop.simulate(model, theta, states[chosen[held_out]]).cost for theta in path]
+        best = int(np.argmin(np.nan_to_num(costs, nan=np.inf)))
+        if not costs[0] - costs[best] > _LEAST_FALL * costs[0]:  # also where it is not finite
+            return None
+        candidate = self.moved(policy, path[best] - path[0])
+        return Proposal(candidate, costs[0] - costs[best], 1, 0.0, error, model.name)
 
     def _ranks(self, model: FieldModel, rejected: Sequence[tuple[Record, Record]]) -> bool:
         """Whether the rejected candidate costs more than the incumbent on the model, too."""

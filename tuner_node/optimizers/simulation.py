@@ -19,7 +19,7 @@ Parikh, Boyd, "Proximal algorithms", Foundations and Trends in Optimization 1, 2
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import linalg
@@ -81,10 +81,11 @@ class Simulation:
 
 @dataclass(frozen=True, eq=False)
 class Improvement:
-    """A law [K b] and by how much its cost is lower on the model."""
+    """A law [K b], by how much its cost is lower on the model, and the laws on the way, it the last."""
 
     theta: Array
     fall: float
+    path: Sequence[Array]
 
 
 def mismatch(
@@ -112,6 +113,27 @@ def mismatch(
     return float(np.mean(errors))
 
 
+def mismatch_of_pieces(
+    loop: Loop, model: FieldModel, measured: Sequence[tuple[Array, Array]], length: int
+) -> float:
+    """How far the rollouts, simulated anew every so many steps, are from the measured ones.
+
+        sum |z_k^model - z_k|^2 / sum |z_k - z_r|^2
+
+    A chaotic plant forgets where it began, so that no model reproduces a whole rollout.
+    """
+    short = replace(loop, horizon=length)
+    error = size = 0.0
+    with np.errstate(over="ignore", invalid="ignore"):
+        for theta, states in measured:
+            starts = np.arange(0, len(states) - length + 1, length)
+            simulated = short.simulate(model, theta, states[starts]).states
+            pieces = states[starts + np.arange(length)[:, None]]
+            error += float(np.sum((simulated - pieces) ** 2))
+            size += float(np.sum((pieces - loop.target) ** 2))
+    return error / max(size, 1e-300) if np.isfinite(error) else np.inf
+
+
 def improve(
     loop: Loop,
     model: FieldModel,
@@ -137,7 +159,7 @@ def improve(
     damping : float
         lambda.
     """
-    start, shape = theta, theta.shape
+    start, shape, path = theta, theta.shape, [theta]
     now = first = loop.simulate(model, theta, fields)
     gradient, curvature, region = _expansion(loop, model, theta, now, V)
     trust = region.copy()
@@ -165,11 +187,12 @@ def improve(
             continue
         gain, value = value - lower, lower
         theta, now = candidate, simulation
+        path.append(theta)
         inner *= fewer
         if gain < _LEAST_GAIN * value:
             break
         gradient, curvature, region = _expansion(loop, model, theta, now, V)
-    return Improvement(theta, first.cost - now.cost)
+    return Improvement(theta, first.cost - now.cost, path)
 
 
 def _expansion(
