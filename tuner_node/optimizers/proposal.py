@@ -46,10 +46,12 @@ _COMPARED = 8
 _FIELDS = 8
 _BEYOND = 1.5
 _SENSITIVITY_MODES = 48
-# No model reproduces the rollouts of a chaotic plant, but one may reproduce so many pieces of each.
+# No model reproduces the rollouts of a chaotic plant, but one may reproduce so many pieces of each. The
+# error of a rollout is then more than so many times that of the pieces; noise adds up more slowly.
 # Then a law is improved from so many measured states, one of three, and chosen by what it costs from
 # the two others.
 _PIECES = 8
+_GROWTH = 50.0
 _STARTS = 80
 _HELD_OUT = 3
 # Trust region of a law that is improved on a model, relative to that of a single step.
@@ -201,7 +203,7 @@ class Proposer:
         measured = [self._closed_loop(r) for r in data if r.usable][-_COMPARED:]
         policy = incumbents[0].policy
         model, error, whole = self._reproducing(self._steps(data, incumbents), measured)
-        if model is not None and self._forgets(model, data):
+        if model is not None and self._forgets(model, error, data):
             return self._from_states(model, error, data, policy, damping)
         if model is not None and whole and (not rejected or self._ranks(model, rejected)):
             return self._from_fields(model, error, data, policy, damping)
@@ -326,15 +328,16 @@ class Proposer:
         judged: list[tuple[float, FieldModel | None]] = [(error_of(m), m) for m in models]
         return min(judged, key=lambda pair: pair[0], default=(np.inf, None))
 
-    def _forgets(self, model: FieldModel, data: Sequence[Record]) -> bool:
+    def _forgets(self, model: FieldModel, error: float, data: Sequence[Record]) -> bool:
         """Whether the plant forgets where it began, as a chaotic one does, also under a law.
 
-        Then the model does not reproduce what it does without control, nor every controlled rollout.
+        Then the model, which has this error on the pieces, does not reproduce what the plant does
+        without control, nor every controlled rollout, by far.
         """
+        most = max(self._reproduced, _GROWTH * error)
 
         def lost(records: Iterable[Record]) -> bool:
             measured = (self._closed_loop(record) for record in records if record.usable)
-            most = self._reproduced
             return any(mismatch(self._loop, model, [own], most) > most for own in measured)
 
         return lost(r for r in data if not r.policy.any()) and lost(
