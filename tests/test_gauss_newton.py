@@ -11,10 +11,11 @@ import pytest
 
 from controller_node.lqt import track
 from controller_node.reduced_model import ReducedModel
-from loop_interfaces.field_models.convolution import fit_convolutions
+from loop_interfaces.field_models.convolution import ConvolutionModel, fit_convolutions
 from tests.small import parameters, same_bits, train_here
 from tuner_node.optimizers import Context, GaussNewton, Rollout, RolloutResult, Trajectory
 from tuner_node.optimizers.proposal import Proposer
+from tuner_node.optimizers.simulation import mismatch, mismatch_of_pieces
 from tuner_node.optimizers.trajectories import Records
 
 N_Z, N_S, N_A, T = 7, 4, 2, 80
@@ -351,3 +352,30 @@ def test_a_plant_that_forgets_is_improved_from_many_states_until_it_gains_nothin
         for p in (data[0].policy, policy)
     )
     assert after < 0.95 * before
+
+
+def test_chaos_is_told_from_disturbances() -> None:
+    """A map at every point: the chaotic logistic one, nearly known, or a random walk."""
+    plant = Plant()
+    proposer, rng = Proposer(plant.context(), plant.best), np.random.default_rng(3)
+
+    def forgets(true: tuple[float, float], known: tuple[float, float], disturbance: float) -> bool:
+        """z+ = true_1 z + true_2 z^2 + disturbance, and a model of it with other coefficients."""
+        symbols = np.array(known)[:, None, None, None] * np.ones(N_Z // 2 + 1)
+        model = ConvolutionModel(symbols.astype(complex), np.zeros((N_Z, N_A)), np.zeros(N_Z))
+        records = Records(10, 1e9)
+        for policy in (0.0 * plant.best, plant.best):
+            states = [rng.uniform(0.2, 0.8, N_Z)]
+            for _ in range(T):
+                after = true[0] * states[-1] + true[1] * states[-1] ** 2
+                states.append(after + disturbance * rng.standard_normal(N_Z))
+            done = Trajectory(np.array(states), np.zeros((T, N_A)))
+            records.add(policy, RolloutResult(1.0, False, done), set())
+        measured = [proposer._closed_loop(record) for record in records.all()]
+        error = mismatch_of_pieces(proposer._loop, model, measured, T // 8)
+        assert 0.0 < error < 0.05
+        assert all(mismatch(proposer._loop, model, [own], 9.0) > 0.05 for own in measured)
+        return proposer._forgets(model, error, records.all())
+
+    assert forgets((3.9, -3.9), (3.9001, -3.9001), 0.0)
+    assert not forgets((1.0, 0.0), (1.0, 0.0), 0.03)

@@ -51,7 +51,7 @@ _SENSITIVITY_MODES = 48
 # Then a law is improved from so many measured states, one of three, and chosen by what it costs from
 # the two others.
 _PIECES = 8
-_GROWTH = 50.0
+_GROWTH = 20.0
 _STARTS = 80
 _HELD_OUT = 3
 # Trust region of a law that is improved on a model, relative to that of a single step.
