@@ -306,7 +306,7 @@ class Proposer:
             lambda: [] if self.n_z % 2 else convolutions((1,), 2),
         )
         fitted: list[FieldModel] = []
-        for kind in kinds:
+        for kind in kinds if measured else ():
             models = kind()
             fitted += models
             error, best = self._best(
