@@ -146,7 +146,7 @@ class Dispatcher:
         known.last_heard = now
         if (frame.values[:, CostColumn.ENDED] == VOID).any():
             void = f"the plant declared episode {known.episode} void"
-            self._retry(known, f"{void}: no action came, or different ones")
+            self._retry(known, f"{void}: no action came, or different starts or actions")
         else:
             known.take_answer(topics.COST.name, frame)
             known.chunk.costs = frame.values.copy()

@@ -136,8 +136,8 @@ class Pair:
         if taken is not None and void and not self.runs(answer.episode) and not paused:
             raise DispatchError(
                 f"the plant took back the cost of episode {answer.episode}, which this run has used, "
-                "because different actions came for one step: stop the second controller and start "
-                "a new run"
+                "because different starts or actions came: stop the second tuner or controller and "
+                "start a new run"
             )
 
     def check_signature(self, model: Frame, design: int) -> None:
