@@ -1,19 +1,22 @@
 """`python -m benchmarks participants`: what it costs that many idle nodes know each other.
 
-A tuner and K pairs of plant and controller, a process each, on the loopback interface only. Nobody
-computes: the tuner waits for a recorder that does not come. Meanwhile it says in its log whom else
-it has not found.
+A tuner and K pairs of plant and controller, a process each, on the loopback interface only. They find
+each other by multicast, or through Fast DDS's discovery server. Nobody computes: the tuner waits for
+a recorder that does not come. Meanwhile it says in its log whom else it has not found.
 """
 
 from __future__ import annotations
 
 import re
+import shutil
+import socket
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from benchmarks.processes import BenchError, BenchProcess, bench, ended_well, machine, table
+from benchmarks.processes import Bench, BenchError, BenchProcess, bench, ended_well, machine, table
 from pdeloop.pairs import PAIR, namespaces, ros_value
 
 NODE_MEMORY = 0.12
@@ -26,7 +29,12 @@ REPORT = 6.0
 """Seconds between two lines of the tuner on who is missing, at the most."""
 
 
-def run(*, pairs: Sequence[int] = (1, 15, 30, 60), seconds: float = 20.0) -> dict[str, Any]:
+def run(
+    *,
+    pairs: Sequence[int] = (1, 5, 10, 30),
+    seconds: float = 20.0,
+    discovery: Literal["multicast", "server"] = "multicast",
+) -> dict[str, Any]:
     """Memory, and processor time over some seconds, with each number of pairs and before any."""
     names = namespaces(max(pairs))
     need, before = NODE_MEMORY * (2 * len(names) + 1), memory_available()
@@ -37,6 +45,8 @@ def run(*, pairs: Sequence[int] = (1, 15, 30, 60), seconds: float = 20.0) -> dic
         )
     rows = []
     with bench() as running:
+        if discovery == "server":
+            _start_server(running)
         waiting = ["recorder:=required", f"pairs:={ros_value(names)}"]
         tuner = running.start("tuner_node", *waiting, problem="burgers")
         nodes = [tuner]
@@ -61,6 +71,22 @@ def run(*, pairs: Sequence[int] = (1, 15, 30, 60), seconds: float = 20.0) -> dic
                 }
             )
     return {"machine": machine(), "available": before, "seconds": seconds, "rows": rows}
+
+
+def _start_server(running: Bench) -> None:
+    """Start a discovery server on a free port of loopback; the nodes started afterwards use it."""
+    program = shutil.which("fast-discovery-server", path=str(Path(sys.executable).parent))
+    if program is None:
+        raise BenchError(
+            "expected the program fast-discovery-server beside Python, found none; install Fast "
+            "DDS's tools, or choose --discovery multicast"
+        )
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = [program, "-i", "0", "-l", "127.0.0.1", "-p", str(port)]
+    running.run("discovery-server", command)
+    running.environment["ROS_DISCOVERY_SERVER"] = f"127.0.0.1:{port}"
 
 
 def _wait_until_found(tuner: BenchProcess, nodes: Sequence[BenchProcess]) -> None:
