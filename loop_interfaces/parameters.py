@@ -52,6 +52,23 @@ INSTRUMENTS = _section(
 )
 """What stands between the field and its controller (docs/robustness.md)."""
 
+ACTUATORS = _section(
+    "PT",
+    Spec("actuator_positions", [], 0.0, 1.0, group="problem").means(
+        "centres of the n_a actuators as shares of L; none: equally spaced, or as the equation has them"
+    ),
+    Spec(
+        "actuator_shape",
+        "equation",
+        choices=("equation", "indicator", "gaussian"),
+        group="problem",
+    ).means(
+        "shape of an actuator. indicator: 1 on its width; gaussian: its width is the standard "
+        "deviation; equation: as the equation has it, which is indicator unless it says otherwise"
+    ),
+)
+"""Where the actuators are and how they act, if not as the equation has it."""
+
 IDENTIFICATION = Spec(
     "identification",
     "regression",
@@ -83,6 +100,7 @@ PROBLEM = _section(
     Spec("actuator_width", 0.15, positive=True, maximum=1).means(
         "width of one actuator as a share of L"
     ),
+    *ACTUATORS,
     Spec("sample_time", 0.05, positive=True, unit="s").means(
         "sampling time; the action is held over it"
     ),

@@ -16,7 +16,7 @@ from typing import Any
 
 import yaml
 
-Value = bool | int | float | str | list[str]
+Value = bool | int | float | str | list[str] | list[float]
 MAX_YAML_BYTES = 1_000_000
 MAX_PARAMETERS = 10_000
 _FILE_NAME = re.compile(r"[^\W_][\w.-]{,99}")
@@ -30,7 +30,8 @@ class ParameterError(ValueError):
 class Spec:
     """One parameter. The type is the default's; `required` ones have no usable default.
 
-    minimum, maximum: inclusive, unless `positive` (then value > 0). choices: the allowed words.
+    minimum, maximum: inclusive, unless `positive` (then value > 0); a list that has them is one of
+    numbers in this range, and one of texts otherwise. choices: the allowed words.
     live: it may be changed while the node runs, because no result depends on it. file_name: a text that
     names files and folders, and therefore holds no path. nodes: letters of the nodes that take it
     (loop_interfaces.parameters.NODES). group: heading of `pdeloop train --help` under which its flag
@@ -69,6 +70,11 @@ class Spec:
         return type(self.default)
 
     @property
+    def numbers(self) -> bool:
+        """Whether it is a list of numbers."""
+        return self.type is list and self.minimum is not None
+
+    @property
     def range(self) -> str:
         """The allowed values in words."""
         if self.choices:
@@ -76,7 +82,7 @@ class Spec:
         if self.file_name:
             return "at most 100 letters, digits, '_', '-' and '.', beginning with a letter or digit"
         words = {int: "a whole number", float: "a number", str: "a text", bool: "true or false"}
-        text = words.get(self.type, "a list of texts")
+        text = words.get(self.type, "a list of numbers" if self.numbers else "a list of texts")
         if self.multiple_of == 2:
             text = "an even whole number"
         if self.positive:
@@ -104,17 +110,23 @@ class Spec:
 
         >>> Spec("horizon", 300, minimum=1).parse("20")
         20
+        >>> Spec("actuator_positions", [], 0.0, 1.0).parse("0.1, 0.5")
+        [0.1, 0.5]
         """
         words = {"true": True, "false": False}
         value: Any = words.get(text, text) if self.type is bool else text
-        if self.type in (int, float):
-            with contextlib.suppress(ValueError):
+        with contextlib.suppress(ValueError):
+            if self.type in (int, float):
                 value = self.type(text)
+            elif self.numbers:
+                value = [float(part) for part in text.strip("[] ").split(",")]
         return self.check(value)
 
     def _coerce(self, value: Any) -> Any:
         if self.type is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value) if abs(value) < 2**1000 else math.inf
+        if self.numbers:
+            return self._coerce_numbers(value)
         if not isinstance(value, self.type) or (self.type is int and isinstance(value, bool)):
             return None
         if isinstance(value, list):
@@ -133,6 +145,15 @@ class Spec:
             if isinstance(value, int) and value % self.multiple_of:
                 return None
         return value
+
+    def _coerce_numbers(self, value: Any) -> list[float] | None:
+        """A list, a tuple or an array of numbers in the range, as a list."""
+        value = value.tolist() if hasattr(value, "tolist") else value
+        if not isinstance(value, list | tuple):
+            return None
+        number = replace(self, default=0.0)
+        found = [number._coerce(item) for item in value]
+        return None if None in found else [float(item) for item in found]
 
 
 def _plain(number: float) -> str:

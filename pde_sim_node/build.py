@@ -8,7 +8,7 @@ from dataclasses import asdict, fields
 from typing import Any
 
 from loop_interfaces.frames import MAX_ID
-from loop_interfaces.parameters import INSTRUMENTS
+from loop_interfaces.parameters import ACTUATORS, INSTRUMENTS
 from pde_sim_node.equations import Equation, configured_equation
 from pde_sim_node.measurement import InstrumentedPlant, Instruments
 from pde_sim_node.plant import Plant
@@ -39,8 +39,12 @@ def fingerprint(values: Mapping[str, Any]) -> int:
     equation = build_equation(values)
     content = {spec: values[spec] for spec in _PLANT_VALUES} | asdict(equation)
     instruments = Instruments(**{spec.name: values[spec.name] for spec in INSTRUMENTS})
-    if not instruments.ideal:  # else it is the same plant as before they were known
+    # What a plant has not is left out: it is the same plant as before that was known.
+    if not instruments.ideal:
         content |= asdict(instruments)
+    content |= {
+        spec.name: values[spec.name] for spec in ACTUATORS if values[spec.name] != spec.default
+    }
     digest = hashlib.sha256(json.dumps([content, sources(equation)], sort_keys=True).encode())
     return 1 + int.from_bytes(digest.digest()[:8], "big") % (MAX_ID - 1)
 
@@ -71,7 +75,7 @@ def build_plant(values: Mapping[str, Any]) -> Plant:
     """The plant of a problem. ValueError, one sentence, if the parameters do not fit together."""
     equation = build_equation(values)
     grid = {name: values[name] for name in _PLANT_VALUES if name != "actuator_width"}
-    grid["width"] = values["actuator_width"]
+    grid |= {name: values[f"actuator_{name}"] for name in ("width", "shape", "positions")}
     instruments = Instruments(**{spec.name: values[spec.name] for spec in INSTRUMENTS})
     if instruments.ideal:
         return Plant(equation, **grid)

@@ -3,6 +3,7 @@
 import math
 import operator
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,7 @@ from pde_sim_node.solver.kernel import etdrk4_step
 from pde_sim_node.solver.memory import StepSettings
 from pde_sim_node.solver.pointwise import all_finite
 from pde_sim_node.solver.workers import ParallelStep
+from pde_sim_node.supports import indicator_supports, placed_supports
 
 DIVERGED_COST = 1e9
 """Mean stage cost of an environment that diverged: very bad, and finite."""
@@ -68,6 +70,12 @@ class Plant:
         Number of actuators.
     width
         Width of one actuator as a fraction of the domain, see `Equation.supports`.
+    shape
+        "indicator", "gaussian" with ``width`` as standard deviation, or "equation", as
+        `Equation.supports` has it.
+    positions
+        Centres of the actuators as fractions of the domain; none: equally spaced, or as
+        `Equation.supports` has them.
     sample_time
         Sampling time, a whole multiple of ``integration_time``.
     integration_time
@@ -124,6 +132,8 @@ class Plant:
         state_weight: float,
         action_weight: float,
         divergence_bound: float = 1e3,
+        shape: str = "equation",
+        positions: Sequence[float] = (),
     ) -> None:
         self.n_z, self.n_a = whole("n_z", n_z, 8), whole("n_a", n_a, 1)
         self.horizon = whole("horizon", horizon, 1)
@@ -137,13 +147,7 @@ class Plant:
         self.divergence_bound = positive("divergence_bound", divergence_bound)
         n_x = grid_points(equation, self.n_z)
         self.x = equation.length * np.arange(n_x) / n_x
-        shapes = np.array(equation.supports(self.x, self.n_a, positive("width", width)), np.float64)
-        if shapes.shape != (n_x, n_a) or not np.isfinite(shapes).all():
-            raise ValueError(
-                f"supports of the equation must return {n_x} x {n_a} finite numbers, got shape "
-                f"{shapes.shape}"
-            )
-        self.supports = shapes
+        self.supports = self._supports(positive("width", width), shape, positions)
         self.field_target = self._checked("target", equation.target(self.x))
         self.target = self.field_target
         make_step = exact_step if isinstance(equation, LinearEquation) else etdrk4_step
@@ -166,6 +170,37 @@ class Plant:
         seconds = time.perf_counter() - began
         self.compiled_in_seconds = seconds if compilations() > before else 0.0
         self._allocate(0)
+
+    def _supports(
+        self, width: float, shape: str, positions: Sequence[float]
+    ) -> NDArray[np.float64]:
+        equation, n_x, n_a = self.equation, len(self.x), self.n_a
+        if shape not in ("equation", "indicator", "gaussian"):
+            raise ValueError(
+                f"actuator_shape must be equation, indicator or gaussian, got {shape!r}"
+            )
+        if len(positions) not in (0, n_a):
+            raise ValueError(
+                f"actuator_positions must have a centre for each of the n_a = {n_a} actuators, got "
+                f"{len(positions)}"
+            )
+        if shape == "equation" and not len(positions):
+            shapes = np.array(equation.supports(self.x, n_a, width), np.float64)
+            if shapes.shape != (n_x, n_a) or not np.isfinite(shapes).all():
+                raise ValueError(
+                    f"supports of the equation must return {n_x} x {n_a} finite numbers, got shape "
+                    f"{shapes.shape}"
+                )
+            return shapes
+        if shape == "equation" and type(equation).supports is not Equation.supports:
+            raise ValueError(
+                f"{equation.name} has actuators of its own, which have no other places: give "
+                "actuator_shape together with actuator_positions"
+            )
+        if shape == "indicator" and not len(positions):
+            return indicator_supports(n_x, n_a, width)
+        centres = positions if len(positions) else (np.arange(n_a) + 0.5) / n_a
+        return placed_supports(n_x, centres, width, gaussian=shape == "gaussian")
 
     @property
     def state_size(self) -> int:

@@ -1,7 +1,9 @@
 """Where on the grid each actuator acts."""
 
+import math
+
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 
 def indicator_supports(n_z: int, n_a: int, width: float) -> NDArray[np.float64]:
@@ -46,4 +48,53 @@ def indicator_supports(n_z: int, n_a: int, width: float) -> NDArray[np.float64]:
                 "take fewer actuators or more grid points"
             )
         supports[left:right, j] = 1.0
+    return supports
+
+
+def placed_supports(
+    n_x: int, positions: ArrayLike, width: float, *, gaussian: bool = False
+) -> NDArray[np.float64]:
+    """Phi_j(x_i) of actuators at given places of the periodic domain, (n_x, n_a).
+
+    With w = width n_x and c the grid index nearest to the centre, support j is 1 on the indices
+    floor(c - w/2) <= i < floor(c + w/2), modulo n_x, as many for each actuator. A Gaussian is
+    exp(-d^2 / (2 width^2)), with the distance d from the centre as a share of the domain. Supports
+    may overlap; their actions then add up.
+
+    Parameters
+    ----------
+    n_x
+        Number of grid points.
+    positions
+        Centres as shares of the domain, from 0 to 1.
+    width
+        Width of one support, or its standard deviation, as a fraction of the domain.
+    gaussian
+        The shape.
+
+    Raises
+    ------
+    ValueError
+        A centre lies outside of the domain, or a Gaussian falls between the grid points.
+    """
+    centres = np.asarray(positions, dtype=np.float64)
+    if not ((centres >= 0.0) & (centres <= 1.0)).all():
+        raise ValueError(
+            f"actuator_positions must be shares of the domain from 0 to 1, got {centres.tolist()}"
+        )
+    if gaussian:
+        if width < 0.5 / n_x:
+            raise ValueError(
+                f"width of a Gaussian actuator must be at least half a grid spacing, {0.5 / n_x:g} at "
+                f"{n_x} grid points, got {width:g}"
+            )
+        distance = np.abs(np.arange(n_x)[:, None] / n_x - centres)
+        distance = np.minimum(distance, 1.0 - distance)
+        shapes: NDArray[np.float64] = np.exp(-0.5 * (distance / width) ** 2)
+        return shapes
+    half = 0.5 * width * n_x
+    supports = np.zeros((n_x, len(centres)))
+    for j, centre in enumerate(np.floor(centres * n_x + 0.5).astype(int).tolist()):
+        points = np.arange(math.floor(centre - half), math.floor(centre + half))
+        supports[points % n_x, j] = 1.0
     return supports

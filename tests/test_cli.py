@@ -43,6 +43,16 @@ def train(out: Path, *more: str, problem: Path = SMALL) -> int:
         ("reduced_order: 4", "reduced_order: 400", "needs at least"),
         ("horizon: 30", "horizon: 0", "'horizon' is 0; expected"),
         ("n_a: 4", "n_aa: 4", "did you mean 'n_a'"),
+        (
+            "n_a: 4",
+            "n_a: 4\n    actuator_positions: [0.1, 0.5]",
+            "the n_a = 4 actuators, got 2",
+        ),
+        (
+            "n_a: 4",
+            "n_a: 1\n    actuator_positions: [1.5]",
+            "expected a list of numbers from 0 to 1",
+        ),
     ],
 )
 def test_a_bad_problem_is_refused(tmp_path, capsys, old, new, words):

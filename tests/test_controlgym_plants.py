@@ -90,7 +90,8 @@ def test_the_shipped_problems_have_controlgyms_sizes(
 def test_eight_equal_actuators_cannot_reach_some_growing_waves(name: str) -> None:
     """Symmetric supports at (j + 1/2) L/8 push cos and sin of 4, 8 and 12 waves alike, or one not.
 
-    So no law with controlgym's actuators stabilises u = 0; twenty narrower ones reach every wave.
+    So no law with controlgym's actuators stabilises u = 0; twenty narrower ones reach every wave, and
+    so do eight at unequal distances.
     """
 
     def unreached(**changes: Any) -> list[int]:
@@ -106,3 +107,4 @@ def test_eight_equal_actuators_cannot_reach_some_growing_waves(name: str) -> Non
 
     assert unreached() == [4, 8, 12]
     assert unreached(n_a=20, actuator_width=0.05) == []
+    assert unreached(actuator_positions=[0.05, 0.17, 0.31, 0.44, 0.55, 0.68, 0.83, 0.93]) == []

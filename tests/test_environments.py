@@ -25,7 +25,8 @@ def test_every_problem_passes_the_check_of_the_library_without_a_warning(problem
 
 def test_an_episode_is_that_of_the_plant_to_the_bit() -> None:
     noise = {"measurement_noise": 0.1, "process_noise": 0.01, "sensors": 4}
-    for changes in ({}, noise):
+    moved = {"actuator_positions": [0.1, 0.15, 0.3, 0.6, 0.7, 0.95], "actuator_shape": "gaussian"}
+    for changes in ({}, noise, moved):
         env = gymnasium.make(BURGERS, **GRID, **changes)
         plant = pdeloop.problem("burgers", **GRID, **changes).plant()
         rng, total, ended = np.random.default_rng(0), 0.0, False

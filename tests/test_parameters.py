@@ -5,14 +5,16 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from loop_interfaces.parameters import NODES, table, taken_by
 from loop_interfaces.problem import load_parameters, shipped_problems
 from loop_interfaces.spec import ParameterError as Refused
 from loop_interfaces.spec import Spec, check_names
-from pde_sim_node.build import build_plant
+from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.equations import EQUATIONS
+from tests.small import parameters
 
 SPECS = {spec.name: spec for spec in table()}
 
@@ -30,6 +32,9 @@ SPECS = {spec.name: spec for spec in table()}
         ("start", "lqg", "'start' is 'lqg'; expected one of lqt, zero"),
         ("seed", -1, "'seed' is -1; expected a whole number from 0"),
         ("pairs", "a", "'pairs' is 'a'; expected a list of texts"),
+        ("actuator_positions", [0.1, 1.2], "is [0.1, 1.2]; expected a list of numbers from 0 to 1"),
+        ("actuator_positions", [0.1, "a"], "is [0.1, 'a']; expected a list of numbers from 0 to 1"),
+        ("actuator_positions", 0.1, "is 0.1; expected a list of numbers from 0 to 1"),
     ],
 )
 def test_a_bad_value_is_refused_with_name_value_and_range(name, value, words):
@@ -51,9 +56,21 @@ def test_a_whole_number_serves_where_a_number_is_expected():
     assert isinstance(value, float)
 
 
+@pytest.mark.parametrize("positions", [[0, 0.5], (0.0, 0.5), np.array([0.0, 0.5])])
+def test_numbers_in_a_list_a_tuple_or_an_array_become_a_list_that_a_file_can_hold(positions):
+    value = SPECS["actuator_positions"].check(positions)
+    assert value == [0.0, 0.5]
+    assert [type(number) for number in value] == [float, float]
+
+
 def test_an_unknown_name_is_refused_with_the_nearest_known_one():
     with pytest.raises(Refused, match="'learning_rat'; did you mean 'learning_rate'"):
         check_names(["learning_rat"], SPECS)
+
+
+def test_a_plant_with_other_actuators_has_another_fingerprint():
+    options = [{}, {"actuator_positions": [0.1, 0.2, 0.5, 0.8]}, {"actuator_shape": "gaussian"}]
+    assert len({fingerprint(parameters(**given)) for given in options}) == len(options)
 
 
 @pytest.mark.parametrize("name", shipped_problems())
@@ -122,7 +139,9 @@ def test_a_text_is_parsed_as_its_parameter_asks():
     assert SPECS["sample_time"].parse("1e-3") == 1e-3
     assert SPECS["publish_clock"].parse("false") is False
     assert SPECS["problem"].parse("5") == "5"
-    for name, text in (("horizon", "2.5"), ("sample_time", "fast"), ("publish_clock", "no")):
+    assert SPECS["actuator_positions"].parse("[0, 0.25]") == [0.0, 0.25]
+    refused = {"horizon": "2.5", "sample_time": "fast", "publish_clock": "no"}
+    for name, text in {**refused, "actuator_positions": "0.1 0.2"}.items():
         with pytest.raises(Refused, match=f"'{name}' is '{text}'; expected"):
             SPECS[name].parse(text)
 

@@ -132,6 +132,8 @@ def within(spec: Spec) -> st.SearchStrategy[Any]:
         return st.floats(
             least, spec.maximum or 1e300, exclude_min=spec.positive, allow_subnormal=False
         )
+    if spec.numbers:
+        return st.lists(st.floats(spec.minimum, spec.maximum, allow_subnormal=False), max_size=3)
     text = st.text(st.characters(codec="utf-8", exclude_categories=("Cc", "Cs")), max_size=20)
     return st.lists(text, max_size=3) if spec.type is list else text
 

@@ -28,6 +28,8 @@ _LARGEST = 1.7976931348623157e308
 def given_parameters(node: Node) -> dict[str, Any]:
     """What the command line and parameter files give this node. ParameterError for unknown names."""
     given = {name: parameter.value for name, parameter in node._parameter_overrides.items()}
+    # rcl knows no type of an empty list, and gives it no value.
+    given = {name: [] if value is None else value for name, value in given.items()}
     known = [spec.name for spec in table()]
     ros_own = [name for name in given if name.split(".")[0] in ("use_sim_time", "qos_overrides")]
     check_names(set(given) - set(ros_own), known)

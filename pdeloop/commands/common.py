@@ -13,6 +13,7 @@ Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 """Where a command adds its parser."""
 DEFAULTS = {spec.name: spec for spec in TUNER}
 """The tuner's parameters by name: their defaults, ranges and meanings."""
+_METAVAR = {int: "N", list: "X,X,..."}
 
 
 def command(
@@ -79,17 +80,21 @@ def add_flags(parser: argparse._ActionsContainer, group: str) -> None:
         own = "the problem's, or " if spec in PROBLEM else ""
         parser.add_argument(
             spec.flag,
-            type=_word if spec.choices else spec.type,
+            type=_word if spec.choices else str if spec.numbers else spec.type,
             choices=spec.choices or None,
-            metavar=None if spec.choices else "N" if spec.type is int else "X",
+            metavar=None if spec.choices else _METAVAR.get(spec.type, "X"),
             help=f"{spec.description} [{own}{spec.default}]".replace("%", "%%"),
         )
 
 
 def given_flags(options: argparse.Namespace) -> dict[str, object]:
     """The parameters whose flags were given, by name."""
-    given = {spec.name: getattr(options, spec.name) for spec in flags()}
-    return {name: value for name, value in given.items() if value is not None}
+    given = [(spec, getattr(options, spec.name)) for spec in flags()]
+    return {
+        spec.name: spec.parse(value) if spec.numbers else value
+        for spec, value in given
+        if value is not None
+    }
 
 
 def _word(text: str) -> str:
