@@ -16,7 +16,7 @@ class Progress:
     """Shows how much of a task is done.
 
     On a terminal a bar, which leaves no trace. Elsewhere a line for every tenth of the work, and for
-    the first news after some seconds without one.
+    the first news after some seconds without one; what was said already is no news.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ class Progress:
             transient=True,
         )
         self._task = self._bar.add_task("", amount="", status="")
-        self._tenths, self._printed_at = -1, time.monotonic()
+        self._tenths, self._told, self._printed_at = -1, "", time.monotonic()
 
     def tell(self, done: int, total: int, status: str = "") -> None:
         """Now `done` of `total` are done; status: a few words on what was done last."""
@@ -49,14 +49,11 @@ class Progress:
             self._bar.update(self._task, completed=done, total=total, amount=amount, status=status)
             return
         tenths, now = 10 * done // total, time.monotonic()
+        words = f"{self._title}: {amount}" + (f", {status}" if status else "")
         first = self._tenths < 0
-        if (
-            done < total
-            and not first
-            and (tenths > self._tenths or now - self._printed_at > PERIOD)
-        ):
-            self._printed_at = now
-            words = f"{self._title}: {amount}" + (f", {status}" if status else "")
+        due = tenths > self._tenths or now - self._printed_at > PERIOD
+        if done < total and not first and due and words != self._told:
+            self._told, self._printed_at = words, now
             self._console.print(words, markup=False)
         self._tenths = tenths
 

@@ -364,7 +364,7 @@ def test_news_after_long_silence_is_a_line(monkeypatch) -> None:
     file = io.StringIO()
     progress = Progress(Console(file=file, width=80), "adapting", "rollouts")
     monkeypatch.setattr("pdeloop.progress.PERIOD", -1.0)
-    for done in (9, 10, 11):
+    for done in (9, 10, 10, 11, 11, 11):
         progress.tell(done, 80, "cost 1.5")
     progress.close()
     said = [f"adapting: {done} of 80 rollouts, cost 1.5" for done in (10, 11)]
