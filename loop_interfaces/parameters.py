@@ -194,10 +194,10 @@ TUNER = _section(
         "field, which the adaptation begins with if none does; 1: take the first, unchecked, as "
         "the paper does"
     ),
-    Spec("evaluation_fields", 10, 1, 1000).means(
+    Spec("evaluation_fields", 10, 1, 1000, group="budget and method").means(
         "sampled initial fields of the closing evaluation"
     ),
-    Spec("evaluation_seed", 0, 0, MAX_SEED).means(
+    Spec("evaluation_seed", 0, 0, MAX_SEED, group="budget and method").means(
         "seed of those fields: the same for every training seed, so that runs compare"
     ),
     Spec("out", "").means("folder of the results and the checkpoint; empty: keep nothing"),

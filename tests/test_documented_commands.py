@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 
 from benchmarks.__main__ import parser
+from pdeloop.cli import COMMANDS
+from pdeloop.cli import parser as pdeloop_parser
 
 TESTS = Path(__file__).resolve().parent
 DOCS = TESTS.parent / "docs"
@@ -24,6 +26,25 @@ def test_every_benchmark_that_a_page_names_can_be_called(page):
         options = parser().parse_args(words)
         module = importlib.import_module(f"benchmarks.{options.program}")
         assert callable(module.run), command
+
+
+PRINTED = re.compile(rf"^(?: {{4}})?(pdeloop (?:{'|'.join(COMMANDS)})\b[^#|>&\n]*)", re.MULTILINE)
+OPTIONAL = re.compile(r"\[[^]]*\]")
+
+
+def printed(page: Path) -> list[str]:
+    """The `pdeloop` commands in a page's blocks of code."""
+    text = page.read_text().replace("\\\n", "").replace("$seed", "0").replace(" 2>", " >")
+    return [OPTIONAL.sub("", command.strip()) for command in PRINTED.findall(text)]
+
+
+PAGES = [*sorted(DOCS.glob("*.md")), DOCS.parent / "README.md"]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_command_that_a_page_prints_is_understood(page):
+    for command in printed(page):
+        assert pdeloop_parser().parse_args(shlex.split(command)[1:]), command
 
 
 @pytest.mark.parametrize("name", ["optimizers.md", "robustness.md", "problems.md"])
