@@ -116,8 +116,8 @@ def study_orders(
     >>> study.orders, study.suggested
     (array([1, 2]), 2)
     """
+    everything = steps_of(trajectories)
     known = [(np.asarray(z, np.float64), np.asarray(a, np.float64)) for z, a in trajectories]
-    everything = steps_of(known)
     tried = sorted({n for n in orders if n >= 1})
     errors, scales = [], np.zeros(2)
     with threadpool_limits(limits=1):  # as in the identification itself

@@ -100,8 +100,10 @@ def steps_of(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> Steps:
         Shapes that do not fit, NaN or infinity.
     """
     befores, afters, inputs = [], [], []
-    for states, actions in trajectories:
-        z, own = _matrix("states", states), _matrix("actions", actions)
+    for trajectory in trajectories:
+        if len(trajectory) != 2:
+            raise ValueError("expected a list of trajectories, each a tuple (states, actions)")
+        z, own = _matrix("states", trajectory[0]), _matrix("actions", trajectory[1])
         if z.shape[0] != len(own) + 1:
             raise ValueError(
                 f"{len(own)} actions belong to {len(own) + 1} states, but {z.shape[0]} states were "

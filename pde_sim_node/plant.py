@@ -287,8 +287,8 @@ class Plant:
             return seeds
         if seeds.ndim != 1 or seeds.size == 0 or not np.issubdtype(seeds.dtype, np.integer):
             raise ValueError(
-                f"seeds must be a one-dimensional array of integers, one for each environment, "
-                f"got shape {seeds.shape} of {seeds.dtype}"
+                f"initial fields must be M seeds, whole numbers like [0, 1], or an array of shape "
+                f"(M, {self.n_z}), one for each environment, got {seeds.dtype} of shape {seeds.shape}"
             )
         if seeds.min() < MEAN_FIELD:
             raise ValueError(

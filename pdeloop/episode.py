@@ -153,7 +153,9 @@ def projected_law(plant: Plant, U: ArrayLike, policy: ArrayLike) -> Law:
     array([0.6, 0.7, 0.6])
     """
     basis = np.asarray(U, dtype=np.float64)
-    basis = finite_array("U", U, (plant.state_size, *basis.shape[1:2]))
+    if basis.ndim != 2 or len(basis) != plant.state_size:
+        raise ValueError(f"U must have shape ({plant.state_size}, n_s), got {basis.shape}")
+    basis = finite_array("U", U, basis.shape)
     gains = np.asarray(policy, dtype=np.float64)
     gains = finite_array("policy", policy, (*gains.shape[:-2], plant.n_a, 2 * basis.shape[1]))
     limit = plant.instruments.action_limit if isinstance(plant, InstrumentedPlant) else 0.0

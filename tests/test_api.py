@@ -95,7 +95,13 @@ def test_what_does_not_fit_is_refused_in_one_sentence(small) -> None:
         (lambda: pdeloop.identify((states, actions), n_s=2, method="dmd"), "expected 'regression'"),
         (lambda: pdeloop.projected_law(plant, basis[1:], np.zeros((n_a, 4))), "U must have shape"),
         (lambda: pdeloop.projected_law(plant, basis, np.zeros((n_a, 3))), "policy must have shape"),
+        (lambda: pdeloop.study_orders((states, actions)), "a list of trajectories"),
         (lambda: pdeloop.rollout(plant, lambda k, z: z, [0]), "actions must have shape"),
+        (lambda: pdeloop.rollout(plant, lambda k, z: z, 0), "must be M seeds, .* or an array"),
+        (
+            lambda: pdeloop.rollout(plant, lambda k, z: z, states[0]),
+            "must be M seeds, .* or an array",
+        ),
         (lambda: gradients.of_actions(np.zeros((3, 1, n_a)), [0]), "actions must have shape"),
         (lambda: gradients.of_actions(holes, [0]), "actions must be finite"),
         (lambda: gradients.of_policy(basis, np.zeros((n_a, 5)), [0]), "policy must have shape"),

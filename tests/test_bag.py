@@ -267,6 +267,11 @@ def test_what_is_no_bag_is_a_clear_error(tmp_path):
     ):
         with pytest.raises(BagError, match=words):
             Bag(path)
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "parameters.yaml").write_text("")
+    with pytest.raises(BagError, match="is a run without a bag; pdeloop train --record"):
+        Bag(run)
     (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information: [1")
     (tmp_path / "x.mcap").write_bytes(b"nonsense")
     with pytest.raises(

@@ -214,8 +214,10 @@ class TunerNode:
         self._guarded(partial(self._participants.update, self._publishers()))
         missing, seconds = self._diagnostics.absent(now)
         if missing:
+            hint = "; do they have this ROS_DOMAIN_ID, namespace and DDS profile?"
             self._log.warning(
-                f"waiting for {' and '.join(missing)} for {seconds:.0f} s",
+                f"waiting for {' and '.join(missing)} for {seconds:.0f} s"
+                + (hint if seconds > 2 * ABSENCE_REPORT else ""),
                 throttle_duration_sec=ABSENCE_REPORT,
             )
         if text := self._participants.newly_paused(now):

@@ -78,7 +78,8 @@ class RunFolder:
         if (self.path / "parameters.yaml").exists():
             raise RunFolderError(
                 f"{self.path} already holds a run; choose another folder, "
-                f"or continue it with: pdeloop train --resume {self.path}"
+                f"or continue it with: pdeloop train --resume {self.path} "
+                "(a tuner_node with -p resume:=true)"
             )
         try:
             make_folder(self.path)

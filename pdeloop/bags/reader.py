@@ -47,6 +47,8 @@ class Bag:
             path = path / "bag"
             found = files(path)
         if not found:
+            if (path / "parameters.yaml").exists():
+                raise BagError(f"{path} is a run without a bag; pdeloop train --record records one")
             raise BagError(f"no bag in {path}: there is no .mcap file")
         self.path = path
         self.files = found
