@@ -19,6 +19,7 @@ GAVE_UP = "gave up after"
 CAUSES = re.compile(
     rf"{GAVE_UP} \d+ attempts|expected one|stop the|two different|took back the cost"
     "|plant has other parameters|actions are not those of the law|diverged under"
+    r"|needs at least \d+ steps"  # the cost of a void exploration was forged into that of a short one
 )
 """What an error says that names a cause."""
 
@@ -32,8 +33,8 @@ def undisturbed(iterations: int) -> Training:
 def audit(plan: Plan) -> str:
     """'same bits', 'error: ...' where the training ended with one, or 'forged'.
 
-    The last one is the limit that docs/security.md names: other bits, as a forged message came to a
-    process that the true one with its header never reached.
+    The last one is the limit that docs/security.md names: other bits, as a forged message, or the
+    answer to a forged state, came to a process that the true one with its header never reached.
 
     Raises
     ------

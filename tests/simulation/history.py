@@ -81,7 +81,10 @@ class History:
         """Topics on which messages are forged, and until when."""
         self._forgeries: set[tuple[Any, ...]] = set()
         self._heard: set[tuple[Any, ...]] = set()
-        """Readers and headers of the forged messages that came, and of the others."""
+        """Readers and headers of the forged messages that came, and of the others. An answer to a
+        forged state counts as forged: the plant can only tell by the answer to its own."""
+        self._answers_forged = False
+        """Whether what a controller sends now answers a forged state."""
         self._cut: set[tuple[str, str]] = set()
         self._gone: dict[str, float] = {}
         self._rates = dict(zip(MAIN, plan.rates, strict=True))
@@ -109,7 +112,9 @@ class History:
 
     @property
     def unopposed(self) -> bool:
-        """Whether a forged message came to a process that the one with its header never reached."""
+        """Whether a forged message, or the answer to a forged state, came to a process that the
+        true one with its header never reached.
+        """
         return not self._forgeries <= self._heard
 
     def send(self, writer: Process, sent: Publication | ModelFailure, pair: int) -> None:
@@ -189,6 +194,7 @@ class History:
 
     def _carry(self, writer: str, process: Process, topic: Topic, raw: bytes, pair: int) -> None:
         """Bring a message to a process; where the line is cut, a reliable one waits for it."""
+        forged = writer == "stranger" or (topic is ACTION and self._answers_forged)
 
         def arrive() -> None:
             if (writer, process.name) in self._cut:
@@ -200,8 +206,12 @@ class History:
         def take() -> None:
             frame = self._codecs[topic].decode(bytes(raw))
             header = topic, pair, frame.run, frame.episode, frame.step, frame.time, frame.plant
-            (self._forgeries if writer == "stranger" else self._heard).add((process, *header))
-            process.take(topic, frame, pair)
+            (self._forgeries if forged else self._heard).add((process, *header))
+            self._answers_forged = forged and topic is STATE
+            try:
+                process.take(topic, frame, pair)
+            finally:
+                self._answers_forged = False
 
         self._later(arrive)
 
