@@ -24,7 +24,7 @@ def config_folder() -> Path:
 def shipped_problems() -> dict[str, Path]:
     """Name and file of every shipped problem."""
     folder = config_folder() / "problems"
-    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"), key=lambda path: path.stem)}
 
 
 def find_problem(name: str) -> Path:

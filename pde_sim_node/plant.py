@@ -171,6 +171,12 @@ class Plant:
         self.compiled_in_seconds = seconds if compilations() > before else 0.0
         self._allocate(0)
 
+    def __repr__(self) -> str:
+        return (
+            f"{type(self).__name__}({self.equation.name}: state of {self.state_size}, "
+            f"{self.n_a} actuators, {self.horizon} steps of {self.sample_time:g})"
+        )
+
     def _supports(
         self, width: float, shape: str, positions: Sequence[float]
     ) -> NDArray[np.float64]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from loop_interfaces.model_rows import pack
 from loop_interfaces.parameters import noisy
 from loop_interfaces.topics import CostColumn
-from pde_sim_node.build import fingerprint
+from pde_sim_node.build import build_equation, fingerprint
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.finished_run import FinishedRun
 from pdeloop.in_process import LocalPair
@@ -47,9 +47,10 @@ def evaluate(
 
     Raises
     ------
-    RunFolderError
-        The run had another plant or law.
+    ValueError
+        The run had another plant or law, or its equation is code that is not allowed.
     """
+    build_equation(run.values)  # refuses code that the user has not named
     if reason := another_loop(run):
         raise RunFolderError(f"{reason}; its policies cannot be evaluated here")
     seeds = len(run.policies)

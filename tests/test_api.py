@@ -81,6 +81,7 @@ def test_a_law_saturates_where_the_plant_does() -> None:
 
 def test_what_does_not_fit_is_refused_in_one_sentence(small) -> None:
     plant, (states, actions) = small.plant(), small.explore()
+    assert repr(plant).startswith("Plant(burgers: state of ")
     n_z, n_a = plant.n_z, plant.n_a
     basis, gradients = np.eye(n_z)[:, :2], pdeloop.Gradients(plant)
     holes = np.where(np.arange(n_a) < 1, np.nan, np.zeros((plant.horizon, 1, n_a)))

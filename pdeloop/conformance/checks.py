@@ -75,7 +75,8 @@ class Check(ABC):
         try:
             yield from self.findings()
         except NoAnswerError as error:
-            yield Finding("no answer", False, str(error))
+            where = f"is it in this ROS_DOMAIN_ID, and has it {self.n_a} actuators (--n-a)?"
+            yield Finding("no answer", False, f"{error}; {where}")
 
     @abstractmethod
     def findings(self) -> Iterator[Finding]:
