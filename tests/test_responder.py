@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -11,23 +13,31 @@ from controller_node.responder import Responder
 from loop_interfaces import model_rows
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import ModelFailure
-from loop_interfaces.topics import ACTION, COMPLETED, MODEL_IDENTIFIED
+from loop_interfaces.topics import ACTION, COMPLETED, MODEL_IDENTIFIED, VOID
 from pde_sim_node.build import build_plant
+from pde_sim_node.plant import Plant
 from pdeloop.in_process import LocalPair
 from tests.small import parameters, same_bits
 from tuner_node.batch import Batch
 
 RUN = 5
 SETTINGS = DesignSettings(n_a=4, reduced_order=4, state_weight=1.0, action_weight=1.0)
-PLANT = build_plant(parameters())
-TARGET = Frame(0, 0, 0, 0.0, PLANT.target)
+
+
+@cache
+def plant() -> Plant:
+    return build_plant(parameters())
+
+
+def target() -> Frame:
+    return Frame(0, 0, 0, 0.0, plant().target)
 
 
 @pytest.fixture
 def responder() -> Responder:
     """A controller that knows the target."""
     made = Responder(SETTINGS)
-    made.target(TARGET)
+    made.target(target())
     return made
 
 
@@ -44,16 +54,16 @@ def models() -> np.ndarray:
 def explore(responder: Responder, episode: int, excitation_seed: int = 2, lose: int = -1):
     """Drive an exploratory episode; the state of step `lose` never reaches the controller."""
     responder.start(start(episode, (1, excitation_seed, 0.1, 0)))
-    states = PLANT.reset(np.array([1]))
-    for k in range(PLANT.horizon + 1):
+    states = plant().reset(np.array([1]))
+    for k in range(plant().horizon + 1):
         if k != lose:
             (send,) = responder.state(Frame(RUN, episode, k, 0.0, states))
             expected = excitation(excitation_seed, k, 4, 0.1)
             assert same_bits(send.frame.values[0], expected)
-        if k < PLANT.horizon:
-            states = PLANT.step(excitation(excitation_seed, k, 4, 0.1)[np.newaxis])
+        if k < plant().horizon:
+            states = plant().step(excitation(excitation_seed, k, 4, 0.1)[np.newaxis])
     costs = np.array([[1.0, 30.0, COMPLETED]])
-    return responder.cost(Frame(RUN, episode, PLANT.horizon, 1.0, costs))
+    return responder.cost(Frame(RUN, episode, plant().horizon, 1.0, costs))
 
 
 def test_exploration_gives_the_model_of_the_same_trajectory_in_process(responder):
@@ -74,9 +84,21 @@ def test_a_lost_sample_asks_for_the_episode_again_and_the_repeat_gives_the_model
     assert same_bits(send.frame.values, models())
 
 
+@pytest.mark.parametrize("ended", [VOID, COMPLETED])
+def test_an_exploration_that_ends_before_its_first_step_is_asked_for_again(responder, ended):
+    """Void before its first action; a forged cost may say that it was completed."""
+    responder.start(start(1, (1, 2, 0.1, 0)))
+    responder.state(Frame(RUN, 1, 0, 0.0, plant().reset(np.array([1]))))
+    (failure,) = responder.cost(Frame(RUN, 1, 0, 0.0, np.array([[0.0, 0.0, ended]])))
+    assert isinstance(failure, ModelFailure) and failure.retry
+    assert failure.reason == "the exploratory episode is void"
+    (send,) = explore(responder, 2)
+    assert same_bits(send.frame.values, models())
+
+
 def test_data_that_allow_no_model_are_a_failure_with_the_reason():
     responder = Responder(DesignSettings(4, 400, 1.0, 1.0))
-    responder.target(TARGET)
+    responder.target(target())
     (failure,) = explore(responder, 1)
     assert not failure.retry
     assert "needs at least" in failure.reason
@@ -85,12 +107,12 @@ def test_data_that_allow_no_model_are_a_failure_with_the_reason():
 def test_the_law_is_answered_whatever_the_order_in_which_its_parts_arrive():
     rows = models()
     policy = model_rows.unpack(rows[0], 4).policy
-    state = Frame(RUN, 3, 0, 0.0, PLANT.reset(np.array([1, 2])).copy())
+    state = Frame(RUN, 3, 0, 0.0, plant().reset(np.array([1, 2])).copy())
     parts = {
         "start": start(3, (1, -1, 0, 0), (2, -1, 0, 0)),
         "policy": Frame(RUN, 3, 0, 0.0, np.stack([policy, 0 * policy])),
         "model": Frame(RUN, 0, 0, 0.0, rows),
-        "target": TARGET,
+        "target": target(),
         "state": state,
     }
     answers = []
@@ -107,13 +129,13 @@ def test_the_law_is_answered_whatever_the_order_in_which_its_parts_arrive():
         assert same_bits(again.frame.values, answers[0].values)
     assert all(same_bits(a.values, answers[0].values) for a in answers)
     s = model_rows.unpack(rows[0], 4)
-    expected = s.K_a @ (s.U.T @ state.values[0]) + s.K_b @ (s.U.T @ PLANT.target)
+    expected = s.K_a @ (s.U.T @ state.values[0]) + s.K_b @ (s.U.T @ plant().target)
     assert np.allclose(answers[0].values[0], expected, rtol=1e-12, atol=1e-13)
     assert (answers[0].values[1] == 0).all()
 
 
 def test_states_of_two_plants_are_not_mixed_into_one_model(responder):
-    responder.target(Frame(0, 0, 0, 0.0, PLANT.target, plant=9))
+    responder.target(Frame(0, 0, 0, 0.0, plant().target, plant=9))
     responder.start(start(1, (1, 2, 0.1, 0)))
     stranger = np.random.default_rng(0).standard_normal((1, 32))
     for k in range(31):
@@ -125,7 +147,7 @@ def test_states_of_two_plants_are_not_mixed_into_one_model(responder):
 
 def test_a_flood_of_strangers_does_not_push_out_the_run_that_is_served(responder):
     responder.start(start(1, (1, 9, 0.1, 0)))
-    state = Frame(RUN, 1, 0, 0.0, PLANT.reset(np.array([1])).copy())
+    state = Frame(RUN, 1, 0, 0.0, plant().reset(np.array([1])).copy())
     (before,) = responder.state(state)
     for stranger in range(100, 200):
         responder.start(start(1, (1, 9, 0.1, 0), run=stranger))
@@ -136,7 +158,7 @@ def test_a_flood_of_strangers_does_not_push_out_the_run_that_is_served(responder
 
 def test_a_state_of_another_episode_or_run_is_not_answered(responder):
     responder.start(start(1, (1, 9, 0.1, 0)))
-    state = PLANT.reset(np.array([1]))
+    state = plant().reset(np.array([1]))
     assert responder.state(Frame(RUN, 2, 0, 0.0, state)) == []
     assert responder.state(Frame(RUN + 1, 1, 0, 0.0, state)) == []
     assert len(responder.state(Frame(RUN, 1, 0, 0.0, state))) == 1
@@ -145,9 +167,9 @@ def test_a_state_of_another_episode_or_run_is_not_answered(responder):
 def test_a_policy_waits_for_the_models_it_belongs_to():
     rows = models()
     policy = model_rows.unpack(rows[0], 4).policy
-    state = Frame(RUN, 3, 0, 0.0, PLANT.reset(np.array([1])).copy())
+    state = Frame(RUN, 3, 0, 0.0, plant().reset(np.array([1])).copy())
     responder = Responder(SETTINGS)
-    responder.target(TARGET)
+    responder.target(target())
     responder.model(Frame(RUN, 0, 1, 0.0, 2.0 * rows))  # of the identification that was thrown away
     responder.start(Frame(RUN, 3, 2, 0.0, np.array([[1.0, -1.0, 0.0, 0.0]])))
     assert responder.policy(Frame(RUN, 3, 2, 0.0, policy[np.newaxis])) == []
@@ -155,12 +177,12 @@ def test_a_policy_waits_for_the_models_it_belongs_to():
     assert responder.waits_for() == ["model"]
     (send,) = responder.model(Frame(RUN, 0, 2, 0.0, rows))
     s = model_rows.unpack(rows[0], 4)
-    expected = s.K_a @ (s.U.T @ state.values[0]) + s.K_b @ (s.U.T @ PLANT.target)
+    expected = s.K_a @ (s.U.T @ state.values[0]) + s.K_b @ (s.U.T @ plant().target)
     assert np.allclose(send.frame.values[0], expected, rtol=1e-12, atol=1e-13)
 
 
 def test_two_runs_are_answered_side_by_side_and_forgotten_when_released(responder):
-    state = PLANT.reset(np.array([1])).copy()
+    state = plant().reset(np.array([1])).copy()
     responder.start(start(1, (1, 9, 0.1, 0)))
     responder.start(start(1, (1, 10, 0.1, 0), run=6))
     (a,) = responder.state(Frame(RUN, 1, 0, 0.0, state))
@@ -196,11 +218,11 @@ def test_a_policy_that_does_not_fit_the_episode_is_refused_and_a_good_one_serves
     responder = Responder(SETTINGS)
     rows = models()
     policy = model_rows.unpack(rows[0], 4).policy
-    responder.target(TARGET)
+    responder.target(target())
     responder.model(Frame(RUN, 0, 0, 0.0, rows))
     responder.start(start(1, (1, -1, 0, 0)))
     responder.policy(Frame(RUN, 1, 0, 0.0, np.stack([policy, policy])))
-    state = Frame(RUN, 1, 0, 0.0, PLANT.reset(np.array([1])).copy())
+    state = Frame(RUN, 1, 0, 0.0, plant().reset(np.array([1])).copy())
     with pytest.raises(FrameError, match="policies for 1 environments, got 2"):
         responder.state(state)
     responder.policy(Frame(RUN, 1, 0, 0.0, policy[np.newaxis]))
@@ -209,7 +231,7 @@ def test_a_policy_that_does_not_fit_the_episode_is_refused_and_a_good_one_serves
 
 def test_a_run_of_a_stranger_fills_no_memory(responder, monkeypatch):
     monkeypatch.setattr("controller_node.responder.MAX_BYTES", 100_000)
-    states = PLANT.reset(np.array([1]))
+    states = plant().reset(np.array([1]))
     for run in range(100, 120):
         responder.start(start(1, (1, 2, 0.1, 0), run=run))
         for k in range(2000):
@@ -227,7 +249,7 @@ def test_a_run_of_a_stranger_fills_no_memory(responder, monkeypatch):
 
 def test_two_different_states_of_one_step_give_no_model_and_ask_for_the_episode_again(responder):
     responder.start(start(1, (1, 2, 0.1, 0)))
-    states = PLANT.reset(np.array([1]))
+    states = plant().reset(np.array([1]))
     responder.state(Frame(RUN, 1, 0, 0.0, states))
     responder.state(Frame(RUN, 1, 3, 0.0, states + 1.0))  # before the plant's
     (failure,) = explore(responder, 1)
@@ -241,7 +263,7 @@ def test_two_different_states_of_one_step_give_no_model_and_ask_for_the_episode_
 def test_an_episode_with_two_different_policies_is_not_answered(responder, when):
     responder.model(Frame(RUN, 0, 0, 0.0, models()))
     good, forged = (Frame(RUN, 4, 0, 0.0, np.full((1, 4, 8), gain)) for gain in (0.1, 0.2))
-    state = Frame(RUN, 4, 0, 0.0, PLANT.reset(np.array([1])))
+    state = Frame(RUN, 4, 0, 0.0, plant().reset(np.array([1])))
     first, second = (forged, good) if when == "before" else (good, forged)
     responder.policy(first)
     responder.start(start(4, (1, -1, 0.0, 0)))
