@@ -242,7 +242,7 @@ class Terminal:
         deadline = time.monotonic() + LIMIT
         while self.read(0.1) and time.monotonic() < deadline:
             pass
-        return self.process.wait(5.0)
+        return self.process.wait(LIMIT)
 
 
 @contextlib.contextmanager
@@ -253,7 +253,7 @@ def terminal(*command: str, cwd: Path, **environment: str) -> Iterator[Terminal]
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(started.process.pid, signal.SIGKILL)
-        started.process.wait(10.0)
+        started.process.wait(LIMIT)
         os.close(started.master)
 
 

@@ -46,9 +46,9 @@ async def refusal(server: Server, said: Any, **headers: str) -> str:
     async with aiohttp.ClientSession() as session:
         url = f"http://127.0.0.1:{server.port}/ws"
         async with session.ws_connect(url, headers=headers) as page:
-            assert (await page.receive_json(timeout=10))["part"] == "hello"
+            assert (await page.receive_json(timeout=600))["part"] == "hello"
             await page.send_json(said)
-            while (answer := await page.receive_json(timeout=10))["part"] != "refusal":
+            while (answer := await page.receive_json(timeout=600))["part"] != "refusal":
                 pass
             return str(answer["text"])
 
@@ -117,10 +117,10 @@ def test_a_page_of_ours_reaches_the_nodes_and_nothing_but_what_they_offer():
             assert (server.take(json.dumps(said)) == "") == done, said
         assert "expected an environment" in server.take("[" * 100_000)
         # Confirmed at once, whatever the node is doing.
-        assert page.requests.get(timeout=10) == Call("/p", "pause")
-        assert page.requests.get(timeout=10) == ShowLoop("/lab")
-        assert page.requests.get(timeout=10) == ShowEpisode(0)  # again, in the other environment
-        assert page.requests.get(timeout=10) == ShowEpisode(1) and page.requests.empty()
+        assert page.requests.get(timeout=600) == Call("/p", "pause")
+        assert page.requests.get(timeout=600) == ShowLoop("/lab")
+        assert page.requests.get(timeout=600) == ShowEpisode(0)  # again, in the other environment
+        assert page.requests.get(timeout=600) == ShowEpisode(1) and page.requests.empty()
 
 
 def test_the_headers_allow_nothing_from_elsewhere_and_no_inline_script():
@@ -216,7 +216,7 @@ def test_connections_that_ask_nothing_are_closed_and_a_page_stays(monkeypatch):
             aiohttp.ClientSession() as session,
             session.ws_connect(url, headers={"Origin": own}) as page,
         ):
-            await page.receive_json(timeout=10)
+            await page.receive_json(timeout=600)
             half = [await asyncio.open_connection("127.0.0.1", server.port) for _ in range(49 + 20)]
             for _, writer in half[:10]:
                 writer.write(b"GET / HTTP/1.1\r\nHost: ")  # and never the rest

@@ -61,7 +61,7 @@ def test_the_readmes_three_terminals_train_and_say_where_the_results_are(
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGTERM)
         for process in started:
-            process.wait(20.0)
+            process.wait(LIMIT)
     shown = (tmp_path / "2.log").read_text()
     for words in (
         "seed 0: reduced model of order",

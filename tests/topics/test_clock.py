@@ -23,17 +23,22 @@ pytestmark = pytest.mark.topics
 
 
 STUCK = """
-import rclpy, threading, time
+import rclpy
 from loop_interfaces.ros import node_loop
 from loop_interfaces.topics import ACTION, STATE
 from tests.test_fast_path import Controller
-node_loop.HOUSEKEEPING = node_loop.WAIT = 60.0  # as long as a wait until a moment that was set back
+node_loop.HOUSEKEEPING = node_loop.WAIT = 600.0  # as long as a wait until a moment that was set back
 rclpy.init()
 loop = node_loop.NodeLoop(rclpy.create_node("stuck"))
-turns = []
-threading.Timer(3.0, loop.stop, ["enough"]).start()
-loop.run(tick=print, deadline=lambda: turns.append(time.monotonic()), housekeeping=lambda now: None)
-print("turns", len(turns) >= 4, max(b - a for a, b in zip(turns, turns[1:])) < 1.5)
+
+def turn():
+    turns.append(None)
+    if len(turns) == 6:
+        loop.stop("enough")
+
+turns = []  # an event or two of the graph may be among them
+loop.run(tick=print, deadline=turn, housekeeping=lambda now: None)
+print(len(turns), "turns")
 
 # With a fast path that is armed all the time.
 controller = Controller(2)
@@ -42,15 +47,14 @@ controller.ordinary(controller.state(4, 0))
 loop.answer_fast(loop.receive(STATE, lambda frame: None), loop.sender(ACTION), controller.path)
 turns.clear()
 loop.resume()
-threading.Timer(3.0, loop.stop, ["enough"]).start()
-loop.run(tick=print, deadline=lambda: turns.append(time.monotonic()), housekeeping=lambda now: None)
-print("turns", len(turns) >= 4, max(b - a for a, b in zip(turns, turns[1:])) < 1.5)
+loop.run(tick=print, deadline=turn, housekeeping=lambda now: None)
+print(len(turns), "turns")
 """
 
 
 def test_a_wait_that_would_last_until_the_clock_is_there_again_is_ended(loop: Processes):
     lines = loop.wait(loop.start("-c", STUCK, name="stuck"), LIMIT).splitlines()
-    assert lines == 2 * ["turns True True"]
+    assert lines == 2 * ["6 turns"]
 
 
 def newest_time(out: Path) -> float:

@@ -228,7 +228,7 @@ def take(message):
         assert own > 0
 node.create_subscription(DiagnosticArray, "/diagnostics", take, 10)
 print("ready", flush=True)
-end = time.monotonic() + 50.0
+end = time.monotonic() + 200.0
 while len(set(stamps)) < 3 and time.monotonic() < end:
     rclpy.spin_once(node, timeout_sec=0.2)
 print(*stamps)
