@@ -59,7 +59,7 @@ class Plant:
 
 
 def make(plant: Plant, policy: np.ndarray | None = None, **changes: Any) -> GaussNewton:
-    settings: dict[str, Any] = {"seed": 5, "rollouts": 32, "context": plant.context()}
+    settings: dict[str, Any] = {"seed": 5, "rollouts": 24, "context": plant.context()}
     return GaussNewton(0.6 * plant.best if policy is None else policy, **(settings | changes))
 
 
@@ -79,7 +79,7 @@ def same_state(a: GaussNewton, b: GaussNewton) -> bool:
 def test_converges_to_the_known_optimum_of_a_linear_quadratic_plant() -> None:
     """Large steps first, on three fields; small ones, near the optimum, are judged on more."""
     plant = Plant()
-    optimizer = make(plant, rollouts=48)
+    optimizer = make(plant, rollouts=36)
     start, best = mean_cost(plant, optimizer.policy), mean_cost(plant, plant.best)
     used, counts = 0, []
     while not optimizer.done:
@@ -87,14 +87,14 @@ def test_converges_to_the_known_optimum_of_a_linear_quadratic_plant() -> None:
         used += len(asked)
         optimizer.tell(measure(plant, asked))
         counts.append(optimizer.state()["fields"].size)
-        again = make(plant, rollouts=48)
+        again = make(plant, rollouts=36)
         again.restore(optimizer.state())
         assert same_state(again, optimizer)
     final = mean_cost(plant, optimizer.best_policy)
     assert start > 1.05 * best
     # The infinite-horizon law is optimal up to the end of the episode.
     assert final == pytest.approx(best, rel=0.01)
-    assert used <= 48
+    assert used <= 36
     assert counts[0] == 3 and counts == sorted(counts) and 3 < counts[-1] <= 6
 
 
@@ -232,17 +232,17 @@ def test_a_restored_training_ends_with_the_same_bits() -> None:
         return optimizer.tell(results)
 
     # What a step leaves follows from what is kept before it, so restoring may come anywhere.
-    whole = make(plant, rollouts=24)
+    whole = make(plant, rollouts=17)
     while not whole.done:
         stored = io.BytesIO()
         np.savez(stored, **whole.state())
         stored.seek(0)
-        again = make(plant, rollouts=24)
+        again = make(plant, rollouts=17)
         with np.load(stored, allow_pickle=False) as arrays:
             again.restore(dict(arrays))
         assert step(again) == step(whole)
         assert same_state(again, whole)
-    assert whole.tells > 10
+    assert whole.tells > 8
 
 
 def test_refuses_foreign_checkpoints() -> None:

@@ -62,16 +62,16 @@ def test_nodes_that_are_killed_in_a_launched_training_are_started_again(
     installed: Processes, workspace: Workspace, tmp_path: Path
 ) -> None:
     run = tmp_path / "run"
-    options = {"problem": SMALL, "iterations": 40, "real_time_factor": 10.0, "namespace": "lab"}
+    options = {"problem": SMALL, "iterations": 30, "real_time_factor": 10.0, "namespace": "lab"}
     options |= {"pairs": 2, "record": "true", "out": run}
     started = launch(installed, workspace, "train.launch.py", **options)
-    for name in ("pde_sim_node", "controller_node", "tuner_node"):
+    for name in ("pde_sim_node", "tuner_node"):  # one of a pair, and the one that ends the training
         rows = adapted(run)
         until(lambda rows=rows: adapted(run) > rows + 2, LIMIT, "progress")
         os.kill(pids(installed, name)[0], signal.SIGKILL)
     said = installed.wait(started, LIMIT)
-    assert said.count("exit code -9") == 3
-    assert_same_training(run, in_process(iterations=40))
+    assert said.count("exit code -9") == 2
+    assert_same_training(run, in_process(iterations=30))
     assert "lab.pair1.controller_node" in said
     assert "Traceback" not in said
     assert (run / "bag" / "metadata.yaml").is_file()
