@@ -1,6 +1,6 @@
 """PPO and SAC of stable-baselines3 on the Gymnasium environments: costs against rollouts.
 
-It needs PyTorch, and so an environment of its own (docs/optimizers.md), and is no part of any extra.
+It needs PyTorch, and so an environment of its own (docs/comparison.md), and is no part of any extra.
 
 An episode begins with a field of the training's seed, and is paid for like any rollout, as are the
 exploration and the check before it. What the agent is told and may do is chosen in its favour:
@@ -83,7 +83,7 @@ def run(
         import torch
     except ModuleNotFoundError as error:
         raise ValueError(
-            f"this needs {error.name}, which no extra installs: see docs/optimizers.md"
+            f"this needs {error.name}, which no extra installs: see docs/comparison.md"
         ) from error
     torch.set_num_threads(1)
     if algorithm not in CONSTANTS:
