@@ -110,6 +110,9 @@ def test_what_does_not_fit_is_refused_in_one_sentence(small) -> None:
         (lambda: pdeloop.train(small, optimizer="adam"), "'optimizer' is 'adam'"),
         (lambda: pdeloop.train(small, over_topics=True), "needs a folder .* give out"),
         (lambda: pdeloop.load_run("/nowhere"), "no run in /nowhere"),
+        (lambda: pdeloop.identify(states, actions, n_s=2), "each a tuple .states, actions."),
+        (lambda: small.explore(-1), "'seed' is -1; expected a whole number"),
+        (lambda: pdeloop.read_measurements("nothing.csv"), "nothing.csv"),
     ):
         with pytest.raises(ValueError, match=words) as caught:
             refused()
@@ -160,19 +163,3 @@ def test_the_trajectories_of_a_recorded_run_are_the_plants_own(tmp_path: Path) -
         lengths.add(len(episode.actions))
     assert lengths == {small.values["horizon"]} and len(others) > 3
     pdeloop.identify((first.states[:, 0], first.actions[:, 0]), n_s=2)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "sentence"),
-    [
-        (
-            lambda small: pdeloop.identify(*small.explore(0), n_s=2),
-            "each a tuple .states, actions.",
-        ),
-        (lambda small: small.explore(-1), "'seed' is -1; expected a whole number"),
-        (lambda small: pdeloop.read_measurements("nothing.csv"), "nothing.csv"),
-    ],
-)
-def test_what_does_not_fit_is_one_sentence(small, wrong, sentence) -> None:
-    with pytest.raises(ValueError, match=sentence):
-        wrong(small)

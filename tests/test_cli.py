@@ -222,9 +222,3 @@ def test_a_file_that_expands_without_end_is_refused(tmp_path, capsys):
     text = "/**:\n  ros__parameters:\n" + "".join(f"    {line}\n" for line in levels)
     (tmp_path / "bomb.yaml").write_text(text)
     assert "more than 10000 parameters" in error_of(capsys, "train", str(tmp_path / "bomb.yaml"))
-
-
-def test_problems_lists_the_shipped_ones(capsys):
-    assert main(["problems"]) == 0
-    text = capsys.readouterr().out
-    assert all(name in text for name in ("burgers", "allen-cahn", "kdv"))

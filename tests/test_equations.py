@@ -232,13 +232,6 @@ def test_an_equation_is_found_by_name_file_or_module(
     assert load_equation("heat.py:Heat") is kind
 
 
-def test_an_edited_file_is_loaded_anew(heat: Path) -> None:
-    before = load_equation(f"{heat}:Heat")
-    heat.write_text(HEAT.replace("0.1", "0.2"))
-    after = load_equation(f"{heat}:Heat")
-    assert (before().conductivity, after().conductivity) == (0.1, 0.2)
-
-
 @pytest.mark.parametrize(
     ("name", "words"),
     [

@@ -21,7 +21,7 @@ import pytest
 
 from pdeloop.cli import main
 from pdeloop.study import Failure, Study, StudyError, executors, rows, run
-from pdeloop.study.executors import cluster, processes
+from pdeloop.study.executors import cluster
 from pdeloop.study.table import text
 from pdeloop.study.training import FILES, train_one
 from tests.small import SMALL, same_bits, train_here
@@ -304,8 +304,3 @@ def test_a_dask_cluster_that_loses_a_worker_gives_the_same_bits(
         with pytest.raises(KeyboardInterrupt):
             run(Study.of(CONTENT), tmp_path / "no", partial(cluster, address), tell=kill_the_other)
     assert contents(out) == contents(reference)
-
-
-def test_two_processes_give_the_same_bits(reference: Path, tmp_path: Path):
-    assert run(Study.of(CONTENT), tmp_path, partial(processes, 2)) == []
-    assert contents(tmp_path) == contents(reference)

@@ -11,7 +11,6 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 from loop_interfaces.model_rows import unpack
-from loop_interfaces.parameters import table
 from tests.loop_harness import ROOT, Processes
 from tests.small_loop import LIMIT
 from tuner_node.seeds import Purpose, derive
@@ -90,8 +89,3 @@ def test_a_linear_plant_written_from_the_interface_page_is_identified_and_tuned(
     assert np.allclose([told[name] for name in ("none", "lqt", "adapted")], expected, rtol=1e-9)
     assert not np.array_equal(lqt, adapted)
     assert found in INTERFACES
-
-
-def test_every_parameter_is_on_the_interface_page():
-    for spec in table():
-        assert f"| `{spec.name}` |" in INTERFACES, spec.name
