@@ -3,30 +3,21 @@
 from __future__ import annotations
 
 import json
-import signal
 import struct
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 
-from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.topics import COMPLETED, COST, START, STATE, VOID
-from pdeloop.live import Live
-from pdeloop.monitor.finder import Finder, run_id
-from pdeloop.monitor.replay import replay
-from recorder_node.recording import Recording
-from recorder_node.sources import sources
-from tests.small import parameters
-from tuner_node.results import RunFolder
+from loop_interfaces.frames import Frame
+from loop_interfaces.topics import COMPLETED, VOID
 from viewer_node.episode_samples import COLUMNS, MAX_COMPONENTS, ROWS, EpisodeSamples, rows_of
 from viewer_node.learning_curve import MAX_POINTS, SENT, LearningCurve
 from viewer_node.loop_nodes import Endpoint, LoopNodes
 from viewer_node.loop_view import SILENT, SLOW, LoopView
 from viewer_node.operation import FAILURE, Call
 from viewer_node.rollout_costs import RolloutCosts
-from viewer_node.web.page import Page, ShowEpisode
+from viewer_node.web.page import Page
 
 PLANT = 7
 
@@ -471,26 +462,24 @@ def part(message: str | bytes) -> tuple[str, tuple[dict[str, Any], np.ndarray]]:
     return header["part"], (header, numbers)
 
 
-def test_another_environment_and_another_loop_are_sent():
-    page, sent = Page(), {}
+def test_the_chosen_environment_and_another_loop_are_sent():
+    page, sent = Page(environment=1), {}
     view = page.view
     view.target(frame([1.0, 2.0, 3.0, 4.0]), 0.0)
     for k in range(5):
         view.state(state(k), 0.0)
     parts = dict(map(part, page.updates(sent, 0.0)))
     np.testing.assert_array_equal(parts["target"][1], [1, 2, 3, 4])
-    assert parts["episode"][0]["environment"] == 0
-    assert page.choose({"environment": 1})
-    view.state(state(5), 0.0)
-    ((header, numbers),) = map(unpacked, page.updates(sent, 0.0))
-    assert header["environment"] == 1 and numbers[0] == 105
+    header, numbers = parts["episode"]
+    assert header["environment"] == 1 and numbers[0] == 100
     view = LoopView()
     page.show(view, domain=3, namespace="/")
     page.refresh(0.0)
     view.state(state(0), 0.0)
     headers = [unpacked(message)[0] for message in page.updates(sent, 0.0)]
     assert [h["part"] for h in headers] == ["status", "curve", "target", "episode"]
-    assert headers[-1]["columns"] == 1 and headers[0]["place"]["domain"] == 3
+    assert headers[-1]["columns"] == 1 and headers[-1]["environment"] == 1
+    assert headers[0]["place"]["domain"] == 3
 
 
 def test_the_colours_span_the_field_and_the_target_and_do_not_flicker():
@@ -507,80 +496,3 @@ def test_the_colours_span_the_field_and_the_target_and_do_not_flicker():
     assert first == [-10.0, pytest.approx(0.3, abs=0.01)]
     assert colours(1) == first
     assert colours(90)[1] > 80
-
-
-# A run on which nothing works.
-
-
-@pytest.fixture
-def own_signals() -> Iterator[None]:
-    """The test's own handlers of SIGINT and SIGTERM; pytest has its back afterwards."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
-
-
-def test_a_run_that_was_interrupted_is_shown_until_it_goes_on(tmp_path, own_signals):
-    folder = RunFolder(tmp_path / "run")
-    folder.create(parameters(seeds=2))
-    folder.note({"event": "designed", "seed": 0})
-    folder.note({"event": "designed", "seed": 1})
-    folder.note({"event": "phase", "phase": "adapt", "rollouts": [9, 9], "budget": [80, 80]})
-    folder.note(adapted(0, 11, 2.0))
-    folder.note(adapted(1, 11, 4.0))
-    page, found = Page(), []
-    looks = iter(range(100))
-
-    def look() -> list[Live]:
-        if next(looks) == 2:
-            status = json.loads(page.updates({}, 0.0)[0])
-            assert status["state"] == "recorded" and not status["recorded"]["finished"]
-            assert "not recorded" in status["recorded"]["note"]
-            assert status["parameters"]["problem"] == "small"
-            assert points(page.view.curve) == [(11, 3.0, 2.0, 4.0)]
-            found.append(Live(17, folder.path, 1.0))
-        return list(found)
-
-    assert replay(folder.path, Finder(folder.path, None, look), page)
-    assert found
-
-
-def test_the_recorded_episode_that_a_page_asks_for_is_shown(tmp_path, own_signals):
-    folder = RunFolder(tmp_path / "run")
-    folder.create(parameters())
-    run = run_id(folder.path)
-    assert run is not None
-    by_topic = {source.array: source for source in sources("/")}
-    recording = Recording(folder.path / "bag", list(by_topic.values()))
-    for episode in (1, 2):
-        ids = {"episode": episode, "run": run}
-        published = [(START, start([[3.0, 4.0, 0.1, 0.0]], **ids))]
-        published += [(STATE, state(step, batch=1, **ids)) for step in range(4)]
-        published += [(COST, cost([1.0], **ids))]
-        for topic, content in published:
-            raw = ArrayCodec(topic.labels).encode(content)
-            recording.take(by_topic[topic], episode * 10**9, raw)
-    recording.close()
-    page, sent, begun = Page(), {}, []
-    for index in (1, 0, 0, 1):
-        page.requests.put(ShowEpisode(index))
-
-    def look() -> list[Live]:
-        parts = dict(map(part, page.updates(sent, 0.0)))
-        begun.append(parts["episode"][0]["episode"] if "episode" in parts else None)
-        return [Live(17, folder.path, 1.0)] if page.requests.empty() else []
-
-    assert replay(folder.path, Finder(folder.path, None, look), page)
-    assert begun == [2, 2, 1, 1, 2]
-
-
-def test_a_stop_signal_ends_the_replay(tmp_path, own_signals):
-    folder = RunFolder(tmp_path / "run")
-    folder.create(parameters())
-
-    def look() -> list[Live]:
-        signal.raise_signal(signal.SIGTERM)
-        return []
-
-    assert not replay(folder.path, Finder(folder.path, None, look), Page())

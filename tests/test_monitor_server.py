@@ -16,7 +16,7 @@ import pytest
 from tests.browser import browser
 from viewer_node.loop_nodes import Endpoint
 from viewer_node.operation import Call
-from viewer_node.web.page import Page, Recorded, ShowEpisode, ShowLoop
+from viewer_node.web.page import Page, ShowLoop
 from viewer_node.web.server import FILES, STATIC, Server
 
 
@@ -96,7 +96,6 @@ def test_a_page_of_ours_reaches_the_nodes_and_nothing_but_what_they_offer():
         text = asyncio.run(refusal(server, {"node": "/p", "verb": "stop"}, Origin=own))
         assert "no node of this loop offers" in text
         page.place["namespaces"] = ["/", "/lab"]
-        page.recorded = Recorded(finished=True, episodes=2)
         for said, done in (
             ({"node": "/p", "verb": "pause"}, True),
             ({"node": "/q", "verb": "pause"}, False),
@@ -105,22 +104,16 @@ def test_a_page_of_ours_reaches_the_nodes_and_nothing_but_what_they_offer():
             (None, False),
             ({"namespace": "/lab"}, True),
             ({"namespace": "/other"}, False),
-            ({"environment": 3}, True),
-            ({"environment": -1}, False),
-            ({"environment": True}, False),
             ({"component": 1}, True),
+            ({"component": -1}, False),
             ({"component": "u"}, False),
-            ({"episode": 1}, True),
-            ({"episode": 2}, False),
-            ({"episode": -1}, False),
+            ({"environment": 1}, False),
         ):
             assert (server.take(json.dumps(said)) == "") == done, said
-        assert "expected an environment" in server.take("[" * 100_000)
+        assert "expected a component" in server.take("[" * 100_000)
         # Confirmed at once, whatever the node is doing.
         assert page.requests.get(timeout=600) == Call("/p", "pause")
-        assert page.requests.get(timeout=600) == ShowLoop("/lab")
-        assert page.requests.get(timeout=600) == ShowEpisode(0)  # again, in the other environment
-        assert page.requests.get(timeout=600) == ShowEpisode(1) and page.requests.empty()
+        assert page.requests.get(timeout=600) == ShowLoop("/lab") and page.requests.empty()
 
 
 def test_the_headers_allow_nothing_from_elsewhere_and_no_inline_script():

@@ -58,12 +58,10 @@ class Bag:
         """Whether it was closed properly."""
         return all(map(finished, self.files)) and (self.path / METADATA).exists()
 
-    def messages(self, start: int | None = None, stop: int | None = None) -> Iterator[Message]:
-        """The messages in the order in which they were written, those in [start, stop) ns if given."""
+    def messages(self) -> Iterator[Message]:
+        """The messages in the order in which they were written."""
         for file in self.files:
-            for message in read(file):
-                if (start or 0) <= message.when and (stop is None or message.when < stop):
-                    yield message
+            yield from read(file)
 
     def find(self, episode: int) -> Iterator[RecordedEpisode]:
         """The episodes of this number; there may be one in each namespace."""
@@ -85,15 +83,10 @@ class Bag:
         except (ValueError, TypeError, AttributeError, RecursionError) as error:
             raise BagError(f"{self.path / PARAMETERS} cannot be read: {error}") from error
 
-    def episodes(
-        self, start: int | None = None, stop: int | None = None
-    ) -> Iterator[RecordedEpisode]:
-        """The episodes in the order of their ends, each when nothing more of it is to come.
-
-        start, stop: only the messages that arrived in [start, stop) ns.
-        """
+    def episodes(self) -> Iterator[RecordedEpisode]:
+        """The episodes in the order of their ends, each when nothing more of it is to come."""
         index, known = EpisodeIndex(), cache(source_of)
-        for message in self.messages(start, stop):
+        for message in self.messages():
             source = known(message.topic)
             if source is not None:
                 index.take(source, message.when, message.data)

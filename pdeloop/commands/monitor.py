@@ -19,12 +19,11 @@ def add(commands: Commands) -> None:
         commands,
         "monitor",
         _monitor,
-        help="a page that shows a loop as it runs, or a run that is over",
+        help="a page that shows a loop as it runs",
         description="Serve a page on 127.0.0.1 that shows a loop as it runs: the field, the actions, "
         "the profile against the target, the training curve, the nodes, and buttons to pause. "
         "Without DIR and ROS_DOMAIN_ID it shows the newest training on this machine, "
-        "and the next one when that has ended. Of a run in DIR that is over it shows the curve, the "
-        "seeds and the recorded episodes. Ctrl-C ends it; the loop never waits for it.",
+        "and the next one when that has ended. Ctrl-C ends it; the loop never waits for it.",
         example="pdeloop monitor runs/burgers-20260101-120000-1 --environment 3",
     )
     add = monitor.add_argument
@@ -33,11 +32,11 @@ def add(commands: Commands) -> None:
         nargs="?",
         type=Path,
         metavar="DIR",
-        help="folder of a run, running or over: show this one only [the newest that runs]",
+        help="folder of a run: show this one only [the newest that runs]",
     )
     add("--port", type=int, default=PORT, metavar="N", help=f"0: a free one [{PORT}]")
     add("--namespace", metavar="NS", help="of the pair to show first [the first there is]")
-    add("--environment", type=int, default=0, metavar="M", help="to show first [0]")
+    add("--environment", type=int, default=0, metavar="M", help="of each episode [0]")
     add("--open", action="store_true", help="open the page in the browser")
     add(
         "--network",
@@ -50,7 +49,6 @@ def _monitor(options: argparse.Namespace) -> int:
     from loop_interfaces.affinity import lower_priority
     from pdeloop.domain import given_domain
     from pdeloop.monitor.finder import Finder, run_id
-    from pdeloop.monitor.replay import replay
     from viewer_node.web.page import Page
     from viewer_node.web.server import Server
 
@@ -61,8 +59,15 @@ def _monitor(options: argparse.Namespace) -> int:
         raise ParameterError(f"--environment is {options.environment}; expected 0 or more")
     if folder is not None and run_id(folder) is None:
         raise ParameterError(f"no run in {folder}; give the folder of one, or none")
-    page = Page(options.environment)
     finder = Finder(folder, given_domain())
+    if folder is not None and finder.find() is None:
+        raise ParameterError(
+            f"no loop works on the run in {folder}; see it with pdeloop report {folder}, or continue "
+            f"it with pdeloop train --resume {folder}"
+        )
+    from pdeloop.monitor.node import show_loops  # here, as it needs ROS
+
+    page = Page(options.environment)
     lower_priority(19)
     try:
         server = Server(page, options.port)
@@ -76,12 +81,9 @@ def _monitor(options: argparse.Namespace) -> int:
     if options.open:
         webbrowser.open(server.url)
     try:
-        if folder is None or finder.find() is not None or replay(folder, finder, page):
-            from pdeloop.monitor.node import show_loops  # here, as it needs ROS
-
-            given = options.namespace
-            namespace = None if given is None else f"/{given.strip('/')}"
-            show_loops(page, finder, namespace=namespace, network=options.network)
+        given = options.namespace
+        namespace = None if given is None else f"/{given.strip('/')}"
+        show_loops(page, finder, namespace=namespace, network=options.network)
     finally:
         server.stop()
     return 0

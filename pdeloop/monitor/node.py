@@ -11,7 +11,10 @@ from __future__ import annotations
 import contextlib
 import os
 import queue
+import signal
+import threading
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +26,10 @@ from loop_interfaces.ros.introspection import NAMELESS, full_name
 from loop_interfaces.ros.node_main import ros_node
 from loop_interfaces.ros.observer import Observer
 from loop_interfaces.ros.parameters import RemoteParameters
+from pde_sim_node.equations import EQUATIONS
 from pdeloop.display import ProgressFile
 from pdeloop.live import Live
 from pdeloop.monitor.finder import Finder, run_id
-from pdeloop.monitor.replay import REFRESH, component_names, short, stop_event
 from pdeloop.monitor.service_call import ServiceCall
 from viewer_node.learning_curve import LearningCurve
 from viewer_node.loop_nodes import ROLES, Endpoint
@@ -39,6 +42,8 @@ REQUEST_PERIOD = 0.1
 """Period (s) of serving the page's requests and of polling the answers of nodes."""
 GRAPH_PERIOD = 1.0
 """Period (s) of polling the ROS graph, and which loop runs."""
+REFRESH = 0.5
+"""Period (s) of updating rates and progress."""
 
 
 class MonitorNode:
@@ -221,10 +226,28 @@ def _progress(folder: Path | None) -> ProgressFile | None:
     return ProgressFile(folder / "progress.jsonl", past=True)
 
 
+def component_names(values: Mapping[str, Any]) -> list[str]:
+    """Names of the components that make up a state, from a plant's parameters."""
+    if values.get("sensors"):
+        count = int(values.get("sensor_delays") or 1)
+        return ["y", *(f"y {k} ago" for k in range(1, count))]
+    equation = EQUATIONS.get(str(values.get("equation")))
+    return ["u"] if equation is None else list(equation.components)
+
+
+def short(folder: Path) -> str:
+    """The folder as a person in the working directory writes it."""
+    with contextlib.suppress(ValueError):
+        return str(folder.resolve().relative_to(Path.cwd()))
+    return str(folder)
+
+
 def show_loops(page: Page, finder: Finder, *, namespace: str | None, network: bool) -> None:
     """Show what `finder` finds, one loop after the other, until SIGINT or SIGTERM."""
     while True:
-        stop = stop_event()
+        stop = threading.Event()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_, stop=stop: stop.set())
         while (live := finder.find()) is None:
             page.refresh(time.monotonic())
             if stop.wait(REFRESH):

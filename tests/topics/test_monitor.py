@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import signal
 import subprocess
@@ -10,10 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from pdeloop.bags.reader import Bag
 from tests.browser import Browser, browser
 from tests.loop_harness import Processes, until, without_domain
 from tests.small import SMALL, paced
@@ -183,7 +180,7 @@ def test_the_monitor_finds_a_training_that_starts_after_it_and_the_page_a_new_mo
         loop.wait(again, LIMIT)
 
 
-def test_a_pair_in_a_namespace_and_an_environment_are_chosen_on_the_page(loop, page, tmp_path):
+def test_a_pair_is_chosen_on_the_page_and_an_environment_by_its_flag(loop, page, tmp_path):
     given = ("--params-file", str(SMALL))
     for number in range(2):
         remap = ("-r", f"__ns:=/pair{number}")
@@ -197,16 +194,13 @@ def test_a_pair_in_a_namespace_and_an_environment_are_chosen_on_the_page(loop, p
     page.until(f"{STATE} === 'running'", LIMIT)
     page.until("document.querySelector('#pair').options.length === 2", LIMIT)
     assert page.ask("document.querySelector('#pair').value") == "/pair1"
-    page.until("document.querySelector('#environment').value === '1'", LIMIT)
-    page.until("document.querySelector('#environment').options.length >= 4", LIMIT)
+    said = "document.querySelector('#field').getAttribute('aria-label')"
+    page.until(f"{said}.includes('environment 1')", LIMIT)
     page.wait_for(lambda: "/pair1/pde_sim_node" in card(page, "plant"), LIMIT, "plant of pair1")
     choose = (
         "(() => { const s = document.querySelector('%s'); s.value = '%s';"
         " s.dispatchEvent(new Event('change')); })()"
     )
-    page.ask(choose % ("#environment", "3"))
-    said = "document.querySelector('#field').getAttribute('aria-label')"
-    page.until(f"{said}.includes('environment 3')", LIMIT)
     page.ask(choose % ("#pair", "/pair0"))
     page.wait_for(lambda: "/pair0/pde_sim_node" in card(page, "plant"), LIMIT, "plant of pair0")
     page.until(f"{STATE} === 'running'", LIMIT)
@@ -214,54 +208,7 @@ def test_a_pair_in_a_namespace_and_an_environment_are_chosen_on_the_page(loop, p
     assert page.console == []
 
 
-def test_a_run_that_is_over_opens_with_its_curve_its_seeds_and_its_recorded_episodes(
-    loop, page, recorded
-):
-    out = recorded
-    page.go(address(loop, loop.pdeloop("monitor", str(out), "--port", "0")))
-    page.until(f"{STATE} === 'finished'", LIMIT)
-    result = json.loads((out / "result.json").read_text())
-    page.until("document.querySelectorAll('#seeds tr').length === 1 + 2 + 1", LIMIT)
-    rows = page.ask("[...document.querySelectorAll('#seeds tr')].map((row) => row.innerText)")
-    for seed in range(2):
-        number, none, lqt, adapted, _ = rows[1 + seed].split("\t")
-        costs = [result["costs"][name][seed] for name in ("none", "lqt", "adapted")]
-        assert int(number) == seed
-        assert [float(none), float(lqt), float(adapted)] == pytest.approx(costs, rel=1e-3)
-    page.wait_for(lambda: page.ask(PAINTED % "curve") > 20, LIMIT, "picture of the curve")
-
-    bag = Bag(out)
-    target, index = bag.target(), list(bag.episodes())
-    move = (
-        "(() => { const s = document.querySelector('%s'); s.value = '%d';"
-        " for (const kind of ['input', 'change']) s.dispatchEvent(new Event(kind)); })()"
-    )
-    for chosen in (len(index) - 1, 1):
-        page.ask(move % ("#recorded", chosen))
-        number = index[chosen].number
-        page.until(f"{FIELD}.includes('episode {number % 2**32} ')", LIMIT)
-        (episode,) = bag.find(number)
-        for step in (0, 7):
-            page.ask(move % ("#time", step))
-            distance = np.sqrt(np.mean((episode.states[step].values[0] - target) ** 2))
-            said = page.wait_for(
-                lambda step=step: re.search(
-                    rf"t = {0.05 * step:.4g} s, rms distance to the target ([\d.]+)",
-                    page.ask("document.querySelector('#profile-text').textContent"),
-                ),
-                LIMIT,
-                f"profile of step {step}",
-            )
-            assert float(said.group(1)) == pytest.approx(distance, rel=1e-3)
-    page.wait_for(lambda: page.ask(PAINTED % "field") > 250, LIMIT, "picture of the field")
-    assert page.ask("document.querySelector('#notice').hidden")
-    assert not page.ask(
-        "[...document.querySelectorAll('#controls button')].some((b) => b.offsetParent)"
-    )
-    assert page.console == []
-
-
-def test_a_port_in_use_and_a_folder_without_a_run_are_told_in_one_line(loop, tmp_path):
+def test_a_port_in_use_and_a_folder_without_a_loop_are_told_in_one_line(loop, recorded, tmp_path):
     first = loop.pdeloop("monitor", "--port", "0")
     port = address(loop, first).rstrip("/").rpartition(":")[2]
     text = loop.wait(loop.pdeloop("monitor", "--port", port), LIMIT, code=1)
@@ -270,3 +217,6 @@ def test_a_port_in_use_and_a_folder_without_a_run_are_told_in_one_line(loop, tmp
     text = loop.wait(loop.pdeloop("monitor", str(tmp_path / "none")), LIMIT, code=1)
     (line,) = text.strip().splitlines()
     assert "no run in" in line
+    text = loop.wait(loop.pdeloop("monitor", str(recorded)), LIMIT, code=1)
+    (line,) = text.strip().splitlines()
+    assert f"see it with pdeloop report {recorded}" in line

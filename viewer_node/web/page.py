@@ -27,8 +27,6 @@ from viewer_node.episode_samples import MAX_COMPONENTS, EpisodeSamples, rows_of
 from viewer_node.loop_view import SILENT, LoopView
 from viewer_node.operation import Call
 
-MAX_INDEX = 2**24
-"""Environments and components that can be asked for."""
 RATE_WINDOW = 3.0
 """Seconds over which rates are taken."""
 COLOUR_PERIOD = 0.5
@@ -44,34 +42,6 @@ class ShowLoop:
     namespace: str
 
 
-@dataclass(frozen=True)
-class ShowEpisode:
-    """A request to show the recorded episode of this index."""
-
-    index: int
-
-
-@dataclass
-class Recorded:
-    """A run on which no process works.
-
-    Parameters
-    ----------
-    finished
-        Whether it came to its end.
-    episodes, chosen, label
-        How many of its episodes were recorded, the index of the one that is shown, and what it is.
-    note
-        Why no episodes can be shown.
-    """
-
-    finished: bool
-    episodes: int = 0
-    chosen: int = 0
-    label: str = ""
-    note: str = ""
-
-
 class Page:
     """The content of all web pages of a monitor, and what they ask for.
 
@@ -84,8 +54,6 @@ class Page:
         differs from loop to loop.
     parameters, controls
         Of its nodes: parameters, and the services that they offer.
-    recorded
-        Set for a run on which no process works.
     requests
         What the pages ask for, for the thread that feeds the view.
     open
@@ -99,9 +67,8 @@ class Page:
         self.place: dict[str, Any] = {"domain": None, "namespaces": [], "begun": 0}
         self.parameters: dict[str, Any] = {}
         self.controls: list[dict[str, Any]] = []
-        self.recorded: Recorded | None = None
         self.component = 0
-        self.requests: queue.SimpleQueue[Call | ShowLoop | ShowEpisode] = queue.SimpleQueue()
+        self.requests: queue.SimpleQueue[Call | ShowLoop] = queue.SimpleQueue()
         self.open = False
         self._status: str | None = None
         self._colours = (0.0, 1.0)
@@ -116,12 +83,11 @@ class Page:
         domain: int | None = None,
         folder: str | None = None,
         namespace: str | None = None,
-        recorded: Recorded | None = None,
     ) -> None:
         """Show another loop, in the environment that was chosen."""
         with self.lock:
             view.environment = self.view.environment
-            self.view, self.recorded = view, recorded
+            self.view = view
             self.parameters, self.controls = {}, []
             self._counts.clear()
             self.place = {
@@ -146,21 +112,13 @@ class Page:
         return offered
 
     def choose(self, wanted: Mapping[str, Any]) -> bool:
-        """Show another environment, component, namespace or recorded episode, if there is one."""
+        """Show another component or namespace, if there is one."""
         with self.lock:
             match wanted:
-                case {"environment": index} if _is_index(index, MAX_INDEX):
-                    self.view.environment = index
-                    if self.recorded is not None:
-                        self.requests.put(ShowEpisode(self.recorded.chosen))
-                case {"component": index} if _is_index(index, MAX_INDEX):
-                    self.component = index
+                case {"component": int(index)} if 0 <= index < MAX_COMPONENTS:
+                    self.component = int(index)
                 case {"namespace": str(name)} if name in self.place["namespaces"]:
                     self.requests.put(ShowLoop(name))
-                case {"episode": index} if self.recorded and _is_index(
-                    index, self.recorded.episodes
-                ):
-                    self.requests.put(ShowEpisode(index))
                 case _:
                     return False
             self._coloured = float("-inf")
@@ -171,7 +129,6 @@ class Page:
         with self.lock:
             view, names = self.view, self.view.components[:MAX_COMPONENTS]
             quiet, remaining = view.quiet(now), view.curve.remaining(time.time())
-            shown = view.shown(now)
             self._counts.append((now, view.rounds, view.episodes))
             while now - self._counts[0][0] > RATE_WINDOW:
                 self._counts.popleft()
@@ -188,15 +145,12 @@ class Page:
                 "quiet": None if quiet is None or quiet < SILENT else round(quiet),
                 "remaining": None if remaining is None else round(remaining),
                 "parameters": self.parameters,
-                "environment": view.environment,
-                "environments": 0 if shown is None else shown.batch,
                 "component": min(self.component, len(names) - 1),
                 "components": names,
                 "rounds": round((view.rounds - rounds) / elapsed, 2),
                 "episodes": round((view.episodes - episodes) / elapsed, 2),
                 "nodes": view.nodes.message(now),
                 "controls": self.controls,
-                "recorded": None if self.recorded is None else vars(self.recorded),
             }
             self._status = json.dumps(status)
             if now - self._coloured > COLOUR_PERIOD:
@@ -267,13 +221,7 @@ class Page:
         return z[rows_of(len(z), shown.components)[shown.part(self.component)]]
 
     def _state(self, now: float) -> str:
-        if self.recorded is not None:
-            return "recorded"
         return "searching" if self.place["domain"] is None else self.view.state_of_loop(now)
-
-
-def _is_index(value: object, count: int) -> bool:
-    return type(value) is int and 0 <= value < count
 
 
 def _pack(header: Mapping[str, Any], values: NDArray[np.floating]) -> bytes:

@@ -2,8 +2,8 @@
 
 GET /, /NAME    the page and its files, all of them from this package
 GET /ws         a WebSocket: what is new (viewer_node.web.page), at most FRAMES times a second; and
-                from the page {"node", "verb"}, to call a service, or what to show: {"namespace"},
-                {"episode"}, {"environment"} or {"component"}
+                from the page {"node", "verb"}, to call a service, or what to show: {"namespace"}
+                or {"component"}
 
 Any page of the web that is open in a browser can send requests to 127.0.0.1. So a request must name
 this server as its host (a foreign name that was made to resolve to 127.0.0.1 does not), one from a
@@ -184,7 +184,7 @@ class Server:
                 return "" if done else offers
             case dict() if self._page.choose(wanted):
                 return ""
-        return "expected an environment, a component, a recorded episode or a known namespace"
+        return "expected a component or a known namespace"
 
 
 async def _on_file(request: web.Request) -> web.FileResponse:

@@ -65,7 +65,7 @@ export function profileChart(model) {
   chart.update = () => {
     const { facts, episode } = model;
     const { header, target } = episode;
-    const now = episode.profile();
+    const now = episode.latest;
     const initial = header?.begin === 0 ? episode.fields.subarray(0, header.rows) : [];
     const length = facts.length || Math.max(1, now.length);
     const lines = [];
@@ -77,8 +77,7 @@ export function profileChart(model) {
     const [low, high] = extent(...lines.map(([, values]) => values), header?.range ?? []);
     let caption = "";
     if (header) {
-      const step = episode.column === null ? header.last : episode.step(episode.column);
-      caption = header.sample_time ? `t = ${text(episode.time(step))} s` : `step ${step}`;
+      caption = header.sample_time ? `t = ${text(episode.time(header.last))} s` : `step ${header.last}`;
       if (target.length === now.length) {
         const squares = now.reduce((sum, u, i) => sum + (u - target[i]) ** 2, 0);
         caption += `, rms distance to the target ${text(Math.sqrt(squares / now.length))}`;

@@ -13,27 +13,14 @@ export class Episode {
   actions = new Float32Array(0);
   latest = new Float32Array(0);
   target = new Float32Array(0);
-  column = null; // the one whose profile is shown; null: the newest state
-
-  // The field of the shown column.
-  profile() {
-    if (this.column === null || this.column >= this.columns) return this.latest;
-    const { rows } = this.header;
-    return this.fields.subarray(this.column * rows, (this.column + 1) * rows);
-  }
 
   take(header, numbers) {
-    if (header.run !== this.header?.run || header.episode !== this.header.episode) this.column = null;
     const split = header.rows * header.columns;
     const end = split + header.actions * header.columns;
     this.fields = numbers.subarray(0, split);
     this.actions = numbers.subarray(split, end);
     this.latest = numbers.subarray(end);
     this.header = header;
-  }
-
-  get columns() {
-    return this.header?.columns ?? 0;
   }
 
   // Time since the start of the episode of a step; steps where the time is not known.
@@ -100,11 +87,6 @@ export function fieldChart(model) {
     c.fillRect(box.left, box.top, box.width, box.height);
     c.imageSmoothingEnabled = false;
     c.drawImage(picture, 0, 0, columns, rows, start, box.top, end - start, box.height);
-    if (episode.column !== null) {
-      const at = Math.round(plot.valToPos(episode.time(episode.step(episode.column)), "x", true));
-      c.fillStyle = "#ffffff";
-      c.fillRect(at - uPlot.pxRatio, box.top, 2 * uPlot.pxRatio, box.height);
-    }
     c.restore();
   }
 
@@ -141,7 +123,7 @@ export function fieldChart(model) {
       const { rows, begin, stride, sample_time: dt } = header;
       const column = Math.floor((t / (dt || 1) - begin) / stride);
       const row = Math.min(rows - 1, Math.floor((x / (facts.length || rows)) * rows));
-      if (column >= 0 && column < episode.columns && row >= 0) {
+      if (column >= 0 && column < header.columns && row >= 0) {
         chart.pointed = true;
         chart.say(`t ${text(t)}, x ${text(x)}: ${facts.name} = ${text(episode.value(column, row))}`);
       }

@@ -19,13 +19,12 @@ const model = {
   notice: "",
   called: null, // "role/verb" of the button that was pressed, until the next status
   confirming: false, // whether a second click on Stop is awaited
-  pointed: null, // the recorded episode that the slider points at, until it is shown
 };
 
 // Change the model, and show it.
 function set(changes) {
   Object.assign(model, changes);
-  showPage(model, { press, choose, seek, point: (pointed) => set({ pointed }) });
+  showPage(model, { press, choose: (what) => link.send(what) });
 }
 
 set({});
@@ -48,8 +47,7 @@ const take = {
     const { length = 0, horizon = 0, n_a = 0 } = status.parameters;
     const facts = { length, horizon, n_a, name: status.components[status.component] };
     if (model.status?.place.begun !== status.place.begun) model.episode = new Episode();
-    const pointed = model.pointed === status.recorded?.chosen ? null : model.pointed;
-    set({ status, facts, pointed, called: null });
+    set({ status, facts, called: null });
     update(ofEpisode);
   },
   curve(curve) {
@@ -63,7 +61,6 @@ const take = {
   episode(header, numbers) {
     model.episode.take(header, numbers);
     update(ofEpisode);
-    if (model.status?.recorded) set({});
   },
   refusal({ text }) {
     set({ notice: text });
@@ -87,16 +84,4 @@ function press(node, role, verb) {
   } else {
     setTimeout(() => set({ confirming: false }), CONFIRM);
   }
-}
-
-// Ask for another environment, component, namespace or recorded episode.
-function choose(what) {
-  link.send(what);
-}
-
-// Show another column of the episode.
-function seek(column) {
-  model.episode.column = column < model.episode.columns - 1 ? column : null;
-  update(ofEpisode);
-  set({});
 }

@@ -24,30 +24,26 @@ const VERBS = {
 };
 const ROLES = { plant: "plant", tuner: "training" };
 const LEVELS = ["good", "warn", "bad", "warn"];
-const MOST_CHOICES = 4096;
 
-// actions: press(node, role, verb), choose(what), seek(column), point(episode).
+// actions: press(node, role, verb), choose(what).
 export function showPage(model, actions) {
   const { status, curve } = model;
   const known = status && curve;
   document.title = `${status?.parameters.problem ?? "pdeloop"} – ${doing(model)[1]} – pdeloop`;
-  const onlyCurve = status?.recorded?.episodes === 0;
   render(
     html`
       <header>
         <${Title} ...${model} />
-        ${known && !status.recorded && html`<${Controls} ...${model} ...${actions} />`}
+        ${known && html`<${Controls} ...${model} ...${actions} />`}
       </header>
       ${known && html`<${Notice} ...${model} /><${Figures} ...${model} />`}
-      <main class=${onlyCurve ? "curve-only" : ""}>
-        <${Panel} id="field" title="Field" before=${known && html`<${Choices} ...${model} ...${actions} />`}>
-          ${known && html`<${Replay} ...${model} ...${actions} />`}
-        <//>
+      <main>
+        <${Panel} id="field" title="Field" before=${known && html`<${Choices} ...${model} ...${actions} />`} />
         <${Panel} id="actions" title=${html`Actions <i>a</i><sub>j</sub>(<i>t</i>)`} />
         <${Panel} id="profile" title="Profile and target" />
         <${Panel} id="curve" title="Training" />
         ${known && html`<${Seeds} ...${model} />`}
-        ${known && !status.recorded && html`<${Nodes} ...${model} />`}
+        ${known && html`<${Nodes} ...${model} />`}
       </main>
     `,
     document.body,
@@ -55,7 +51,7 @@ export function showPage(model, actions) {
 }
 
 // A panel with a chart, which fills `.plot` and says in `output` what it shows.
-function Panel({ id, title, before, children }) {
+function Panel({ id, title, before }) {
   return html`
     <section class="panel ${id}" aria-labelledby="${id}-title">
       <div class="head">
@@ -64,7 +60,6 @@ function Panel({ id, title, before, children }) {
         ${before}
       </div>
       <div class="plot" id=${id} role="img"></div>
-      ${children}
     </section>
   `;
 }
@@ -73,8 +68,7 @@ function Panel({ id, title, before, children }) {
 function doing({ status, connected }) {
   if (connected === false) return ["bad", "no connection to the monitor"];
   if (!status) return ["", "connecting"];
-  const { state, paused, activity, quiet, stopping, recorded } = status;
-  if (recorded) return recorded.finished ? ["", "finished"] : ["warn", "not finished; nothing works on it"];
+  const { state, paused, activity, quiet, stopping } = status;
   const [className, words] = STATES[state] ?? ["", state];
   if (state === "paused") return [className, `${paused.map((role) => ROLES[role]).join(" and ")} paused`];
   const busy = state === "running" || state === "silent" || state === "waiting";
@@ -135,7 +129,7 @@ function Button({ role, verb, status, connected, called, confirming, press }) {
 
 // What stands below the title is a function of the newest status, so that nothing old stays.
 function Notice({ status, notice }) {
-  const { requests, activity, state, stopping, recorded } = status;
+  const { requests, activity, state, stopping } = status;
   const words = requests.map(({ role, verb, seconds, failure }) => {
     const asked = `${VERBS[verb][0]} ${ROLES[role]}`;
     if (failure) return `${asked}: ${failure}`;
@@ -143,13 +137,13 @@ function Notice({ status, notice }) {
     return `${asked}: asked for${seconds > 1 ? ` ${duration(seconds)} ago` : ""}${when}`;
   });
   if (stopping && state !== "ended") words.push("The training ends after the rollouts under way.");
-  const all = [notice, STATES[state]?.[2], recorded?.note, ...words].filter(Boolean).join(" · ");
+  const all = [notice, STATES[state]?.[2], ...words].filter(Boolean).join(" · ");
   return html`<p id="notice" class="notice" role="alert" hidden=${!all}>${all}</p>`;
 }
 
 function Figures({ status, curve }) {
   const { mean, references, budget, axis, phase, seeds, paid } = curve;
-  const { recorded, remaining, rounds, episodes } = status;
+  const { remaining, rounds, episodes } = status;
   const closing = references.adapted; // what the closing evaluation gave counts, once it is there
   const cost = closing ?? mean.at(-1) ?? null;
   const share = references.lqt && cost !== null ? 100 * (1 - cost / references.lqt) : null;
@@ -158,16 +152,16 @@ function Figures({ status, curve }) {
   const rows = [
     ["phase", phase],
     [axis, paid[1] && count, budget ? ` of ${budget}` : ""],
-    !recorded && ["time left", remaining !== null && duration(remaining)],
+    ["time left", remaining !== null && duration(remaining)],
     [closing === undefined ? "cost now" : "evaluated cost", text(cost)],
     ["against LQT", share !== null && Math.abs(share).toFixed(1), side],
     ["seeds", seeds.length],
-    !recorded && ["rounds", text(rounds < 10 ? rounds : Math.round(rounds)), " 1/s"],
-    recorded ? ["recorded episodes", String(recorded.episodes)] : ["episodes", text(episodes), " 1/s"],
+    ["rounds", text(rounds < 10 ? rounds : Math.round(rounds)), " 1/s"],
+    ["episodes", text(episodes), " 1/s"],
   ];
   return html`
     <dl id="figures" class="figures">
-      ${rows.filter(Boolean).map(
+      ${rows.map(
         ([name, value, unit = ""]) => html`
           <div><dt>${name}</dt><dd><span>${value || "–"}</span><small>${unit}</small></dd></div>
         `,
@@ -176,11 +170,9 @@ function Figures({ status, curve }) {
   `;
 }
 
-// Which component, pair and environment is shown.
+// Which component and pair is shown.
 function Choices({ status, choose }) {
-  const { components, component, environments, environment, place } = status;
-  const most = Math.min(environments, MOST_CHOICES);
-  const numbers = Array.from({ length: most }, (_, i) => String(i));
+  const { components, component, place } = status;
   const choice = (name, names, chosen, take) => html`
     <label hidden=${names.length < 2}>
       ${name} <select id=${name} value=${chosen} onChange=${(event) => take(event.target.value)}>
@@ -197,44 +189,7 @@ function Choices({ status, choose }) {
       place.namespace = value;
       choose({ namespace: value });
     }),
-    choice("environment", numbers, String(Math.min(environment, most - 1)), (value) => {
-      status.environment = Number(value);
-      choose({ environment: status.environment });
-    }),
   ];
-}
-
-// Two sliders for a run that is over: which recorded episode, and when in it.
-function Replay({ status, episode, pointed, point, seek, choose }) {
-  const { recorded } = status;
-  if (!recorded?.episodes) return null;
-  const chosen = pointed ?? recorded.chosen;
-  const last = Math.max(0, episode.columns - 1);
-  const column = episode.column ?? last;
-  const time = episode.header ? text(episode.time(episode.step(column))) : "–";
-  const number = (event) => Number(event.target.value);
-  return html`
-    <div id="replay" class="replay">
-      <label for="time">time</label>
-      <input id="time" type="range" min="0" max=${last} value=${column} onInput=${(e) => seek(number(e))} />
-      <output id="time-text" class="muted">
-        ${episode.header?.sample_time ? `${time} s` : `step ${time}`}
-      </output>
-      <label for="recorded">episode</label>
-      <input
-        id="recorded"
-        type="range"
-        min="0"
-        max=${recorded.episodes - 1}
-        value=${chosen}
-        onInput=${(event) => point(number(event))}
-        onChange=${(event) => choose({ episode: number(event) })}
-      />
-      <output id="recorded-text" class="muted">
-        ${chosen + 1} of ${recorded.episodes}${chosen === recorded.chosen ? `: ${recorded.label}` : ""}
-      </output>
-    </div>
-  `;
 }
 
 // What the closing evaluation gave, once it has been.
