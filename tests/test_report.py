@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -14,6 +15,7 @@ import pytest
 from matplotlib.image import imread
 
 from loop_interfaces.controllers import CONTROLLERS
+from pdeloop.report import learning
 from pdeloop.report.data import gather
 from pdeloop.report.style import STYLE
 from tests.browser import browser
@@ -111,6 +113,8 @@ def test_steps_damping_and_model_error_are_those_of_the_history(folder):
     assert steps.accepted.any() and (steps.relative[steps.accepted] < 1).all()
     assert (steps.damping > 0).all() and (steps.predicted < 1).all()
     assert steps.mismatch.tolist() == [row["mismatch"] for row in own if "mismatch" in row]
+    small = learning.steps(replace(steps, mismatch=1e-7 * steps.mismatch), name).axes[2]
+    assert small.get_ylim()[0] < 1e-7 * steps.mismatch.min()  # a good model is shown, too
 
 
 def test_a_curve_is_the_cost_of_the_policy_at_so_many_rollouts(folder):

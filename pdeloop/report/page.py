@@ -118,7 +118,7 @@ def _of_problem(problem: ProblemData) -> Drawn:
     for controller, steps in problem.steps.items():
         yield (
             f"{name}-steps",
-            f"Steps of {NAMES[controller]}",
+            f"Steps of {NAMES['gauss_newton']}",  # no other optimiser judges its steps
             f"Seed {seed}, steps accepted: {steps.accepted.sum()} of {len(steps.accepted)}. Below them "
             "the damping, which a rejection raises, and the relative error of the best fitted model "
             "in predicting how measured trajectories differ.",

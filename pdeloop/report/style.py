@@ -56,7 +56,15 @@ def image(ax: Axes, values: Array, extent: tuple[float, float, float, float], **
 def plain_log(ax: Axes, ratio: float) -> None:
     """A logarithmic axis over this ratio, its ticks written as plain numbers."""
     ax.set_yscale("log")
-    subs = (1.0, 3.0) if ratio > 30 else (1.0, 2.0, 5.0) if ratio > 6 else (1.0, 1.5, 2, 3, 4, 6, 8)
+    subs = (
+        (1.0,)
+        if ratio > 1e4
+        else (1.0, 3.0)
+        if ratio > 30
+        else (1.0, 2.0, 5.0)
+        if ratio > 6
+        else (1.0, 1.5, 2, 3, 4, 6, 8)
+    )
     ax.yaxis.set_major_locator(LogLocator(10, subs=subs))
     ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     ax.yaxis.set_minor_locator(NullLocator())
