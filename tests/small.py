@@ -16,7 +16,7 @@ from tuner_node.training import Training
 _OWN = ("optimizer", "seed", "seeds", "rollouts", "iterations", "start")
 
 SMALL = Path(__file__).parent / "data" / "small.yaml"
-REPRODUCED = (str(SMALL), "--seeds", "2", "--iterations", "12")
+REPRODUCED = (str(SMALL), "--seeds", "2", "--iterations", "8")
 """What a small reproduction is asked for."""
 RECORDED = {"iterations": "6", "seeds": "2"}
 """What the small recorded run is asked for."""

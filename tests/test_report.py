@@ -48,7 +48,7 @@ def reported(base: Path, reproduced: Path | None) -> Path:
     out = reproduced or base / "out"
     with processes(base) as running:
         if not reproduced:
-            options = ("--in-process", "--rollouts", "33", "--optimizer", "gauss_newton")
+            options = ("--in-process", "--rollouts", "21", "--optimizer", "gauss_newton")
             words = ("train", str(SMALL), "--seeds", "2", *options, "--out", str(out))
             running.wait(running.pdeloop(*words), LIMIT)
         running.wait(running.pdeloop("report", str(out)), LIMIT)

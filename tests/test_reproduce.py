@@ -26,7 +26,7 @@ def test_every_number_is_that_of_the_trainings(reproduction):
     study = reproduction_in(out)
     runs = runs_of(study, out, "small")
     for name, how in LEARNED.items():
-        budget = {"rollouts": 24} if how["optimizer"] == "gauss_newton" else {"iterations": 12}
+        budget = {"rollouts": 16} if how["optimizer"] == "gauss_newton" else {"iterations": 8}
         training = train_here(parameters(seeds=2, identification="dmdc", **how, **budget))
         for seed in range(2):
             with np.load(out / "small" / name / str(seed) / "curve.npz") as curve:
