@@ -72,7 +72,8 @@ class Exploration:
         if (ended != COMPLETED).any():
             step = int(ended.max())
             return self._failure(
-                f"the plant diverged under exploration at step {step}; lower exploration_variance",
+                f"the plant diverged under exploration at step {step}; lower exploration_variance, "
+                "or measurement_noise, which raises it",
                 retry=False,
             )
         if self._unusable is not None:

@@ -79,7 +79,7 @@ class LocalPair:
         if batch.exploratory and (lost >= 0).any():
             raise ValueError(
                 f"no reduced model: the plant diverged under exploration at step {int(lost.max())}; "
-                "lower exploration_variance"
+                "lower exploration_variance, or measurement_noise, which raises it"
             )
         return episode
 
