@@ -108,7 +108,7 @@ def design(
     model = identify(
         trajectories,
         method=settings.identification,
-        n_s=model_order(asdict(settings)),
+        n_s=min(model_order(asdict(settings)), target.size),  # sensors may be fewer
         p=settings.dmdc_rank,
     )
     weights = {"state_weight": settings.state_weight, "action_weight": settings.action_weight}

@@ -46,7 +46,7 @@ INSTRUMENTS = _section(
     Spec("sensors", 0, 0, 65536, group="problem").means(
         "point sensors n_y, equally spaced, instead of the whole state; 0: the whole state"
     ),
-    Spec("sensor_delays", 4, 1, 1024, group="problem").means(
+    Spec("sensor_delays", 1, 1, 1024, group="problem").means(
         "last measurements d of each sensor that the published state holds, if there are sensors"
     ),
 )

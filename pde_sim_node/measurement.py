@@ -65,7 +65,7 @@ class Instruments:
     process_noise: float = 0.0
     action_limit: float = 0.0
     sensors: int = 0
-    sensor_delays: int = 4
+    sensor_delays: int = 1
 
     @property
     def ideal(self) -> bool:

@@ -97,6 +97,8 @@ class TrainingSettings:
     action_limit: float = 0.0
     measurement_noise: float = 0.0
     """Standard deviation of the noise on every number of the states; 0 also with point sensors."""
+    sensors: int = 0
+    """Point sensors whose readings the states are; 0: the states are whole."""
     model: Array | None = None
     """Rows of a reduced model to start from instead of identifying one."""
 

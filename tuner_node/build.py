@@ -118,6 +118,8 @@ def build_training(values: Mapping[str, Any]) -> Training:
     )
     given |= {
         "exploration_variance": max(values["exploration_variance"], variance),
+        # One at every point measures the whole state.
+        "sensors": values["sensors"] if values["sensors"] < values["n_z"] else 0,
         "measurement_noise": 0.0 if values["sensors"] else values["measurement_noise"],
         "model": read_model(Path(values["model"]), values["n_a"]) if values["model"] else None,
     }

@@ -310,6 +310,7 @@ class Training:
             measured=self.measured[m],
             action_limit=self.settings.action_limit,
             noise=self.settings.measurement_noise,
+            sensors=self.settings.sensors,
         )
 
     def _asked(self) -> list[list[Rollout]]:

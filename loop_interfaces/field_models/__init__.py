@@ -2,6 +2,7 @@
 
 from loop_interfaces.field_models.convolution import ConvolutionModel
 from loop_interfaces.field_models.differential import DifferentialModel
+from loop_interfaces.field_models.sensed import SensedModel
 
-FieldModel = ConvolutionModel | DifferentialModel
+FieldModel = ConvolutionModel | DifferentialModel | SensedModel
 """A model z_{k+1} = step(z_k, a_k) with its jacobians."""

@@ -101,6 +101,9 @@ class Context:
         Magnitude at which actions saturate; 0 for none.
     noise : float
         Standard deviation of the noise on every number of the states; 0 for none, or unknown.
+    sensors : int
+        n_y, point sensors at (j + 1/2) / n_y of a periodic domain, of whose last readings the states
+        consist; 0: the states are whole.
     """
 
     U: Array
@@ -112,6 +115,7 @@ class Context:
     measured: Sequence[Measured] = ()
     action_limit: float = 0.0
     noise: float = 0.0
+    sensors: int = 0
 
 
 class Optimizer(Protocol):

@@ -15,6 +15,7 @@ import numpy as np
 from loop_interfaces.field_models import FieldModel
 from loop_interfaces.field_models.convolution import fit_convolutions
 from loop_interfaces.field_models.differential import fit_differential
+from loop_interfaces.field_models.sensed import SensedModel, fit_sensed, interpolated
 from tuner_node.optimizers.base import Array, Context, Row
 from tuner_node.optimizers.fit import LocalModel, extended_basis, fit
 from tuner_node.optimizers.selection import KAPPAS, LOCAL, RIDGES, Pair, choices, mismatches
@@ -41,6 +42,8 @@ _LEAST_WEIGHT = 0.05
 _REPRODUCED = 0.05
 _REPRODUCED_NOISY = 0.3
 _COMPARED = 8
+# More point sensors than this are taken for a field.
+_MOST_SENSORS = 32
 # Measured initial fields that a law is improved on, the newest, and how far from their mean further
 # ones are. Coordinates of the sensitivities of each component, at least.
 _FIELDS = 8
@@ -75,7 +78,7 @@ class Proposal:
         Their smallest relative error in predicting measured differences of trajectories, or that of the
         model of the whole field in reproducing the rollouts.
     kind : str
-        "local", "convolution" or "differential".
+        "local", "convolution", "differential" or "sensed".
     """
 
     policy: Array
@@ -156,6 +159,9 @@ class Proposer:
         # A target outside of U leaves the law without a constant part.
         self._one = 1.0 if self._s_r_square > 1e-20 * float(np.sum(target * target)) else 0.0
         self._loop = Loop(U, target, self._q, self._r, self._horizon, self._action_limit, self._one)
+        # One component, of which each sensor's last reading is the state.
+        self._sensed = context.sensors == target.size and target.size <= _MOST_SENSORS
+        self._first_fit: SensedModel | None = None
 
     def theta(self, policy: Array) -> Array:
         """[K_a b] of a policy, (n_a, n_s + 1)."""
@@ -202,6 +208,10 @@ class Proposer:
         )
         measured = [self._closed_loop(r) for r in data if r.usable][-_COMPARED:]
         policy = incumbents[0].policy
+        if self._sensed:
+            proposal = self._from_readings(data, policy, damping)
+            if proposal is not None:
+                return proposal
         model, error, whole = self._reproducing(self._steps(data, incumbents), measured)
         if model is not None and self._forgets(model, error, data):
             return self._from_states(model, error, data, policy, damping)
@@ -278,6 +288,59 @@ class Proposer:
             self.theta(policy),
             _spread(np.stack(fields[-_FIELDS:])),
             extended_basis(self._U, [record.states for record in data], modes),
+            _TRUST * damping,
+        )
+        candidate = self.moved(policy, improved.theta - self.theta(policy))
+        return Proposal(candidate, improved.fall, 1, 0.0, error, model.name)
+
+    def _from_readings(
+        self, data: Sequence[Record], policy: Array, damping: float
+    ) -> Proposal | None:
+        """A law that was improved on a model of the field between the sensors, if one is found."""
+
+        def fitted(
+            rollouts: Sequence[Record], start: SensedModel | None
+        ) -> tuple[SensedModel, Array, float]:
+            actions = [record.actions for record in rollouts]
+            readings = [
+                record.states[: len(a)] for record, a in zip(rollouts, actions, strict=True)
+            ]
+            return fit_sensed(readings, actions, start)
+
+        def chosen(records: Sequence[Record]) -> list[Record]:
+            """Whole rollouts, the newest, each once, and none that went far away."""
+            most = LOCAL * self._mean_cost(self._before[0])
+            return list(
+                {
+                    record.states.tobytes(): record
+                    for record in records
+                    if len(record.actions) == self._horizon and self._mean_cost(record) <= most
+                }.values()
+            )[-_COMPARED:]
+
+        # From what is known before the first rollout, so that it is the same in a resumed training.
+        if self._first_fit is None:
+            self._first_fit = fitted(chosen(self._before), None)[0]
+        rollouts = chosen(data)
+        model, fields, error = fitted(rollouts, self._first_fit)
+        if not error <= self._reproduced:
+            return None
+        sensors, n = self._target.size, fields.shape[1]
+        U = np.zeros((n, self.n_s))
+        U[n // (2 * sensors) :: n // sensors] = self._U
+        loop = replace(
+            self._loop,
+            U=U,
+            target=interpolated(self._target),
+            state_weight=self._q * sensors / n,
+        )
+        own = dict(zip((record.states[0].tobytes() for record in rollouts), fields, strict=True))
+        improved = improve(
+            loop,
+            model,
+            self.theta(policy),
+            _spread(np.stack(list(own.values()))),
+            extended_basis(U, [np.eye(n)], n),
             _TRUST * damping,
         )
         candidate = self.moved(policy, improved.theta - self.theta(policy))

@@ -1,0 +1,342 @@
+"""A partial differential equation of a field of which a few points are measured.
+
+    dz/dt = sum_pj c_pj d^j(z^p)/dx^j + c + B a,        B_i(x) = b 1[|x - x_i| < w/2],
+                                                         x_i = (i + 1/2) / n_a + x_0 + i s / n_a
+
+on a periodic domain of length 1, with time in sampling times. Neither the equation nor the actuators
+depend on where on the domain something happens, so that they have a dozen unknowns, however fine the
+grid. The fields in which the rollouts begin are unknown, too: a few Fourier coefficients each. All of
+them are fitted at once to the readings y_k = z_k(sensors) of whole rollouts,
+
+    min  mean over rollouts and steps |y_k^model - y_k|^2 + a small ridge,
+
+by the method of Levenberg and Marquardt, first over the beginning of the rollouts and then
+further. What lies between the sensors is seen, later, where it passes one.
+
+References
+----------
+Le Dimet, Talagrand, "Variational algorithms for analysis and assimilation of meteorological
+observations", Tellus A 38, 1986 (initial fields from readings: 4D-Var). Raissi, Perdikaris,
+Karniadakis, "Physics-informed neural networks", J. Comput. Phys. 378, 2019 (equation and field from few
+points).
+Lawson, SIAM J. Numer. Anal. 4(3), 1967 (the integrator: Runge-Kutta with the linear part exact).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import resample
+
+Array = NDArray[np.float64]
+Spectrum = NDArray[np.complex128]
+
+# p and j of the terms; 1 is added for the constant.
+_TERMS = ((1, 0), (1, 1), (1, 2), (1, 3), (2, 0), (2, 1), (3, 0))
+_COEFFICIENTS = len(_TERMS) + 1
+# b, x_0, s and w.
+_ACTUATORS = 4
+_SHARED = _COEFFICIENTS + _ACTUATORS
+# The wavenumber and the number of samples that give the coefficients and actuators their units.
+_WAVENUMBER = 2.0 * np.pi * 8
+_TIME = 100.0
+# Fourier coefficients of an initial field: the mean, and so many cosines and sines.
+_WAVES = 16
+# The least number of grid points.
+_POINTS = 64
+# A linear part that grows faster, in a sampling time, would overflow within an episode.
+_FASTEST_GROWTH = 0.5
+# First values of the dispersion c_13, in its unit: no descent leads from waves that run one way
+# to waves that run the other.
+_DISPERSIONS = (0.0, -20.0, 20.0, -10.0, 10.0, -30.0, 30.0)
+# An error with which none of the others is tried, and the number of rollouts that are fitted then.
+_ENOUGH = 1e-5
+_CALMEST = 2
+# Shares of the rollouts that are fitted one after the other, and the most steps for each.
+_FIRST = (0.05, 0.1, 0.2, 0.4, 1.0)
+_LATER = (0.4, 1.0)
+_ITERATIONS, _LAST_ITERATIONS = 20, 60
+_COMPARED = 100
+# Ridges, on the readings' scale: of the shared unknowns, and of Fourier coefficients, which grows with
+# the wavenumber.
+_SHARED_RIDGE = 1e-5
+_FIELD_RIDGE, _FIELD_RIDGE_WAVE = 1e-3, 4.0
+_DAMPING = (1e-2, 1e-9, 1e4)
+_LEAST_GAIN = 1e-3
+_DIFFERENCE = 1e-5
+
+
+def grid_points(sensors: int) -> int:
+    """How many the field has, so that the sensors at (j + 1/2) / n_y are among them."""
+    return 2 * sensors * max(1, -(-_POINTS // (2 * sensors)))
+
+
+def interpolated(readings: Array) -> Array:
+    """The field (n,) of lowest wavenumbers with these readings (n_y,)."""
+    sensors = len(readings)
+    n = grid_points(sensors)
+    field: Array = resample(readings, n)
+    return np.roll(field, n // (2 * sensors))
+
+
+@dataclass(frozen=True, eq=False)
+class SensedModel:
+    """The equation on n grid points, stepped by one sampling time.
+
+    Attributes
+    ----------
+    shared : (12,) array
+        The unknowns that all rollouts share, in their units.
+    B : (n, n_a) array
+        What the actions do in a sampling time.
+    """
+
+    shared: Array
+    B: Array
+
+    name = "sensed"
+    components = 1
+
+    @classmethod
+    def of(cls, shared: Array, sensors: int, n_a: int) -> SensedModel:
+        """With the grid for so many sensors."""
+        n = grid_points(sensors)
+        return cls(shared, np.fft.irfft(_Equation(shared, n, n_a).actuators, n).T)
+
+    @cached_property
+    def _equation(self) -> _Equation:
+        return _Equation(self.shared, *self.B.shape)
+
+    def step(self, z: Array, a: Array) -> Array:
+        """The field after a sampling time from z (..., n), with the actions a (..., n_a)."""
+        after = self._equation.step(np.fft.rfft(z), self._equation.force(a))
+        moved: Array = np.fft.irfft(after, z.shape[-1])
+        return moved
+
+    def jacobians(self, z: Array, V: Array) -> Array:
+        """V^T (d step / dz) V, (T, r, r), at the states z (T, n); V (n, r) is orthonormal."""
+        size = _DIFFERENCE * max(float(np.abs(z).max()), 1e-300)
+        force = self._equation.force(np.zeros(self.B.shape[1]))
+        first = self._equation.step(np.fft.rfft(z), force)
+        changed = self._equation.step(np.fft.rfft(z[:, None] + size * V.T), force)
+        moved = np.fft.irfft((changed - first[:, None]) / size, z.shape[1])
+        jacobians: Array = (moved @ V).swapaxes(1, 2)
+        return jacobians
+
+
+class _Equation:
+    """The equation in Fourier space, for unknowns of any shape (..., 12)."""
+
+    def __init__(self, shared: Array, n: int, n_a: int) -> None:
+        self.n, waves = n, np.arange(n // 2 + 1)
+        derivative = 2j * np.pi * waves
+        self._kept = waves < n // 2
+        derivative[~self._kept] = 0.0
+        symbols = np.zeros((3, *shared.shape[:-1], waves.size), dtype=np.complex128)
+        for i, (p, j) in enumerate(_TERMS):
+            unit = 1.0 / (_TIME * _WAVENUMBER**j)
+            symbols[p - 1] += unit * shared[..., i, None] * derivative**j
+        linear, self._square, self._cube = symbols
+        linear = np.minimum(linear.real, _FASTEST_GROWTH) + 1j * linear.imag
+        self._half = np.exp(0.5 * linear)
+        self._whole = self._half**2
+        self._constant = n / _TIME * shared[..., _COEFFICIENTS - 1]
+        b, x_0, s, w = np.moveaxis(shared[..., _COEFFICIENTS:, None, None], -3, 0) / _TIME
+        own = np.arange(n_a)[:, None]
+        places = (own + 0.5) / n_a + x_0 + (own - 0.5 * (n_a - 1)) * s / n_a
+        width = (0.5 + w) / n_a
+        # Smooth towards the grid's last wavenumber, so that the edges of an actuator do not ring.
+        shape = width * np.sinc(waves * width) * np.exp(-((waves / (0.45 * n)) ** 8))
+        self.actuators: Spectrum = n * b * shape * np.exp(-2j * np.pi * waves * places)
+
+    def force(self, a: Array) -> Spectrum:
+        """The constant, and the effect of the actions (..., n_a)."""
+        force: Spectrum = np.sum(a[..., None] * self.actuators, axis=-2)
+        force[..., 0] += self._constant
+        return force
+
+    def step(self, z: Spectrum, force: Spectrum) -> Spectrum:
+        half, whole = self._half, self._whole
+        first = self._rate(z, force)
+        second = self._rate(half * (z + 0.5 * first), force)
+        third = self._rate(half * z + 0.5 * second, force)
+        fourth = self._rate(whole * z + half * third, force)
+        after: Spectrum = whole * z + (whole * first + 2.0 * half * (second + third) + fourth) / 6.0
+        return after
+
+    def _rate(self, z: Spectrum, force: Spectrum) -> Spectrum:
+        """What is not linear, on a grid that has room for the products."""
+        count = z.shape[-1]
+        field = 2.0 * np.fft.irfft(z, 2 * self.n)
+        square = field * field
+        rate: Spectrum = force + 0.5 * (
+            self._square * np.fft.rfft(square)[..., :count]
+            + self._cube * np.fft.rfft(square * field)[..., :count]
+        )
+        rate *= self._kept
+        return rate
+
+
+def fit_sensed(
+    readings: Sequence[Array], actions: Sequence[Array], start: SensedModel | None = None
+) -> tuple[SensedModel, Array, float]:
+    """Fit the equation and the initial fields of rollouts.
+
+    Parameters
+    ----------
+    readings, actions : sequences of (T, n_y) and (T, n_a) arrays
+        Of rollouts of one length: y_k and a_k.
+    start : SensedModel, optional
+        Where to begin; from several equations, with no actuators, if there is none.
+
+    Returns
+    -------
+    SensedModel, (rollouts, n) array and float
+        The one with the least error, its initial fields, and the error: the mean of
+        |y_k^model - y_k|^2, relative to that of |y_k|^2.
+    """
+    y, a = np.stack(readings), np.stack(actions)
+    begun = _first_guess(y, a) if start is None else start.shared
+    problem = _Problem(y, a)
+    error, shared, fields = problem.fit(begun, problem.interpolated(), _LATER)
+    model = SensedModel.of(shared, y.shape[2], a.shape[2])
+    n = len(model.B)
+    return model, np.fft.irfft(_spectrum(fields, n), n), error
+
+
+def _first_guess(y: Array, a: Array) -> Array:
+    """The unknowns that rollouts y (R, T, n_y) and a (R, T, n_a) share, from the calmest of them."""
+    calmest = np.argsort(np.sum(y * y, axis=(1, 2)), kind="stable")[:_CALMEST]
+    problem = _Problem(y[calmest], a[calmest])
+    least, best = np.inf, np.zeros(_SHARED)
+    for dispersion in _DISPERSIONS:
+        first = np.zeros(_SHARED)
+        first[_TERMS.index((1, 3))] = dispersion
+        error, shared, _ = problem.fit(first, problem.interpolated(), _FIRST)
+        if error < least:
+            least, best = error, shared
+        if least <= _ENOUGH:
+            break
+    return best
+
+
+class _Problem:
+    """Readings y (R, T, n_y) and actions a (R, T, n_a), and the least squares problem."""
+
+    def __init__(self, y: Array, a: Array) -> None:
+        self.y, self.a = y, a
+        self._size = float(np.sqrt(np.mean(y * y))) or 1.0
+        sensors = y.shape[2]
+        self._n = grid_points(sensors)
+        waves = np.arange(self._n // 2 + 1)
+        places = (np.arange(sensors) + 0.5) / sensors
+        # Of a transform: the field at the sensors.
+        twice = np.where((waves == 0) | (waves == self._n // 2), 1.0, 2.0)
+        self._read = np.exp(2j * np.pi * waves[:, None] * places) * (twice / self._n)[:, None]
+        self._waves = np.r_[0, 1 : _WAVES + 1, 1 : _WAVES + 1]
+
+    def interpolated(self) -> Array:
+        """Initial fields from the first readings alone, (R, 33)."""
+        sensors = self.y.shape[2]
+        places = (np.arange(sensors) + 0.5) / sensors
+        grid = np.arange(self._n) / self._n
+        fields = np.stack([np.interp(grid, places, y[0], period=1.0) for y in self.y])
+        z = np.fft.rfft(fields)[:, : _WAVES + 1] / self._n
+        return np.hstack([z.real, z.imag[:, 1:]])
+
+    def fit(
+        self, shared: Array, fields: Array, shares: Sequence[float]
+    ) -> tuple[float, Array, Array]:
+        """The error per reading, relative to their size, and the unknowns."""
+        error = np.inf
+        for share in shares:
+            steps = max(2, round(share * self.y.shape[1]))
+            error, shared, fields = self._descend(shared, fields, steps)
+        return error, shared, fields
+
+    def _descend(self, shared: Array, fields: Array, steps: int) -> tuple[float, Array, Array]:
+        damping, least, most = _DAMPING
+        ridge = self._ridge()
+        x = np.concatenate([shared, fields.ravel()])
+
+        def parts(x: Array) -> tuple[Array, Array]:
+            return x[:_SHARED], x[_SHARED:].reshape(fields.shape)
+
+        def objective(x: Array) -> tuple[float, float]:
+            shared, fields = parts(x)
+            residual = self._residuals(shared[None], fields[None], steps)
+            error = float(np.sum(residual**2))
+            total = error + float(np.sum(ridge * x * x))
+            return (total if np.isfinite(total) else np.inf), error
+
+        # Unknowns on the way to a good model may overflow: their error is then infinite.
+        with np.errstate(over="ignore", invalid="ignore"):
+            now, error = objective(x)
+            for _ in range(_ITERATIONS if steps < self.y.shape[1] else _LAST_ITERATIONS):
+                residual, J = self._linearised(*parts(x), steps)
+                if not np.isfinite(J).all():
+                    break
+                H, g = J @ J.T, J @ residual + ridge * x
+                H[np.diag_indices(x.size)] += ridge
+                before = now
+                while damping < most:
+                    damped = H + np.diag(damping * np.diag(H) + 1e-12)
+                    moved = x - np.linalg.solve(damped, g)
+                    value, own = objective(moved)
+                    if value < now:
+                        x, now, error = moved, value, own
+                        damping = max(damping / 5.0, least)
+                        break
+                    damping *= 5.0
+                if not now < (1.0 - _LEAST_GAIN) * before:
+                    break
+        shared, fields = parts(x)
+        return (error if np.isfinite(now) else np.inf), shared, fields
+
+    def _ridge(self) -> Array:
+        rollouts = len(self.y)
+        own = _FIELD_RIDGE * (1.0 + (self._waves / _FIELD_RIDGE_WAVE) ** 2) / self._size
+        return np.concatenate(
+            [np.full(_SHARED, _SHARED_RIDGE**2), np.tile(own**2 / rollouts, rollouts)]
+        )
+
+    def _residuals(self, shared: Array, fields: Array, steps: int) -> Array:
+        """Errors of the readings for unknowns (P, 12) and (P, R, 33), each as a share of the whole."""
+        n_a, stride = self.a.shape[2], -(-steps // _COMPARED)
+        equation = _Equation(shared[:, None], self._n, n_a)
+        z = _spectrum(fields, self._n)
+        residuals = []
+        for k in range(steps):
+            if k % stride == 0:
+                residuals.append((z @ self._read).real - self.y[:, k])
+            z = equation.step(z, equation.force(self.a[:, k]))
+        whole: Array = np.stack(residuals, axis=2)
+        whole /= self._size * np.sqrt(whole[0].size)
+        return whole
+
+    def _linearised(self, shared: Array, fields: Array, steps: int) -> tuple[Array, Array]:
+        """Residuals (r,) and their derivatives (unknowns, r). A field moves its own rollout alone."""
+        rollouts, own = fields.shape
+        count = 1 + _SHARED + own
+        all_shared, all_fields = np.tile(shared, (count, 1)), np.tile(fields, (count, 1, 1))
+        all_shared[1 : 1 + _SHARED] += _DIFFERENCE * np.eye(_SHARED)
+        all_fields[1 + _SHARED :] += _DIFFERENCE * np.eye(own)[:, None]
+        residuals = self._residuals(all_shared, all_fields, steps)
+        changes = (residuals[1:] - residuals[0]) / _DIFFERENCE
+        J = np.zeros((_SHARED + rollouts * own, *residuals[0].shape))
+        J[:_SHARED] = changes[:_SHARED]
+        for m in range(rollouts):
+            J[_SHARED + m * own : _SHARED + (m + 1) * own, m] = changes[_SHARED:, m]
+        return residuals[0].ravel(), J.reshape(len(J), -1)
+
+
+def _spectrum(fields: Array, n: int) -> Spectrum:
+    """The transform on n points of Fourier coefficients (..., 33)."""
+    z = np.zeros((*fields.shape[:-1], n // 2 + 1), dtype=np.complex128)
+    z[..., : _WAVES + 1] = n * fields[..., : _WAVES + 1]
+    z[..., 1 : _WAVES + 1] += 1j * n * fields[..., _WAVES + 1 :]
+    return z

@@ -1,0 +1,125 @@
+"""A differential equation, its actuators and the fields are found from a few point sensors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_limits
+
+import pdeloop
+from loop_interfaces.field_models.sensed import SensedModel, fit_sensed, grid_points, interpolated
+from pdeloop.episode import rollout
+from tests.small import same_bits
+from tuner_node.optimizers import Context, GaussNewton, Rollout, RolloutResult, Trajectory
+
+Array = np.ndarray
+SENSORS = 8
+FIELD = 11
+
+
+def test_the_kdv_equation_is_found_from_eight_sensors() -> None:
+    """u_t = -u_xxx + 3 (u^2)_x on a domain of length 20; the soliton is not seen in the beginning."""
+    problem = pdeloop.problem("kdv", sensors=SENSORS)
+    plant = problem.plant()
+    explored, actions = problem.explore(1000)
+    uncontrolled = rollout(plant, lambda k, y: np.zeros((1, plant.n_a)), [FIELD])
+    scale = np.sqrt(plant.x.size / SENSORS)
+    readings = np.stack([explored[:-1], uncontrolled.states[:-1, 0]]) / scale
+    with threadpool_limits(1):
+        model, fields, error = fit_sensed(readings, [actions, uncontrolled.actions[:, 0]])
+    assert error < 1e-5
+    transport, diffusion, dispersion, quadratic = _coefficients(model)
+    assert dispersion == pytest.approx(-1 / 20**3, rel=0.02)
+    assert quadratic == pytest.approx(3 / 20, rel=0.02)
+    assert abs(transport) < 1e-3 and abs(diffusion) < 5e-5
+    plant.reset([FIELD])
+    true = plant.states[0, :: plant.x.size // fields.shape[1]]
+    assert np.linalg.norm(fields[1] - true) < 0.01 * np.linalg.norm(true)
+
+
+def _coefficients(model: SensedModel) -> Array:
+    """c_11, c_12, c_13, c_21 per second, of a sampling time of 0.01 s."""
+    small, n = 1e-4, len(model.B)
+    x = np.arange(n) / n
+    none = np.zeros(model.B.shape[1])
+    still = model.step(np.zeros(n), none)
+
+    def effect(z: Array) -> Array:
+        """dz/dt in Fourier space."""
+        return np.fft.rfft(model.step(z, none) - still - z) / (0.01 * n / 2)
+
+    one, two = (effect(small * np.cos(2 * np.pi * k * x))[k] / small for k in (1, 2))
+    k = 2 * np.pi
+    # i k c_1 - k^2 c_2 - i k^3 c_3 at the first two wavenumbers.
+    transport, dispersion = np.linalg.solve(
+        [[k, -(k**3)], [2 * k, -8 * k**3]], [one.imag, two.imag]
+    )
+    (diffusion,) = np.linalg.lstsq(np.array([[3 * k**2]]), np.array([one.real - two.real]))[0]
+    bent = effect(0.01 * np.cos(k * x))
+    quadratic = bent[2].imag / (2 * k * 0.5 * 0.01**2)
+    return np.array([transport, diffusion, dispersion, quadratic])
+
+
+@pytest.fixture
+def model() -> SensedModel:
+    shared = np.array([2.0, 1.0, 1.5, -3.0, 0.2, 0.5, -0.1, 0.1, 5.0, -1.0, 0.5, 2.0])
+    return SensedModel.of(shared, SENSORS, 5)
+
+
+def test_jacobians_are_the_derivatives_of_a_step(model: SensedModel) -> None:
+    n = len(model.B)
+    z = np.cos(2 * np.pi * np.arange(n) / n) + np.linspace(0.0, 0.5, 3)[:, None]
+    V = np.linalg.qr(np.random.default_rng(0).standard_normal((n, 6)))[0]
+    change, none = V @ np.arange(1.0, 7.0), np.zeros(5)
+    moved = (model.step(z + 1e-3 * change, none) - model.step(z - 1e-3 * change, none)) / 2e-3
+    expected = np.einsum("tij,j->ti", model.jacobians(z, V), np.arange(1.0, 7.0))
+    np.testing.assert_allclose(moved @ V, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_an_action_moves_the_field_as_the_input_matrix_says(model: SensedModel) -> None:
+    z, action = np.zeros(len(model.B)), np.array([0.0, 1.0, 0.0, 0.0, -0.5])
+    moved = model.step(z, action) - model.step(z, 0.0 * action)
+    effect = model.B @ action
+    assert np.linalg.norm(moved - effect) < 0.05 * np.linalg.norm(effect)
+
+
+def test_readings_are_interpolated_by_the_lowest_wavenumbers() -> None:
+    n = grid_points(SENSORS)
+    sensors = (np.arange(SENSORS) + 0.5) / SENSORS
+    field = interpolated(np.cos(2 * np.pi * sensors) + 0.5)
+    np.testing.assert_allclose(field, np.cos(2 * np.pi * np.arange(n) / n) + 0.5, atol=1e-12)
+
+
+def test_gauss_newton_controls_with_few_sensors_and_continues_with_the_same_bits() -> None:
+    problem = pdeloop.problem("allen-cahn", sensors=SENSORS, horizon=24)
+    plant = problem.plant()
+    explored, actions = problem.explore(0)
+    U = np.eye(SENSORS)
+    context = Context(
+        *(U, plant.target, plant.state_weight, plant.action_weight, plant.horizon),
+        Trajectory(explored[:-1], actions),
+        sensors=SENSORS,
+    )
+
+    def make() -> GaussNewton:
+        start = np.zeros((plant.n_a, 2 * SENSORS))
+        return GaussNewton(start, seed=0, rollouts=10, context=context)
+
+    def measure(asked: Rollout) -> RolloutResult:
+        K = asked.policy[:, :SENSORS]
+        b = asked.policy[:, SENSORS:] @ plant.target
+        episode = rollout(plant, lambda k, y: y @ K.T + b, [asked.field_seed])
+        seen = Trajectory(episode.states[:, 0], episode.actions[:, 0])
+        return RolloutResult(float(episode.costs.mean[0]), trajectory=seen)
+
+    first, later = make(), make()
+    row = first.tell([measure(asked) for asked in first.ask()])
+    assert row["model"] == "sensed"
+    for _ in range(2):
+        first.tell([measure(first.ask()[0])])
+    later.restore(first.state())
+    rows = [optimizer.tell([measure(optimizer.ask()[0])]) for optimizer in (first, later)]
+    assert rows[0] == rows[1] and rows[0]["accepted"] and rows[0]["relative_cost"] < 0.8
+    for optimizer in (first, later):
+        optimizer.tell([measure(asked) for asked in optimizer.ask()])
+    assert same_bits(first.ask()[0].policy, later.ask()[0].policy)
