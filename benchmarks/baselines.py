@@ -268,7 +268,7 @@ def limit(problem: str, settings: Mapping[str, Any]) -> float | None:
     own = {**settings, "identification": "dmdc", "identification_attempts": 10}
     # Fewer sensors or weaker actuators do not lower it.
     known = find(load_parameters(problem, {**own, "sensors": 0, "action_limit": 0.0}))
-    return None if known is None else float(known.open_loop.mean())
+    return None if known is None else float(known.mean())
 
 
 def text(result: Mapping[str, Any]) -> str:

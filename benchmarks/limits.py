@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,17 +19,11 @@ from loop_interfaces.parameters import PROBLEM
 from pde_sim_node.build import build_equation, build_plant
 from pdeloop.episode import mean_field_cost
 
-__all__ = ["FOLDER", "Limits", "content", "find"]
+__all__ = ["FOLDER", "content", "find"]
 
 FOLDER = Path(__file__).parent / "open_loop_limits"
 AGREEMENT = 1e-6
 """Relative, of two plants' costs without control: another compiler rounds differently."""
-
-
-class Limits(NamedTuple):
-    """The costs that no controller undercuts, by field, (fields,)."""
-
-    open_loop: NDArray[np.float64]
 
 
 def content(values: Mapping[str, Any], open_loop: Mapping[str, list[float]]) -> dict[str, Any]:
@@ -41,8 +35,8 @@ def content(values: Mapping[str, Any], open_loop: Mapping[str, list[float]]) -> 
     }
 
 
-def find(values: Mapping[str, Any], folder: Path = FOLDER) -> Limits | None:
-    """The limits of a problem on the fields of its closing evaluation; None if they are not known.
+def find(values: Mapping[str, Any], folder: Path = FOLDER) -> NDArray[np.float64] | None:
+    """The limit on each field (fields,) of a closing evaluation; None if it is not known.
 
     Parameters
     ----------
@@ -60,7 +54,7 @@ def find(values: Mapping[str, Any], folder: Path = FOLDER) -> Limits | None:
         return None
     now = mean_field_cost(build_plant(values))
     same = abs(now / known["no_control_cost"] - 1) <= AGREEMENT
-    return Limits(np.array(costs, dtype=np.float64)) if same else None
+    return np.array(costs, dtype=np.float64) if same else None
 
 
 def _parameters(values: Mapping[str, Any]) -> dict[str, Any]:

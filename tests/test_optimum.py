@@ -112,7 +112,7 @@ def test_the_limits_from_zero_are_the_same(limits):
 def test_limits_hold_for_their_plant_only(limits):
     folder, result = limits
     found = find(values_of(), folder)
-    assert found is not None and found.open_loop.tolist() == result["open_loop"]["0"]
+    assert found is not None and found.tolist() == result["open_loop"]["0"]
     for change in ({"learning_rate": 1.0}, {"seed": 5}, {"reduced_order": 3}):
         assert find(values_of(**change), folder) is not None
     for change in (

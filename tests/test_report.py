@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -15,8 +14,8 @@ import pytest
 from matplotlib.image import imread
 
 from loop_interfaces.controllers import CONTROLLERS
-from pdeloop.report import learning
 from pdeloop.report.data import gather
+from pdeloop.report.learning import EDGE, steps
 from pdeloop.report.style import STYLE
 from tests.browser import browser
 from tests.loop_harness import processes
@@ -98,23 +97,30 @@ def test_a_controller_has_the_same_colour_in_every_figure(folder):
 
 
 def test_steps_damping_and_model_error_are_those_of_the_history(folder):
-    """The figure's data against result.json; the paper's optimiser has none."""
+    """What the figure draws against result.json; the paper's optimiser has no such figure."""
     problem = gather(folder).problems[0]
     name = controllers_of(folder)[-1]
     base = folder if is_run(folder) else folder / "small" / name / str(problem.shown)
     history = json.loads((base / "result.json").read_text())["history"]
-    assert list(problem.steps) == [name]
-    steps = problem.steps[name]
     before = problem.runs[name].before[problem.shown]
     own = [row for row in history if row["seed"] == problem.shown]
-    decided = [row for row in own if "accepted" in row]
-    assert steps.decided.tolist() == [row["rollouts"] - before for row in decided]
-    assert steps.accepted.tolist() == [row["accepted"] for row in decided]
-    assert steps.accepted.any() and (steps.relative[steps.accepted] < 1).all()
-    assert (steps.damping > 0).all() and (steps.predicted < 1).all()
-    assert steps.mismatch.tolist() == [row["mismatch"] for row in own if "mismatch" in row]
-    small = learning.steps(replace(steps, mismatch=1e-7 * steps.mismatch), name).axes[2]
-    assert small.get_ylim()[0] < 1e-7 * steps.mismatch.min()  # a good model is shown, too
+    proposed = [row for row in own if "mismatch" in row]
+    top, middle, bottom = steps(problem.history(name), "red").axes
+    drawn = {line.get_label(): line.get_xydata() for line in top.lines}
+    for label, accepted in (("accepted", True), ("rejected", False)):
+        decided = [row for row in own if row.get("accepted") is accepted]
+        assert drawn[label][:, 0].tolist() == [row["rollouts"] - before for row in decided]
+        costs = [min(row.get("relative_cost", EDGE), EDGE) for row in decided]
+        assert drawn[label][:, 1].tolist() == costs
+    assert len(drawn["accepted"]) and (drawn["accepted"][:, 1] < 1).all()
+    assert (drawn["predicted"][:, 1] < 1).all() and (middle.lines[0].get_ydata() > 0).all()
+    assert bottom.lines[0].get_ydata().tolist() == [row["mismatch"] for row in proposed]
+    fine = [
+        {**row, "mismatch": 1e-7 * row["mismatch"]} if "mismatch" in row else row
+        for row in problem.history(name)
+    ]
+    least = 1e-7 * min(row["mismatch"] for row in proposed)
+    assert steps(fine, "red").axes[2].get_ylim()[0] < least  # a good model is shown, too
 
 
 def test_a_curve_is_the_cost_of_the_policy_at_so_many_rollouts(folder):

@@ -62,8 +62,7 @@ def _monitor(options: argparse.Namespace) -> int:
     finder = Finder(folder, given_domain())
     if folder is not None and finder.find() is None:
         raise ParameterError(
-            f"no loop works on the run in {folder}; see it with pdeloop report {folder}, or continue "
-            f"it with pdeloop train --resume {folder}"
+            f"no loop works on the run in {folder}; a finished one is shown by: pdeloop report {folder}"
         )
     from pdeloop.monitor.node import show_loops  # here, as it needs ROS
 

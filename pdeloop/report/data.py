@@ -59,26 +59,6 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class JudgedSteps:
-    """What became of the steps that one seed's optimiser tried, and of the models behind them.
-
-    decided (N,): rollouts of the adaptation when each was decided; accepted (N,) bool; relative (N,):
-    cost of the candidate over the incumbent's, on the fields it ran on, NaN where one diverged;
-    predicted (N,): the same as the quadratic model predicts it; damping (N,): lambda afterwards;
-    proposed (P,), mismatch (P,): rollouts when a step was proposed, and the error E of the best model
-    then.
-    """
-
-    decided: Array
-    accepted: NDArray[np.bool_]
-    relative: Array
-    predicted: Array
-    damping: Array
-    proposed: Array
-    mismatch: Array
-
-
-@dataclass(frozen=True)
 class ProblemData:
     """A problem's part of a report.
 
@@ -122,11 +102,14 @@ class ProblemData:
     def models(self) -> list[ModelRows]:
         return self.first.models
 
-    @property
-    def steps(self) -> dict[str, JudgedSteps]:
-        """By controller, where the optimiser judges its steps."""
-        found = {name: _steps(run, self.shown) for name, run in self.runs.items()}
-        return {name: steps for name, steps in found.items() if steps is not None}
+    def history(self, controller: str) -> list[dict[str, Any]]:
+        """The rows of the shown seed's optimiser; `rollouts` are those of the adaptation."""
+        run = self.runs[controller]
+        return [
+            {**row, "rollouts": row["rollouts"] - run.before[self.shown]}
+            for row in run.result["history"]
+            if row["seed"] == run.seeds[self.shown]
+        ]
 
 
 @dataclass(frozen=True)
@@ -269,29 +252,3 @@ def _behaviours(data: ProblemData) -> list[Behaviour]:
             field[diverged + 1 :], action[diverged:] = np.nan, np.nan
         found.append(Behaviour(name, field, action, float(costs.mean[i]), diverged))
     return found
-
-
-def _steps(run: FinishedRun, shown: int) -> JudgedSteps | None:
-    """The judged steps of one seed; None for an optimiser that does not judge them."""
-    own = [row for row in run.result["history"] if row["seed"] == run.seeds[shown]]
-    decided = [row for row in own if "accepted" in row and "damping" in row]
-    proposed = [row for row in own if "mismatch" in row]
-    if not decided or not proposed:
-        return None
-
-    def numbers(rows: Sequence[Mapping[str, Any]], name: str) -> Array:
-        return np.array([row.get(name, np.nan) for row in rows], dtype=np.float64)
-
-    used, made = (numbers(rows, "rollouts") - run.before[shown] for rows in (decided, proposed))
-    # The step that was decided is the last one proposed before.
-    last = np.searchsorted(made, used, side="left") - 1
-    predicted = 1 - numbers(proposed, "predicted_fall") / numbers(proposed, "cost")
-    return JudgedSteps(
-        decided=used,
-        accepted=np.array([bool(row["accepted"]) for row in decided]),
-        relative=numbers(decided, "relative_cost"),
-        predicted=np.where(last >= 0, predicted[last], np.nan),
-        damping=numbers(decided, "damping"),
-        proposed=made,
-        mismatch=numbers(proposed, "mismatch"),
-    )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,12 +12,13 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from pde_sim_node.plant import DIVERGED_COST
-from pdeloop.report.data import Curve, JudgedSteps, ProblemData
+from pdeloop.report.data import Curve, ProblemData
 from pdeloop.report.style import COLOURS, LINES, NAMES, panels, plain_log
 
 Array = NDArray[np.float64]
+Rows = Sequence[Mapping[str, Any]]
 EDGE = 1.5
-"""Candidates that cost more, relative to the incumbent, stand at the edge of their figure."""
+"""Candidates that cost more, relative to the incumbent, or diverged stand at this height."""
 
 
 def training_curves(problems: Sequence[ProblemData]) -> Figure:
@@ -57,49 +59,59 @@ def _band(ax: Axes, curve: Curve) -> tuple[float, float]:
     return float(below.min()), float((mean + std).max())
 
 
-def steps(shown: JudgedSteps, controller: str) -> Figure:
-    """Steps accepted and rejected, the damping, and the error of the model behind them."""
+def steps(history: Rows, colour: str) -> Figure:
+    """Steps accepted and rejected, the damping, and the error of the model behind them.
+
+    history: the rows of one seed whose optimiser judges its steps.
+    """
+    decided = [row for row in history if "accepted" in row]
+    proposed = [row for row in history if "mismatch" in row]
     figure = Figure(figsize=(6.4, 5.2))
     top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=(1.6, 1, 1))
-    _candidates(top, shown, COLOURS[controller])
-    middle.step(shown.decided, shown.damping, where="post", color="0.25", linewidth=1)
-    middle.plot(shown.decided, shown.damping, "o", color="0.25", markersize=3)
-    plain_log(middle, float(np.max(shown.damping) / np.min(shown.damping)))
+    _candidates(top, decided, proposed, colour)
+    used = _column(decided, "rollouts")
+    damping = _column(decided, "damping")
+    middle.step(used, damping, "o-", where="post", color="0.25", ms=3, lw=1)
+    plain_log(middle, float(np.max(damping) / np.min(damping)))
     middle.set_ylabel("damping $\\lambda$")
-    bottom.plot(shown.proposed, shown.mismatch, "o-", color="0.25", markersize=3, linewidth=1)
+    mismatch = _column(proposed, "mismatch")
+    bottom.plot(_column(proposed, "rollouts"), mismatch, "o-", color="0.25", ms=3, lw=1)
     bottom.axhline(1.0, color="0.6", linestyle=":", linewidth=1)
     bottom.set_title("dotted: no prediction at all", loc="right", fontsize=8, color="0.4", pad=2)
-    low = max(min(0.4, 0.5 * float(np.nanmin(shown.mismatch))), 1e-16)  # exact up to rounding
+    low = max(min(0.4, 0.5 * float(np.nanmin(mismatch))), 1e-16)  # exact up to rounding
     plain_log(bottom, 2.6 / low)
     bottom.set_ylim(low, 2.6)
     bottom.set_ylabel("model error E")
     bottom.set_xlabel("rollouts of the adaptation")
-    bottom.set_xlim(0, 1.02 * float(shown.decided[-1]))
+    bottom.set_xlim(0, 1.02 * float(used[-1]))
     bottom.xaxis.set_major_locator(MaxNLocator(8, steps=[1, 2, 5, 10], integer=True))
     figure.align_ylabels()
     return figure
 
 
-def _candidates(ax: Axes, shown: JudgedSteps, colour: str) -> None:
-    """Cost of each candidate over the incumbent's; those beyond the axis stand at its edge."""
-    inside = ~shown.accepted & (shown.relative < EDGE)
-    outside = ~shown.accepted & ~inside
-    heights = np.where(outside, EDGE, shown.relative)
+def _candidates(ax: Axes, decided: Rows, proposed: Rows, colour: str) -> None:
+    """Cost of each candidate over the incumbent's, as it was predicted and as it came out."""
+    used, relative = _column(decided, "rollouts"), _column(decided, "relative_cost")
+    heights = np.where(relative < EDGE, relative, EDGE)
+    accepted = np.array([bool(row["accepted"]) for row in decided])
+    # The step that was decided is the last one proposed before.
+    last = np.searchsorted(_column(proposed, "rollouts"), used) - 1
+    predicted = (1 - _column(proposed, "predicted_fall") / _column(proposed, "cost"))[last]
     ax.axhline(1.0, color="0.6", linestyle=":", linewidth=1)
-    ax.plot(shown.decided, shown.predicted, "D", ms=4, color="0.5", mfc="none", label="predicted")
+    ax.plot(used, predicted, "D", ms=4, color="0.5", mfc="none", label="predicted")
     for which, marker, tint, label in (
-        (shown.accepted, "o", colour, "accepted"),
-        (inside, "x", "black", "rejected"),
-        (outside, "^", "black", f"rejected, above {EDGE:g} or diverged"),
+        (accepted, "o", colour, "accepted"),
+        (~accepted, "x", "black", "rejected"),
     ):
-        if which.any():
-            where = shown.decided[which]
-            ax.plot(where, heights[which], marker, color=tint, label=label, clip_on=False)
-    known = np.concatenate([shown.relative[shown.accepted | inside], shown.predicted, [1.0]])
-    top = EDGE if outside.any() else max(1.05, float(np.nanmax(known)) + 0.05)
-    ax.set_ylim(min(0.9, float(np.nanmin(known)) - 0.05), top)
+        ax.plot(used[which], heights[which], marker, color=tint, label=label, clip_on=False)
+    known = np.concatenate([heights, predicted, [1.0]])
+    ax.set_ylim(min(0.9, float(np.nanmin(known)) - 0.05), min(EDGE, np.nanmax(known) + 0.05))
     ax.set_ylabel("candidate's cost over\nthe incumbent's")
-    ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, handletextpad=0.2)
+    ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, handletextpad=0.2)
+
+
+def _column(rows: Rows, name: str) -> Array:
+    return np.array([row.get(name, np.nan) for row in rows], dtype=np.float64)
 
 
 def bars(problems: Sequence[ProblemData]) -> Figure:

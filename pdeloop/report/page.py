@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 from pdeloop.report import figures, learning
 from pdeloop.report.data import ProblemData, ReportData, gather
-from pdeloop.report.style import NAMES, STYLE
+from pdeloop.report.style import COLOURS, NAMES, STYLE
 from pdeloop.reproduction import PAPER, beside_the_paper
 from pdeloop.study.run import ASKED
 from pdeloop.study.table import AVERAGES, CAVEAT, cost_text, reduction_texts
@@ -115,15 +115,19 @@ def _shared(problems: Sequence[ProblemData]) -> Drawn:
 def _of_problem(problem: ProblemData) -> Drawn:
     """The figures of one problem."""
     name, seed = problem.name, problem.first.seeds[problem.shown]
-    for controller, steps in problem.steps.items():
-        yield (
-            f"{name}-steps",
-            f"Steps of {NAMES['gauss_newton']}",  # no other optimiser judges its steps
-            f"Seed {seed}, steps accepted: {steps.accepted.sum()} of {len(steps.accepted)}. Below them "
-            "the damping, which a rejection raises, and the relative error of the best fitted model "
-            "in predicting how measured trajectories differ.",
-            learning.steps(steps, controller),
-        )
+    for controller in problem.runs:
+        history = problem.history(controller)
+        judged = [row["accepted"] for row in history if "accepted" in row]
+        if judged:
+            yield (
+                f"{name}-steps",
+                f"Steps of {NAMES['gauss_newton']}",  # no other optimiser judges its steps
+                f"Seed {seed}, steps accepted: {sum(judged)} of {len(judged)} (at {learning.EDGE:g} "
+                "stands what costs more or diverged). Below them the damping, which a rejection "
+                "raises, and the relative error of the best fitted model in predicting how measured "
+                "trajectories differ.",
+                learning.steps(history, COLOURS[controller]),
+            )
     if not problem.behaviours:
         return
     yield (

@@ -219,4 +219,4 @@ def test_a_port_in_use_and_a_folder_without_a_loop_are_told_in_one_line(loop, re
     assert "no run in" in line
     text = loop.wait(loop.pdeloop("monitor", str(recorded)), LIMIT, code=1)
     (line,) = text.strip().splitlines()
-    assert f"see it with pdeloop report {recorded}" in line
+    assert line.endswith(f"is shown by: pdeloop report {recorded}")
