@@ -134,7 +134,7 @@ def test_the_kept_limits_hold_for_the_shipped_problems():
     names = sorted(path.stem for path in FOLDER.glob("*.json"))
     assert names == ["allen-cahn", "burgers", "kdv"]
     for name in names:
-        assert find(load_parameters(name, {})), (
+        assert find(load_parameters(name, {})) is not None, (
             f"python -m benchmarks optimum {name} --save {FOLDER}"
         )
 
