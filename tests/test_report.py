@@ -109,6 +109,9 @@ def test_steps_damping_and_model_error_are_those_of_the_history(folder):
     drawn = {line.get_label(): line.get_xydata() for line in top.lines}
     for label, accepted in (("accepted", True), ("rejected", False)):
         decided = [row for row in own if row.get("accepted") is accepted]
+        assert decided or label not in drawn
+        if not decided:
+            continue
         assert drawn[label][:, 0].tolist() == [row["rollouts"] - before for row in decided]
         costs = [min(row.get("relative_cost", EDGE), EDGE) for row in decided]
         assert drawn[label][:, 1].tolist() == costs

@@ -103,7 +103,8 @@ def _candidates(ax: Axes, decided: Rows, proposed: Rows, colour: str) -> None:
         (accepted, "o", colour, "accepted"),
         (~accepted, "x", "black", "rejected"),
     ):
-        ax.plot(used[which], heights[which], marker, color=tint, label=label, clip_on=False)
+        if which.any():  # an empty line that is not clipped has no extent to lay out
+            ax.plot(used[which], heights[which], marker, color=tint, label=label, clip_on=False)
     known = np.concatenate([heights, predicted, [1.0]])
     ax.set_ylim(min(0.9, float(np.nanmin(known)) - 0.05), min(EDGE, np.nanmax(known) + 0.05))
     ax.set_ylabel("candidate's cost over\nthe incumbent's")
