@@ -109,6 +109,30 @@ def _spread(fields: Array) -> Array:
     return np.concatenate([fields, mean + _BEYOND * (fields - mean)])
 
 
+def _steps(
+    data: Sequence[Record], weights: Sequence[float], V: Array | None = None
+) -> tuple[Array, ...]:
+    """Of all steps z, a, z after, and the weights of their rollouts; V^T z where there is a V."""
+    parts = []
+    for record, weight in zip(data, weights, strict=True):
+        states = record.states if V is None else record.states @ V
+        n = min(len(record.actions), len(states) - 1)
+        parts.append((states[:n], record.actions[:n], states[1 : n + 1], np.full(n, weight)))
+    return tuple(np.concatenate(columns) for columns in zip(*parts, strict=True))
+
+
+def _fit(
+    data: Sequence[Record], shares: Sequence[float], V: Array, fields: int
+) -> list[LocalModel]:
+    """The local models on V; so many rollouts make a rollout older by one."""
+    newest = max(record.stamp for record in data)
+    ages = [(newest - record.stamp) // fields for record in data]
+    young = [max(_AGEING**age, _AGEING_FLOOR) for age in ages]
+    weights = [own * share for own, share in zip(young, shares, strict=True)]
+    x, a, after, weight = _steps(data, weights, V)
+    return fit(x, a, after - x, weight, RIDGES, leading=min(_CUBIC_MODES, V.shape[1]))
+
+
 class Proposer:
     """Proposes policies for one problem.
 
@@ -137,11 +161,8 @@ class Proposer:
                 f"the exploratory trajectory must have states of {target.size} and actions of "
                 f"{n_a} numbers, but the shapes are {states.shape} and {actions.shape}."
             )
-        self.n_z, self.n_s, self.n_a = U.shape[0], U.shape[1], n_a
-        self._U, self._target, self._modes = U, target, max(_MODES, U.shape[1])
-        self._q, self._r = context.state_weight, context.action_weight
-        self._horizon = context.horizon
-        self._action_limit = context.action_limit
+        self.n_z, self.n_s = U.shape
+        self._modes = max(_MODES, U.shape[1])
         self._noise = context.noise
         self._reproduced = _REPRODUCED_NOISY if self._noise else _REPRODUCED
         self._cleaned: WeakKeyDictionary[Record, Record] = WeakKeyDictionary()
@@ -157,8 +178,9 @@ class Proposer:
         self._s_r: Array = np.sum(U * target[:, None], axis=0)
         self._s_r_square = float(np.sum(self._s_r * self._s_r))
         # A target outside of U leaves the law without a constant part.
-        self._one = 1.0 if self._s_r_square > 1e-20 * float(np.sum(target * target)) else 0.0
-        self._loop = Loop(U, target, self._q, self._r, self._horizon, self._action_limit, self._one)
+        one = 1.0 if self._s_r_square > 1e-20 * float(np.sum(target * target)) else 0.0
+        weights = context.state_weight, context.action_weight
+        self._loop = Loop(U, target, *weights, context.horizon, context.action_limit, one)
         # One component, of which each sensor's last reading is the state.
         self._sensed = context.sensors == target.size and target.size <= _MOST_SENSORS
         self._first_fit: SensedModel | None = None
@@ -171,7 +193,7 @@ class Proposer:
         """The policy after a step of theta; K_b moves least among those with the wanted b."""
         moved = policy.copy()
         moved[:, : self.n_s] += step[:, : self.n_s]
-        if self._one:
+        if self._loop.one:
             moved[:, self.n_s :] += np.outer(step[:, self.n_s], self._s_r / self._s_r_square)
         return moved
 
@@ -212,15 +234,17 @@ class Proposer:
             proposal = self._from_readings(data, policy, damping)
             if proposal is not None:
                 return proposal
-        model, error, whole = self._reproducing(self._steps(data, incumbents), measured)
+        shares = self._shares(data, incumbents)
+        steps = _steps(data, [max(share, _LEAST_WEIGHT) for share in shares])
+        model, error, whole = self._reproducing(steps, measured)
         if model is not None and self._forgets(model, error, data):
             return self._from_states(model, error, data, policy, damping)
         if model is not None and whole and (not rejected or self._ranks(model, rejected)):
             return self._from_fields(model, error, data, policy, damping)
-        V = extended_basis(self._U, [record.states for record in data], self._modes)
-        models = self._fit(data, V, incumbents)
+        loop, V = self._loop, self._basis(data, self._modes)
+        models = _fit(data, shares, V, len(incumbents))
         pairs = self._pairs(V, incumbents, others)
-        errors = mismatches(models, pairs, self._horizon)
+        errors = mismatches(models, pairs, loop.horizon)
         paths = [self._path(record, V) for record in incumbents if len(record.actions)]
         least = _LEAST_FALL * self._level(incumbents)
         proposal = None
@@ -229,10 +253,10 @@ class Proposer:
             step, fall = damped_step(
                 ensemble,
                 paths,
-                target=V.T @ self._target,
-                state_weight=self._q,
-                action_weight=self._r,
-                gamma=float(np.exp(-kappa / self._horizon)),
+                target=V.T @ loop.target,
+                state_weight=loop.state_weight,
+                action_weight=loop.action_weight,
+                gamma=float(np.exp(-kappa / loop.horizon)),
                 damping=damping,
             )
             candidate = self.moved(policy, step)
@@ -258,18 +282,13 @@ class Proposer:
             self._cleaned[record] = replace(record, states=states)
         return self._cleaned[record]
 
-    def _steps(self, data: Sequence[Record], incumbents: Sequence[Record]) -> list[Array]:
-        """z, a, z after, and weights of all steps."""
+    def _shares(self, data: Sequence[Record], incumbents: Sequence[Record]) -> list[float]:
+        """How much each rollout counts in a fit: less, the more it costs above the incumbent's."""
         level = self._level(incumbents)
-        z, a, after, weights = [], [], [], []
-        for record in data:
-            length = min(len(record.actions), len(record.states) - 1)
-            weight = min(1.0, level / max(self._mean_cost(record), 1e-300)) ** 2
-            z.append(record.states[:length])
-            a.append(record.actions[:length])
-            after.append(record.states[1 : length + 1])
-            weights.append(np.full(length, max(weight, _LEAST_WEIGHT)))
-        return [np.concatenate(parts) for parts in (z, a, after, weights)]
+        return [min(1.0, level / max(self._mean_cost(record), 1e-300)) ** 2 for record in data]
+
+    def _basis(self, data: Sequence[Record], modes: int) -> Array:
+        return extended_basis(self._loop.U, [record.states for record in data], modes)
 
     def _from_fields(
         self,
@@ -287,7 +306,7 @@ class Proposer:
             model,
             self.theta(policy),
             _spread(np.stack(fields[-_FIELDS:])),
-            extended_basis(self._U, [record.states for record in data], modes),
+            self._basis(data, modes),
             _TRUST * damping,
         )
         candidate = self.moved(policy, improved.theta - self.theta(policy))
@@ -314,7 +333,7 @@ class Proposer:
                 {
                     record.states.tobytes(): record
                     for record in records
-                    if len(record.actions) == self._horizon and self._mean_cost(record) <= most
+                    if len(record.actions) == self._loop.horizon and self._mean_cost(record) <= most
                 }.values()
             )[-_COMPARED:]
 
@@ -325,14 +344,14 @@ class Proposer:
         model, fields, error = fitted(rollouts, self._first_fit)
         if not error <= self._reproduced:
             return None
-        sensors, n = self._target.size, fields.shape[1]
+        sensors, n = self._loop.target.size, fields.shape[1]
         U = np.zeros((n, self.n_s))
-        U[n // (2 * sensors) :: n // sensors] = self._U
+        U[n // (2 * sensors) :: n // sensors] = self._loop.U
         loop = replace(
             self._loop,
             U=U,
-            target=interpolated(self._target),
-            state_weight=self._q * sensors / n,
+            target=interpolated(self._loop.target),
+            state_weight=self._loop.state_weight * sensors / n,
         )
         own = dict(zip((record.states[0].tobytes() for record in rollouts), fields, strict=True))
         improved = improve(
@@ -377,7 +396,7 @@ class Proposer:
             )
             if error <= self._reproduced:
                 return best, error, True
-        length = max(self._horizon // _PIECES, 1)
+        length = max(self._loop.horizon // _PIECES, 1)
         error, best = self._best(
             fitted, lambda m: mismatch_of_pieces(self._loop, m, measured, length)
         )
@@ -429,7 +448,7 @@ class Proposer:
             model,
             self.theta(policy),
             states[chosen[~held_out]],
-            extended_basis(self._U, [record.states for record in data], self._modes),
+            self._basis(data, self._modes),
             _TRUST * damping,
         ).path
         costs = [self._loop.simulate(model, theta, states[chosen[held_out]]).cost for theta in path]
@@ -448,49 +467,15 @@ class Proposer:
         )
         return bool(candidate > incumbent)
 
-    def _fit(
-        self, data: Sequence[Record], V: Array, incumbents: Sequence[Record]
-    ) -> list[LocalModel]:
-        newest = max(record.stamp for record in data)
-        level = self._level(incumbents)
-        x, a, change, weights = [], [], [], []
-        for record in data:
-            coordinates = record.states @ V
-            length = min(len(record.actions), len(coordinates) - 1)
-            age = (newest - record.stamp) // len(incumbents)
-            weight = max(_AGEING**age, _AGEING_FLOOR)
-            weight *= min(1.0, level / max(self._mean_cost(record), 1e-300)) ** 2
-            x.append(coordinates[:length])
-            a.append(record.actions[:length])
-            change.append(coordinates[1 : length + 1] - coordinates[:length])
-            weights.append(np.full(length, weight))
-        return fit(
-            np.concatenate(x),
-            np.concatenate(a),
-            np.concatenate(change),
-            np.concatenate(weights),
-            RIDGES,
-            leading=min(_CUBIC_MODES, V.shape[1]),
-        )
-
     def _level(self, incumbents: Sequence[Record]) -> float:
         return float(np.mean([self._mean_cost(record) for record in incumbents]))
 
     def _mean_cost(self, record: Record) -> float:
-        length = len(record.actions)
-        error = record.states[:length] - self._target
-        total = self._q * np.sum(error * error) + self._r * np.sum(record.actions * record.actions)
-        return float(total) / max(length, 1)
+        return self._loop.mean_cost(record.states[: len(record.actions)], record.actions)
 
     def _path(self, record: Record, V: Array) -> Path:
-        length = len(record.actions)
-        x = record.states[:length] @ V
-        free = None
-        if self._action_limit:
-            free = (np.abs(record.actions) < self._action_limit).astype(np.float64)
-        features = np.hstack([x[:, : self.n_s], np.full((length, 1), self._one)])
         K = np.ascontiguousarray(record.policy[:, : self.n_s])
-        return Path(x, record.actions, features, K, free)
+        return self._loop.path(record.states[: len(record.actions)], record.actions, K, V)
 
     def _pairs(
         self, V: Array, incumbents: Sequence[Record], others: Sequence[Record | None]

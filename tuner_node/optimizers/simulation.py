@@ -18,6 +18,7 @@ Parikh, Boyd, "Proximal algorithms", Foundations and Trends in Optimization 1, 2
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -65,9 +66,23 @@ class Loop:
                 if self.action_limit:
                     np.clip(a[k], -self.action_limit, self.action_limit, out=a[k])
                 z[k + 1] = model.step(z[k], a[k])
-            error = z[:-1] - self.target
-            cost = self.state_weight * np.sum(error * error) + self.action_weight * np.sum(a * a)
-        return Simulation(z[:-1], a, float(cost) / (self.horizon * len(fields)))
+            return Simulation(z[:-1], a, self.mean_cost(z[:-1], a))
+
+    def mean_cost(self, states: Array, actions: Array) -> float:
+        """Mean stage cost of states (..., n_z) and the actions (..., n_a) that answer them."""
+        error = states - self.target
+        cost = self.state_weight * np.sum(error * error)
+        cost += self.action_weight * np.sum(actions * actions)
+        return float(cost) / max(math.prod(actions.shape[:-1]), 1)
+
+    def path(self, states: Array, actions: Array, K: Array, V: Array) -> Path:
+        """A trajectory under the feedback K in the coordinates x = V^T z, of which s are the first."""
+        x = states @ V
+        features = np.hstack([x[:, : K.shape[1]], np.full((len(x), 1), self.one)])
+        free = None
+        if self.action_limit:
+            free = (np.abs(actions) < self.action_limit).astype(np.float64)
+        return Path(x, actions, features, K, free)
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,14 +221,10 @@ def _expansion(
     B = V.T @ model.B
     with np.errstate(over="ignore", invalid="ignore"):
         for i in range(count):
-            states, actions = simulation.states[:, i], simulation.actions[:, i]
-            x = states @ V
-            features = np.hstack([x[:, : n_f - 1], np.full((len(x), 1), loop.one)])
-            free = None
-            if loop.action_limit:
-                free = (np.abs(actions) < loop.action_limit).astype(np.float64)
+            states = simulation.states[:, i]
+            path = loop.path(states, simulation.actions[:, i], theta[:, :-1], V)
             expansion = expand(
-                Path(x, actions, features, theta[:, :-1], free),
+                path,
                 model.jacobians(states, V),
                 B,
                 target=V.T @ loop.target,
@@ -223,6 +234,6 @@ def _expansion(
             )
             gradient += expansion.gradient / count
             curvature += expansion.curvature / count
-            energy += features.T @ features / (len(features) * count)
+            energy += path.features.T @ path.features / (len(path.features) * count)
     energy[np.diag_indices(n_f)] += ISOTROPY * np.trace(energy) / n_f
     return gradient, curvature, loop.action_weight * energy
