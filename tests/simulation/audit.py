@@ -34,7 +34,8 @@ def audit(plan: Plan) -> str:
     """'same bits', 'error: ...' where the training ended with one, or 'forged'.
 
     The last one is the limit that docs/security.md names: other bits, as a forged message, or the
-    answer to a forged state, came to a process that the true one with its header never reached.
+    answer to a forged state, came to a process that the true one with its header never reached, or
+    reached when the run's last cost was on its way.
 
     Raises
     ------

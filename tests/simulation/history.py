@@ -23,6 +23,8 @@ from loop_interfaces.topics import (
     START,
     STATE,
     TARGET,
+    VOID,
+    CostColumn,
     Topic,
 )
 from tests.simulation.disk import Disk
@@ -83,6 +85,8 @@ class History:
         self._heard: set[tuple[Any, ...]] = set()
         """Readers and headers of the forged messages that came, and of the others. An answer to a
         forged state counts as forged: the plant can only tell by the answer to its own."""
+        self._taken_back: set[tuple[int, int]] = set()
+        """Pairs and episodes whose cost is void, which the tuner has not heard yet."""
         self._answers_forged = False
         """Whether what a controller sends now answers a forged state."""
         self._cut: set[tuple[str, str]] = set()
@@ -113,9 +117,9 @@ class History:
     @property
     def unopposed(self) -> bool:
         """Whether a forged message, or the answer to a forged state, came to a process that the
-        true one with its header never reached.
+        true one with its header never reached, or contradicted too late for the run.
         """
-        return not self._forgeries <= self._heard
+        return bool(self._taken_back) or not self._forgeries <= self._heard
 
     def send(self, writer: Process, sent: Publication | ModelFailure, pair: int) -> None:
         """Bring a message to who reads its topic in the namespace of a pair, as the network at that
@@ -129,6 +133,8 @@ class History:
         raw = self._codecs[topic].encode(sent.frame)
         if topic.latched:
             self._latched[writer.name, pair, topic] = raw
+        if topic is COST and _is_void(sent.frame):
+            self._taken_back.add((pair, sent.frame.episode))
         self._sent.append((topic, raw, pair))
         if self.time < self._forged.get(topic.name, 0.0):
             forgery = self._codecs[topic].encode(self._forgery(sent.frame))
@@ -207,6 +213,8 @@ class History:
             frame = self._codecs[topic].decode(bytes(raw))
             header = topic, pair, frame.run, frame.episode, frame.step, frame.time, frame.plant
             (self._forgeries if forged else self._heard).add((process, *header))
+            if topic is COST and process.name == "tuner" and _is_void(frame):
+                self._taken_back.discard((pair, frame.episode))
             self._answers_forged = forged and topic is STATE
             try:
                 process.take(topic, frame, pair)
@@ -289,7 +297,8 @@ class History:
             self._at(end, lambda: self._cut.discard((writer, reader)))
         elif kind == "stall":
             if who in self._processes:
-                self._processes[who].stalled = end
+                process = self._processes[who]
+                process.stalled = max(process.stalled, end)
         elif kind in ("pause plant", "step plant"):
             self._call(who, "pause")
             if kind == "step plant":
@@ -336,3 +345,7 @@ class History:
 
     def _at(self, time: float, event: Callable[[], None]) -> None:
         heapq.heappush(self._events, (time, next(self._numbers), event))
+
+
+def _is_void(cost: Frame) -> bool:
+    return bool((cost.values[:, CostColumn.ENDED] == VOID).any())
