@@ -10,6 +10,7 @@ from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING, Any
 from unittest import mock
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -76,16 +77,23 @@ def remembering() -> Iterator[None]:
 
     Nearly all histories compute the same, and it is not what they are about.
     """
-    own_design, own_propose = identification.design, Proposer.propose
+    own_design = identification.design
+    own_begin, own_propose = Proposer.__init__, Proposer.propose
+    begun: WeakKeyDictionary[Proposer, Any] = WeakKeyDictionary()
 
     def design(*args: Any) -> Any:
         return _once(lambda: own_design(*args), args)
 
+    def begin(self: Proposer, *args: Any) -> None:
+        own_begin(self, *args)
+        begun[self] = args
+
     def propose(self: Proposer, *args: Any, **how: Any) -> Any:
-        return _once(lambda: own_propose(self, *args, **how), (self._U, self._before, args, how))
+        return _once(lambda: own_propose(self, *args, **how), (begun[self], args, how))
 
     with (
         mock.patch.object(identification, "design", design),
+        mock.patch.object(Proposer, "__init__", begin),
         mock.patch.object(Proposer, "propose", propose),
     ):
         yield
