@@ -98,7 +98,7 @@ def design(
     target : (n_z,) array
         z_r.
     settings : DesignSettings
-        Method, order and weights.
+        Method, order, which is lowered to the size of the state where that is smaller, and weights.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def design(
     model = identify(
         trajectories,
         method=settings.identification,
-        n_s=min(model_order(asdict(settings)), target.size),  # sensors may be fewer
+        n_s=min(model_order(asdict(settings)), target.size),
         p=settings.dmdc_rank,
     )
     weights = {"state_weight": settings.state_weight, "action_weight": settings.action_weight}

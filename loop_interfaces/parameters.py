@@ -114,7 +114,8 @@ PROBLEM = _section(
         "an environment whose field exceeds this magnitude has diverged"
     ),
     Spec("reduced_order", 4, 0, 1024, nodes="CT", group="budget and method").means(
-        "n_s, order of the reduced model; 0: as the exploratory episode suggests, of one seed"
+        "n_s, order of the reduced model, at most the size of the state; 0: as the exploratory "
+        "episode suggests, of one seed"
     ),
     IDENTIFICATION,
     Spec("dmdc_rank", 0, 0, 4096, nodes="CT").means(

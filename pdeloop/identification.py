@@ -88,7 +88,7 @@ def identify_file(path: Path, given: Mapping[str, Any]) -> Identified:
     found = read_measurements(path)
     sources = [{"trajectory": number} for number in range(len(found.trajectories))]
     known = {"sample_time": found.sample_time}
-    return _identified(found.trajectories, found.target, sources, {**known, **given})
+    return _identified(found.trajectories, found.target, sources, known, given)
 
 
 def identify_bag(
@@ -125,15 +125,22 @@ def identify_bag(
     if not trajectories:
         raise BagError(f"the chosen episodes have no environment {environment}")
     known = as_recorded(bag.parameters().get(chosen[-1].key[1], {}))
-    return _identified(trajectories, target, sources, {**known, **given})
+    return _identified(trajectories, target, sources, known, given)
 
 
 def _identified(
     trajectories: Trajectories,
     target: Array,
     sources: list[dict[str, int]],
-    values: Mapping[str, Any],
+    recorded: Mapping[str, Any],
+    given: Mapping[str, Any],
 ) -> Identified:
+    if given.get("reduced_order", 0) > target.size:
+        raise BagError(
+            f"expected an order of at most {target.size}, the numbers of a state, got "
+            f"{given['reduced_order']}"
+        )
+    values = {**recorded, **given}
     try:
         study = study_orders(trajectories)
     except ValueError:  # too few steps; the model itself may still be had
