@@ -265,9 +265,10 @@ def table(folder: Path, budget: int) -> list[dict[str, Any]]:
 
 def limit(problem: str, settings: Mapping[str, Any]) -> float | None:
     """The cost of the best inputs for each field, below which no controller comes; None: unknown."""
-    own = {**settings, "identification": "dmdc", "identification_attempts": 10}
     # Fewer sensors or weaker actuators do not lower it.
-    known = find(load_parameters(problem, {**own, "sensors": 0, "action_limit": 0.0}))
+    strong = {"sensors": 0, "sensor_delays": 1, "action_limit": 0.0}
+    own = {**settings, **strong, "identification": "dmdc", "identification_attempts": 10}
+    known = find(load_parameters(problem, own))
     return None if known is None else float(known.mean())
 
 
