@@ -189,6 +189,7 @@ def test_a_worker_with_other_versions_is_refused_or_accepted_on_request(
         ({"variants": {"a": 1}}, "variant 'a' is 1"),
         ({"settings": 3}, "'settings' is 3"),
         ({"seed": 3}, "unknown entries: seed"),
+        ({"/**": {}}, "this is a problem's file; expected a study's"),
     ],
 )
 def test_a_study_that_cannot_be_is_refused_in_one_sentence(change: dict[str, Any], sentence: str):

@@ -60,6 +60,10 @@ class Study:
         """
         if not isinstance(content, dict):
             raise StudyError(f"the study is {content!r}; expected a table with 'problems'")
+        if "/**" in content:
+            raise StudyError(
+                "this is a problem's file; expected a study's, which lists it in 'problems'"
+            )
         entries = ("problems", "seeds", "variants", "settings", "curves")
         unknown = sorted(set(map(str, content)) - {*entries})
         if unknown:
