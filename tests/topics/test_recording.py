@@ -244,12 +244,12 @@ def test_a_training_that_must_be_recorded_stops_when_the_recorder_does(loop, tmp
     assert verify(hand.bag).count == 0
 
 
-@pytest.mark.parametrize("recorder", ["start", "required"])
+@pytest.mark.parametrize(("recorder", "iterations"), [("start", 300), ("required", 100_000)])
 def test_a_full_disk_ends_the_recording_and_the_training_as_the_user_chose(
-    loop, tmp_path, recorder
+    loop, tmp_path, recorder, iterations
 ):
     with small_disk(tmp_path / "disk", megabytes=2) as disk:
-        hand = Hand(loop, disk / "bag", tmp_path / "run", recorder, 150)
+        hand = Hand(loop, disk / "bag", tmp_path / "run", recorder, iterations)
         text = loop.wait(hand.recorder, LIMIT, code=3)
         last = text.strip().splitlines()[-1]
         assert last.startswith(f"recorder_node: cannot write to {disk / 'bag'}: ")
@@ -257,7 +257,7 @@ def test_a_full_disk_ends_the_recording_and_the_training_as_the_user_chose(
         assert "recording stopped" in last
         loop.wait(hand.tuner, LIMIT, code=0 if recorder == "start" else 1)
         if recorder == "start":
-            assert_same_training(hand.out, in_process(iterations=150))
+            assert_same_training(hand.out, in_process(iterations=iterations))
         report = verify(hand.bag)
         assert report.count == 0 and report.compared["policies"] > 20
 

@@ -15,7 +15,7 @@ ROLLOUTS = 27
 def test_actions_of_a_wrong_shape_with_the_right_ids_change_nothing(loop: Processes, tmp_path):
     """Somebody who listens to the loop answers each state before, at and after its step."""
     out = tmp_path / "run"
-    plant = start_pair(loop)["plant"]
+    plant = start_pair(loop, real_time_factor=20.0)["plant"]  # so that the stranger keeps up
     stranger = loop.start("-c", WRONG_SHAPES, name="stranger")
     until(lambda: "listening" in loop.output(stranger), LIMIT, "the stranger")
     options = {"rollouts": ROLLOUTS, "optimizer": "gauss_newton", "seeds": 2}
@@ -28,6 +28,7 @@ def test_actions_of_a_wrong_shape_with_the_right_ids_change_nothing(loop: Proces
 
 WRONG_SHAPES = """
 from dataclasses import replace
+import time
 import numpy as np, rclpy
 from std_msgs.msg import Float64MultiArray
 from loop_interfaces.frames import ArrayCodec
@@ -48,7 +49,10 @@ def answer(message):
             publisher.publish(actions.encode(wrong))
             count += 1
     print(count, flush=True)
-node.create_subscription(Float64MultiArray, "state", answer, reader_qos(STATE), raw=True)
+qos = reader_qos(STATE)
+subscription = node.create_subscription(Float64MultiArray, "state", answer, qos, raw=True)
+while not (publisher.get_subscription_count() and subscription.get_publisher_count()):
+    time.sleep(0.01)
 print("listening", flush=True)
 rclpy.spin(node)
 """
