@@ -16,9 +16,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from benchmarks.processes import Bench, BenchError, BenchProcess, bench, ended_well, machine, table
+from benchmarks.processes import BenchError, BenchProcess, bench, ended_well, machine, table
+from loop_interfaces.problem import config_folder
 from pdeloop.pairs import PAIR, namespaces, ros_value
 
+SERVER = "fast-discovery-server"
+"""The program, which comes with Fast DDS."""
 NODE_MEMORY = 0.12
 """GB of a node, for the check that all of them fit."""
 GROUP = 5
@@ -46,7 +49,9 @@ def run(
     rows = []
     with bench() as running:
         if discovery == "server":
-            _start_server(running)
+            command, address = server_command()
+            running.run("discovery-server", command)
+            running.environment["ROS_DISCOVERY_SERVER"] = address
         waiting = ["recorder:=required", f"pairs:={ros_value(names)}"]
         tuner = running.start("tuner_node", *waiting, problem="burgers")
         nodes = [tuner]
@@ -73,20 +78,29 @@ def run(
     return {"machine": machine(), "available": before, "seconds": seconds, "rows": rows}
 
 
-def _start_server(running: Bench) -> None:
-    """Start a discovery server on a free port of loopback; the nodes started afterwards use it."""
-    program = shutil.which("fast-discovery-server", path=str(Path(sys.executable).parent))
+def server_command() -> tuple[list[str], str]:
+    """The command of a discovery server on a free port of loopback, and its address for the nodes.
+
+    Raises
+    ------
+    BenchError
+        There is no such program, neither beside Python nor on the path.
+    """
+    beside = str(Path(sys.executable).parent)
+    program = shutil.which(SERVER, path=beside) or shutil.which(SERVER)
     if program is None:
         raise BenchError(
-            "expected the program fast-discovery-server beside Python, found none; install Fast "
+            f"expected the program {SERVER} beside Python or on the path, found none; install Fast "
             "DDS's tools, or choose --discovery multicast"
         )
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    command = [program, "-i", "0", "-l", "127.0.0.1", "-p", str(port)]
-    running.run("discovery-server", command)
-    running.environment["ROS_DISCOVERY_SERVER"] = f"127.0.0.1:{port}"
+        port = str(free.getsockname()[1])
+    profile = config_folder() / "fastdds_discovery_server.xml"
+    # Otherwise it also opens shared memory, which nobody uses and which stays when it is killed.
+    without_memory = ["env", "FASTDDS_BUILTIN_TRANSPORTS=UDPv4"]
+    where = ["-l", "127.0.0.1", "-p", port, "-x", str(profile)]
+    return [*without_memory, program, "-i", "0", *where], f"127.0.0.1:{port}"
 
 
 def _wait_until_found(tuner: BenchProcess, nodes: Sequence[BenchProcess]) -> None:

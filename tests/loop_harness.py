@@ -36,6 +36,18 @@ def until(condition: Callable[[], object], limit: float, what: str) -> None:
         time.sleep(0.02)
 
 
+def udp_sockets(pid: int) -> list[tuple[str, int]]:
+    """Local address (hexadecimal) and port of the UDP sockets of a process."""
+    inodes = set()
+    for entry in Path(f"/proc/{pid}/fd").iterdir():
+        target = str(entry.readlink())
+        if target.startswith("socket:["):
+            inodes.add(target[8:-1])
+    lines = Path(f"/proc/{pid}/net/udp").read_text().splitlines()[1:]
+    own = [line.split()[1].split(":") for line in lines if line.split()[9] in inodes]
+    return [(address, int(port, 16)) for address, port in own]
+
+
 class Forked:
     """A node or a program in a process that was forked, not executed; used like a Popen.
 
@@ -120,12 +132,16 @@ class Processes:
 
     def start(self, *command: str, name: str = "") -> Any:
         """Run `python COMMAND...` with its output in a file (see `output`)."""
-        path = self._new_log(name or Path(command[-1]).name)
         if self.forks and command[0] == "-c":
-            return self._fork(path, *command)
+            return self._fork(self._new_log(name or Path(command[-1]).name), *command)
+        return self.program(sys.executable, *command, name=name)
+
+    def program(self, *command: str, name: str = "") -> Any:
+        """Run any program in the same way."""
+        path = self._new_log(name or Path(command[-1]).name)
         with path.open("wb") as log:
             process = subprocess.Popen(
-                [sys.executable, *command],
+                command,
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,

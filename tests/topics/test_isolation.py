@@ -7,29 +7,16 @@ import shutil
 import socket
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 from loop_interfaces.isolation import NETWORK, PROFILE, loopback_environment, outside_sockets
 from loop_interfaces.problem import config_folder
 from pdeloop.domain import DomainError, own_domain
-from tests.loop_harness import ROOT, Processes, until
+from tests.loop_harness import ROOT, Processes, udp_sockets, until
 from tests.small_loop import LIMIT
 
 pytestmark = pytest.mark.topics
-
-
-def udp_sockets(pid: int) -> list[tuple[str, int]]:
-    """Local address (hexadecimal) and port of the UDP sockets of a process."""
-    inodes = set()
-    for entry in Path(f"/proc/{pid}/fd").iterdir():
-        target = str(entry.readlink())
-        if target.startswith("socket:["):
-            inodes.add(target[8:-1])
-    lines = Path(f"/proc/{pid}/net/udp").read_text().splitlines()[1:]
-    own = [line.split()[1].split(":") for line in lines if line.split()[9] in inodes]
-    return [(address, int(port, 16)) for address, port in own]
 
 
 def test_the_hundred_and_third_node_of_a_domain_has_its_ports_and_all_on_loopback(loop: Processes):
