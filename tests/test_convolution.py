@@ -99,7 +99,7 @@ def test_jacobians_are_derivatives_of_the_step(model: ConvolutionModel) -> None:
 
 def loop(limit: float = 0.0) -> Loop:
     U = np.linalg.qr(np.random.default_rng(5).standard_normal((N_Z, 4)))[0]
-    return Loop(U, 0.1 * np.ones(N_Z), 1.0, 0.5, STEPS, limit, 1.0)
+    return Loop(U, 0.1 * np.ones(N_Z), 1.0, 0.5, STEPS, limit)
 
 
 @pytest.mark.parametrize("limit", [0.0, 0.2])

@@ -9,7 +9,6 @@ from benchmarks.warm_start import warm_start
 from loop_interfaces.field_models.differential import DifferentialModel, fit_differential
 from loop_interfaces.problem import load_parameters
 from pdeloop.in_process import LocalPair
-from tuner_node.optimizers.proposal import Proposer
 from tuner_node.optimizers.simulation import Loop, mismatch
 
 N_Z, N_A = 65, 2
@@ -60,7 +59,7 @@ def test_burgers_is_recognised_and_simulated_where_fronts_cross_six_points_a_sam
     values = load_parameters("burgers", {"optimizer": "gauss_newton"})
     pair = LocalPair(values)
     plant, training = pair.plant, warm_start(values, pair)
-    policy, context = training.starts()[0], training._context(0)
+    context = training._context(0)
     assert context is not None
     rollouts = [context.exploration, *(m.trajectory for m in context.measured)]
     z, after = (
@@ -71,7 +70,6 @@ def test_burgers_is_recognised_and_simulated_where_fronts_cross_six_points_a_sam
     for found, true in zip(model.symbols, (-1e-4 * k**2, -0.5j * k), strict=True):
         np.testing.assert_allclose(found / plant.sample_time, true, atol=0.1 * np.abs(true).max())
     q, r = context.state_weight, context.action_weight
-    loop = Loop(context.U, context.target, q, r, context.horizon, 0.0, 1.0)
-    theta = Proposer(context, policy).theta
-    measured = [(theta(m.policy), m.trajectory.states[:-1]) for m in context.measured]
+    loop = Loop(context.U, context.target, q, r, context.horizon, 0.0)
+    measured = [(loop.theta(m.policy), m.trajectory.states[:-1]) for m in context.measured]
     assert mismatch(loop, model, measured, 1.0) < 0.01

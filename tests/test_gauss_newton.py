@@ -14,7 +14,7 @@ from controller_node.reduced_model import ReducedModel
 from loop_interfaces.field_models.convolution import ConvolutionModel, fit_convolutions
 from tests.small import parameters, same_bits, train_here
 from tuner_node.optimizers import Context, GaussNewton, Rollout, RolloutResult, Trajectory
-from tuner_node.optimizers.proposal import Proposer
+from tuner_node.optimizers.proposals import Proposer, chaotic
 from tuner_node.optimizers.simulation import mismatch, mismatch_of_pieces
 from tuner_node.optimizers.trajectories import Records
 
@@ -282,12 +282,14 @@ def test_a_step_moves_the_gains_and_the_constant_part_by_what_it_says() -> None:
     plant = Plant()
     proposer = Proposer(plant.context(), plant.best)
     step = np.random.default_rng(8).standard_normal((N_A, N_S + 1))
-    moved = proposer.moved(plant.best, step)
+    moved = proposer.loop.moved(plant.best, step)
     s_r = plant.U.T @ plant.target
     constant = (moved - plant.best)[:, N_S:] @ s_r
     np.testing.assert_allclose((moved - plant.best)[:, :N_S], step[:, :N_S], atol=1e-12)
     np.testing.assert_allclose(constant, step[:, N_S], atol=1e-12)
-    np.testing.assert_allclose(proposer.theta(moved) - proposer.theta(plant.best), step, atol=1e-12)
+    np.testing.assert_allclose(
+        proposer.loop.theta(moved) - proposer.loop.theta(plant.best), step, atol=1e-12
+    )
 
 
 def test_a_target_outside_of_the_basis_leaves_the_constant_part_alone() -> None:
@@ -338,7 +340,7 @@ def test_a_plant_that_forgets_is_improved_from_many_states_until_it_gains_nothin
     (model,) = fit_convolutions(z, a, then, np.ones(len(z)), degrees=(1,), ridges=(1e-9,))
     falls = []
     for _ in range(20):
-        proposal = proposer._from_states(model, 0.01, data, policy, 1e-3)
+        proposal = chaotic.propose(proposer.loop, model, 0.01, data, policy, 1e-3)
         if proposal is None:
             break
         falls.append(proposal.fall)
@@ -348,7 +350,7 @@ def test_a_plant_that_forgets_is_improved_from_many_states_until_it_gains_nothin
     other = plant.run(data[0].policy, 99).trajectory
     assert other is not None
     before, after = (
-        proposer._loop.simulate(model, proposer.theta(p), other.states).cost
+        proposer.loop.simulate(model, proposer.loop.theta(p), other.states).cost
         for p in (data[0].policy, policy)
     )
     assert after < 0.95 * before
@@ -371,11 +373,11 @@ def test_chaos_is_told_from_disturbances() -> None:
                 states.append(after + disturbance * rng.standard_normal(N_Z))
             done = Trajectory(np.array(states), np.zeros((T, N_A)))
             records.add(policy, RolloutResult(1.0, False, done), set())
-        measured = [proposer._closed_loop(record) for record in records.all()]
-        error = mismatch_of_pieces(proposer._loop, model, measured, T // 8)
+        measured = [proposer.loop.measured(record) for record in records.all()]
+        error = mismatch_of_pieces(proposer.loop, model, measured, T // 8)
         assert 0.0 < error < 0.05
-        assert all(mismatch(proposer._loop, model, [own], 9.0) > 0.05 for own in measured)
-        return proposer._forgets(model, error, records.all())
+        assert all(mismatch(proposer.loop, model, [own], 9.0) > 0.05 for own in measured)
+        return chaotic.forgets(proposer.loop, model, error, records.all(), 0.05)
 
     assert forgets((3.9, -3.9), (3.9001, -3.9001), 0.0)
     assert not forgets((1.0, 0.0), (1.0, 0.0), 0.03)

@@ -37,7 +37,7 @@ from pde_sim_node.plant import Plant
 from tests.simulation.disk import Disk
 from tests.small import parameters
 from tuner_node.build import build_dispatcher, build_training
-from tuner_node.optimizers.proposal import Proposer
+from tuner_node.optimizers.proposals import Proposer
 from tuner_node.results import RunIdentity
 from tuner_node.session import Session
 

@@ -42,7 +42,7 @@ from tuner_node.optimizers.base import (
     require_results,
     require_state,
 )
-from tuner_node.optimizers.proposal import Proposer
+from tuner_node.optimizers.proposals import Proposer
 from tuner_node.optimizers.trajectories import GROWING, Record, Records
 
 __all__ = ["GaussNewton"]
@@ -242,7 +242,7 @@ class GaussNewton:
             **self._now.arrays(),
             "seed": np.array(self._seed),
             "field_count": np.array(self._field_count),
-            **self._records.state(self._proposer.n_z, *self._now.policy.shape),
+            **self._records.state(len(self._proposer.loop.U), *self._now.policy.shape),
         }
 
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:

@@ -42,6 +42,11 @@ class Record:
         """Whether the rollout came to its end."""
         return bool(np.isfinite(self.cost))
 
+    @property
+    def acted_from(self) -> Array:
+        """The states that an action followed, (L, n_z)."""
+        return self.states[: len(self.actions)]
+
 
 class Records:
     """The last rollouts, and older ones that are still referred to.

@@ -1,0 +1,16 @@
+"""The next policy to try, a pure function of the remembered trajectories.
+
+One of four kinds, the first that applies:
+
+1. `sensed`: there are few point sensors, and a model of the field between them reproduces their
+   readings.
+2. `chaotic`: a model of the whole field reproduces the rollouts in pieces, but the plant forgets where
+   it began.
+3. `whole_field`: a model of the whole field reproduces the rollouts from beginning to end.
+4. `local`: always; local models of the plant agree on a direction.
+
+`proposer` chooses; `reproducing` fits and judges the models of the whole field.
+"""
+
+from tuner_node.optimizers.proposals.proposal import Proposal as Proposal
+from tuner_node.optimizers.proposals.proposer import Proposer as Proposer

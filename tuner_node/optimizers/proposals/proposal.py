@@ -1,0 +1,68 @@
+"""A policy to try, and what the four kinds of proposals have in common."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tuner_node.optimizers.base import Array, Row
+
+# Coordinates of the local models and of the sensitivities, at least.
+MODES = 32
+# A step that predicts less than this share of the cost is not worth its rollouts.
+LEAST_FALL = 1e-3
+# Trust region of a law that is improved on a model, relative to that of a single step.
+TRUST = 1e-2
+# The newest rollouts that a model of the field has to reproduce.
+COMPARED = 8
+# Further initial fields are so many times as far from the mean of the measured ones.
+_BEYOND = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """A policy to try.
+
+    Attributes
+    ----------
+    policy : (n_a, 2 n_s) array
+    fall : float
+        The fall of the mean stage cost that the quadratic model predicts.
+    models : int
+        How many models were averaged.
+    kappa : float
+        Forgetting.
+    mismatch : float
+        Their smallest relative error in predicting measured differences of trajectories, or that of the
+        model of the whole field in reproducing the rollouts.
+    kind : str
+        "local", "convolution", "differential" or "sensed".
+    """
+
+    policy: Array
+    fall: float
+    models: int
+    kappa: float
+    mismatch: float
+    kind: str = "local"
+
+    def row(self) -> Row:
+        """What a history row says about it."""
+        return {
+            "predicted_fall": self.fall,
+            "models": self.models,
+            "kappa": self.kappa,
+            "mismatch": self.mismatch,
+            "model": self.kind,
+        }
+
+
+def spread(fields: Array) -> Array:
+    """The initial fields (F, n_z), and as many that lie further from their mean.
+
+    A law that is best on a few fields is not on their neighbours; on a model, more of them cost no
+    rollouts.
+    """
+    mean = fields.mean(axis=0)
+    return np.concatenate([fields, mean + _BEYOND * (fields - mean)])

@@ -1,0 +1,141 @@
+"""Chooses the kind of proposal, and asks for one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from tuner_node.optimizers.base import Array, Context
+from tuner_node.optimizers.proposals import chaotic, local, whole_field
+from tuner_node.optimizers.proposals.proposal import COMPARED, Proposal
+from tuner_node.optimizers.proposals.reproducing import (
+    REPRODUCED,
+    REPRODUCED_NOISY,
+    ranks,
+    reproducing_model,
+    steps_of,
+)
+from tuner_node.optimizers.proposals.sensed import MOST_SENSORS, SensedProposals
+from tuner_node.optimizers.simulation import Loop
+from tuner_node.optimizers.trajectories import Record, denoised
+
+# The smallest weight of a rollout in the fit of a model of the whole field.
+_LEAST_WEIGHT = 0.05
+
+
+class Proposer:
+    """Proposes policies for one problem.
+
+    Parameters
+    ----------
+    context : Context
+    policy : (n_a, 2 n_s) array
+        Any policy of the training, for its shape.
+
+    Attributes
+    ----------
+    loop : Loop
+        The closed loop and its cost.
+    """
+
+    def __init__(self, context: Context, policy: Array) -> None:
+        U = np.array(context.U, dtype=np.float64)
+        target = np.array(context.target, dtype=np.float64)
+        n_a, columns = policy.shape
+        if U.ndim != 2 or columns != 2 * U.shape[1]:
+            raise ValueError(
+                f"a policy of shape {policy.shape} does not fit a basis U of shape {U.shape}."
+            )
+        if target.shape != U.shape[:1]:
+            raise ValueError(
+                f"the target must have shape {U.shape[:1]}, but it has {target.shape}."
+            )
+        states, actions = context.exploration.states, context.exploration.actions
+        if states.shape[1:] != target.shape or actions.shape[1:] != (n_a,):
+            raise ValueError(
+                f"the exploratory trajectory must have states of {target.size} and actions of "
+                f"{n_a} numbers, but the shapes are {states.shape} and {actions.shape}."
+            )
+        weights = context.state_weight, context.action_weight
+        self.loop = Loop(U, target, *weights, context.horizon, context.action_limit)
+        self._noise = context.noise
+        self._reproduced = REPRODUCED_NOISY if self._noise else REPRODUCED
+        self._cleaned: WeakKeyDictionary[Record, Record] = WeakKeyDictionary()
+        before = [
+            Record(-1, np.zeros_like(policy), np.inf, states, actions),
+            *(
+                Record(-1, m.policy, m.cost, m.trajectory.states, m.trajectory.actions)
+                for m in context.measured
+            ),
+        ]
+        self._before = [self._clean(record) for record in before]
+        self._sensed: SensedProposals | None = None
+        # One component, of which each sensor's last reading is the state.
+        if context.sensors == target.size and target.size <= MOST_SENSORS:
+            self._sensed = SensedProposals(self.loop, self._before, self._reproduced)
+
+    def propose(
+        self,
+        records: Sequence[Record],
+        incumbents: Sequence[Record],
+        others: Sequence[Record | None],
+        *,
+        damping: float,
+        accepted: bool,
+    ) -> Proposal | None:
+        """The next policy to try, or None if no model gives a finite step.
+
+        Parameters
+        ----------
+        records : sequence of Record
+            All remembered rollouts.
+        incumbents : sequence of Record
+            The rollouts of the incumbent on the fields of the moment.
+        others : sequence of Record or None
+            On the same fields: the candidate that was rejected last, or the previous incumbent.
+        damping : float
+            lambda.
+        accepted : bool
+            Whether the last candidate was accepted.
+        """
+        loop, reproduced = self.loop, self._reproduced
+        records = [self._clean(record) for record in records]
+        incumbents = [self._clean(record) for record in incumbents]
+        others = [other and self._clean(other) for other in others]
+        data = [record for record in (*self._before, *records) if len(record.states) > 1]
+        rejected = (
+            [] if accepted else [(i, o) for i, o in zip(incumbents, others, strict=True) if o]
+        )
+        policy = incumbents[0].policy
+        if self._sensed is not None:
+            proposal = self._sensed.propose(data, policy, damping)
+            if proposal is not None:
+                return proposal
+        # A rollout counts less in a fit, the more it costs above the incumbent's.
+        level = loop.mean_cost_of(incumbents)
+        shares = [min(1.0, level / max(loop.cost_of(record), 1e-300)) ** 2 for record in data]
+        model, error, whole = reproducing_model(
+            loop,
+            steps_of(data, [max(share, _LEAST_WEIGHT) for share in shares]),
+            [loop.measured(record) for record in data if record.usable][-COMPARED:],
+            reproduced,
+        )
+        if model is not None and chaotic.forgets(loop, model, error, data, reproduced):
+            return chaotic.propose(loop, model, error, data, policy, damping)
+        if model is not None and whole and (not rejected or ranks(model, loop, rejected)):
+            return whole_field.propose(loop, model, error, data, policy, damping)
+        return local.propose(
+            *(loop, data, shares, incumbents, others), damping=damping, accepted=accepted
+        )
+
+    def _clean(self, record: Record) -> Record:
+        """The rollout without what of its noise can be told from the fields."""
+        if not self._noise:
+            return record
+        if record not in self._cleaned:  # every proposal asks for all remembered rollouts
+            states = denoised(record.states, self._noise)
+            self._cleaned[record] = replace(record, states=states)
+        return self._cleaned[record]
