@@ -96,6 +96,20 @@ def test_an_exploration_that_ends_before_its_first_step_is_asked_for_again(respo
     assert same_bits(send.frame.values, models())
 
 
+def test_a_void_exploration_forged_into_a_completed_one_names_who_else_may_have_said_so(responder):
+    responder.start(start(1, (1, 2, 0.1, 0)))
+    states = plant().reset(np.array([1]))
+    for k in range(2):
+        responder.state(Frame(RUN, 1, k, 0.0, states))
+    (failure,) = responder.cost(Frame(RUN, 1, 1, 0.0, np.array([[0.5, 0.5, COMPLETED]])))
+    assert isinstance(failure, ModelFailure) and not failure.retry
+    assert failure.reason == (
+        "the exploratory episode ended at step 1, but a model of n_s = 4 modes and n_a = 4 inputs "
+        "needs at least 8 steps; lower reduced_order or raise the horizon, and if that is long "
+        "enough, stop the other node that publishes episode/cost"
+    )
+
+
 def test_data_that_allow_no_model_are_a_failure_with_the_reason():
     responder = Responder(DesignSettings(4, 400, 1.0, 1.0))
     responder.target(target())

@@ -19,7 +19,6 @@ GAVE_UP = "gave up after"
 CAUSES = re.compile(
     rf"{GAVE_UP} \d+ attempts|expected one|stop the|two different|took back the cost"
     "|plant has other parameters|actions are not those of the law|diverged under"
-    r"|needs at least \d+ steps"  # the cost of a void exploration was forged into that of a short one
 )
 """What an error says that names a cause."""
 

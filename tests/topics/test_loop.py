@@ -155,5 +155,5 @@ def test_a_model_that_cannot_be_designed_stops_the_run_with_the_reason(loop: Pro
     path.write_text(SMALL.read_text().replace("reduced_order: 4", "reduced_order: 400"))
     run = loop.pdeloop("train", str(path), "--out", str(tmp_path / "run"))
     text = loop.wait(run, LIMIT, code=1)
-    assert "no reduced model: a model of n_s = 32 modes" in text.splitlines()[-1]
+    assert "a model of n_s = 32 modes and n_a = 4 inputs needs at least 36" in text.splitlines()[-1]
     assert "Traceback" not in text
