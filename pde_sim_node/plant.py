@@ -1,7 +1,5 @@
 """The plant: M sampled PDEs side by side, each z_{k+1} = f(z_k, a_k)."""
 
-import math
-import operator
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,13 +10,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from loop_interfaces.jit.native import compilations
 from loop_interfaces.topics import COMPLETED
+from pde_sim_node.actuators import actuator_supports
+from pde_sim_node.arguments import grid_points, internal_steps, positive, whole
 from pde_sim_node.equations import Equation, LinearEquation
 from pde_sim_node.solver.exact import exact_step
 from pde_sim_node.solver.kernel import etdrk4_step
 from pde_sim_node.solver.memory import StepSettings
 from pde_sim_node.solver.pointwise import all_finite
 from pde_sim_node.solver.workers import ParallelStep
-from pde_sim_node.supports import indicator_supports, placed_supports
 
 DIVERGED_COST = 1e9
 """Mean stage cost of an environment that diverged: very bad, and finite."""
@@ -147,7 +146,9 @@ class Plant:
         self.divergence_bound = positive("divergence_bound", divergence_bound)
         n_x = grid_points(equation, self.n_z)
         self.x = equation.length * np.arange(n_x) / n_x
-        self.supports = self._supports(positive("width", width), shape, positions)
+        self.supports = actuator_supports(
+            equation, self.x, self.n_a, positive("width", width), shape, positions
+        )
         self.field_target = self._checked("target", equation.target(self.x))
         self.target = self.field_target
         make_step = exact_step if isinstance(equation, LinearEquation) else etdrk4_step
@@ -176,37 +177,6 @@ class Plant:
             f"{type(self).__name__}({self.equation.name}: state of {self.state_size}, "
             f"{self.n_a} actuators, {self.horizon} steps of {self.sample_time:g})"
         )
-
-    def _supports(
-        self, width: float, shape: str, positions: Sequence[float]
-    ) -> NDArray[np.float64]:
-        equation, n_x, n_a = self.equation, len(self.x), self.n_a
-        if shape not in ("equation", "indicator", "gaussian"):
-            raise ValueError(
-                f"actuator_shape must be equation, indicator or gaussian, got {shape!r}"
-            )
-        if len(positions) not in (0, n_a):
-            raise ValueError(
-                f"actuator_positions must have a centre for each of the n_a = {n_a} actuators, got "
-                f"{len(positions)}"
-            )
-        if shape == "equation" and not len(positions):
-            shapes = np.array(equation.supports(self.x, n_a, width), np.float64)
-            if shapes.shape != (n_x, n_a) or not np.isfinite(shapes).all():
-                raise ValueError(
-                    f"supports of the equation must return {n_x} x {n_a} finite numbers, got shape "
-                    f"{shapes.shape}"
-                )
-            return shapes
-        if shape == "equation" and type(equation).supports is not Equation.supports:
-            raise ValueError(
-                f"{equation.name} has actuators of its own, which have no other places: give "
-                "actuator_shape together with actuator_positions"
-            )
-        if shape == "indicator" and not len(positions):
-            return indicator_supports(n_x, n_a, width)
-        centres = positions if len(positions) else (np.arange(n_a) + 0.5) / n_a
-        return placed_supports(n_x, centres, width, gaussian=shape == "gaussian")
 
     @property
     def state_size(self) -> int:
@@ -394,50 +364,3 @@ class Plant:
         total = np.where(diverged, DIVERGED_COST * self.horizon, self.totals)
         mean = np.where(diverged, DIVERGED_COST, self.totals / max(self.step_index, 1))
         return EpisodeCosts(mean=mean, total=total, diverged_step=self.diverged_step.copy())
-
-
-def grid_points(equation: Equation, n_z: int) -> int:
-    """Grid points of each component of a state of size n_z."""
-    components = len(equation.components)
-    if components > 1 and not isinstance(equation, LinearEquation):
-        raise ValueError(
-            f"{equation.name} has {components} components, which only a LinearEquation may have"
-        )
-    if n_z % (2 * components) or n_z < 8 * components:
-        near = max(8 * components, n_z + -n_z % (2 * components))
-        raise ValueError(
-            f"n_z must be {components} times an even number of grid points, 8 or more, for the "
-            f"components {', '.join(equation.components)} of {equation.name}, got {n_z}: take {near}"
-        )
-    return n_z // components
-
-
-def whole(name: str, value: int, minimum: int) -> int:
-    """A whole number of at least `minimum`; ValueError otherwise."""
-    try:
-        number = operator.index(value)
-    except TypeError:
-        raise ValueError(f"{name} must be a whole number, got {value!r}") from None
-    if number < minimum:
-        raise ValueError(f"{name} must be at least {minimum}, got {number}")
-    return number
-
-
-def positive(name: str, value: float) -> float:
-    """A positive, finite number; ValueError otherwise."""
-    if not 0 < value < math.inf:
-        raise ValueError(f"{name} must be positive and finite, got {value!r}")
-    return float(value)
-
-
-def internal_steps(sample_time: float, integration_time: float) -> int:
-    """Internal steps of a sampling time; by rounding, as 0.01 // 0.00001 is 999."""
-    ratio = sample_time / integration_time
-    steps = round(ratio)
-    if steps < 1 or abs(ratio - steps) > 1e-9 * ratio:
-        near = max(steps, 1)
-        raise ValueError(
-            f"sample_time must be a whole multiple of integration_time, got {sample_time!r} and "
-            f"{integration_time!r}: take an integration_time of {sample_time / near:.12g}"
-        )
-    return steps

@@ -17,8 +17,8 @@ from pdeloop.finished_run import FinishedRun
 from pdeloop.in_process import LocalPair
 from pdeloop.output import aligned
 from tuner_node.batch import Batch
-from tuner_node.results import RunFolderError
 from tuner_node.rollouts import CONTROLLERS
+from tuner_node.run_folder import RunFolderError
 from tuner_node.seeds import Purpose, derive, evaluation_noise
 
 Array = NDArray[np.float64]

@@ -16,8 +16,8 @@ from loop_interfaces.model_rows import ModelRows
 from loop_interfaces.topics import COMPLETED
 from pde_sim_node.plant import DIVERGED_COST, EpisodeCosts
 from pdeloop.episode import EpisodeRecord
-from tuner_node.results import RunFolder
 from tuner_node.rollouts import CONTROLLERS
+from tuner_node.run_folder import RunFolder
 
 Array = NDArray[np.float64]
 RESAMPLES = 9999

@@ -15,7 +15,7 @@ from loop_interfaces.affinity import least_busy_cores, usable_cores
 from loop_interfaces.isolation import PROFILE
 from loop_interfaces.spec import ParameterError, Spec
 from pde_sim_node.build import fingerprint
-from tuner_node.results import RunFolder
+from tuner_node.run_folder import RunFolder
 
 MAX_PAIRS = 64
 """On one machine; on several, start the pairs by hand (docs/scaling.md)."""

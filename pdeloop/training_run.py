@@ -28,7 +28,7 @@ from pdeloop.pairs import LoopNode, Transport
 from pdeloop.supervisor import Child, NodeError, Supervisor, node_command
 from tuner_node import narration
 from tuner_node.build import build_training
-from tuner_node.results import RunFolder, RunFolderError, timestamp
+from tuner_node.run_folder import RunFolder, RunFolderError, timestamp
 from tuner_node.run_store import RunWriter
 
 BUILT_IN = {"nodes": [], "law": "affine"}

@@ -11,7 +11,7 @@ import pytest
 from pdeloop.cli import main
 from tests.small import SMALL, parameters, same_bits, train_here
 from tuner_node import checkpoint
-from tuner_node.results import RunFolder
+from tuner_node.run_folder import RunFolder
 
 
 def error_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:

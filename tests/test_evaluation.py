@@ -12,7 +12,7 @@ import pytest
 from pde_sim_node.build import fingerprint
 from pdeloop.cli import main
 from tests.small import SMALL
-from tuner_node.results import RunFolder
+from tuner_node.run_folder import RunFolder
 
 COSTS = ("none", "lqt", "adapted")
 

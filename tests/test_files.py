@@ -22,7 +22,7 @@ from pdeloop.cli import FAILED, main
 from pdeloop.report.data import gather
 from tests.small import SMALL
 from tuner_node import checkpoint
-from tuner_node.results import RunFolder, RunFolderError
+from tuner_node.run_folder import RunFolder, RunFolderError
 
 OPTIMIZERS = ("two_point", "gauss_newton")
 

@@ -19,7 +19,7 @@ from pdeloop.cli import main
 from pdeloop.supervisor import Child, keep_on
 from pdeloop.training_run import resolve
 from tests.small import SMALL
-from tuner_node.results import RunFolder
+from tuner_node.run_folder import RunFolder
 
 
 def test_one_pair_has_no_namespace_and_several_share_one_clock() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pdeloop.live import Live, announced, running
 from pdeloop.monitor.finder import Finder
-from tuner_node.results import RunFolder
+from tuner_node.run_folder import RunFolder
 
 
 def test_a_loop_is_found_as_long_as_it_runs(tmp_path, monkeypatch):

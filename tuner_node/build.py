@@ -18,8 +18,8 @@ from tuner_node.dispatch import Dispatcher
 from tuner_node.exploration import least_variance
 from tuner_node.optimizers import NEED_TRAJECTORIES, OPTIMIZERS, Context, Optimizer, TwoPoint
 from tuner_node.optimizers.gauss_newton import FIELDS
-from tuner_node.results import RunIdentity
 from tuner_node.rollouts import CHECK, EXPLORATION
+from tuner_node.run_folder import RunIdentity
 from tuner_node.training import Training
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from loop_interfaces.frames import MAX_ID
 from tuner_node import checkpoint
-from tuner_node.results import RunFolder, RunIdentity
+from tuner_node.run_folder import RunFolder, RunIdentity
 from tuner_node.training import Training
 
 CHECKPOINT_PERIOD = 1.0

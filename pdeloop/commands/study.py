@@ -85,7 +85,8 @@ def carry_out(
     from pdeloop.study.executors import cluster, processes
     from pdeloop.study.run import run
     from pdeloop.study.table import plot, rows, text
-    from tuner_node.results import timestamp, versions
+    from tuner_node.results import versions
+    from tuner_node.run_folder import timestamp
 
     if options.processes is not None and (options.processes < 1 or options.scheduler):
         raise ParameterError(

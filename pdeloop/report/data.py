@@ -25,7 +25,7 @@ from pdeloop.study.description import Study
 from pdeloop.study.training import CURVE
 from tuner_node.build import build_training
 from tuner_node.checkpoint import taken
-from tuner_node.results import RunFolderError
+from tuner_node.run_folder import RunFolderError
 
 Array = NDArray[np.float64]
 

@@ -24,7 +24,7 @@ from pdeloop.study.run import ASKED
 from pdeloop.study.table import AVERAGES, CAVEAT, cost_text, reduction_texts
 from pdeloop.study.table import figures as figures_of
 from tuner_node.budget import PURPOSES
-from tuner_node.results import RunFolderError
+from tuner_node.run_folder import RunFolderError
 
 PIXELS_PER_INCH = 115
 """On the page; the file has more, which an enlarged figure shows."""

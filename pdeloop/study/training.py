@@ -17,7 +17,8 @@ from pdeloop.evaluation import mean_costs
 from pdeloop.in_process import LocalPair, train
 from pdeloop.training_run import BUILT_IN
 from tuner_node.build import build_training
-from tuner_node.results import RunFolder, versions
+from tuner_node.results import versions
+from tuner_node.run_folder import RunFolder
 
 FILES = ("parameters.yaml", "policy.npz", "result.json")
 """The files of a run folder that a training of a study leaves, in the order of writing."""

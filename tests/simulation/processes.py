@@ -38,7 +38,7 @@ from tests.simulation.disk import Disk
 from tests.small import parameters
 from tuner_node.build import build_dispatcher, build_training
 from tuner_node.optimizers.proposals import Proposer
-from tuner_node.results import RunIdentity
+from tuner_node.run_folder import RunIdentity
 from tuner_node.session import Session
 
 if TYPE_CHECKING:

@@ -1,0 +1,53 @@
+"""Checks of the plant's arguments: the value, or a ValueError that says what is right."""
+
+import math
+import operator
+
+from pde_sim_node.equations import Equation, LinearEquation
+
+
+def grid_points(equation: Equation, n_z: int) -> int:
+    """Grid points of each component of a state of size n_z."""
+    components = len(equation.components)
+    if components > 1 and not isinstance(equation, LinearEquation):
+        raise ValueError(
+            f"{equation.name} has {components} components, which only a LinearEquation may have"
+        )
+    if n_z % (2 * components) or n_z < 8 * components:
+        near = max(8 * components, n_z + -n_z % (2 * components))
+        raise ValueError(
+            f"n_z must be {components} times an even number of grid points, 8 or more, for the "
+            f"components {', '.join(equation.components)} of {equation.name}, got {n_z}: take {near}"
+        )
+    return n_z // components
+
+
+def whole(name: str, value: int, minimum: int) -> int:
+    """A whole number of at least `minimum`; ValueError otherwise."""
+    try:
+        number = operator.index(value)
+    except TypeError:
+        raise ValueError(f"{name} must be a whole number, got {value!r}") from None
+    if number < minimum:
+        raise ValueError(f"{name} must be at least {minimum}, got {number}")
+    return number
+
+
+def positive(name: str, value: float) -> float:
+    """A positive, finite number; ValueError otherwise."""
+    if not 0 < value < math.inf:
+        raise ValueError(f"{name} must be positive and finite, got {value!r}")
+    return float(value)
+
+
+def internal_steps(sample_time: float, integration_time: float) -> int:
+    """Internal steps of a sampling time; by rounding, as 0.01 // 0.00001 is 999."""
+    ratio = sample_time / integration_time
+    steps = round(ratio)
+    if steps < 1 or abs(ratio - steps) > 1e-9 * ratio:
+        near = max(steps, 1)
+        raise ValueError(
+            f"sample_time must be a whole multiple of integration_time, got {sample_time!r} and "
+            f"{integration_time!r}: take an integration_time of {sample_time / near:.12g}"
+        )
+    return steps

@@ -1,0 +1,259 @@
+"""A training's folder and what is in it.
+
+parameters.yaml    the resolved parameters, in ROS form: what defines the training
+run.json           the run's id on the network, how often its tuner was started, and the plant's
+                   fingerprint if it was given (0: not)
+progress.jsonl     what happened, one JSON object a line, as it happened
+checkpoint         the training's state (tuner_node.checkpoint), and the one before
+policy.npz         policy (S, n_a, 2 n_s), lqt (the same), model rows (S, rows, n_s), seeds (S,)
+result.json        costs, reductions, history, seeds, versions, timing, the plant's fingerprint
+logs/              one file a node, when the command line started them
+"""
+
+import contextlib
+import fcntl
+import json
+import os
+import secrets
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loop_interfaces import model_rows
+from loop_interfaces.array_files import read_arrays
+from loop_interfaces.files import make_folder, open_own, read_json, write_atomically
+from loop_interfaces.frames import MAX_ID
+from loop_interfaces.parameters import EXECUTION, PLANT, RECORDER, VIEWER, as_recorded, table
+from loop_interfaces.spec import ParameterError, check, read_yaml, yaml_text
+from tuner_node import checkpoint
+from tuner_node.results import check_result, policy_arrays, summarise, versions
+from tuner_node.training import Training
+
+TRANSIENT = (
+    *(
+        "out",
+        "resume",
+        "pairs",
+        "max_batch",
+        "episode_timeout",
+        "max_attempts",
+        "recorder",
+        "plant",
+    ),
+    *(spec.name for spec in (*PLANT, *EXECUTION, *RECORDER, *VIEWER)),
+)
+"""Parameters that change how a training is carried out, not what comes out of it."""
+
+
+class RunFolderError(ValueError):
+    """The folder cannot be used as asked; the text says why and what to do."""
+
+
+@dataclass(frozen=True)
+class RunIdentity:
+    """run: the id in every frame of this training; incarnation: starts of its tuner so far."""
+
+    run: int
+    incarnation: int
+
+
+class RunFolder:
+    """The files of one training. Writing errors are OSErrors; nothing is left half-written."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.checkpoint = path / "checkpoint"
+
+    def create(self, parameters: Mapping[str, Any]) -> None:
+        """Begin a new training here. RunFolderError if the folder holds one or cannot be written."""
+        if (self.path / "parameters.yaml").exists():
+            raise RunFolderError(
+                f"{self.path} already holds a run; choose another folder, "
+                f"or continue it with: pdeloop train --resume {self.path} "
+                "(a tuner_node with -p resume:=true)"
+            )
+        try:
+            make_folder(self.path)
+            kept = {k: v for k, v in parameters.items() if k not in ("out", "resume")}
+            # parameters.yaml comes last and whole: where it is, there is a run.
+            self._identify(RunIdentity(1 + secrets.randbelow(MAX_ID - 1), 0), parameters)
+            text = yaml_text(kept, "resolved parameters of this run")
+            write_atomically(self.path / "parameters.yaml", text.encode())
+        except OSError as error:
+            raise RunFolderError(f"cannot write to {self.path}: {error.strerror}") from error
+
+    def reopen(self, parameters: Mapping[str, Any]) -> RunIdentity:
+        """Continue the training here. RunFolderError if there is none, or with other parameters."""
+        self.unfinished()
+        try:
+            known = read_json(self.path / "run.json")
+            self._check_same(known["parameters"], parameters)
+            identity = RunIdentity(int(known["run"]), int(known["incarnation"]) + 1)
+            if not (0 < identity.run < MAX_ID and 0 < identity.incarnation < 2**21):
+                raise ValueError("ids out of range")
+            return self._identify(identity, known["parameters"])
+        except RunFolderError:
+            raise
+        except (
+            OSError,
+            LookupError,
+            TypeError,
+            ValueError,
+            ArithmeticError,
+            AttributeError,
+        ) as error:
+            raise RunFolderError(f"{self.path}/run.json cannot be used: {error}") from error
+
+    def parameters(self) -> dict[str, Any]:
+        """The resolved parameters of the training here."""
+        path = self.path / "parameters.yaml"
+        if not path.is_file():
+            raise RunFolderError(f"no run in {self.path}: there is no parameters.yaml")
+        try:
+            return read_yaml(path)
+        except ParameterError as error:
+            raise RunFolderError(str(error)) from error
+
+    def unfinished(self) -> dict[str, Any]:
+        """The parameters of a training to continue. RunFolderError if this version cannot."""
+        known = self.parameters()
+        if "rollouts" not in known:
+            raise RunFolderError(
+                f"the run in {self.path} is of an older version, which did not count its rollouts; "
+                "it cannot be continued, start a new one"
+            )
+        return known
+
+    def values(self) -> dict[str, Any]:
+        """The parameters of the training here, with the present defaults of what is not in its file."""
+        given = as_recorded(self.parameters())
+        return {**given, **check(table(), given)}
+
+    def _check_same(self, known: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+        """RunFolderError showing every difference that would change the results.
+
+        A parameter that a run of an older version does not know has its default there: a new one's is
+        always what was done before.
+        """
+        defaults = {spec.name: spec.default for spec in table()}
+        known = as_recorded(known)
+        there = {name: known.get(name, defaults.get(name)) for name in {*known, *now}}
+        changes = [
+            f"{name}: {there[name]!r} there, {now.get(name)!r} now"
+            for name in sorted(set(there) - set(TRANSIENT))
+            if there[name] != now.get(name)
+        ]
+        if changes:
+            raise RunFolderError(
+                f"the run in {self.path} has other parameters ({'; '.join(changes)}); "
+                "continue it with its own, or start a new run in another folder"
+            )
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other processes from working on the run. RunFolderError if one does."""
+        try:
+            file = open_own(self.path / "lock", 0)
+        except OSError as error:
+            raise RunFolderError(f"cannot write to {self.path}: {error.strerror}") from error
+        with file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise RunFolderError(
+                    f"another process works on the run in {self.path}; let it end, or stop it"
+                ) from error
+            yield
+
+    def note(self, row: Mapping[str, Any]) -> None:
+        """Append one line to progress.jsonl."""
+        with open_own(self.path / "progress.jsonl", os.O_APPEND) as file:
+            end = file.seek(0, os.SEEK_END)
+            file.seek(max(0, end - 1))
+            torn = end > 0 and file.read(1) != b"\n"  # by a disk that was full
+            file.write(b"\n" * torn + json.dumps(row).encode() + b"\n")
+
+    def finish(self, training: Training, extra: Mapping[str, Any]) -> dict[str, Any]:
+        """Write policy.npz and result.json; returns the latter's content."""
+        known = {"plant": training.plant, "versions": versions()}
+        summary = summarise(training) | dict(extra) | known
+        buffer = BytesIO()
+        np.savez(buffer, **policy_arrays(training))  # type: ignore[arg-type]
+        write_atomically(self.path / "policy.npz", buffer.getvalue())
+        text = json.dumps(summary, indent=1)
+        write_atomically(self.path / "result.json", text.encode())
+        return summary
+
+    def policies(self) -> dict[str, NDArray[Any]]:
+        """The arrays of policy.npz: `policy`, `lqt`, `model`.
+
+        Raises
+        ------
+        RunFolderError
+            They cannot be read, or are not those of a run with these parameters.
+        """
+        path = self.path / "policy.npz"
+        if not path.exists():
+            raise RunFolderError(
+                f"no results in {self.path}: the run is not finished; "
+                f"continue it with: pdeloop train --resume {self.path}"
+            )
+        values = self.values()
+        n_a, seeds = values["n_a"], values["seeds"]
+        try:
+            arrays = read_arrays(path)
+            model = checkpoint.taken(arrays, "model", "f", (seeds, None, None))
+            law = (seeds, n_a, 2 * model.shape[2])
+            for rows in model:
+                model_rows.unpack(rows, n_a)
+            return {
+                "policy": checkpoint.taken(arrays, "policy", "f", law),
+                "lqt": checkpoint.taken(arrays, "lqt", "f", law),
+                "model": model,
+            }
+        except ValueError as error:
+            raise RunFolderError(
+                f"{path} cannot be read ({error}); write it anew: delete it and result.json, then "
+                f"pdeloop train --resume {self.path}"
+            ) from error
+
+    def result(self) -> dict[str, Any]:
+        """The content of result.json.
+
+        Raises
+        ------
+        RunFolderError
+            It cannot be read, or is not that of a run with these parameters.
+        """
+        path = self.path / "result.json"
+        values = self.values()
+        try:
+            content = read_json(path)
+            check_result(content, values["seed"], values["seeds"])
+            return content
+        except (ValueError, TypeError) as error:
+            raise RunFolderError(
+                f"{path} cannot be used ({error}); is the run finished? Else delete it, and: "
+                f"pdeloop train --resume {self.path}"
+            ) from error
+
+    def _identify(self, identity: RunIdentity, parameters: Mapping[str, Any]) -> RunIdentity:
+        content = {
+            "run": identity.run,
+            "incarnation": identity.incarnation,
+            "plant": parameters.get("plant", 0),
+            "parameters": {k: v for k, v in parameters.items() if k not in TRANSIENT},
+        }
+        write_atomically(self.path / "run.json", json.dumps(content).encode())
+        return identity
+
+
+def timestamp() -> str:
+    """Local time for folder names."""
+    return time.strftime("%Y%m%d-%H%M%S") + f"-{os.getpid()}"
