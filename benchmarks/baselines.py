@@ -50,7 +50,6 @@ BUDGETS = (20, 40, 80)
 LOOKS = {
     "gauss-newton": (CONTROLLERS["gauss_newton"].colour, "-o"),
     "two-point": (CONTROLLERS["lqt_po"].colour, "-o"),
-    "directions": (CONTROLLERS["lqt_po"].colour, "--s"),
     "lqt": (CONTROLLERS["lqt"].colour, "--o"),
     "lqt-again": (CONTROLLERS["lqt"].colour, "-s"),
     "mpc": (CONTROLLERS["lqt"].colour, ":^"),

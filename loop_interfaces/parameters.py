@@ -216,12 +216,9 @@ TUNER = _section(
     Spec(
         "optimizer",
         "gauss_newton",
-        choices=("two_point", "directions", "gauss_newton"),
+        choices=("two_point", "gauss_newton"),
         group="budget and method",
     ).means("method of the adapt phase"),
-    Spec("directions", 4, 1, 1_000_000, group="budget and method").means(
-        "directions D of a step of the optimizer 'directions', which takes 2 D rollouts side by side"
-    ),
     Spec("recorder", "none", choices=("none", "start", "required")).means(
         "none: run without one; start: begin when a recorder is ready, go on if it stops; "
         "required: stop if it stops"
@@ -259,8 +256,8 @@ def with_budget(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def with_identification(given: Mapping[str, Any]) -> dict[str, Any]:
     """The given parameters, with the identification of an optimizer that was tuned for the paper's."""
-    learns_from_costs = given.get("optimizer") in ("two_point", "directions")
-    return {**({"identification": "dmdc"} if learns_from_costs else {}), **given}
+    tuned_for_dmdc = given.get("optimizer") == "two_point"
+    return {**({"identification": "dmdc"} if tuned_for_dmdc else {}), **given}
 
 
 def as_recorded(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -22,7 +22,6 @@ from tuner_node.training import Training
 NOISE = {"measurement_noise": 0.05, "process_noise": 0.02}
 BUDGETS: list[dict[str, Any]] = [
     {"optimizer": "gauss_newton", "rollouts": 15, **NOISE},
-    {"optimizer": "directions", "directions": 3, "rollouts": 26},
     {"optimizer": "two_point", "rollouts": 16},
     {"optimizer": "two_point", "iterations": 3},
 ]
@@ -115,11 +114,9 @@ def test_a_result_that_cannot_be_used_is_not_counted():
             "'rollouts' is 1; expected at least 5: 1 for the exploration, 2 to check",
         ),
         ({"rollouts": 8, "optimizer": "gauss_newton"}, "expected at least 9: .*6 for a step"),
-        ({"rollouts": 10, "optimizer": "directions"}, "expected at least 11: .*8 for a step"),
         ({"rollouts": 2, "identification_attempts": 1}, "expected at least 3: 1 for .*, 2 for a"),
         ({"rollouts": 20, "iterations": 4}, "'rollouts' and 'iterations' both set the budget"),
         ({"iterations": 4, "optimizer": "gauss_newton"}, "'iterations' is 4; expected 'rollouts'"),
-        ({"iterations": 4, "optimizer": "directions"}, "counts no iterations"),
     ],
 )
 def test_a_budget_that_cannot_be_kept_is_refused(options, words):

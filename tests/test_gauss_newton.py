@@ -90,7 +90,7 @@ def test_converges_to_the_known_optimum_of_a_linear_quadratic_plant() -> None:
         again = make(plant, rollouts=36)
         again.restore(optimizer.state())
         assert same_state(again, optimizer)
-    final = mean_cost(plant, optimizer.best_policy)
+    final = mean_cost(plant, optimizer.policy)
     assert start > 1.05 * best
     # The infinite-horizon law is optimal up to the end of the episode.
     assert final == pytest.approx(best, rel=0.01)
@@ -104,7 +104,7 @@ def test_improves_a_plant_that_is_not_linear() -> None:
     start = mean_cost(plant, optimizer.policy)
     while not optimizer.done:
         optimizer.tell(measure(plant, optimizer.ask()))
-    assert mean_cost(plant, optimizer.best_policy) < 0.95 * start
+    assert mean_cost(plant, optimizer.policy) < 0.95 * start
 
 
 def test_asks_are_pure_rows_are_json_and_the_budget_is_kept() -> None:
@@ -209,7 +209,7 @@ def test_a_warm_start_that_diverges_is_halved_until_it_does_not() -> None:
     while not optimizer.done:
         row = optimizer.tell(measure(plant, optimizer.ask()))
         assert json.dumps(row, allow_nan=False)
-    assert mean_cost(plant, optimizer.best_policy) < 1.1 * mean_cost(plant, plant.best)
+    assert mean_cost(plant, optimizer.policy) < 1.1 * mean_cost(plant, plant.best)
 
 
 def test_only_divergence_never_moves_the_policy() -> None:

@@ -100,8 +100,6 @@ def test_recorder_and_viewer_leave_the_core_of_the_pair_to_it(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--directions", "4", "--optimizer", "two_point"], "--directions goes with"),
-        (["--directions", "99"], "'directions' is 99; expected at most 48"),
         (["--in-process", "--pairs", "2"], "leave out --in-process"),
         (["--in-process", "--view"], "leave out --in-process"),
         (["--pairs", "65"], "'pairs' is 65"),

@@ -1,22 +1,20 @@
-"""The zeroth-order optimisers: the paper's update, divergence, checkpoints, determinism."""
+"""The two-point method: the paper's update, divergence, checkpoints, determinism."""
 
 from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 
 from tuner_node import oracle
-from tuner_node.optimizers import OPTIMIZERS, Directions, Optimizer, RolloutResult, TwoPoint
+from tuner_node.optimizers import OPTIMIZERS, GaussNewton, Optimizer, RolloutResult, TwoPoint
 
 SHAPE = (2, 6)
 N_A, N_S = 2, 3
 POLICY = np.random.default_rng(0).standard_normal(SHAPE)
-Make = Callable[..., Optimizer]
 
 
 def cost(policy: np.ndarray, field_seed: int) -> float:
@@ -29,14 +27,6 @@ def two_point(**changes: Any) -> TwoPoint:
     return TwoPoint(POLICY, **(settings | changes))
 
 
-def directions(**changes: Any) -> Directions:
-    settings: dict[str, Any] = {"seed": 3, "rollouts": 24, "learning_rate": 1e-2, "directions": 2}
-    return Directions(POLICY, **(settings | changes))
-
-
-BOTH = pytest.mark.parametrize("make", [two_point, directions])
-
-
 def measure(optimizer: Optimizer) -> list[RolloutResult]:
     return [RolloutResult(cost(r.policy, r.field_seed)) for r in optimizer.ask()]
 
@@ -45,7 +35,7 @@ def test_two_point_is_the_papers_iteration() -> None:
     optimizer = two_point(smoothing_radius=0.2)
     policy = POLICY.copy()
     for k in range(12):
-        theta, field = oracle.orthonormal_directions(3, k, SHAPE, 1)[0], oracle.field_seed(3, k)
+        theta, field = oracle.direction(3, k, SHAPE), oracle.field_seed(3, k)
         plus, minus = policy + 0.2 * theta, policy - 0.2 * theta
         asked = optimizer.ask()
         assert np.array_equal(asked[0].policy, plus)
@@ -58,20 +48,18 @@ def test_two_point_is_the_papers_iteration() -> None:
         assert row["cost_plus"] == cost(plus, field)
         assert row["cost_minus"] == cost(minus, field)
     assert optimizer.done
-    assert np.array_equal(optimizer.best_policy, policy)
+    assert np.array_equal(optimizer.policy, policy)
 
 
-@BOTH
-def test_the_cost_falls(make: Make) -> None:
-    optimizer = make(rollouts=2000)
+def test_the_cost_falls() -> None:
+    optimizer = two_point(rollouts=2000)
     while not optimizer.done:
         optimizer.tell(measure(optimizer))
-    assert cost(optimizer.best_policy, 0) - 1.0 < 0.2 * (cost(POLICY, 0) - 1.0)
+    assert cost(optimizer.policy, 0) - 1.0 < 0.2 * (cost(POLICY, 0) - 1.0)
 
 
-@BOTH
-def test_ask_is_pure_and_rows_are_json(make: Make) -> None:
-    optimizer = make()
+def test_ask_is_pure_and_rows_are_json() -> None:
+    optimizer = two_point()
     total = 0
     while not optimizer.done:
         first, second = optimizer.ask(), optimizer.ask()
@@ -87,11 +75,9 @@ def test_ask_is_pure_and_rows_are_json(make: Make) -> None:
     assert optimizer.ask() == []
 
 
-@BOTH
-def test_what_is_handed_out_cannot_change_the_optimiser(make: Make) -> None:
-    optimizer = make()
+def test_what_is_handed_out_cannot_change_the_optimiser() -> None:
+    optimizer = two_point()
     optimizer.policy[:] = np.nan
-    optimizer.best_policy[:] = np.nan
     for rollout in optimizer.ask():
         rollout.policy[:] = np.nan
     optimizer.state()["policy"][:] = np.nan
@@ -107,13 +93,10 @@ DIVERGED = [
 ]
 
 
-@BOTH
 @pytest.mark.parametrize("bad", DIVERGED)
 @pytest.mark.parametrize("place", [0, 1])
-def test_a_diverged_rollout_stays_out_of_the_policy(
-    make: Make, bad: RolloutResult, place: int
-) -> None:
-    optimizer = make()
+def test_a_diverged_rollout_stays_out_of_the_policy(bad: RolloutResult, place: int) -> None:
+    optimizer = two_point()
     optimizer.tell(measure(optimizer))
     before = optimizer.policy
     results = measure(optimizer)
@@ -122,18 +105,15 @@ def test_a_diverged_rollout_stays_out_of_the_policy(
     assert row["diverged"] == 1
     assert row["updated"] is False
     assert json.dumps(row, allow_nan=False)
-    # Directions goes back to the best iterate, which here is one of the two so far.
-    allowed = [before] if optimizer.name == "two_point" else [before, POLICY]
-    assert any(np.array_equal(optimizer.policy, policy) for policy in allowed)
+    assert np.array_equal(optimizer.policy, before)
     halved = optimizer.tell(measure(optimizer))
     assert halved["learning_rate"] == 0.5 * float(row["learning_rate"])
     assert halved["updated"] is True
     assert optimizer.tell(measure(optimizer))["learning_rate"] == halved["learning_rate"]
 
 
-@BOTH
-def test_an_overflowing_step_stays_out_of_the_policy(make: Make) -> None:
-    optimizer = make(learning_rate=1e300)
+def test_an_overflowing_step_stays_out_of_the_policy() -> None:
+    optimizer = two_point(learning_rate=1e300)
     results = [RolloutResult(1e300 * (i + 1)) for i in range(len(optimizer.ask()))]
     row = optimizer.tell(results)
     assert row["updated"] is False
@@ -141,13 +121,11 @@ def test_an_overflowing_step_stays_out_of_the_policy(make: Make) -> None:
     assert np.array_equal(optimizer.policy, POLICY)
 
 
-@BOTH
-def test_only_divergence_never_moves_the_policy(make: Make) -> None:
-    optimizer = make()
+def test_only_divergence_never_moves_the_policy() -> None:
+    optimizer = two_point()
     while not optimizer.done:
         optimizer.tell([RolloutResult(np.nan, diverged=True)] * len(optimizer.ask()))
     assert np.array_equal(optimizer.policy, POLICY)
-    assert np.array_equal(optimizer.best_policy, POLICY)
 
 
 def through_file(optimizer: Optimizer) -> dict[str, np.ndarray]:
@@ -158,35 +136,32 @@ def through_file(optimizer: Optimizer) -> dict[str, np.ndarray]:
         return dict(stored)
 
 
-@BOTH
-def test_a_restored_training_ends_with_the_same_bits(make: Make) -> None:
+def test_a_restored_training_ends_with_the_same_bits() -> None:
     def step(optimizer: Optimizer) -> dict[str, Any]:
         results = measure(optimizer)
         if optimizer.tells == 2:
             results[0] = RolloutResult(np.nan, diverged=True)
         return optimizer.tell(results)
 
-    whole = make()
+    whole = two_point()
     while not whole.done:
-        again = make()
+        again = two_point()
         again.restore(through_file(whole))
         assert again.tells == whole.tells
         assert step(again) == step(whole)
-        assert np.array_equal(again.best_policy, whole.best_policy)
+        assert np.array_equal(again.policy, whole.policy)
         state, expected = again.state(), whole.state()
         assert all(np.array_equal(state[k], expected[k], equal_nan=True) for k in expected)
 
 
-@BOTH
-def test_refuses_a_foreign_checkpoint_and_stays_as_it_was(make: Make) -> None:
-    optimizer = make()
+def test_refuses_a_foreign_checkpoint_and_stays_as_it_was() -> None:
+    optimizer = two_point()
     with pytest.raises(ValueError, match="seed = 4, but this training has seed = 3"):
-        optimizer.restore(make(seed=4).state())
+        optimizer.restore(two_point(seed=4).state())
     with pytest.raises(ValueError, match="smoothing_radius"):
-        optimizer.restore(make(smoothing_radius=0.5).state())
-    other = two_point() if make is directions else directions()
+        optimizer.restore(two_point(smoothing_radius=0.5).state())
     with pytest.raises(ValueError, match="holds"):
-        optimizer.restore(other.state())
+        optimizer.restore({"policy": POLICY})
     with pytest.raises(ValueError, match=r"has shape \(2, 4\)"):
         optimizer.restore(optimizer.state() | {"policy": POLICY[:, :4]})
     with pytest.raises(ValueError, match="finite"):
@@ -194,9 +169,8 @@ def test_refuses_a_foreign_checkpoint_and_stays_as_it_was(make: Make) -> None:
     assert np.array_equal(optimizer.policy, POLICY)
 
 
-@BOTH
-def test_refuses_the_wrong_number_of_results(make: Make) -> None:
-    optimizer = make()
+def test_refuses_the_wrong_number_of_results() -> None:
+    optimizer = two_point()
     with pytest.raises(ValueError, match="one result per rollout"):
         optimizer.tell(measure(optimizer)[:1])
     while not optimizer.done:
@@ -205,70 +179,22 @@ def test_refuses_the_wrong_number_of_results(make: Make) -> None:
         optimizer.tell([])
 
 
-@BOTH
 @pytest.mark.parametrize("value", [0, -1.0, np.nan, np.inf])
 @pytest.mark.parametrize("name", ["learning_rate", "smoothing_radius", "rollouts"])
-def test_refuses_bad_parameters(make: Make, name: str, value: float) -> None:
+def test_refuses_bad_parameters(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"{name} must be positive"):
-        make(**{name: value})
+        two_point(**{name: value})
 
 
-@pytest.mark.parametrize("cls", [TwoPoint, Directions])
-def test_refuses_bad_policies(cls: Make) -> None:
+def test_refuses_bad_policies() -> None:
     settings: dict[str, Any] = {"seed": 0, "rollouts": 16, "learning_rate": 1.0}
     for policy in (POLICY[0], POLICY[:, :5], POLICY[:0]):
         with pytest.raises(ValueError, match="must have shape"):
-            cls(policy, **settings)
+            TwoPoint(policy, **settings)
     with pytest.raises(ValueError, match="must be finite"):
-        cls(POLICY * np.inf, **settings)
-
-
-def test_directions_of_one_is_the_papers_step() -> None:
-    one, pair = directions(directions=1, learning_rate=1e-3), two_point()
-    one.tell(measure(one))
-    pair.tell(measure(pair))
-    np.testing.assert_allclose(one.policy, pair.policy, rtol=1e-15)
-
-
-def test_directions_average_their_estimates() -> None:
-    optimizer = directions(directions=3)
-    thetas = oracle.orthonormal_directions(3, 0, SHAPE, 3)
-    field = oracle.field_seed(3, 0)
-    estimates = [
-        oracle.gradient(cost(POLICY + 0.1 * t, field), cost(POLICY - 0.1 * t, field), t, 0.1)
-        for t in thetas
-    ]
-    asked = optimizer.ask()
-    assert {r.field_seed for r in asked} == {field}
-    np.testing.assert_array_equal(asked[3].policy, POLICY - 0.1 * thetas[1])
-    optimizer.tell(measure(optimizer))
-    np.testing.assert_allclose(optimizer.policy, POLICY - 1e-2 * np.mean(estimates, axis=0))
-
-
-def test_directions_returns_to_the_best_iterate() -> None:
-    optimizer = directions()
-    optimizer.tell(measure(optimizer))
-    second = optimizer.policy
-    optimizer.tell(measure(optimizer))
-    row = optimizer.tell([RolloutResult(100.0)] * 4)
-    assert row["updated"] is False
-    assert np.array_equal(optimizer.policy, optimizer.best_policy)
-    assert any(np.array_equal(optimizer.best_policy, p) for p in (POLICY, second))
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"directions": 0}, r"1 \.\. 12"),
-        ({"directions": 13}, r"1 \.\. 12"),
-        ({"rollouts": 6, "directions": 4}, r"1 \.\. 3"),
-    ],
-)
-def test_directions_refuses_bad_parameters(changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        directions(**changes)
+        TwoPoint(POLICY * np.inf, **settings)
 
 
 def test_the_registry_knows_every_optimiser_by_its_name() -> None:
     assert all(cls.name == name for name, cls in OPTIMIZERS.items())  # type: ignore[attr-defined]
-    assert {"two_point", "directions"} <= set(OPTIMIZERS)
+    assert set(OPTIMIZERS.values()) == {TwoPoint, GaussNewton}

@@ -44,8 +44,7 @@ def read_model(path: Path, n_a: int) -> NDArray[np.float64]:
 def first_step(values: Mapping[str, Any]) -> int:
     """Rollouts that the optimiser needs to change the policy once."""
     # Gauss-Newton measures the policy it begins with, and then the first candidate.
-    steps = {"two_point": 2, "directions": 2 * values["directions"], "gauss_newton": 2 * FIELDS}
-    return int(steps[values["optimizer"]])
+    return {"two_point": 2, "gauss_newton": 2 * FIELDS}[values["optimizer"]]
 
 
 def check_budget(values: Mapping[str, Any], trajectories: bool, step: int) -> None:
@@ -88,14 +87,6 @@ def build_training(values: Mapping[str, Any]) -> Training:
         "learning_rate": values["learning_rate_from_zero" if from_zero else "learning_rate"],
         "smoothing_radius": values["smoothing_radius"],
     }
-    if values["optimizer"] == "directions":
-        most = 2 * values["n_a"] * order
-        if order and values["directions"] > most:
-            raise ValueError(
-                f"parameter 'directions' is {values['directions']}; expected at most {most}, as "
-                "many as there are entries of the policy"
-            )
-        options["directions"] = values["directions"]
 
     def make_optimizer(
         policy: NDArray[np.float64], seed: int, context: Context | None, rollouts: int

@@ -33,10 +33,8 @@ _FIELD_STREAM = 0x4649454C44  # "FIELD"
 _SEED_LIMIT = 2**53
 
 
-def orthonormal_directions(seed: int, iteration: int, shape: tuple[int, int], count: int) -> Array:
-    """Directions of an iteration, orthonormal in the Frobenius inner product.
-
-    The Q factor of a Gaussian matrix, each direction alone uniform on the sphere.
+def direction(seed: int, iteration: int, shape: tuple[int, int]) -> Array:
+    """Theta of an iteration, uniform on the sphere of unit Frobenius norm.
 
     Parameters
     ----------
@@ -44,27 +42,16 @@ def orthonormal_directions(seed: int, iteration: int, shape: tuple[int, int], co
         Not negative.
     shape : tuple of int
         (n_a, 2 n_s), the shape of a policy.
-    count : int
-        1 .. n_a 2 n_s.
 
     Returns
     -------
-    (count, n_a, 2 n_s) array
+    (n_a, 2 n_s) array
     """
-    size = shape[0] * shape[1]
-    if not 1 <= count <= size:
-        raise ValueError(
-            f"a policy of shape {shape} has 1 .. {size} directions, but {count} were asked for."
-        )
-    rng = np.random.default_rng([seed, _DIRECTION_STREAM, iteration])
-    directions: Array = rng.standard_normal((count, *shape))
-    for i in range(count):
-        # Gram-Schmidt, twice, is orthogonal to rounding.
-        for _ in range(2 if i else 1):
-            for j in range(i):
-                directions[i] -= np.sum(directions[i] * directions[j]) * directions[j]
-            directions[i] /= np.sqrt(np.sum(directions[i] * directions[i]))
-    return directions
+    theta: Array = np.random.default_rng([seed, _DIRECTION_STREAM, iteration]).standard_normal(
+        shape
+    )
+    theta /= np.sqrt(np.sum(theta * theta))
+    return theta
 
 
 def field_seed(seed: int, iteration: int) -> int:

@@ -131,7 +131,7 @@ class Training:
 
     def policies(self) -> Array:
         """The adapted policies, of the shape of the warm starts."""
-        return np.stack([optimizer.best_policy for optimizer in self.optimizers])
+        return np.stack([optimizer.policy for optimizer in self.optimizers])
 
     def warm_starts(self) -> Array:
         """The LQT policies of the models, (S, n_a, 2 n_s)."""

@@ -91,11 +91,6 @@ def _train(options: argparse.Namespace) -> int:
         view=options.view,
     )
     given = given_flags(options)
-    if (
-        options.directions is not None
-        and given.setdefault("optimizer", "directions") != "directions"
-    ):
-        raise ParameterError("--directions goes with --optimizer directions")
     for name in ("rollouts", "iterations"):
         if given.get(name) == 0:
             raise ParameterError(f"--{name} is 0; expected a whole number of at least 1")

@@ -45,13 +45,13 @@ def test_pairs_on_hosts_with_faults_one_of_them_killed_give_the_same_bits() -> N
     assert row["seconds"] < LIMIT
 
 
-def test_the_command_line_starts_pairs_and_directions(loop: Processes, tmp_path) -> None:
-    options = {"rollouts": 25, "directions": 4, "seeds": 2}
+def test_the_command_line_starts_pairs(loop: Processes, tmp_path) -> None:
+    options = {"optimizer": "two_point", "iterations": 3, "seeds": 4}
     words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
     out = tmp_path / "run"
     loop.wait(loop.pdeloop("train", str(SMALL), *words, "--pairs", "2", "--out", str(out)), LIMIT)
-    assert_same_training(out, train_here(parameters(optimizer="directions", **options)))
-    assert len(json.loads((out / "result.json").read_text())["history"]) == 2 * 8 // 4
+    assert_same_training(out, train_here(parameters(**options)))
+    assert len(json.loads((out / "result.json").read_text())["history"]) == 3 * 4
 
 
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")

@@ -10,14 +10,9 @@ from tuner_node.optimizers.base import RolloutResult as RolloutResult
 from tuner_node.optimizers.base import State as State
 from tuner_node.optimizers.base import Trajectory as Trajectory
 from tuner_node.optimizers.gauss_newton import GaussNewton as GaussNewton
-from tuner_node.optimizers.zeroth_order import Directions as Directions
-from tuner_node.optimizers.zeroth_order import TwoPoint as TwoPoint
+from tuner_node.optimizers.two_point import TwoPoint as TwoPoint
 
 # The names that parameters and the command line use.
-OPTIMIZERS: dict[str, Callable[..., Optimizer]] = {
-    cls.name: cls for cls in (TwoPoint, Directions, GaussNewton)
-}
-NEED_TRAJECTORIES = tuple(
-    cls.name for cls in (TwoPoint, Directions, GaussNewton) if cls.needs_trajectories
-)
+OPTIMIZERS: dict[str, Callable[..., Optimizer]] = {cls.name: cls for cls in (TwoPoint, GaussNewton)}
+NEED_TRAJECTORIES = tuple(cls.name for cls in (TwoPoint, GaussNewton) if cls.needs_trajectories)
 """The optimisers whose results must carry their trajectories."""

@@ -136,11 +136,7 @@ class Optimizer(Protocol):
 
     @property
     def policy(self) -> Array:
-        """The current policy, of the shape it began with; always finite."""
-
-    @property
-    def best_policy(self) -> Array:
-        """The policy to use when the training is over."""
+        """The policy so far, of the shape it began with; always finite."""
 
     @property
     def tells(self) -> int:

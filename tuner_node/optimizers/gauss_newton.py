@@ -181,8 +181,6 @@ class GaussNewton:
         """The incumbent: the best policy so far."""
         return self._now.policy.copy()
 
-    best_policy = policy
-
     @property
     def tells(self) -> int:
         """How many times `tell` was called."""

@@ -1,0 +1,154 @@
+"""Descent along two-point estimates of the gradient, which need costs alone; the paper's method.
+
+Each step draws one direction Theta and one initial field, measures the rollouts pi +- r Theta on it,
+and steps along the estimate of `tuner_node.oracle`,
+
+    pi <- pi - eta (n_a n_s / r) (J(pi + r Theta) - J(pi - r Theta)) Theta.
+
+A step with a diverged rollout, or that would not be finite, is not taken and halves eta from then on.
+
+References
+----------
+Zhang, Mowlavi, Benosman, Basar, "Policy Optimization for PDE Control with a Warm Start",
+arXiv:2403.01005, section IV.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tuner_node import oracle
+from tuner_node.optimizers.base import (
+    Array,
+    Context,
+    Rollout,
+    RolloutResult,
+    Row,
+    State,
+    checked_policy,
+    require_positive,
+    require_results,
+    require_state,
+)
+
+
+class TwoPoint:
+    """Policy optimisation from costs alone.
+
+    Parameters
+    ----------
+    policy0 : (n_a, 2 n_s) array
+        Where to start.
+    seed : int
+        Determines all directions and fields.
+    rollouts : int
+        The budget, spent in floor(rollouts / 2) steps.
+    learning_rate : float
+        eta, for the mean stage cost. Too large: rollouts diverge and it halves itself.
+    smoothing_radius : float
+        r. Too large: the estimate is that of a smoother cost, and rollouts diverge.
+    context : Context, optional
+        Not used; every optimiser takes it.
+    """
+
+    name = "two_point"
+    needs_trajectories = False
+
+    def __init__(
+        self,
+        policy0: ArrayLike,
+        *,
+        seed: int,
+        rollouts: int,
+        learning_rate: float,
+        smoothing_radius: float = 0.1,
+        context: Context | None = None,
+    ) -> None:
+        require_positive(
+            rollouts=rollouts, learning_rate=learning_rate, smoothing_radius=smoothing_radius
+        )
+        self._policy = checked_policy(policy0)
+        self._seed = seed
+        self._steps = rollouts // 2
+        self._learning_rate = learning_rate
+        self._radius = smoothing_radius
+        self._tells = 0
+
+    @property
+    def policy(self) -> Array:
+        """The current policy."""
+        return self._policy.copy()
+
+    @property
+    def tells(self) -> int:
+        """Steps that are over, two rollouts each."""
+        return self._tells
+
+    @property
+    def done(self) -> bool:
+        """Whether the budget is used."""
+        return self._tells >= self._steps
+
+    def ask(self) -> list[Rollout]:
+        """The rollouts pi + r Theta and pi - r Theta on one field."""
+        if self.done:
+            return []
+        field, moved = self._field_seed(), self._radius * self._direction()
+        return [Rollout(self._policy + moved, field), Rollout(self._policy - moved, field)]
+
+    def tell(self, results: Sequence[RolloutResult]) -> Row:
+        """Step along the estimate, or halve the learning rate."""
+        require_results(results, 0 if self.done else 2)
+        row: Row = {
+            "rollouts": 2 * (self._tells + 1),
+            "iteration": self._tells + 1,
+            "field_seed": self._field_seed(),
+            "learning_rate": self._learning_rate,
+            "diverged": sum(not result.usable for result in results),
+        }
+        for key, result in zip(("cost_plus", "cost_minus"), results, strict=True):
+            if result.usable:
+                row[key] = float(result.cost)
+        row["updated"] = False
+        if not row["diverged"]:
+            plus, minus = (float(result.cost) for result in results)
+            # Finite costs can still be so large that the step overflows.
+            with np.errstate(over="ignore", invalid="ignore"):
+                estimate = oracle.gradient(plus, minus, self._direction(), self._radius)
+                policy = self._policy - self._learning_rate * estimate
+                norm = float(np.sqrt(np.sum(estimate * estimate)))
+            if np.isfinite(plus + minus):
+                row["cost"] = (plus + minus) / 2
+            if np.isfinite(policy).all() and np.isfinite(norm):
+                self._policy = policy
+                row |= {"gradient_norm": norm, "updated": True}
+        if not row["updated"]:
+            self._learning_rate *= 0.5
+        self._tells += 1
+        return row
+
+    def state(self) -> State:
+        """The policy, the steps and the learning rate, with the parameters they belong to."""
+        return {
+            "policy": self._policy.copy(),
+            "tells": np.array(self._tells),
+            "learning_rate": np.array(self._learning_rate),
+            "seed": np.array(self._seed),
+            "smoothing_radius": np.array(self._radius),
+        }
+
+    def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
+        """Continue from a checkpoint with the same seed and radius."""
+        require_state(state, self.state(), ("seed", "smoothing_radius"))
+        policy, learning_rate = checked_policy(state["policy"]), state["learning_rate"].item()
+        require_positive(learning_rate=float(learning_rate))
+        self._policy, self._learning_rate = policy, float(learning_rate)
+        self._tells = int(state["tells"].item())
+
+    def _field_seed(self) -> int:
+        return oracle.field_seed(self._seed, self._tells)
+
+    def _direction(self) -> Array:
+        n_a, columns = self._policy.shape
+        return oracle.direction(self._seed, self._tells, (n_a, columns))
