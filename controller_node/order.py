@@ -61,7 +61,14 @@ class OrderStudy:
     suggested: int
 
     def rows(self) -> list[dict[str, float]]:
-        """For each order: it, its singular value relative to the largest, and its errors."""
+        """The study as a table.
+
+        Returns
+        -------
+        list of dict
+            For each order: `order`, `singular_value` relative to the largest, and the relative errors
+            `one_step_error` and `rollout_error`.
+        """
         relative = self.singular_values[self.orders - 1] / self.singular_values[0]
         columns = (self.orders, relative, self.one_step, self.rollout)
         names = ("order", "singular_value", "one_step_error", "rollout_error")
@@ -71,7 +78,13 @@ class OrderStudy:
         ]
 
     def text(self) -> str:
-        """A table of the orders, for people."""
+        """The study as a table to be printed.
+
+        Returns
+        -------
+        str
+            A line of names, one for each order, and a note; the suggested order is marked.
+        """
         lines = ["  order  singular value  one-step error  rollout error"]
         for row in self.rows():
             order, *numbers = row.values()

@@ -26,11 +26,16 @@ class ReducedModel:
     Attributes
     ----------
     A : (n_s, n_s) array
+        A read-only copy, as are the others.
     B : (n_s, n_a) array
+        Of the actions.
     U : (n_z, n_s) array
         Orthonormal columns; the largest entry of each column is positive, so that U is unique.
 
-    The arrays are read-only copies. A ValueError names the array whose shape or values do not fit.
+    Raises
+    ------
+    ValueError
+        Names the array whose shape or values do not fit.
     """
 
     A: Array

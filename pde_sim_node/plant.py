@@ -44,7 +44,14 @@ class EpisodeCosts:
     diverged_step: NDArray[np.int64]
 
     def rows(self) -> NDArray[np.float64]:
-        """As `episode/cost` has them, (M, 3), see CostColumn."""
+        """As the topic `episode/cost` has them.
+
+        Returns
+        -------
+        (M, 3)
+            mean, total, and the step in which the environment diverged, or a number that stands for a
+            completed episode, as in docs/interfaces.md.
+        """
         ended = np.where(self.diverged_step >= 0, self.diverged_step, COMPLETED)
         return np.column_stack([self.mean, self.total, ended.astype(np.float64)])
 
@@ -343,6 +350,11 @@ class Plant:
         -------
         (M, n_z), (M,)
             New arrays: the states z_{k+1} and the stage costs l_k.
+
+        Raises
+        ------
+        ValueError
+            States and actions have other shapes.
         """
         new = np.array(states, dtype=np.float64, order="C")
         held = np.array(actions, dtype=np.float64, order="C")
@@ -359,7 +371,13 @@ class Plant:
         return new, costs
 
     def episode_costs(self) -> EpisodeCosts:
-        """The costs of the episode so far."""
+        """The costs of the episode so far.
+
+        Returns
+        -------
+        EpisodeCosts
+            Mean and sum of the stage costs of each environment, and where it diverged.
+        """
         diverged = self.diverged_step >= 0
         total = np.where(diverged, DIVERGED_COST * self.horizon, self.totals)
         mean = np.where(diverged, DIVERGED_COST, self.totals / max(self.step_index, 1))

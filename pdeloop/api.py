@@ -55,6 +55,16 @@ class Problem:
         `Plant.reset` begins another episode, of any M. `states` (M, n_z) are the fields, `step`
         takes actions (M, n_a), and `episode_costs` has what it cost so far.
 
+        Parameters
+        ----------
+        batch
+            M, at least 1.
+
+        Returns
+        -------
+        Plant
+            With noise, limits and sensors where the problem has them.
+
         Raises
         ------
         ValueError
@@ -66,6 +76,11 @@ class Problem:
 
     def explore(self, seed: int = 0) -> tuple[Array, Array]:
         """The exploratory episode that a training with this seed begins with.
+
+        Parameters
+        ----------
+        seed
+            Of the training, from 0 on.
 
         Returns
         -------
@@ -104,6 +119,11 @@ def problem(
     parameters
         Any parameter of docs/interfaces.md by name: n_z, n_a, horizon, measurement_noise, ... Code of
         an own equation ('file.py:Class') is run if it is named here as `equation`.
+
+    Returns
+    -------
+    Problem
+        With all parameters checked against their ranges.
 
     Raises
     ------

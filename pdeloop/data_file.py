@@ -44,11 +44,22 @@ class Measurements:
 def read_measurements(path: str | Path) -> Measurements:
     """The measurements in a file.
 
-    .npz : `states` (N + 1, n_z), `actions` (N, n_a), `target` (n_z,), `sample_time`; with one axis
-        more in front of states and actions where there are several trajectories.
-    .csv : a line of names, t, z..., a..., then a line for each instant; a time that does not grow
-        begins another trajectory, and the actions of a trajectory's last line are not used. The line
-        whose t is the word target has z_r.
+    In a .npz file are the arrays `states` (N + 1, n_z), `actions` (N, n_a), `target` (n_z,) and
+    `sample_time` (s), with one axis more in front of states and actions where there are several
+    trajectories.
+
+    A .csv file has a line of names, t, z..., a..., then a line for each instant, t in s. A time that
+    does not grow begins another trajectory, and the actions of a trajectory's last line are not used.
+    The line whose t is the word target has z_r.
+
+    Parameters
+    ----------
+    path
+        Of the file, which ends in .npz or .csv.
+
+    Returns
+    -------
+    Measurements
 
     Raises
     ------

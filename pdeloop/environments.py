@@ -65,13 +65,45 @@ class Environment(gymnasium.Env[Array, Array]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Begin an episode with the field of this seed, or of one that is drawn; (state_size,)."""
+        """Begin an episode.
+
+        Parameters
+        ----------
+        seed
+            Of the initial field; without one it is drawn.
+        options
+            Not used.
+
+        Returns
+        -------
+        observation : (state_size,) array
+            z_0, as it is measured.
+        info : dict
+            Empty.
+        """
         super().reset(seed=seed)
         states = self.plant.reset([field_seed(self.np_random) if seed is None else seed])
         return states[0].copy(), {}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """Hold the action (n_a,) for a sampling time."""
+        """Hold the action for a sampling time.
+
+        Parameters
+        ----------
+        action : (n_a,) array
+            a_k.
+
+        Returns
+        -------
+        observation : (state_size,) array
+            z_{k+1}, as it is measured.
+        reward : float
+            Minus the stage cost of z_k and a_k, and minus the penalty if the plant diverged.
+        terminated, truncated : bool
+            Whether the plant diverged, and whether the horizon is reached.
+        info : dict
+            Empty.
+        """
         plant = self.plant
         plant.totals.fill(0.0)  # so that they are those of this step, to the bit
         states = plant.step(np.asarray(action)[np.newaxis])
@@ -122,7 +154,27 @@ class VectorEnvironment(VectorEnv[Array, Array, NDArray[Any]]):
         seed: int | Sequence[int] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Array, dict[str, Any]]:
-        """Begin M episodes, with the fields of seeds s, s + 1, ... or of a list's; (M, state_size)."""
+        """Begin M episodes.
+
+        Parameters
+        ----------
+        seed
+            s of the initial fields s, s + 1, ..., or a list of M; without one they are drawn.
+        options
+            Not used.
+
+        Returns
+        -------
+        observations : (M, state_size) array
+            The states z_0, as they are measured.
+        info : dict
+            Empty.
+
+        Raises
+        ------
+        ValueError
+            A list of other than M seeds.
+        """
         if seed is None:
             seeds = self._field_seeds(range(self.num_envs))
         else:
@@ -136,7 +188,24 @@ class VectorEnvironment(VectorEnv[Array, Array, NDArray[Any]]):
     def step(
         self, actions: Array
     ) -> tuple[Array, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """Hold the actions (M, n_a) for a sampling time; those of ended environments do not count."""
+        """Hold the actions for a sampling time.
+
+        Parameters
+        ----------
+        actions : (M, n_a) array
+            a_k; those of ended environments do not count.
+
+        Returns
+        -------
+        observations : (M, state_size) array
+            The states z_{k+1}, as they are measured.
+        rewards : (M,) array
+            As of `Environment.step`.
+        terminated, truncated : (M,) bool arrays
+            Whether an environment diverged, and whether the horizon is reached.
+        info : dict
+            Empty.
+        """
         plant, again = self.plant, np.flatnonzero(self._ended)
         if len(again) == self.num_envs:
             states, info = self.reset()
@@ -173,7 +242,18 @@ def spaces(plant: Plant) -> tuple[Space[Any], Space[Any]]:
 
 
 def environment_id(problem: str) -> str:
-    """The id of a shipped problem: pdeloop/AllenCahn-v0 of allen-cahn."""
+    """The id of a shipped problem.
+
+    Parameters
+    ----------
+    problem
+        Its name, like allen-cahn.
+
+    Returns
+    -------
+    str
+        Of `gymnasium.make`, like pdeloop/AllenCahn-v0.
+    """
     return f"pdeloop/{''.join(word.capitalize() for word in problem.split('-'))}-v0"
 
 

@@ -72,8 +72,11 @@ class FinishedRun:
     def trajectories(self) -> Iterator[EpisodeRecord]:
         """The complete episodes in the run's bag, in their order, each when it is asked for.
 
-        The states (T + 1, M, state_size) are those that were published; so are the `fields`, as a bag
-        has no others.
+        Yields
+        ------
+        EpisodeRecord
+            Its states (T + 1, M, state_size) are those that were published; so are the `fields`, as a
+            bag has no others.
 
         Raises
         ------
@@ -100,6 +103,15 @@ class FinishedRun:
 
 def load_run(folder: str | Path) -> FinishedRun:
     """A finished run from its folder: costs, policies, models and trajectories as arrays.
+
+    Parameters
+    ----------
+    folder
+        As `pdeloop train --out` or `pdeloop.train(..., out=...)` leaves it.
+
+    Returns
+    -------
+    FinishedRun
 
     Raises
     ------

@@ -34,7 +34,7 @@ class CostGradient(NamedTuple):
     ----------
     cost : float
         J, the mean stage cost, averaged over the M initial fields; infinite if a rollout diverges.
-    gradient : array
+    gradient : (T, M, n_a) or (n_a, 2 n_s) array
         dJ/da or dJ/dpolicy, of its argument's shape; zero if a rollout diverges.
     of_fields : (M, n_z) array
         dJ/dz_0.
@@ -99,6 +99,16 @@ class Gradients:
             a_k from each of the M fields, for the T steps of an episode.
         fields : (M,) int, or (M, n_z)
             Initial fields.
+
+        Returns
+        -------
+        CostGradient
+            J, dJ/da (T, M, n_a) and dJ/dz_0 (M, n_z).
+
+        Raises
+        ------
+        ValueError
+            Shapes that do not fit the plant, NaN or infinity.
         """
         shape = self.plant.horizon, len(np.asarray(fields)), self.plant.n_a
         given = finite_array("actions", actions, shape)
@@ -115,6 +125,16 @@ class Gradients:
             [K_a K_b].
         fields : (M,) int, or (M, n_z)
             Initial fields.
+
+        Returns
+        -------
+        CostGradient
+            J, dJ/dpolicy (n_a, 2 n_s) and dJ/dz_0 (M, n_z).
+
+        Raises
+        ------
+        ValueError
+            Shapes that do not fit the plant, NaN or infinity.
         """
         basis = np.asarray(U, dtype=np.float64)
         basis = finite_array("U", U, (self.plant.n_z, *basis.shape[1:2]))
@@ -128,11 +148,41 @@ class Gradients:
         return found._replace(gradient=by_policy)
 
     def of_law(self, U: Array, theta: Array, fields: ArrayLike) -> CostGradient:
-        """J and dJ/dtheta of the law a = theta [U^T z; 1], theta (n_a, n_s + 1)."""
+        """J and dJ/dtheta of the law a = theta [U^T z; 1].
+
+        Parameters
+        ----------
+        U : (n_z, n_s)
+            Basis.
+        theta : (n_a, n_s + 1)
+            [K b]; b counts nothing where the target lies outside of U.
+        fields : (M,) int, or (M, n_z)
+            Initial fields.
+
+        Returns
+        -------
+        CostGradient
+            J, dJ/dtheta (n_a, n_s + 1) and dJ/dz_0 (M, n_z).
+        """
         return self._gradient(self.law(U, theta, fields), theta, U)
 
     def law(self, U: Array, theta: Array, fields: ArrayLike) -> EpisodeRecord:
-        """An episode under a law; infinite costs where it makes the actions overflow."""
+        """An episode under the law a = theta [U^T z; 1].
+
+        Parameters
+        ----------
+        U : (n_z, n_s)
+            Basis.
+        theta : (n_a, n_s + 1)
+            [K b].
+        fields : (M,) int, or (M, n_z)
+            Initial fields.
+
+        Returns
+        -------
+        EpisodeRecord
+            Without states and with infinite costs where the law makes the actions overflow.
+        """
         return self._roll(
             fields, lambda _, states: features(U, self.plant.target, states) @ theta.T
         )

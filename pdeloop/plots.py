@@ -28,6 +28,19 @@ __all__ = [
 def plot_episode(plant: Plant, episode: EpisodeRecord, environment: int = 0) -> Figure:
     """One environment of an episode: its field in space and time, and its actions.
 
+    Parameters
+    ----------
+    plant
+        Whose episode it was: it gives the axes, in m and s.
+    episode
+        As `rollout` returns it.
+    environment
+        Which of the M, from 0 on.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
     Raises
     ------
     ValueError
@@ -56,27 +69,77 @@ def plot_episode(plant: Plant, episode: EpisodeRecord, environment: int = 0) -> 
 
 
 def plot_costs(run: FinishedRun) -> Figure:
-    """Mean stage cost of no control, LQT and the adapted policy, over seeds and fields."""
+    """Mean stage cost of no control, LQT and the adapted policy, over seeds and fields.
+
+    Parameters
+    ----------
+    run
+        A finished training.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
     return _drawn(lambda data: learning.bars([data]), run)
 
 
 def plot_training(run: FinishedRun) -> Figure:
-    """Cost against rollouts, relative to LQT: mean and standard deviation over the seeds."""
+    """Cost against rollouts, relative to LQT: mean and standard deviation over the seeds.
+
+    Parameters
+    ----------
+    run
+        A finished training.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
     return _drawn(lambda data: learning.training_curves([data]), run)
 
 
 def plot_behaviour(run: FinishedRun) -> Figure:
-    """Fields, actions and final profiles of the first seed's controllers from the mean field."""
+    """Fields, actions and final profiles of the first seed's controllers from the mean field.
+
+    Parameters
+    ----------
+    run
+        A finished training.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
     return _drawn(figures.behaviour, run)
 
 
 def plot_gains(run: FinishedRun) -> Figure:
-    """The gains K_a and K_b of the first seed, before and after the adaptation."""
+    """The gains K_a and K_b of the first seed, before and after the adaptation.
+
+    Parameters
+    ----------
+    run
+        A finished training.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
     return _drawn(figures.gains, run)
 
 
 def plot_spectrum(run: FinishedRun) -> Figure:
-    """Eigenvalues of the reduced models, without control and with each controller's gains."""
+    """Eigenvalues of the reduced models, without control and with each controller's gains.
+
+    Parameters
+    ----------
+    run
+        A finished training.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
     return _drawn(figures.spectrum, run)
 
 
