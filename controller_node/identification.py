@@ -75,6 +75,8 @@ def identify(
     ValueError
         The data allow no such model, or there is no such method.
     """
+    if not any(np.any(actions) for _, actions in trajectories):
+        raise ValueError("all actions are zero, which says nothing of B; excite the plant")
     n_s = n_s or study_orders(trajectories).suggested
     if method in ("field", "regression"):
         return regression.identify(trajectories, n_s=n_s)

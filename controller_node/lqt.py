@@ -62,6 +62,11 @@ class Gains(NamedTuple):
     P: Array
     poles: NDArray[np.complex128]
 
+    def __repr__(self) -> str:
+        n_a, n_s = self.K_a.shape
+        radius = np.abs(self.poles).max()
+        return f"Gains(K_a and K_b of {n_a} x {n_s}, closed loop of spectral radius {radius:.4g})"
+
     @property
     def policy(self) -> Array:
         """[K_a K_b], shape (n_a, 2 n_s)."""

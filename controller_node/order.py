@@ -60,6 +60,10 @@ class OrderStudy:
     rollout: Array
     suggested: int
 
+    def __repr__(self) -> str:
+        tried = f"{self.orders.min()} to {self.orders.max()}"
+        return f"OrderStudy(order {self.suggested} suggested of {tried})"
+
     def rows(self) -> list[dict[str, float]]:
         """The study as a table.
 

@@ -63,6 +63,11 @@ class ReducedModel:
                 f"and B with {n_s} rows, but A is {self.A.shape} and B is {self.B.shape}."
             )
 
+    def __repr__(self) -> str:
+        return (
+            f"ReducedModel(order {self.n_s}: A, B with {self.n_a} inputs, U with {self.n_z} rows)"
+        )
+
     @property
     def n_z(self) -> int:
         """Dimension of the full state."""

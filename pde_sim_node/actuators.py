@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pde_sim_node.equations import Equation
+from pde_sim_node.equations.base import result_of
 from pde_sim_node.supports import indicator_supports, placed_supports
 
 
@@ -48,7 +49,7 @@ def actuator_supports(
             f"{len(positions)}"
         )
     if shape == "equation" and not len(positions):
-        supports = np.array(equation.supports(x, n_a, width), np.float64)
+        supports = np.array(result_of(equation.supports, x, n_a, width), np.float64)
         if supports.shape != (len(x), n_a) or not np.isfinite(supports).all():
             raise ValueError(
                 f"supports of the equation must return {len(x)} x {n_a} finite numbers, got shape "

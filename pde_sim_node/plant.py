@@ -13,6 +13,7 @@ from loop_interfaces.topics import COMPLETED
 from pde_sim_node.actuators import actuator_supports
 from pde_sim_node.arguments import grid_points, internal_steps, positive, whole
 from pde_sim_node.equations import Equation, LinearEquation
+from pde_sim_node.equations.base import result_of
 from pde_sim_node.solver.exact import exact_step
 from pde_sim_node.solver.kernel import etdrk4_step
 from pde_sim_node.solver.memory import StepSettings
@@ -156,7 +157,7 @@ class Plant:
         self.supports = actuator_supports(
             equation, self.x, self.n_a, positive("width", width), shape, positions
         )
-        self.field_target = self._checked("target", equation.target(self.x))
+        self.field_target = self._checked("target", result_of(equation.target, self.x))
         self.target = self.field_target
         make_step = exact_step if isinstance(equation, LinearEquation) else etdrk4_step
         began, before = time.perf_counter(), compilations()
@@ -280,7 +281,7 @@ class Plant:
         fields = {}
         for seed in set(seeds.tolist()):
             rng = None if seed == MEAN_FIELD else np.random.default_rng(seed)
-            field = self.equation.initial_field(self.x, rng)
+            field = result_of(self.equation.initial_field, self.x, rng)
             fields[seed] = self._checked("initial_field", field)
         return np.stack([fields[seed] for seed in seeds.tolist()])
 

@@ -49,6 +49,10 @@ class Problem:
     given: Mapping[str, Any]
     values: Mapping[str, Any]
 
+    def __repr__(self) -> str:
+        given = "".join(f", {name}={value!r}" for name, value in self.given.items())
+        return f"Problem({self.source!r}{given})"
+
     def plant(self, batch: int = 1) -> Plant:
         """A plant of M = `batch` environments, at the start of an episode with the fields 0 .. M - 1.
 

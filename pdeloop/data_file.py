@@ -19,6 +19,8 @@ __all__ = ["Measurements", "read_measurements"]
 Array = NDArray[np.float64]
 MAX_TEXT_BYTES = 2**28
 """Of a .csv file."""
+LARGEST = 1e100
+"""Magnitude of a number, so that squares and their sums stay finite."""
 NAMES = ("states", "actions", "target", "sample_time")
 
 
@@ -96,6 +98,12 @@ def _check(found: Measurements) -> None:
             )
         if not (np.isfinite(states).all() and np.isfinite(actions).all()):
             raise ValueError(f"expected finite numbers, got NaN or infinity in trajectory {number}")
+        largest = max(np.abs(states).max(), np.abs(actions).max())
+        if largest > LARGEST:
+            raise ValueError(
+                f"expected numbers of magnitude {LARGEST:g} at most, got {largest:g} in trajectory "
+                f"{number}"
+            )
     if not found.trajectories:
         raise ValueError("it holds no trajectory of two states or more")
     if not np.isfinite(target).all():
@@ -117,6 +125,11 @@ def _npz(path: Path) -> Measurements:
     if times.size != 1:
         raise ValueError(f"expected one number as sample_time, got shape {times.shape}")
     several = states.ndim == 3
+    if several and (actions.ndim != 3 or len(actions) != len(states)):
+        raise ValueError(
+            "expected states (K, N + 1, n_z) and actions (K, N, n_a) of K trajectories, got shapes "
+            f"{states.shape} and {actions.shape}"
+        )
     pairs = zip(states, actions, strict=True) if several else [(states, actions)]
     return Measurements(list(pairs), target, float(times.reshape(())))
 
@@ -149,6 +162,10 @@ def _table(lines: Iterator[list[str]]) -> Measurements:
         if len(line) != len(head):
             raise ValueError(f"expected {len(head)} values in row {number}, got {len(line)}")
         if line[0].strip() == "target":
+            if target is not None:
+                raise ValueError(
+                    f"expected one row whose t is the word target, got another, {number}"
+                )
             target = _numbers(line[1 : 1 + n_z], number)
             continue
         rows.append(_numbers(line, number))

@@ -60,7 +60,7 @@ class Environment(gymnasium.Env[Array, Array]):
     ) -> None:
         self.plant = pdeloop.problem(problem, **parameters).plant()
         self.observation_space, self.action_space = spaces(self.plant)
-        self._penalty = divergence_penalty
+        self._penalty = penalty(divergence_penalty)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -139,12 +139,14 @@ class VectorEnvironment(VectorEnv[Array, Array, NDArray[Any]]):
         divergence_penalty: float = DIVERGED_COST,
         **parameters: Any,
     ) -> None:
+        if not isinstance(num_envs, int) or num_envs < 1:
+            raise ValueError(f"num_envs is {num_envs!r}; expected a whole number of 1 or more")
         self.num_envs = num_envs
         self.plant = pdeloop.problem(problem, **parameters).plant(num_envs)
         self.single_observation_space, self.single_action_space = spaces(self.plant)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._penalty = divergence_penalty
+        self._penalty = penalty(divergence_penalty)
         self._generators = [np_random()[0] for _ in range(num_envs)]
         self._ended = np.zeros(num_envs, dtype=np.bool_)
 
@@ -178,7 +180,8 @@ class VectorEnvironment(VectorEnv[Array, Array, NDArray[Any]]):
         if seed is None:
             seeds = self._field_seeds(range(self.num_envs))
         else:
-            seeds = [seed + m for m in range(self.num_envs)] if isinstance(seed, int) else [*seed]
+            given = np.atleast_1d(seed).tolist()
+            seeds = given if np.ndim(seed) else [given[0] + m for m in range(self.num_envs)]
             if len(seeds) != self.num_envs:
                 raise ValueError(f"expected {self.num_envs} seeds, one for each, got {len(seeds)}")
             self._generators = [np_random(own)[0] for own in seeds]
@@ -228,6 +231,13 @@ class VectorEnvironment(VectorEnv[Array, Array, NDArray[Any]]):
 def field_seed(generator: np.random.Generator) -> int:
     """The seed of the next initial field."""
     return int(generator.integers(2**53))
+
+
+def penalty(given: float) -> float:
+    """The divergence penalty. ValueError unless it is a finite number of 0 or more."""
+    if not 0 <= given < np.inf:
+        raise ValueError(f"divergence_penalty is {given!r}; expected a finite number of 0 or more")
+    return given
 
 
 def spaces(plant: Plant) -> tuple[Space[Any], Space[Any]]:

@@ -42,6 +42,12 @@ class EpisodeRecord:
     actions: Array
     costs: EpisodeCosts
 
+    def __repr__(self) -> str:
+        steps, cost = len(self.actions), self.costs.mean
+        return (
+            f"EpisodeRecord({steps} steps of {len(cost)} environments, mean cost {cost.mean():.4g})"
+        )
+
     @property
     def whole(self) -> bool:
         """Whether no environment diverged."""

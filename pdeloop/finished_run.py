@@ -57,6 +57,10 @@ class FinishedRun:
     costs: dict[str, Array]
     rollouts: list[dict[str, int]]
 
+    def __repr__(self) -> str:
+        means = ", ".join(f"{name} {costs.mean():.4g}" for name, costs in self.costs.items())
+        return f"FinishedRun({self.values['problem']}, {len(self.policies)} seeds, mean costs: {means})"
+
     @property
     def seeds(self) -> range:
         """The training seeds."""

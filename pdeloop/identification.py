@@ -17,6 +17,7 @@ from controller_node.identification import DesignSettings, design
 from controller_node.order import OrderStudy, study_orders
 from loop_interfaces.model_rows import ModelRows, pack
 from loop_interfaces.parameters import as_recorded, model_order, table
+from loop_interfaces.spec import ParameterError
 from loop_interfaces.topics import COMPLETED, CostColumn
 from pdeloop.bags.episodes import RecordedEpisode
 from pdeloop.bags.reader import Bag
@@ -141,16 +142,22 @@ def _identified(
             f"{given['reduced_order']}"
         )
     values = {**recorded, **given}
+    study, none = None, ""
     try:
         study = study_orders(trajectories)
-    except ValueError:  # too few steps; the model itself may still be had
-        study = None
+    except ValueError as error:  # too few steps; the model itself may still be had
+        none = str(error)
     defaults = {spec.name: spec.default for spec in table()} | {"reduced_order": 0}
     order = model_order({**defaults, **values}) or (study and study.suggested)
     if not order:
-        raise BagError("there are too few steps to suggest an order; give it with --order")
+        raise BagError(f"no order can be suggested: {none}; or give one with --order")
     own = {"n_a": trajectories[0][1].shape[1], "reduced_order": order, "dmdc_order": order}
     settings = DesignSettings.of({**defaults, **values, **own})
+    if given.get("dmdc_rank") and settings.identification != "dmdc":
+        raise ParameterError(
+            f"--rank is that of the identification dmdc, and this one is {settings.identification}: "
+            "add --identification dmdc, or leave --rank out"
+        )
     model = design(trajectories, target, settings)
     steps = sum(len(actions) for _, actions in trajectories)
     return Identified(model, sources, steps, study, values.get("sample_time"))

@@ -73,6 +73,24 @@ def test_its_parts_make_what_the_training_made(run, small) -> None:
         assert same_bits(pdeloop.rollout(plant, law, fields).costs.mean, costs[0])
 
 
+def test_what_a_session_shows_of_an_object_is_one_line(run, small) -> None:
+    plant, trajectory = small.plant(), small.explore()
+    model = pdeloop.identify(trajectory, n_s=2)
+    gains = pdeloop.track(model, state_weight=1.0, action_weight=1.0)
+    still = pdeloop.rollout(plant, lambda k, z: np.zeros((1, plant.n_a)), [0])
+    for shown, words in (
+        (pdeloop.problem("kdv", n_z=64), "Problem('kdv', n_z=64)"),
+        (plant, "Plant(burgers: state of "),
+        (model, "ReducedModel(order 2: "),
+        (gains, f"Gains(K_a and K_b of {plant.n_a} x 2, closed loop of spectral radius 0."),
+        (pdeloop.study_orders([trajectory]), "OrderStudy(order "),
+        (still, f"EpisodeRecord({plant.horizon} steps of 1 environments, mean cost "),
+        (run, "FinishedRun(small, 1 seeds, mean costs: none "),
+    ):
+        assert repr(shown).startswith(words)
+        assert "\n" not in repr(shown) and len(repr(shown)) < 120
+
+
 def test_a_law_saturates_where_the_plant_does() -> None:
     plant = pdeloop.problem(SMALL, action_limit=0.2).plant()
     law = pdeloop.projected_law(plant, np.eye(plant.n_z)[:, :2], np.full((plant.n_a, 4), 9.0))
@@ -81,7 +99,6 @@ def test_a_law_saturates_where_the_plant_does() -> None:
 
 def test_what_does_not_fit_is_refused_in_one_sentence(small) -> None:
     plant, (states, actions) = small.plant(), small.explore()
-    assert repr(plant).startswith("Plant(burgers: state of ")
     n_z, n_a = plant.n_z, plant.n_a
     basis, gradients = np.eye(n_z)[:, :2], pdeloop.Gradients(plant)
     holes = np.where(np.arange(n_a) < 1, np.nan, np.zeros((plant.horizon, 1, n_a)))

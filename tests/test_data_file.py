@@ -63,7 +63,15 @@ NAN = np.full((61, 4), np.nan)
         ({"actions": np.zeros((60, 0))}, "same n_z numbers"),
         ({"target": np.zeros(3)}, "same n_z numbers"),
         ({"target": np.full(4, np.inf)}, "target of finite numbers"),
-        ({"states": np.zeros((2, 61, 4))}, "zip|shapes"),
+        (
+            {"states": np.zeros((2, 61, 4))},
+            r"K trajectories, got shapes \(2, 61, 4\) and \(60, 2\)",
+        ),
+        (
+            {"states": np.zeros((2, 61, 4)), "actions": np.zeros((1, 60, 2))},
+            r"K trajectories, got shapes \(2, 61, 4\) and \(1, 60, 2\)",
+        ),
+        ({"actions": np.full((60, 2), 1e200)}, r"magnitude 1e\+100 at most, got 1e\+200"),
         ({"states": np.array(["x"])}, "real numbers in states"),
         ({"states": np.array([object()])}, "holds no arrays"),
         ({"sample_time": 0.0}, "sample_time above 0"),
@@ -89,6 +97,7 @@ def test_a_flawed_npz_is_refused(tmp_path: Path, changes: dict[str, Any], words:
         (b"t,z1,a1\ntarget,0,\n0,1,1\n1,1,1\n3,1,1\n", "expected equal steps of t, got 1 to 2"),
         (b"t,z1,a1\ntarget,0,\n0,1,1\nnan,1,1\n", "expected a time t in row 4"),
         (b"t,z1,a1\ntarget,0,\n0,1,\n1,1,1\n", "finite numbers, got NaN"),
+        (b"t,z1,a1\ntarget,0,\n0,1,1\ntarget,0,\n1,1,1\n", "one row .* got another, 4"),
         (b'"' + b"t," * 10**6, "no table of commas|expected the names"),
     ],
 )
@@ -118,8 +127,17 @@ def test_the_command_line_says_it_in_one_line(
 ) -> None:
     (tmp_path / "own.csv").write_text("t,z1,a1\ntarget,0,\n0,1,1\n1,2,1\n")
     assert main(["identify", "--data", str(tmp_path / "own.csv")]) == FAILED
-    assert "too few steps to suggest an order" in capsys.readouterr().err
+    assert "too few, or vary too little, to hold some of them out" in capsys.readouterr().err
     assert main(["identify", "--data", str(EXAMPLE), "--order", "9"]) == FAILED
     assert capsys.readouterr().err.count("\n") == 1
+    assert main(["identify", "--data", str(EXAMPLE), "--rank", "4"]) == FAILED
+    assert "add --identification dmdc, or leave --rank out" in capsys.readouterr().err
+    assert (
+        main(["identify", "--data", str(EXAMPLE), "--rank", "7", "--identification", "dmdc"]) == 0
+    )
+    capsys.readouterr()
+    np.savez(tmp_path / "idle.npz", **arrays(actions=np.zeros((60, 2))))
+    assert main(["identify", "--data", str(tmp_path / "idle.npz")]) == FAILED
+    assert "all actions are zero" in capsys.readouterr().err
     assert main(["identify", "--data", str(EXAMPLE), "--episode", "1"]) == FAILED
     assert "choose from a bag" in capsys.readouterr().err

@@ -98,3 +98,14 @@ def test_actions_that_do_not_fit_are_refused() -> None:
             env.step(refused)
         with pytest.raises(ValueError, match="actions must"):
             batch.step(refused[np.newaxis])
+
+
+def test_keywords_that_do_not_fit_are_refused() -> None:
+    for given in (np.nan, np.inf, -1.0):
+        for make in (gymnasium.make, gymnasium.make_vec):
+            with pytest.raises(ValueError, match=r"divergence_penalty is .* a finite number of 0"):
+                make(BURGERS, **GRID, divergence_penalty=given)
+    with pytest.raises(ValueError, match="num_envs is 0; expected a whole number of 1 or more"):
+        gymnasium.make_vec(BURGERS, num_envs=0, **GRID)
+    with pytest.raises(ValueError, match="unknown parameter 'n_zz'; did you mean 'n_z'"):
+        gymnasium.make(BURGERS, n_zz=32)

@@ -530,10 +530,32 @@ def test_a_users_equation_is_compiled_once_for_all_processes(tmp_path: Path) -> 
     ("old", "new", "words"),
     [
         ("return STRENGTH * u**2", "return open(u)", r"Numba .*flawed.py, line \d+: .*open"),
+        (
+            "return STRENGTH * u**2",
+            "return np.linalg.qq(u)",
+            r"Numba .*flawed.py, line 22: Attr.* 'qq'",
+        ),
+        (
+            "nonlinearity(u)",
+            "nonlinearity(self, u)",
+            r"function u -> g\(u\) .*flawed.py, line 20: Type",
+        ),
         ("np.full_like(k, -self.rate)", "-self.rate", "multiplier of the equation must return"),
+        (
+            "np.full_like(k, -self.rate)",
+            "np.full_like(k, np.nan)",
+            "17 finite .* got NaN or infinity$",
+        ),
+        ("np.full_like(k, -self.rate)", "k[:3]", r"got shape \(3,\)$"),
+        (
+            "np.full_like(k, -self.rate)",
+            "k[99]",
+            r"multiplier .* fails: .*flawed.py, line 18: Index",
+        ),
         ("self.rate - 0.01 * k**2", "k / 0 * 1j", "linear_operator of the equation must return"),
         ("self.rate - 0.01 * k**2", "1e6 + k", "growth rate"),
         ("np.ones_like(x)", "np.ones(3)", "target of the equation must return"),
+        ("np.ones_like(x)", "x @ 'a'", r"target of the equation fails: .*flawed.py, line 28: UF"),
         (
             "def target(self, x)",
             "def supports(self, *_): ...\n    def target(self, x)",
@@ -546,8 +568,9 @@ def test_a_flawed_equation_is_refused(tmp_path: Path, old: str, new: str, words:
     path = tmp_path / "flawed.py"
     assert old in FISHER
     path.write_text(FISHER.replace(old, new))
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises(ValueError, match=words) as refused:
         make(load_equation(f"{path}:Fisher")(), **FISHER_GRID)
+    assert "\n" not in str(refused.value)
 
 
 def test_a_second_plant_does_not_compile_again() -> None:

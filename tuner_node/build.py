@@ -36,7 +36,11 @@ def read_model(path: Path, n_a: int) -> NDArray[np.float64]:
             f"the model in {path} must be one array of finite rows, got shape {rows.shape}"
         )
     model: NDArray[np.float64] = rows[0]
-    if not unpack(model, n_a).U.any(axis=0).all():
+    try:
+        basis = unpack(model, n_a).U
+    except ValueError as error:
+        raise ValueError(f"{path} holds the model of another plant: {error}") from error
+    if not basis.any(axis=0).all():
         raise ValueError(f"the model in {path} has modes that are zero; identify one anew")
     return model
 

@@ -14,6 +14,7 @@ see `LinearEquation`.
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar
 
@@ -39,6 +40,32 @@ def parameter(
             "unit": unit,
         },
     )
+
+
+def result_of(method: Callable[..., Any], *arguments: Any) -> Any:
+    """What a method of an equation returns.
+
+    Raises
+    ------
+    ValueError
+        The method raised an exception; the text names its line.
+    """
+    try:
+        return method(*arguments)
+    except Exception as error:
+        raise ValueError(f"{method.__name__} of the equation fails: {located(error)}") from error
+
+
+def located(error: Exception) -> str:
+    """An exception in one line, with the line of the function that the `try` block called."""
+    called = error.__traceback__.tb_next if error.__traceback__ else None
+    where = f"{called.tb_frame.f_code.co_filename}, line {called.tb_lineno}: " if called else ""
+    return f"{where}{in_one_line(error)}"
+
+
+def in_one_line(error: Exception) -> str:
+    """Kind and text of an exception."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
 @dataclass(frozen=True, kw_only=True)

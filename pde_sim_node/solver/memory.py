@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from loop_interfaces.jit.simd import WIDTH, whole_lanes
 from pde_sim_node.equations import Equation, Field, Spectrum
+from pde_sim_node.equations.base import result_of
 from pde_sim_node.solver.fft import is_transform_length, radices_of, twiddles_of
 from pde_sim_node.solver.spectra import TRANSFORM
 
@@ -55,20 +56,21 @@ class StepSettings:
 
     def operator(self, name: str) -> Spectrum:
         """L(k) or m(k), the equation's method of that name; ValueError for a wrong shape or NaN."""
-        values = getattr(self.equation, name)(self.wavenumbers)
+        values = result_of(getattr(self.equation, name), self.wavenumbers)
         modes, components = self.n_x // 2 + 1, len(self.equation.components)
         shape = (modes,) if components == 1 else (modes, components, components)
-        if (
-            not isinstance(values, np.ndarray)
-            or values.shape != shape
-            or values.dtype.kind not in "iufc"
-            or not np.isfinite(values).all()
-        ):
-            raise ValueError(
-                f"{name} of the equation must return an array of {' x '.join(map(str, shape))} "
-                f"finite numbers for k of shape ({modes},), got {values!r}"
-            )
-        return values
+        if not isinstance(values, np.ndarray) or values.dtype.kind not in "iufc":
+            got = repr(values)
+        elif values.shape != shape:
+            got = f"shape {values.shape}"
+        elif not np.isfinite(values).all():
+            got = "NaN or infinity"
+        else:
+            return values
+        raise ValueError(
+            f"{name} of the equation must return an array of {' x '.join(map(str, shape))} "
+            f"finite numbers for k of shape ({modes},), got {got}"
+        )
 
 
 def step_plan_type(*own: tuple[str, Any]) -> np.dtype[np.void]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from loop_interfaces.jit.cache import cached_njit
 from loop_interfaces.jit.native import MachineCode
+from pde_sim_node.equations.base import in_one_line, located
 
 LOOPS: dict[Callable[[float], float], MachineCode] = {}
 
@@ -49,23 +50,35 @@ def pointwise_loop(function: Callable[[float], float]) -> int:
     code = MachineCode(loop, types.void(types.CPointer(types.float64), types.intp), function)  # type: ignore[no-untyped-call]
     try:
         return LOOPS.setdefault(function, code)()
-    except NumbaError as error:
+    except Exception as error:  # Numba lets some of its own pass, like an AttributeError
+        why = reason(function)
+        if why is None:
+            raise
         raise ValueError(
             f"the nonlinearity {function.__qualname__} must be a scalar function u -> g(u) "
-            f"that Numba can compile for a float64: {reason(function)}"
+            f"that Numba can compile for a float64: {why}"
         ) from error
 
 
-def reason(function: Callable[[float], float]) -> str:
+def reason(function: Callable[[float], float]) -> str | None:
     """Why Numba cannot compile a function by itself, in one line, with the line of the source."""
     alone: Any = numba.njit(function)
+    code = function.__code__
     try:
         alone.compile((types.float64,))
     except NumbaError as error:
         text = str(error).partition("\n")[2] or str(error)  # after "Failed in nopython mode ..."
         words = re.split(r"\n\s*(?:There are|File |During)", text)[0].replace(">>>", "").split()
-        code = function.__code__
         line = getattr(getattr(error, "loc", None), "line", code.co_firstlineno)
         return f"{code.co_filename}, line {line}: {' '.join(words)}"
+    except Exception as error:  # without a place, which Python may know
+        try:
+            function(0.5)
+        except Exception as own:
+            if code.co_filename in located(own):
+                return located(own)
+        return f"{code.co_filename}, line {code.co_firstlineno}: {in_one_line(error)}"
     (signature,) = alone.nopython_signatures
+    if signature.return_type == types.float64:
+        return None
     return f"it returns {signature.return_type}, expected a float64"
