@@ -84,7 +84,10 @@ class History:
         self._forgeries: set[tuple[Any, ...]] = set()
         self._heard: set[tuple[Any, ...]] = set()
         """Readers and headers of the forged messages that came, and of the others. An answer to a
-        forged state counts as forged: the plant can only tell by the answer to its own."""
+        forged state counts as forged: the plant can only tell by the answer to its own. So does one
+        of a controller that does not sign, to a plant that no other has answered yet."""
+        self._answered: set[Process] = set()
+        """Plants that the loop's own controller has answered."""
         self._taken_back: set[tuple[int, int]] = set()
         """Pairs and episodes whose cost is void, which the tuner has not heard yet."""
         self._answers_forged = False
@@ -151,14 +154,21 @@ class History:
         """Bring the samples of an episode to the tuners, if they read them."""
         if self.plan.iterations or self.rng.random() < self.plan.loss:
             return
-        shown = [samples]
+        shown = [(samples, self._heard)]
         if self.time < self._forged.get("samples", 0.0):
-            shown.append([(topic, self._forgery(frame)) for topic, frame in samples])
+            forgery = [(topic, self._forgery(frame)) for topic, frame in samples]
+            shown.append((forgery, self._forgeries))
+
+        def see(
+            tuner: TunerProcess, batch: list[tuple[Topic, Frame]], came: set[tuple[Any, ...]]
+        ) -> None:
+            came.add((tuner, "samples", plant.pair, batch[0][1].episode))
+            tuner.see(batch, plant.pair)
+
         for tuner in self._processes.values():
             if isinstance(tuner, TunerProcess) and (plant.name, tuner.name) not in self._cut:
-                for batch in shown:
-                    see = partial(tuner.see, batch, plant.pair)
-                    self._later(partial(self._handing, tuner, see))
+                for batch, came in shown:
+                    self._later(partial(self._handing, tuner, partial(see, tuner, batch, came)))
 
     def missing(self, pair: int) -> list[str]:
         """Which nodes of a pair the tuner does not find on the network."""
@@ -200,7 +210,7 @@ class History:
 
     def _carry(self, writer: str, process: Process, topic: Topic, raw: bytes, pair: int) -> None:
         """Bring a message to a process; where the line is cut, a reliable one waits for it."""
-        forged = writer == "stranger" or (topic is ACTION and self._answers_forged)
+        answers_forged = topic is ACTION and self._answers_forged
 
         def arrive() -> None:
             if (writer, process.name) in self._cut:
@@ -211,6 +221,10 @@ class History:
 
         def take() -> None:
             frame = self._codecs[topic].decode(bytes(raw))
+            if topic is ACTION and writer.startswith("controller"):
+                self._answered.add(process)
+            unsigned = writer == "unsigned rival" and process not in self._answered
+            forged = writer == "stranger" or answers_forged or unsigned
             header = topic, pair, frame.run, frame.episode, frame.step, frame.time, frame.plant
             (self._forgeries if forged else self._heard).add((process, *header))
             if topic is COST and process.name == "tuner" and _is_void(frame):
@@ -321,10 +335,11 @@ class History:
             self._forged[who] = end
         elif kind == "second controller":
             if who == "signs":  # with another limit of the actions
-                self._join(ControllerProcess(self, "rival", action_limit=0.1))
+                rival: Process = ControllerProcess(self, "rival", action_limit=0.1)
             else:
-                self._join(Stranger(self, "rival", "controller"))
-            self._at(end, lambda: self._end("rival"))
+                rival = Stranger(self, "unsigned rival", "controller")
+            self._join(rival)
+            self._at(end, lambda: self._end(rival.name))
         elif kind == "second tuner":
             disk = Disk(random.Random(self.plan.seed + 3))
             self._join(TunerProcess(self, "rival tuner", disk, run=RUN + 1))
