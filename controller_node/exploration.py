@@ -106,6 +106,13 @@ class Exploration:
         time = self._signature() or cost.time
         return Publication(MODEL_IDENTIFIED, replace(cost, step=0, time=time, values=rows))
 
+    def take_back(self, plant: int) -> list[ModelFailure]:
+        """Why a plant's models mean nothing, if that turned out after they were published; once."""
+        if self._unusable is None or not isinstance(self.outcomes.get(plant), Publication):
+            return []
+        self.outcomes[plant] = self._unusable
+        return [self._unusable]
+
     def _signature(self) -> float:
         start, settings = self._start, self._settings
         digest = digest_of(start.values, settings.action_limit) if start.plant else 0

@@ -123,7 +123,7 @@ class Responder:
         run = self._runs.get(self._served[0])
         return run is not None and run.exploration is not None
 
-    def target(self, frame: Frame) -> list[Publication]:
+    def target(self, frame: Frame) -> list[Publication | ModelFailure]:
         """Take the target z_r of a plant, (n_z,)."""
         self._targets[frame.plant] = frame.values.copy()
         _forget(self._targets, frame.plant, self._served[1])
@@ -155,7 +155,7 @@ class Responder:
             return list(run.exploration.outcomes.values())  # the answer may have been lost
         return self._answer_pending()
 
-    def policy(self, frame: Frame) -> list[Publication]:
+    def policy(self, frame: Frame) -> list[Publication | ModelFailure]:
         """Take the policies [K_a K_b] of an episode's environments, (M, n_a, 2 n_s).
 
         Raises
@@ -183,7 +183,7 @@ class Responder:
         run.policy, run.answering = replace(frame, values=frame.values.copy()), None
         return self._answer_pending()
 
-    def model(self, frame: Frame) -> list[Publication]:
+    def model(self, frame: Frame) -> list[Publication | ModelFailure]:
         """Take a run's reduced models, as in model_rows. ValueError if they leave no room for U."""
         run = self._run(frame.run, 2 * frame.values.nbytes)
         run.models = [model_rows.unpack(rows.copy(), self._settings.n_a) for rows in frame.values]
@@ -191,10 +191,11 @@ class Responder:
         run.generation, run.answering = frame.step, None
         return self._answer_pending()
 
-    def state(self, frame: Frame) -> list[Publication]:
+    def state(self, frame: Frame) -> list[Publication | ModelFailure]:
         """Answer the states of an episode's environments, (M, n_z).
 
-        They are kept while something that the answer needs has not come.
+        They are kept while something that the answer needs has not come. A second, different state of
+        an exploratory episode takes back the models that came of the first.
 
         Raises
         ------
@@ -202,6 +203,7 @@ class Responder:
             The state does not fit the start, or the policies and models do not fit it.
         """
         answering = self._answering(frame)
+        taken_back: list[ModelFailure] = []
         if answering is None:
             self._pending = replace(frame, values=frame.values.copy())
             self.counters["states that had to wait"] += 1
@@ -212,11 +214,12 @@ class Responder:
             exploration = self._runs[frame.run].exploration
             assert exploration is not None
             self._keep_sample(exploration, frame)
+            taken_back = exploration.take_back(frame.plant)
             actions = exploration.actions(frame.step)
         self._pending, self._served, self.episode = None, (frame.run, frame.plant), frame.episode
         self.advance_counters(1, frame.step)
         time = answering.signature or frame.time
-        return [Publication(ACTION, replace(frame, time=time, values=actions))]
+        return [Publication(ACTION, replace(frame, time=time, values=actions)), *taken_back]
 
     def advance_counters(self, answers: int, step: int) -> None:
         """Account for states of the present episode, up to `step`, that were answered."""
@@ -357,7 +360,7 @@ class Responder:
         law.set(policy.values, index)
         return law
 
-    def _answer_pending(self) -> list[Publication]:
+    def _answer_pending(self) -> list[Publication | ModelFailure]:
         return self.state(self._pending) if self._pending is not None else []
 
 

@@ -249,6 +249,11 @@ def test_an_exploratory_episode_is_done_with_its_model_and_fails_with_its_reason
     ((_, last),) = starts(served.assign(exploratory, 0.0))
     with pytest.raises(DispatchError, match="no reduced model: p is too large"):
         served.failure(0, ModelFailure(RUN, last.episode, False, "p is too large"), 0.0)
+    with pytest.raises(
+        DispatchError, match=f"took back the model of episode {again.episode}.*two st"
+    ):
+        served.failure(0, ModelFailure(RUN, again.episode, True, "two states came"), 0.0)
+    assert served.failure(0, ModelFailure(RUN, start.episode, True, "a state was lost"), 0.0) == []
 
 
 def test_costs_of_a_plant_with_other_parameters_are_refused():

@@ -273,6 +273,17 @@ def test_two_different_states_of_one_step_give_no_model_and_ask_for_the_episode_
     assert model.topic is MODEL_IDENTIFIED
 
 
+def test_a_state_that_contradicts_an_exploration_takes_back_its_model_once(responder):
+    (model,) = explore(responder, 1)
+    assert model.topic is MODEL_IDENTIFIED
+    last = Frame(RUN, 1, 3, 0.0, plant().reset(np.array([1])) + 1.0, model.frame.plant)
+    action, failure = responder.state(last)
+    assert action.topic is ACTION
+    assert isinstance(failure, ModelFailure) and "two different states came" in failure.reason
+    assert len(responder.state(last)) == 1
+    assert responder.start(start(1, (1, 2, 0.1, 0))) == [failure]
+
+
 @pytest.mark.parametrize("when", ["before", "after"])
 def test_an_episode_with_two_different_policies_is_not_answered(responder, when):
     responder.model(Frame(RUN, 0, 0, 0.0, models()))

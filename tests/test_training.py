@@ -241,3 +241,17 @@ def test_an_order_from_the_data_is_of_one_seed():
         ValueError, match="'reduced_order' is 0 and 'seeds' is 2; expected one seed"
     ):
         build_training(parameters(reduced_order=0, seeds=2))
+
+
+def test_a_trajectory_that_was_cut_short_is_no_rollout_to_the_end():
+    values = parameters(optimizer="gauss_newton", rollouts=20)
+    training, pair = build_training(values), LocalPair(values)
+    training.finish(pair.run(training.next_batch()))
+    pair.use_models(training.models)
+    result = pair.run(training.next_batch())
+    (first, second), horizon = result.trajectories, values["horizon"]
+    short = replace(first, states=first.states[:4], actions=first.actions[:3])
+    with pytest.raises(ValueError, match=f"after 3 and {horizon} steps, expected one horizon"):
+        training.finish(replace(result, trajectories=[short, second]))
+    training.finish(result)
+    assert training.phase == "adapt"

@@ -244,9 +244,17 @@ class Dispatcher:
         return self._begin_episodes(now)
 
     def failure(self, pair: int, failure: ModelFailure, now: float) -> list[PairPublication]:
-        """Take the report that an exploratory episode gave no model."""
+        """Take the report that an exploratory episode gave no model, or none that means anything."""
         known = self.pairs[pair]
-        if known.chunk is None or (failure.run, failure.episode) != (self.run, known.episode):
+        if failure.run != self.run:
+            return []
+        if not known.runs(failure.episode):
+            if (topics.MODEL_IDENTIFIED.name, failure.episode) in known.answers:
+                raise DispatchError(
+                    f"the controller took back the model of episode {failure.episode}, which this run "
+                    f"has used, because {failure.reason}; stop who else publishes state and start a "
+                    "new run"
+                )
             return []
         if not failure.retry:
             raise DispatchError(f"no reduced model: {failure.reason}")

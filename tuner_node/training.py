@@ -113,6 +113,7 @@ class Training:
                 f"the plant has other parameters (fingerprint {result.plant}) than the one this run "
                 f"began with ({self.plant}); continue it with that one, or start a new run"
             )
+        self._check_steps(result)
         self.plant = result.plant
         if self.phase == "identify":
             assert result.models is not None
@@ -128,6 +129,18 @@ class Training:
         if self.phase == "adapt":
             return self._tell(result)
         return self._evaluated(result)
+
+    def _check_steps(self, result: BatchResult) -> None:
+        """Raise ValueError if a trajectory to the end has not as many steps as those before."""
+        known = [kept.trajectory for own in self.measured for kept in own]
+        known += [explored for explored in self.explorations if explored is not None]
+        known += [r.trajectory for r in result.rollouts() if r.trajectory and not r.diverged]
+        steps = sorted({len(trajectory.actions) for trajectory in known})
+        if len(steps) > 1:
+            raise ValueError(
+                f"rollouts of this run ended after {' and '.join(map(str, steps))} steps, expected one "
+                "horizon: stop who else publishes episode/cost and start a new run"
+            )
 
     def policies(self) -> Array:
         """The adapted policies, of the shape of the warm starts."""

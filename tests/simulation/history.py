@@ -152,7 +152,7 @@ class History:
 
     def show(self, plant: Process, samples: list[tuple[Topic, Frame]]) -> None:
         """Bring the samples of an episode to the tuners, if they read them."""
-        if self.plan.iterations or self.rng.random() < self.plan.loss:
+        if self.plan.iterations or not samples or self.rng.random() < self.plan.loss:
             return
         shown = [(samples, self._heard)]
         if self.time < self._forged.get("samples", 0.0):
