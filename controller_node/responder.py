@@ -194,7 +194,8 @@ class Responder:
     def state(self, frame: Frame) -> list[Publication | ModelFailure]:
         """Answer the states of an episode's environments, (M, n_z).
 
-        They are kept while something that the answer needs has not come. A second, different state of
+        They are kept while something that the answer needs has not come, but not two different ones of
+        one step. A second, different state of
         an exploratory episode takes back the models that came of the first.
 
         Raises
@@ -205,6 +206,10 @@ class Responder:
         answering = self._answering(frame)
         taken_back: list[ModelFailure] = []
         if answering is None:
+            waiting, self._pending = self._pending, None
+            if waiting is not None and _contradict(waiting, frame):  # the plant repeats its own
+                self.counters["different states of one step"] += 1
+                return []
             self._pending = replace(frame, values=frame.values.copy())
             self.counters["states that had to wait"] += 1
             return []
@@ -369,3 +374,9 @@ def _forget(known: OrderedDict[int, Any], newest: int, protected: int) -> None:
     known.move_to_end(newest)
     if len(known) > MAX_RUNS:
         del known[next(key for key in known if key not in (newest, protected))]
+
+
+def _contradict(a: Frame, b: Frame) -> bool:
+    """Whether two states of one step are not the same."""
+    same = (a.run, a.plant, a.episode, a.step) == (b.run, b.plant, b.episode, b.step)
+    return same and not np.array_equal(a.values, b.values)

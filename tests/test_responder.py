@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -271,6 +272,13 @@ def test_two_different_states_of_one_step_give_no_model_and_ask_for_the_episode_
     assert "two different states came for step 3" in failure.reason
     (model,) = explore(responder, 2)
     assert model.topic is MODEL_IDENTIFIED
+
+
+def test_of_two_different_states_that_wait_neither_is_answered(responder):
+    state = Frame(RUN, 1, 0, 0.0, plant().reset(np.array([1])))
+    assert responder.state(state) == responder.state(replace(state, values=state.values + 1)) == []
+    assert responder.start(start(1, (1, 2, 0.1, 0))) == []
+    assert len(responder.state(state)) == 1
 
 
 def test_a_state_that_contradicts_an_exploration_takes_back_its_model_once(responder):
