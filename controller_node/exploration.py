@@ -110,8 +110,8 @@ class Exploration:
         """Why a plant's models mean nothing, if that turned out after they were published; once."""
         if self._unusable is None or not isinstance(self.outcomes.get(plant), Publication):
             return []
-        self.outcomes[plant] = self._unusable
-        return [self._unusable]
+        failure = self.outcomes[plant] = replace(self._unusable, retry=False)
+        return [failure]
 
     def _signature(self) -> float:
         start, settings = self._start, self._settings

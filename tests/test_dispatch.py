@@ -252,8 +252,9 @@ def test_an_exploratory_episode_is_done_with_its_model_and_fails_with_its_reason
     with pytest.raises(
         DispatchError, match=f"took back the model of episode {again.episode}.*two st"
     ):
-        served.failure(0, ModelFailure(RUN, again.episode, True, "two states came"), 0.0)
-    assert served.failure(0, ModelFailure(RUN, start.episode, True, "a state was lost"), 0.0) == []
+        served.failure(0, ModelFailure(RUN, again.episode, False, "two states came"), 0.0)
+    for known in (start, again):  # a controller that was started anew has lost the states
+        assert served.failure(0, ModelFailure(RUN, known.episode, True, "0 states"), 0.0) == []
 
 
 def test_costs_of_a_plant_with_other_parameters_are_refused():

@@ -249,7 +249,8 @@ class Dispatcher:
         if failure.run != self.run:
             return []
         if not known.runs(failure.episode):
-            if (topics.MODEL_IDENTIFIED.name, failure.episode) in known.answers:
+            used = (topics.MODEL_IDENTIFIED.name, failure.episode) in known.answers
+            if used and not failure.retry:  # with `retry` it has only lost the states since
                 raise DispatchError(
                     f"the controller took back the model of episode {failure.episode}, which this run "
                     f"has used, because {failure.reason}; stop who else publishes state and start a "
