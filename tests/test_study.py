@@ -216,6 +216,10 @@ def test_the_command_runs_continues_and_refuses_another_study(
     words = (str(file), "--out", str(tmp_path / "new"), "--scheduler")
     assert main(["study", *words, "127.0.0.1"]) == 1
     assert "expected one like tcp://localhost:8786" in capsys.readouterr().err
+    assert main(["study", *words, ""]) == 1
+    assert "address is ''; expected one like" in capsys.readouterr().err
+    assert main(["study", *words, "tls://127.0.0.1:1"]) == 1
+    assert "needs certificates" in capsys.readouterr().err
     assert main(["study", *words, "tcp://127.0.0.1:1"]) == 1
     assert "no Dask scheduler answers" in capsys.readouterr().err
 

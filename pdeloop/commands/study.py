@@ -88,7 +88,7 @@ def carry_out(
     from tuner_node.results import versions
     from tuner_node.run_folder import timestamp
 
-    if options.processes is not None and (options.processes < 1 or options.scheduler):
+    if options.processes is not None and (options.processes < 1 or options.scheduler is not None):
         raise ParameterError(
             "--processes is how many trainings run on this machine: expected at least 1, and no "
             "--scheduler"
@@ -99,7 +99,7 @@ def carry_out(
     progress = Progress(console, name, "trainings")
     executor = (
         partial(cluster, options.scheduler)
-        if options.scheduler
+        if options.scheduler is not None
         else partial(processes, options.processes)
     )
     try:

@@ -143,6 +143,11 @@ def _version_at(address: str) -> str:
         raise StudyError(
             f"the scheduler's address is {address!r}; expected one like tcp://localhost:8786"
         ) from error
+    except TypeError as error:  # distributed's word for a tls:// address without certificates
+        raise StudyError(
+            f"{address} needs certificates, which Dask's configuration does not name: set ca-file, "
+            "client.cert and client.key in distributed.comm.tls"
+        ) from error
     except OSError as error:
         raise StudyError(
             f"no Dask scheduler answers at {address} within {CONNECTING:.0f} s; start one with: "
