@@ -22,12 +22,14 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from benchmarks.baselines import pairs
 from benchmarks.descent import WINDOW, Descent, descend
 from benchmarks.limits import content
 from benchmarks.warm_start import warm_start
@@ -68,6 +70,7 @@ def optimise_law(
     evaluations: Mapping[int, Sequence[int]],
     tolerance: float,
     from_zero: bool = False,
+    given: Mapping[str, Any] = MappingProxyType({}),
 ) -> tuple[Descent, Law, dict[str, dict[int, list[float]]]]:
     """The optimum of the class for the basis of one training seed.
 
@@ -87,13 +90,15 @@ def optimise_law(
         Of `descend`.
     from_zero
         Begin with zero gains instead of those of LQ tracking.
+    given
+        Parameters that replace those of the problem.
 
     Returns
     -------
     Where the descent ended, the law, and the costs by field of the laws lqt and optimum.
     """
     with threadpool_limits(limits=1):
-        values = load_parameters(problem, {})
+        values = load_parameters(problem, dict(given))
         gradients = Gradients(build_plant(values))
         plant = gradients.plant
         training = warm_start({**values, "seed": seed}, LocalPair(values, plant))
@@ -158,17 +163,24 @@ def inverse_root(matrix: Array) -> Array:
 
 
 def optimise_inputs(
-    problem: str, field_seed: int, *, law: Law | None, tolerance: float
+    problem: str,
+    field_seed: int,
+    *,
+    law: Law | None,
+    tolerance: float,
+    given: Mapping[str, Any] = MappingProxyType({}),
 ) -> tuple[Descent]:
     """The optimal inputs of one initial field, from those of a law, or from none."""
     with threadpool_limits(limits=1):
-        gradients = Gradients(build_plant(load_parameters(problem, {})))
+        gradients = Gradients(build_plant(load_parameters(problem, dict(given))))
         inputs = np.zeros((gradients.plant.horizon, 1, gradients.plant.n_a))
         if law is not None:
             episode = gradients.law(*law, [field_seed])
             inputs = episode.actions if episode.whole else inputs
         found = descend(
-            lambda given: gradients.of_actions(given, [field_seed])[:2], inputs, tolerance=tolerance
+            lambda actions: gradients.of_actions(actions, [field_seed])[:2],
+            inputs,
+            tolerance=tolerance,
         )
     return (found,)
 
@@ -183,6 +195,7 @@ def run(
     tolerance: float = 2e-4,
     jobs: int | None = None,
     from_zero: bool = False,
+    settings: Sequence[str] = (),
     save: Path | None = None,
 ) -> list[dict[str, Any]]:
     """The limits of each problem, as JSON-able numbers.
@@ -203,6 +216,8 @@ def run(
         Processes; one a core if not given.
     from_zero
         Begin with zero gains and inputs instead of those of LQ tracking.
+    settings
+        Words NAME=JSON: parameters of the problems, like reduced_order=4.
     save
         Folder to which the open-loop limits are written, as PROBLEM.json (benchmarks.limits).
     """
@@ -211,13 +226,14 @@ def run(
             raise ValueError(f"--{name} must be at least 1, got {number}")
     if evaluation_fields < 1 or not 0 < tolerance < 1:
         raise ValueError("--evaluation-fields must be at least 1 and --tolerance between 0 and 1")
+    given = pairs(settings)
     evaluations = {draw: evaluation_seeds(draw, evaluation_fields) for draw in evaluation_seed}
     results = []
     # Processes, as L-BFGS and the loop over the steps hold the interpreter's lock.
     cores = jobs or len(os.sched_getaffinity(0))
     with ProcessPoolExecutor(cores, mp_context=get_context("spawn")) as pool:
         for problem in problems or tuple(PAPER):
-            values = load_parameters(problem, {})
+            values = load_parameters(problem, dict(given))
             work: partial[Any] = partial(
                 optimise_law,
                 problem,
@@ -225,10 +241,11 @@ def run(
                 evaluations=evaluations,
                 tolerance=tolerance,
                 from_zero=from_zero,
+                given=given,
             )
             laws = _all(pool, work, range(seeds), f"{values['problem']}, law of seed")
             law = None if from_zero else laws[0][1]
-            work = partial(optimise_inputs, problem, law=law, tolerance=tolerance)
+            work = partial(optimise_inputs, problem, law=law, tolerance=tolerance, given=given)
             drawn = [field for own in evaluations.values() for field in own]
             inputs = _all(pool, work, drawn, f"{values['problem']}, inputs of field")
             costs = iter([found.cost for (found,) in inputs])

@@ -139,6 +139,15 @@ def test_the_kept_limits_hold_for_the_shipped_problems():
         )
 
 
+def test_a_law_has_the_order_that_is_asked_for():
+    given = {"fields": 2, "evaluations": {}, "tolerance": 1e-2}
+    for order in (2, 3):
+        _, (U, theta), _ = optimum.optimise_law(
+            str(SMALL), 0, **given, given={"reduced_order": order, "dmdc_order": order}
+        )
+        assert U.shape[1] == order and theta.shape[1] == order + 1
+
+
 def test_the_command_line_prints_the_limits_and_refuses_nonsense(capsys, tmp_path):
     options = ["--seeds", "1", "--fields", "2", "--evaluation-fields", "1"]
     given = ["optimum", str(SMALL), *options, "--tolerance", "0.01", "--jobs", "1"]
@@ -150,3 +159,5 @@ def test_the_command_line_prints_the_limits_and_refuses_nonsense(capsys, tmp_pat
     for words in (["--seeds", "0"], ["--tolerance", "2"], ["--fields", "0"]):
         assert run(parser, ["optimum", str(SMALL), *words]) == 1
         assert words[0].lstrip("-") in capsys.readouterr().err
+    assert run(parser, ["optimum", str(SMALL), "--settings", "n_zz=3"]) == 1
+    assert "unknown parameter 'n_zz'" in capsys.readouterr().err
