@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """For `colcon build`, which calls setup.py. What the package is stands in pyproject.toml."""
 
 from setuptools import setup

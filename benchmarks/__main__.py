@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`python -m benchmarks PROGRAM`: the measuring programs.
 
 A program is a module with two functions: `run`, whose parameters are its options, explained in its

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Methods at equal rollouts, one table a problem: `python -m benchmarks baselines STUDY ...`.
 
 benchmarks/studies/STUDY.yaml is a study of the project's optimisers, and names the methods of others

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`python -m benchmarks batch`: environment-steps a second against the batch, and where its knee is.
 
 A round of M environments takes t(M) = c + w M + s(M): what a message costs whatever is in it, what

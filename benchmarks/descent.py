@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Minimise a mean stage cost with exact gradients until it falls no further: L-BFGS.
 
 Source: Liu & Nocedal, Mathematical Programming 45 (1989); Nocedal & Wright, Numerical Optimization,

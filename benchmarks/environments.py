@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`python -m benchmarks environments`: environment-steps a second of the Gymnasium environments.
 
 The batch of `VectorEnvironment` beside Gymnasium's own vector environments of as many single ones, in

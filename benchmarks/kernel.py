@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """How long one sampling time of one environment takes: this plant against other implementations.
 
 All of them integrate the same equation with the same ETDRK4 and the same dealiasing. NumPy stands

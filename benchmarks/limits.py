@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The open-loop limits that `python -m benchmarks optimum --save` keeps, to compare costs with.
 
 A limit counts only for the plant it was computed for: all of the plant's parameters must agree, and

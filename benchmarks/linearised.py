@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`python -m benchmarks linearised`: LQR of the exact linearisation at the target, with the full state.
 
 For the linear problems it is the optimum over an infinite horizon; for the others it is what a perfect

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Methods of others, for `python -m benchmarks baselines`: the same plants and budgets of rollouts.
 
 Each begins like a training, with an exploration, a reduced model and their check, and pays for them.

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`python -m benchmarks optimum`: how good can a policy be?
 
 Two limits, both with exact gradients (`pde_sim_node.solver.adjoint`) of the noise-free plant:

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`python -m benchmarks overhead WHAT`: how much a recorder, a viewer or the live page slows a loop.
 
 The same three nodes train all the time and only the other process comes and goes, so that what else

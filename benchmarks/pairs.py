@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`python -m benchmarks pairs`: one training served by pairs on several hosts, some of which fail.
 
 The hosts are network namespaces joined by veth (benchmarks.hosts). The tuner is on one, every pair

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`python -m benchmarks participants`: what it costs that many idle nodes know each other.
 
 A tuner and K pairs of plant and controller, a process each, on the loopback interface only. They find

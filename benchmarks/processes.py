@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The processes of a measurement: nodes in a domain of their own, spoken to through pipes."""
 
 from __future__ import annotations

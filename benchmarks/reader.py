@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Reads all that a viewer publishes, or all that the live page at an address is told.
 
     python -m benchmarks.reader [http://127.0.0.1:8080/]

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`python -m benchmarks realtime`: jitter and missed deadlines at P1's 20 Hz and at 1 kHz.
 
 A plant with `real_time_factor` and a controller run one episode at each rate; the plant itself says

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """PPO and SAC of stable-baselines3 on the Gymnasium environments: costs against rollouts.
 
 It needs PyTorch, and so an environment of its own (docs/comparison.md), and is no part of any extra.

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`python -m benchmarks rtt`: the loop's rounds a second beside a bare ping-pong, in one run.
 
 Both run all the time, in processes of their own, and take turns of a fraction of a second, so that

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """How soon a recorded training answers its operator: services, requests in a queue, and Ctrl-C."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`python -m benchmarks train`: a whole training over topics against the same one in one process.
 
 The two take turns. Without start-up means: from the first reduced model to the end. The start-up

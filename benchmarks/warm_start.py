@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The beginning of a training, which every method has and pays for: exploration, model, check."""
 
 from __future__ import annotations

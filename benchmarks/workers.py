@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`python -m benchmarks workers`: wall time of a study against the number of its worker processes.
 
 From one worker follow the time of every training and of the start, and from these what more workers

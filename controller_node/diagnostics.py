@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """How the controller is, as its /diagnostics show it. Pure."""
 
 from controller_node.responder import Responder

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A reduced linear model of the plant (`reduced_model`) by DMD with control (DMDc).
 
 With Z = [z_0 .. z_{N-1}], Z' = [z_1 .. z_N] and Y = [a_0 .. a_{N-1}] (one column per step), the

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """An exploratory episode: its random actions, its states, and the model from them. Pure."""
 
 from dataclasses import asdict, replace

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The controller's fast path: maps a serialised state to its serialised action within an episode.
 
 It answers the states of an episode that a law answers as `responder` does, to the bit.

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A first law from a model of the whole field, linearised at the target.
 
 POD modes of an exploratory episode are the directions in which the fields are large, and a law needs

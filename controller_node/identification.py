@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """From exploratory trajectories to a reduced model with its LQ-tracking gains."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The projected control law, compiled.
 
 An environment's action does not depend on how many environments are in the batch, nor on its place

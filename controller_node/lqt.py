@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Linear-quadratic tracking gains of a reduced model.
 
 For s_{k+1} = A s_k + B a_k and the stage cost (s - s_r)^T Q (s - s_r) + a^T R a with a constant

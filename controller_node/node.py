@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """controller_node: the projected LQ-tracking law as a ROS 2 node.
 
 Subscribes  state, target, episode/start, policy, model, episode/cost

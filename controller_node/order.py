@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Which order n_s the data support: errors of models on steps that they were not fitted to.
 
 Every trajectory is cut into pieces; each of four times every fourth piece is held out, and the others

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The projected control law, for a batch of environments that each have their own policy.
 
     a = K_a U^T z + K_b U^T z_r,        policy = [K_a K_b], shape (n_a, 2 n_s)

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A reduced linear model of the plant, and what every way to identify one begins with.
 
     z_{k+1} = f(z_k, a_k)    is approximated on s = U^T z by    s_{k+1} = A s_k + B a_k

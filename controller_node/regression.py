@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A reduced linear model of the plant by least squares in reduced coordinates.
 
 With U the first n_s left singular vectors of Z' = [z_1 .. z_N], Z = [z_0 .. z_{N-1}] and

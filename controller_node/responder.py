@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The controller's side of the loop: answer every state. Pure: no ROS, no clock.
 
 It answers every state of an episode whose start it has, also one it has answered before, and the

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A controller in 150 lines: local sensors, saturated actuators. Nothing of pdeloop is imported.
 
 Actuator j sees only y_j, the mean of the field over its own part of the grid, and the same mean r_j of

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Plants and controllers of a problem, in a namespace: they serve whichever tuner comes.
 
 ros2 launch pdeloop loop.launch.py problem:=kdv namespace:=lab

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A training: plants, controllers, the tuner and, if asked for, a recorder. Ends with the tuner.
 
 ros2 launch pdeloop train.launch.py problem:=burgers record:=true pairs:=2

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Which cores a process runs on. No ROS import."""
 
 import contextlib

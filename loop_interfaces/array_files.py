@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """NumPy's .npz files, read without trusting them. No ROS import."""
 
 import zipfile

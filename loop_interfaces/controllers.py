@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The controllers whose costs are shown: one name and one colour each, wherever they appear.
 
 The command line, the report, the live page and the views take them from here. The colours are those

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What a node reports on /diagnostics: a level, a sentence, named values. No ROS import.
 
 Levels as in diagnostic_msgs/DiagnosticStatus: OK; WARN, needs attention (a message was

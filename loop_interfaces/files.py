@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Files that are whole or not there, whatever moment a crash comes at.
 
 No symbolic link is followed.

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The array on the wire: std_msgs/Float64MultiArray with a five-number header, as CDR bytes.
 
 Every array of the loop travels as one `Float64MultiArray` whose `layout.dim` is labelled and filled

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Where a run's messages may go: by default nowhere but the loopback interface."""
 
 import ipaddress

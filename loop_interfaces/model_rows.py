@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """How a reduced model with its gains is laid out as one array of rows with n_s columns.
 
 Every part has n_s columns (or is transposed to have), so the parts stack:

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The parameters of all nodes: name, type, default, range, unit and meaning, in one table.
 
 A problem is one YAML file (loop_interfaces.spec), read unchanged by the three nodes

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Where the problems are, and a problem's resolved parameters. No ROS import."""
 
 import math

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What the protocols of the three nodes return: messages to send. No ROS import.
 
 A node's protocol is an object without clock, thread or network: an event comes in (a frame, or the

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Many serialised messages in one: what the plant publishes for recorders and viewers.
 
 A reader of its own for every state and action would cost the loop a packet and a wake-up per sample

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Signatures: with which policy, model and target an action was computed, and how a model was.
 
 Tuner, controller and plant compute the same numbers from what each of them knows, so the plant can

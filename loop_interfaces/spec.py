@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A parameter as data, what values are good for it, and the files that hold them. No ROS import.
 
 A file is YAML in ROS parameter-file form (`/**: ros__parameters: ...`).

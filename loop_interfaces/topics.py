@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The topics of the loop: names, axes, quality of service, and why. No ROS import.
 
 Names are relative, so a namespace makes a second loop. docs/interfaces.md describes them for

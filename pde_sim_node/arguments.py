@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Checks of the plant's arguments: the value, or a ValueError that says what is right."""
 
 import math

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A plant from a problem's resolved parameters."""
 
 import hashlib

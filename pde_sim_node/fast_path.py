@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The plant's fast path: maps a serialised action to the next serialised state within an episode.
 
 It answers the awaited action as `lockstep` does, to the bit, where a step is compiled code alone.

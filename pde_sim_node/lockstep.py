@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The plant's side of the loop: lock-step, at-least-once, idempotent. Pure: no ROS, no clock.
 
     start(e) -> state(e, 0) <- action(e, 0) -> state(e, 1) ... state(e, T) <- action(e, T) -> cost(e)

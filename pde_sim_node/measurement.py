@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What stands between a field and its controller: noise, actuators that saturate, few sensors.
 
     y_k = C z_k + v_k,                      v_k ~ N(0, measurement_noise^2 I)

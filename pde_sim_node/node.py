@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """pde_sim_node: the plant as a ROS 2 node.
 
 Subscribes  episode/start, action

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The plant: M sampled PDEs side by side, each z_{k+1} = f(z_k, a_k)."""
 
 import time

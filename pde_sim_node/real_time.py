@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """When each state is due on the wall clock, and how late they were. Pure: no clock.
 
 State 0 goes out at once and sets the grid; every further one is due a period after the one before.

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What a plant must still know of a run when its process is started again. Pure: a file, no ROS.
 
 A plant that is killed while it is paused must not run on, and one whose controller signs must not take

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Which starts and actions a plant has taken in a run, and which further ones contradict them. Pure.
 
 Whoever is asked twice answers the same to the bit. So another answer to a state that was answered

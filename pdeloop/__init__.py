@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Control of PDEs from Python: what the command line does, on arrays (docs/python.md).
 
 >>> import pdeloop

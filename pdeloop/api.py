@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The Python API: problems, their plants and explorations, identification and training."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The command line `pdeloop`: its commands, and what becomes of their errors.
 
 Exit codes: docs/command-line.md.

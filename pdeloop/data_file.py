@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Own measurements in a file, .npz or .csv (docs/identification.md), as trajectories."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What a person sees of a run, and where it comes from: lines for events, a bar while it adapts."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A ROS domain of one's own, so that two runs on a machine never meet."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The shipped problems as Gymnasium environments: `import pdeloop.environments` registers them.
 
 >>> import gymnasium

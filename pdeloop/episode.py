@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """An episode of a plant under a law, in this process."""
 
 from __future__ import annotations

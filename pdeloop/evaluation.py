@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`pdeloop evaluate`: the cost of a run's policies on sampled fields or the mean field."""
 
 from __future__ import annotations

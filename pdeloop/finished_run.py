@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A finished run as its folder holds it, and how far its costs lie below those of LQT."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Mean stage costs with their exact gradients: of actions, of policies, and of the initial fields.
 
 With the adjoint eta_k = dJ/dz_k, eta_T = 0, of J = 1/(MT) sum (q |z_k - z_r|^2 + r |a_k|^2) and

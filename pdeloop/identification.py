@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`pdeloop identify`: a reduced model, and its LQ-tracking gains, from recorded trajectories.
 
 Only states, actions and the target are used, so the plant may be any, this one or a real one.

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The training without ROS: the same plant, controller and training code, called directly.
 
 It gives the bit-identical policy of the loop over topics, because every number is made by the same

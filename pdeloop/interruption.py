@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The end of a command by a signal, or by an operator's request."""
 
 from __future__ import annotations

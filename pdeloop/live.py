@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Which loops run on this machine: `pdeloop train` says so here, `monitor` asks.
 
 Each puts a file into a folder of this user's under the temporary one and holds a lock on it. The

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Data on stdout for scripts, and tables for people."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The nodes of a run: which plants and controllers serve one tuner, and what each is told.
 
 `pdeloop train` starts them as processes (pdeloop.supervisor); `ros2 launch` by the files in launch/.

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Figures of runs and episodes, in the style of `pdeloop report`, for notebooks and papers."""
 
 from __future__ import annotations

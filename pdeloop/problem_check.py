@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`pdeloop check FILE`: whether a problem's numbers are ones that a training can work with.
 
 Four findings: the integration step, by halving it; the actuators, by the plant linearised at the

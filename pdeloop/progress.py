@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """How far something is: a live bar with the time left on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations

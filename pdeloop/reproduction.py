@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The paper's experiment as a study: its three adapted controllers, on the paper's models."""
 
 from __future__ import annotations

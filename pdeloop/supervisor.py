@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Starts the nodes of a run as processes, restarts those that die, and ends all of them."""
 
 from __future__ import annotations

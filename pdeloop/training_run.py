@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`pdeloop train`: one training, over topics or in this process, in a folder of its own."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A rosbag2 bag that is written as it grows: one MCAP file and metadata.yaml. No ROS import.
 
 What `flush` has written survives SIGKILL: the MCAP file consists of whole chunks up to there, which

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """recorder_node: writes the loop's topics to a rosbag2 bag, as a ROS 2 node.
 
 Subscribes  every topic of the loop in its namespace (and of `pairs`), /clock, /diagnostics, /rosout

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The other nodes of the loop, as the ROS graph shows them.
 
 Whether all have discovered the recorder's subscriptions, and what parameters they have.

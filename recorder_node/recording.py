@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A recording: the loop's messages in one bag. No ROS.
 
 bag/bag.mcap, bag/metadata.yaml    the bag

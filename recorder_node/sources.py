@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The topics of the loop that are recorded, and what each of them is. Pure."""
 
 from __future__ import annotations

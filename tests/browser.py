@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A real headless browser, steered over the Chrome DevTools protocol."""
 
 from __future__ import annotations

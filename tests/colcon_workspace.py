@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A colcon workspace with a clean copy of the sources, built once for the tests that ask for it."""
 
 from __future__ import annotations

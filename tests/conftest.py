@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Shared by the tests: processes of a loop, and a watch on what they leave behind."""
 
 from __future__ import annotations

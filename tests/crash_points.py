@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Trainings that are killed, or refused by the disk, at each call that changes their folder.
 
 `python -m tests.crash_points FOLDER [KIND ...]` trains a small problem once undisturbed. Then, for each

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Fast paths of a plant and a controller on real topics; for topics/test_fast_path.py."""
 
 from __future__ import annotations

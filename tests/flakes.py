@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """How often a test fails that should not: the tests over topics again and again, on a busy machine.
 
     python -m tests.flakes --runs 10 --load 4 [-n WORKERS] [-k EXPRESSION]

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A Python program in a process of its own."""
 
 from __future__ import annotations

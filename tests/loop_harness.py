@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Real nodes in real processes on a ROS domain of their own, with a limit on every wait.
 
 Most of what it takes to start a node is imports and the loading of compiled code, a second of a

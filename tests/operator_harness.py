@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Drives tests.operator_program from a test, with a limit on every wait."""
 
 from __future__ import annotations

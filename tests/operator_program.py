@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """An operator's ROS tools in a process of their own, with commands and answers through a pipe.
 
 {"know": [SERVICE, ...]}            look for these already, so that a call is quick

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Plants of the tests: of any equation, on any grid, and a linear one."""
 
 from __future__ import annotations

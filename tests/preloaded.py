@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What nodes and commands import and load, done once by the process that they are forked from.
 
 `tests.loop_harness` starts that process with this module.

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The small problem of the tests: its parameters, and a training of it in this process."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Disks that refuse: a real one that is full after a megabyte, and a folder nobody can write to."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The small problem over topics: its nodes, how far its training is, and what must come of it."""
 
 from __future__ import annotations

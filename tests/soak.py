@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`python -m tests.soak`: trainings under random faults, each compared bit for bit with a quiet one.
 
 Every training runs as `pdeloop train` in processes of its own, with a relay that loses, repeats and

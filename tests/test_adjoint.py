@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The adjoint of the plant's step against finite differences of the plant and exact identities."""
 
 from dataclasses import dataclass

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`import pdeloop`: the same bits as the command line, arrays in and out, refusals in one sentence."""
 
 from __future__ import annotations

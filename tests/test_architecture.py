@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The names in docs/architecture.md exist where it says they are."""
 
 from __future__ import annotations

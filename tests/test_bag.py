@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Bags: written from serialised bytes, read back by independent libraries, safe against what breaks."""
 
 from __future__ import annotations

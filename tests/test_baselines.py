@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`python -m benchmarks baselines`: methods of others on the same fields, with the same budget."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The budget: every rollout that the plant pays is counted, once, and no seed pays more."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The hand-over between the middleware's thread and the node's own, over all interleavings.
 
 A model of loop_interfaces.fast_path.channel: every line of the two programs there is one atomic step.

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The command line: every error is one clear line and a non-zero exit, and nothing is half-done."""
 
 from __future__ import annotations

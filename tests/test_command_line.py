@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The command line as a tool: help, JSON, colours, exit codes, completion in real shells."""
 
 from __future__ import annotations

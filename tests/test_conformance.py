@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The checks of stand-ins: this project's nodes pass, and every hidden mistake is named."""
 
 from __future__ import annotations

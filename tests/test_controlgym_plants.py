@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The PDEs of controlgym: its trajectories, initial fields, supports and default sizes."""
 
 from pathlib import Path

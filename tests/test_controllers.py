@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Names and colours of the controllers: each its own, and told apart with any colour vision."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Convolution models are found from one episode, and a law improved on one is a minimum there."""
 
 from __future__ import annotations

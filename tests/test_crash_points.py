@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A training comes to the same policy, whichever call that changes its folder is the last, or fails."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Own measurements in files: read as they are documented, refused in one sentence if they are not."""
 
 from __future__ import annotations

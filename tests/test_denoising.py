@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What measurement noise leaves of a trajectory of few modes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What the nodes say of themselves: levels and values by what has happened to them."""
 
 from __future__ import annotations

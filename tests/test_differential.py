@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The differential equation behind a plant is found from few rollouts and reproduces them."""
 
 from __future__ import annotations

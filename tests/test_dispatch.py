@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The dispatcher: whatever pairs do, every row of a batch gets its own result, once."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """DMDc recovers linear systems, is unique, and refuses what it cannot identify."""
 
 from __future__ import annotations

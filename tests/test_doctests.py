@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The examples in docstrings are true."""
 
 from __future__ import annotations

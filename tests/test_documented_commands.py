@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Tables of measured costs name the command that gives them, and the command exists."""
 
 from __future__ import annotations

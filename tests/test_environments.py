@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The Gymnasium environments: the library's own check, and the plant's bits."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """One episode in one process: what the plant does step by step, and what is kept of it."""
 
 from __future__ import annotations

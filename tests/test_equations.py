@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The equations: parameters, fields, operators, and equations from elsewhere."""
 
 import os

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """ETDRK4: coefficients against their series and exact formulas, and the order of the scheme."""
 
 import math

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`pdeloop evaluate`: costs of the built-in plant and law, and of no other."""
 
 from __future__ import annotations

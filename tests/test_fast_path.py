@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The fast path from bytes to bytes: the same bytes as the ordinary one, and only where it may."""
 
 from __future__ import annotations

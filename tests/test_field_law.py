@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A law from a model of the whole field is optimal on the linearised plant."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Damaged, forged and misplaced files: a sentence each, no link followed, nothing unpacked blindly."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The fitted local models and the sensitivities along trajectories."""
 
 from __future__ import annotations

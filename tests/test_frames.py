@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The wire: our CDR bytes are those of ROS, and nothing but the interface is accepted."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Gauss-Newton on measured trajectories: a known optimum, its safeguards, its checkpoints."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The rules of the house: layers point downwards, and pure modules never see ROS."""
 
 from __future__ import annotations

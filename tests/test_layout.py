@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Pairs, cores and the fitted models: the pure parts of scaling out and of `python -m benchmarks`."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The layouts for PlotJuggler, Foxglove and RViz: their form, and that they name what there is."""
 
 from __future__ import annotations

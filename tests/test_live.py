@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Which loop the live page watches: the one that runs, or the one it was told."""
 
 from __future__ import annotations

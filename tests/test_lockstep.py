@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The plant's protocol: every fault on the way is an event here, and changes no number."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The tracking gains solve the Riccati equation, are optimal, and reach the best steady state."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What stands between the field and its controller: noise, saturation and sensors, from theory."""
 
 from __future__ import annotations

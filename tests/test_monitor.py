@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The live page's pure parts: what is kept, what is told, when the loop is left alone."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The server of the live page: what it serves, to whom, and what a page may ask of the nodes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The two-point method: the paper's update, divergence, checkpoints, determinism."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The limits of `python -m benchmarks optimum`: against known optima; for whom they hold."""
 
 import json

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Directions, seeds, and the two-point estimate against theory."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The order from held-out data: that of a planted system, and lower where noise hides it."""
 
 from __future__ import annotations

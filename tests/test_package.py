@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The ROS 2 package: manifest, what colcon installs, and what the launch files would start."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Parameters: every refusal names the parameter, the value and the range."""
 
 from __future__ import annotations

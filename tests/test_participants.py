@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Who else is on the network: what a tuner waits for, and what ends it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The plant: against controlgym, exact solutions, conservation laws, and itself to the last bit."""
 
 import hashlib

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The projected law: the formula, bit identity over batches, and what it refuses."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`pdeloop check` and `pdeloop new`: modes and steps against theory, a template that passes."""
 
 from __future__ import annotations

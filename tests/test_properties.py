@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Round trips, and every malformed input refused with its sentence, for inputs nobody thought of."""
 
 from __future__ import annotations

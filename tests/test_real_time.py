@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The pace of a plant in real time: a pure grid of instants, and what missed it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What docs/reference renders says what goes in and what comes out, with the shapes of arrays."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Least squares in reduced coordinates: recovers systems, needs no unit, and its error is known."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The report of a small run: every figure, and a page that a real browser shows without complaint."""
 
 from __future__ import annotations

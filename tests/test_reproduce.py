@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The paper's experiment on the small problem: complete, continued to the bit, and its table."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The controller's protocol: answers are pure, and what is missing is said, never guessed."""
 
 from __future__ import annotations

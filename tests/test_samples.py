@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Batches of serialised messages, and the clock they are stamped with."""
 
 from __future__ import annotations

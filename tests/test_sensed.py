@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A differential equation, its actuators and the fields are found from a few point sensors."""
 
 from __future__ import annotations

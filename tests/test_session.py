@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A training held, stopped and continued by an operator: the same policy, to the bit."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Signatures: only a controller that was told what the tuner published moves the plant."""
 
 from __future__ import annotations

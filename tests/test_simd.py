@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The fused multiply-add: one rounding, on every machine."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Trainings over a simulated network: the bits of one process, or an error that names a cause."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The plants against exact solutions and against an independent integrator."""
 
 from collections.abc import Callable

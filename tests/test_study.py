@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Studies: the same results wherever the trainings run, whatever ends them meanwhile."""
 
 from __future__ import annotations

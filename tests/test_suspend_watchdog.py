@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A suspended process notices; a busy or starved one is not taken for it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """One seed, one policy: in any batch, after any interruption, and never anything but finite."""
 
 from __future__ import annotations

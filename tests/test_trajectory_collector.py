@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Trajectories from the topics: complete, attributed, cut where they diverged, or not there at all."""
 
 from __future__ import annotations

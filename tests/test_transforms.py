@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The compiled transforms against numpy.fft."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The cells of the tutorial run as they stand, on a smaller problem and with fewer steps."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What the viewer makes of the loop's messages: numbers, profile, picture."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The threads that share a step: who takes which slice, and on which cores they are."""
 
 from __future__ import annotations

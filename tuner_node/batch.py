@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What a training asks for and gets: batches of rollouts and their results; and what defines it."""
 
 from collections.abc import Sequence

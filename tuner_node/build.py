@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A training from resolved parameters."""
 
 from collections.abc import Mapping

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What must survive a crash: arrays in a file that is whole or not there.
 
 A checkpoint is one line `pdeloop-checkpoint 1 <sha256>` followed by an npz archive without pickled

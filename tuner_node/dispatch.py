@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Distributes the rollouts of a batch to pairs of nodes, as episodes. Pure: no ROS, no clock.
 
 A batch is cut into chunks of at most `max_batch` rows. Each becomes an episode of a pair that is free,

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """How strongly to explore a plant whose measurements are noisy."""
 
 ACCURACY = 0.045

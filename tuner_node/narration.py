@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A training in words: its events, how far it is, and its outcome. Pure.
 
 The tuner logs these lines, and `pdeloop train` shows them.

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """tuner_node: identifies, designs and adapts over topics, as a ROS 2 node.
 
 For each pair of plant and controller, in its namespace:

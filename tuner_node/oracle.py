@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Perturbations of a policy, and the two-point gradient estimate.
 
 For a policy pi = [K_a K_b] of shape (n_a, 2 n_s), a direction Theta with |Theta|_F = 1 and a

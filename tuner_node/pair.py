@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A pair of plant and controller as the dispatcher knows it, and what contradicts that. Pure."""
 
 import math

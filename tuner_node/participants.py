@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Who else is on the network, and what follows for a session. Pure."""
 
 from collections.abc import Mapping, Sequence

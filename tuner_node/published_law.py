@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Whether the actions of a rollout are those of the law that the tuner publishes the gains of."""
 
 from collections.abc import Sequence

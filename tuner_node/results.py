@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What a training came to: the contents of `result.json` and `policy.npz`."""
 
 import platform

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The rollouts that the phases of a training want, beside those that the optimisers ask for. Pure.
 
 All of them are functions of the training's seeds and of how often a seed has explored.

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A training's folder and what is in it.
 
 parameters.yaml    the resolved parameters, in ROS form: what defines the training

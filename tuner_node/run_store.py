@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Keeps a training's folder up to date: progress lines, checkpoints, results."""
 
 import secrets

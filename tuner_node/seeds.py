@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Every random choice of a training is a pure function of (seed, purpose, index).
 
 So a run that was interrupted, restarted, batched or distributed draws what an undisturbed one does.

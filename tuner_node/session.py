@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """One training carried out by plant and controller pairs: Training and Dispatcher joined. Pure.
 
 Events of the pairs go to the dispatcher; `advance` takes what it answers, finishes a batch whose

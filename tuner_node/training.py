@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The training as a state machine: which rollouts it needs next, what it does with their costs.
 
     phase     rollouts of each seed                     next phase

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The state of a training as the arrays of a checkpoint, and back."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Collects the trajectories of an episode from the ordinary `state` and `action` topics. Pure.
 
 A sample that was lost is never interpolated: the episode has no trajectories then, and is run again. So

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """How the viewer is, as its /diagnostics show it. Pure."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The states and actions of one environment in one episode, in a bounded memory. Pure.
 
 Columns are steps of the episode; when they run out, every second one is dropped and a column stands

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The learning curve: from a run's progress lines, or from the costs on the topics. Pure."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Which nodes of a loop are there, and what they report of themselves. Pure.
 
 `now` is any monotonic time in s.

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Reads the topics of one pair into a view: on a timer, never woken by a message.
 
 A loop of thousands of rounds a second would wake who waits for its messages as often, and take a

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What is known of one loop: the one core of the ROS views and of the web page. Pure.
 
 Frames of the loop's topics go in; episodes, numbers, learning curve and the state of the nodes come

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """viewer_node: shows a running loop to RViz, Foxglove and PlotJuggler, as a ROS 2 node.
 
 Subscribes  state, action (or samples_throttled), target, episode/start, policy, model, episode/cost

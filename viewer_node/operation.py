@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What operators ask of a loop's nodes, and who is paused. Pure.
 
 `now` is any monotonic time in s.

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The field of one environment over space and time as a picture. Pure."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Which controller caused which cost, by the gains that were published. Pure."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """driver_node: runs episodes of a plant and controller on demand and times them.
 
 Publishes episode/start, policy, model and hears episode/cost, like a tuner. Reads one JSON object a

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """ping_node: one end of a raw ping-pong, the yardstick of `python -m benchmarks rtt`.
 
 Nothing but the middleware: bytes are published and taken as they are, on a WaitSet with one

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The Swift-Hohenberg equation, u_t = r u - (1 + d_xx)^2 u - u^3 + a, which makes stripes."""
 
 from dataclasses import dataclass

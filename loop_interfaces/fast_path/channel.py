@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """One subscription and one publisher shared by the middleware's thread and the node's own thread.
 
 Only the middleware's thread takes from the subscription, in the callback with which the middleware

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The fast path of plant and controller, which differ in one compiled function each.
 
 Within an episode only the step, the time and the values of a message differ from the one before. A

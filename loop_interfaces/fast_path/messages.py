@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Serialised messages of the loop inside compiled functions (see `frames` for their format).
 
 Within an episode a peer sends the same prefix and the same run, episode and plant in every message.

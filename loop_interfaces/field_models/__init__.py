@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Models of the whole field of a plant, identified from its trajectories."""
 
 from loop_interfaces.field_models.convolution import ConvolutionModel

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A model of the whole field that does not depend on where on the domain something happens.
 
 On a periodic grid, with * for the circular convolution and z^p taken at every grid point,

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A partial differential equation with constant coefficients, identified from rollouts.
 
     dz/dt = sum_pj c_pj d^j(z^p)/dx^j + B a + c,        p = 1, 2,  j = 0, 1, 2,

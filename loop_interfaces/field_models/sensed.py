@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A partial differential equation of a field of which a few points are measured.
 
     dz/dt = sum_pj c_pj d^j(z^p)/dx^j + c + B a,        B_i(x) = b 1[|x - x_i| < w/2],

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """How functions are compiled, and when a compiled one on disk is out of date.
 
 Numba keeps compiled functions beside the source (or in the user's cache folder where that cannot be

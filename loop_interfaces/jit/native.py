@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Machine code by its address, inside compiled functions, and words that threads share.
 
 The machine code is what a C library or Numba's cfunc offers.

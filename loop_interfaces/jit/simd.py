@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Eight float64 side by side, inside compiled functions.
 
 Numba leaves vectorisation to the compiler, which gives up on the butterflies of an FFT. A value of

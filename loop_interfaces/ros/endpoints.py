@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Endpoints of the loop's array topics: quality of service, senders and receivers of frames.
 
 They hand serialised bytes to the middleware and take them from it, so that no per-element Python is

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What every node offers to ROS tools, and who else is in the graph: /diagnostics, trigger services.
 
 All of it runs in the node's housekeeping, off the hot path: nothing here is called for a message of

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The event loop of a node: raw array topics on a WaitSet, everything else on an executor.
 
 A message of an array topic is taken as bytes, after a wait for the array subscriptions alone: by

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The `main` of a node: its ROS context, its signals, its exit code."""
 
 import contextlib

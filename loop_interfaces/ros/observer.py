@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What event loops of nodes have in common, and that of a node that observes.
 
 The nodes that answer states have one of their own (loop_interfaces.ros.node_loop). An observer's

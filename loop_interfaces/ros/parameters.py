@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Declares the parameters of loop_interfaces.parameters on a node, and reads another node's.
 
 All are read-only but the live ones, which no result depends on.

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Reads the states and actions of a loop without taking part in it: for recorders and observers.
 
 The plant of this project publishes them together on `samples` (loop_interfaces.samples), which

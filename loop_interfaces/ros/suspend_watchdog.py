@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Watchdog that detects a suspended process (SIGSTOP, a frozen machine) and a stuck event loop."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The equations the plant can integrate: a file per PDE, all registered by name.
 
 An equation of your own is one class like these; how the plant finds it: `configured_equation`.

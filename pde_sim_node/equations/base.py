@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What an equation of the plant is: its parameters, its operators, its fields.
 
 Every equation has the form, on the periodic interval [0, L) and in Fourier space,

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The Fisher-KPP equation."""
 
 from dataclasses import dataclass

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The real Ginzburg-Landau equation."""
 
 from dataclasses import dataclass

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The Kuramoto-Sivashinsky equation with Gaussian actuators and an equilibrium as target."""
 
 from dataclasses import dataclass

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Which equation a name stands for: one of the project, or one from elsewhere.
 
 One from elsewhere is Python code, which is executed to get it. So a name that a problem's file gives

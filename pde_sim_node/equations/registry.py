@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The equations that come with the plant, by name."""
 
 from collections.abc import Mapping

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The transpose of the plant's derivative: exact gradients of whatever depends on a trajectory.
 
 For z' = f(z, a), the compiled step of `kernel`, `Adjoint.pull_back` gives

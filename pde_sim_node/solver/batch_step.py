@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The loop of a compiled step over the environments: each is advanced, costed and checked.
 
 An environment is computed alone and by the same instructions whatever stands beside it, so its

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Coefficients of ETDRK4, exponential time differencing with a fourth-order Runge-Kutta rule.
 
 For du/dt = L u + N(u) with a diagonal L, one step of length dt is

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The exact step of a linear plant: a propagator for each wavenumber, no Runge-Kutta.
 
 The spectra v_f of the components f of an environment become

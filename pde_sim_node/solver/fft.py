@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The complex FFT of the kernel: Stockham's, over one transform, in lanes of eight.
 
 A complex sequence of length m is two planes of float64 at an address `w`: real parts from offset

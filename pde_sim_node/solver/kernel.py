@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The compiled step of the plant: ETDRK4 for one environment after the other.
 
 With N = m F[g(u)] + F_a the nonlinear part and the forcing of a held action, one internal step is

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The input of a compiled step: its settings, and the layout of constants and scratch in memory."""
 
 from collections.abc import Mapping

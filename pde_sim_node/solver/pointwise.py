@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Scalar functions over an array, compiled: the nonlinearity of an equation, and a check."""
 
 import math

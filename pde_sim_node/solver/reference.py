@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The time step in plain NumPy: what the compiled one of `kernel` computes, to be read.
 
 It is the step of `etdrk4` (equations and sources there) for the real FFT v of the state, with the

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Compiled transforms between a state, its spectrum and a field on the dealiased grid.
 
 Spectra are those of u(x) = sum_j X_j exp(2 pi i j x / L), j = -n_x/2..n_x/2: the real FFT over the

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A step of a batch as compiled code, with all that it works on in one record."""
 
 from typing import Any

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The compiled step of a batch of environments, shared out to the threads of a pool."""
 
 import os

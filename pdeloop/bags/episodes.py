@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The episodes of a bag: what belongs to each, and whether all of it was recorded. Pure.
 
 A reader follows the messages with it in the order in which they were recorded.

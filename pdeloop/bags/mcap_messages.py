@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The messages of MCAP files, whether or not the files were finished. No ROS import.
 
 A file is read with the library `mcap`, record by record up to its last whole one and without its

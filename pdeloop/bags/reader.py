@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Reads the loop's messages back from an MCAP bag, and sorts them into episodes.
 
 A bag was not finished if its recorder was killed, or the disk was full.

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`pdeloop bag verify`: computes a recorded run again and compares it bit by bit.
 
 Every complete episode is run again from its seeds, policies and models (or the excitation's seed):

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`pdeloop bag`: what is done with recordings."""
 
 from __future__ import annotations

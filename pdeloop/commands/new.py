@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`pdeloop new NAME`: a folder with a PDE that runs, to be changed into one's own."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`pdeloop check plant|controller|tuner`: whether a stand-in keeps to docs/interfaces.md. Pure.
 
 Each check plays the other two nodes with one environment. It repeats starts and states, withholds

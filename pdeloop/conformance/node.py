@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The loop's topics for the checks of pdeloop.conformance.checks."""
 
 from __future__ import annotations

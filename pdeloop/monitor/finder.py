@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Which loop the monitor shows: the given one, or the training that runs."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The monitor as a ROS 2 node: reads the loop's topics now and then, calls its services when asked.
 
 Subscribes  episode/start, policy, model, episode/cost, episode/paused, target, /diagnostics;

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """How the monitor calls the services of the loop's nodes, never waiting."""
 
 from __future__ import annotations

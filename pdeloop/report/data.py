@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What a report shows, gathered from the folder of a run or of a reproduction."""
 
 from __future__ import annotations

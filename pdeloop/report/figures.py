@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The figures of a report about one problem: one function each, data in, a matplotlib figure out."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The figures about learning: cost against rollouts, the steps that were tried, the final costs."""
 
 from __future__ import annotations

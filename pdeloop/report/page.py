@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`pdeloop report`: figures for a paper, and one page that shows them and needs no network.
 
 DIR/report/NAME.png, NAME.svg    the figures

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What all figures of a report share. A controller's colour: loop_interfaces.controllers.
 
 Fields are drawn with cividis and gains with PuOr, which any colour vision can read.

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What a study consists of. Pure but for the problems' files."""
 
 from __future__ import annotations

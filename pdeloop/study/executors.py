@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Where the trainings of a study run: processes of this machine, or a Dask cluster."""
 
 from __future__ import annotations

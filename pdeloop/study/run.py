@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Carries a study out, or on: what is not in its folder yet is trained.
 
 DIR/study.json                what was asked for

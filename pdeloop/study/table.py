@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The table and the figure of a study."""
 
 from __future__ import annotations

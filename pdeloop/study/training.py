@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """One training of a study: a function of its parameters alone, wherever it runs."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """relay_node: sits on the state and action topics between a plant and a controller.
 
 Start the plant with `-r state:=state_sent` and the controller with `-r action:=action_sent`; the

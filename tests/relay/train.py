@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`python -m tests.relay.train ARGUMENTS`: `pdeloop train ARGUMENTS` with a relay with faults between
 plant and controller.
 """

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The protocols of plant, controller and tuner, as they are, over a network in virtual time.
 
     python -m tests.simulation --seeds 0 10000

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Simulates seeds on all cores and prints what fails, with the smallest plan that does."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The tuner's disk: what is left of its checkpoints after a crash at any call, or a power cut.
 
 Checkpoints are written and read by `tuner_node.checkpoint` itself, in a folder in memory. Only what

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """One training over a simulated network, from its plan."""
 
 from __future__ import annotations

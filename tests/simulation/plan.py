@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What goes wrong in a simulated training, drawn from a seed."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The processes of a simulated loop: the project's protocols as they are, and strangers."""
 
 from __future__ import annotations

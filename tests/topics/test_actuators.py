@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Actuators at unequal places, over topics: the training of one process, and a law that helps."""
 
 from __future__ import annotations

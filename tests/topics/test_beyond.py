@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Gauss-Newton with noise, action limits and sensors over topics: the training of one process."""
 
 from __future__ import annotations

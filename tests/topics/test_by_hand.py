@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The README's three terminals, as it prints them."""
 
 from __future__ import annotations

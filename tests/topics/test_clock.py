@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A machine clock that jumps by days changes nothing: every wait uses the monotonic clock."""
 
 from __future__ import annotations

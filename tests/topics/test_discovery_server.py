@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Nodes that find each other through Fast DDS's discovery server."""
 
 from __future__ import annotations

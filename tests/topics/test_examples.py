@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The examples of docs/bring-your-own.md, run as the page says."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The fast paths of plant and controller: the same bytes, and the expected messages only."""
 
 from __future__ import annotations

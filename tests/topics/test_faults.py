@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Whatever happens to processes and messages on the way, the training ends with one policy."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What the documents say is enough: their examples are taken from the pages and run as they stand."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What ROS tools see of the running nodes: diagnostics, parameters, time, names."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """By default nothing of a run leaves the machine, and two runs on it do not meet."""
 
 from __future__ import annotations

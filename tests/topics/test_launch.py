@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The package as colcon installs it, started by its launch files, over real topics.
 
 ROS's own `launch` and `launch_ros` read them where an installation of ROS is. They are not on PyPI:

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The loop over real topics, in real processes: the same training as in one process, to the bit."""
 
 from __future__ import annotations

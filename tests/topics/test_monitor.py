@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The live page in a real browser, beside a real loop over topics."""
 
 from __future__ import annotations

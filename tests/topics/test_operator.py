@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What an operator does with the services: pause, step, resume, stop; the policy stays the same."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Scaling out, real time and cores of one's own: over real topics, with limits."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The README's commands one after the other: each accepts what the one before it left."""
 
 from __future__ import annotations

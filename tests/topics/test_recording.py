@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Recording real loops: nothing is missed, everything can be recomputed, and failures do no harm."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The SROS2 policy names exactly what the running nodes do."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Trainings under random faults: every one ends with the undisturbed policy."""
 
 from __future__ import annotations

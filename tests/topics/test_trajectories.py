@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Gauss-Newton over topics: a stranger on the topic of its trajectories' actions."""
 
 from __future__ import annotations

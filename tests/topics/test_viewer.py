@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The viewer beside a running loop: what it shows is the loop's, and the loop does not notice it."""
 
 from __future__ import annotations

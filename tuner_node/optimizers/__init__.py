@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Optimisers of a policy behind one interface: see `tuner_node.optimizers.base`."""
 
 from collections.abc import Callable

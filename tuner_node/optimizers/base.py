@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What every optimiser of a policy is: it asks for rollouts, and is told their outcome.
 
     while not optimizer.done:

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A local model of the plant, fitted to measured trajectories.
 
 It is affine, plus quadratic in a few modes, plus cubic in fewer.

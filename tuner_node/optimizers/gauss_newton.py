@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Gauss-Newton on measured trajectories.
 
 The cost is a sum of squares of measured quantities; only its sensitivity to the gains needs a

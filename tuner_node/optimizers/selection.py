@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Which fitted models to trust: those that predict how measured trajectories differ.
 
 A model that follows one trajectory well can still be wrong about its neighbours, and a step needs

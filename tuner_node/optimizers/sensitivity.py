@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What a change of the gains does to a trajectory, along a measured trajectory.
 
 The law a = K s + b has the parameters theta = [K b], of shape (n_a, n_s + 1), in row-major order; s

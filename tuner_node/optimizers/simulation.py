@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Improve a law on a model that reproduces the measured rollouts.
 
 With a model of the whole field (`loop_interfaces.field_models`) the closed loop can be simulated from

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The trajectories an optimiser remembers, and how they survive a checkpoint."""
 
 from collections.abc import Mapping

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Descent along two-point estimates of the gradient, which need costs alone; the paper's method.
 
 Each step draws one direction Theta and one initial field, measures the rollouts pi +- r Theta on it,

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What a web page is sent: the status, the learning curve, the target and the shown episode. Pure.
 
 A message is JSON text. One with numbers is binary, little-endian: the length of the header (uint32),

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The web server of the live page: on 127.0.0.1 only, and for no other page than its own.
 
 GET /, /NAME    the page and its files, all of them from this package

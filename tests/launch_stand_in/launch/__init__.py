@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """As much of ROS's `launch` as the launch files use, where it is not installed: it is not on PyPI.
 
 Same names, same meaning, no substitutions and no remote anything. With LAUNCH_DRY_RUN=1 it prints what

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Where a launch description comes from."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The next policy to try, a pure function of the remembered trajectories.
 
 One of four kinds, the first that applies:

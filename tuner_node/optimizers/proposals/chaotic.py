@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A law for a plant that forgets where it began, improved on a model of the whole field.
 
 Applies where a model reproduces the rollouts in pieces, but not from beginning to end, with control or

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A damped Gauss-Newton step on the local models that predict best.
 
 Always applies; the other kinds of proposals come before it.

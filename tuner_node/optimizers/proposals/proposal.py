@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A policy to try, and what the four kinds of proposals have in common."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Chooses the kind of proposal, and asks for one."""
 
 from __future__ import annotations

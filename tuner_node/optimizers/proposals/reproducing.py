@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Which model of the whole field to believe: the first that reproduces the measured rollouts."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """With few point sensors: a law that is improved on a model of the field between them.
 
 Applies where every sensor is read once and a model of the field reproduces the last rollouts' readings.

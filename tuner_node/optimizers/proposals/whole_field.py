@@ -1,3 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A law that is improved on a model of the whole field.
 
 Applies where such a model reproduces the last rollouts from beginning to end.

@@ -1,3 +1,4 @@
+// Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 // A chart in the page's colours, drawn by uPlot (vendor/uplot) at most once a frame.
 
 import { DARK, colour, text } from "./format.js";

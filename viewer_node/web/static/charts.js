@@ -1,3 +1,4 @@
+// Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 // Actions, profile and learning curve.
 
 import { Chart } from "./chart.js";

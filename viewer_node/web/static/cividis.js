@@ -1,3 +1,4 @@
+// Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 // The colour map cividis (Nunez, Anderton, Renslow, PLoS ONE 13(7), 2018; CC0), 256 colours, as the
 // report draws fields: perceptually uniform, and the same with a colour vision deficiency.
 const HEX =

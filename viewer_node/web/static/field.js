@@ -1,3 +1,4 @@
+// Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 // What was seen of the shown episode, and its picture in space and time.
 
 import { CIVIDIS, css } from "./cividis.js";

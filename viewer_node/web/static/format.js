@@ -1,3 +1,4 @@
+// Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 // Colours of the page's style, and numbers as a person writes them.
 
 export const DARK = matchMedia("(prefers-color-scheme: dark)");

@@ -1,3 +1,4 @@
+// Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 // The connection to the monitor: a WebSocket that comes back by itself.
 
 const FIRST = 500; // ms before the first attempt to come back, doubled up to LAST

@@ -1,3 +1,4 @@
+// Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 // The live page: what comes over the link goes into the charts and the page around them.
 
 import { actionsChart, curveChart, profileChart } from "./charts.js";

@@ -1,3 +1,4 @@
+// Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 // The page around the charts: its markup as functions of the model, rendered by Preact.
 
 import htm from "./htm.mjs";
