@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from controller_node.identification import DesignSettings, design_each
 from controller_node.policy import excitation
-from loop_interfaces.frames import Frame
+from loop_interfaces.frames import KEPT_ARRAY, Frame
 from loop_interfaces.parameters import model_order
 from loop_interfaces.protocol import ModelFailure, Publication
 from loop_interfaces.signature import design_digest, digest_of, signature
@@ -25,7 +25,7 @@ class Exploration:
     outcomes : dict
         What came out of it, by plant; filled in by the responder.
     nbytes : int
-        Size of the states that are kept.
+        Size of the states that are kept, and of what keeps them.
     """
 
     def __init__(self, start: Frame, settings: DesignSettings) -> None:
@@ -56,7 +56,7 @@ class Exploration:
     def keep(self, state: Frame) -> None:
         """Keep a state for the identification."""
         self._states[state.plant, state.step] = state.values.copy()
-        self.nbytes += state.values.nbytes
+        self.nbytes += state.values.nbytes + KEPT_ARRAY
 
     def give_up(self, reason: str, *, retry: bool) -> None:
         """No model can come out of the episode, whatever its cost is."""
@@ -72,12 +72,7 @@ class Exploration:
         if (ended == VOID).any() or not cost.step:
             return self._failure("the exploratory episode is void", retry=True)
         if (ended != COMPLETED).any():
-            step = int(ended.max())
-            return self._failure(
-                f"the plant diverged under exploration at step {step}; lower exploration_variance, "
-                "or measurement_noise, which raises it",
-                retry=False,
-            )
+            return self._failure(self._divergence(cost), retry=False)
         if self._unusable is not None:
             return self._unusable
         known = {step: z for (plant, step), z in self._states.items() if plant == cost.plant}
@@ -113,6 +108,19 @@ class Exploration:
             return []
         failure = self.outcomes[plant] = replace(self._unusable, retry=False)
         return [failure]
+
+    def _divergence(self, cost: Frame) -> str:
+        """That the plant diverged, in words; and if its states went on, who else may have said so."""
+        ended = cost.values[:, CostColumn.ENDED]
+        env, step = int(ended.argmax()), int(ended.max())
+        told = f"the plant diverged under exploration at step {step}; lower exploration_variance"
+        last = [z[env] for (p, k), z in self._states.items() if p == cost.plant and k >= step]
+        if all(np.array_equal(z, last[0]) for z in last):
+            return told
+        return (
+            f"{told}, or measurement_noise, which raises it; without such noise, stop the other node "
+            "that publishes episode/cost, as the states still changed after that step"
+        )
 
     def _signature(self) -> float:
         start, settings = self._start, self._settings

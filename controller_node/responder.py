@@ -18,7 +18,7 @@ from controller_node.exploration import Exploration
 from controller_node.identification import DesignSettings
 from controller_node.policy import ProjectedLaw
 from loop_interfaces import model_rows
-from loop_interfaces.frames import Frame, FrameError
+from loop_interfaces.frames import KEPT_ARRAY, Frame, FrameError
 from loop_interfaces.protocol import Counters, ModelFailure, Publication
 from loop_interfaces.signature import NOT_SIGNED, digest_of, signature
 from loop_interfaces.topics import ACTION, COMPLETED, MAX_GAIN, CostColumn, StartColumn, start_rows
@@ -314,7 +314,7 @@ class Responder:
         """Keep a state of an exploratory episode for its identification."""
         if not exploration.lacks(state):
             return
-        if self._has_room(state.run, state.values.nbytes):
+        if self._has_room(state.run, state.values.nbytes + KEPT_ARRAY):
             exploration.keep(state)
         else:
             exploration.give_up(

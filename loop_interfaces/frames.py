@@ -35,6 +35,10 @@ _NATIVE = np.dtype("<f8")
 _HEAD = struct.Struct("<5d")
 
 
+KEPT_ARRAY = 320
+"""Bytes that Python takes for an array that is kept under its ids, besides the values."""
+
+
 class FrameError(ValueError):
     """An array message that does not follow the interface; the text says what and what was expected."""
 
@@ -169,7 +173,9 @@ class ArrayCodec:
         start = len(head)
         buffer = head + bytes(8 * (HEADER + total))
         data = np.ndarray(shape, _NATIVE, buffer, start + _HEAD.size)
-        if len(self._templates) >= 64:  # shapes are few; a bound keeps a long life flat
+        # Shapes are few; a bound keeps a long life flat.
+        known = sum(len(buffer) for buffer, _, _ in self._templates.values())
+        if len(self._templates) >= 64 or known > MAX_VALUES:
             self._templates.clear()
         self._templates[shape] = (buffer, start, data)
         return self._templates[shape]

@@ -84,3 +84,11 @@ def test_what_is_not_the_interface_is_refused(change, expected):
     change(bad)
     with pytest.raises(FrameError, match=expected):
         ArrayCodec(labels).decode(serialize_message(bad))
+
+
+def test_messages_of_ever_other_shapes_leave_little_behind():
+    codec = ArrayCodec(("env", "actuator"))
+    for rows in range(2_000_000, 2_000_020):
+        codec.encode(frame_of((rows, 1)))
+    kept = sum(len(buffer) for buffer, _, _ in codec._templates.values())
+    assert kept < 3 * 8 * 2_000_020

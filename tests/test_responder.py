@@ -15,7 +15,7 @@ from controller_node.responder import Responder
 from loop_interfaces import model_rows
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import ModelFailure
-from loop_interfaces.topics import ACTION, COMPLETED, MODEL_IDENTIFIED, VOID
+from loop_interfaces.topics import ACTION, COMPLETED, MODEL_IDENTIFIED, VOID, CostColumn
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import Plant
 from pdeloop.in_process import LocalPair
@@ -110,6 +110,30 @@ def test_a_void_exploration_forged_into_a_completed_one_names_who_else_may_have_
         "needs at least 8 steps; lower reduced_order or raise the horizon, and if that is long "
         "enough, stop the other node that publishes episode/cost"
     )
+
+
+@pytest.mark.parametrize("forged", [False, True])
+def test_a_divergence_that_the_states_do_not_show_names_who_else_may_have_said_so(
+    responder, forged
+):
+    made = plant()
+    states = made.reset(np.array([1]))
+    responder.start(start(1, (1, 2, 0.1 if forged else 1e9, 0)))
+    for k in range(31):
+        (send,) = responder.state(Frame(RUN, 1, k, 0.0, states))
+        states = made.step(send.frame.values) if k < 30 else states
+    cost = made.episode_costs().rows()
+    assert (cost[0, CostColumn.ENDED] == COMPLETED) == forged
+    cost[0, CostColumn.ENDED] = 0.0
+    (failure,) = responder.cost(Frame(RUN, 1, 30, 0.0, cost))
+    assert isinstance(failure, ModelFailure) and not failure.retry
+    told = "the plant diverged under exploration at step 0; lower exploration_variance"
+    if forged:
+        told += (
+            ", or measurement_noise, which raises it; without such noise, stop the other node that "
+            "publishes episode/cost, as the states still changed after that step"
+        )
+    assert failure.reason == told
 
 
 def test_data_that_allow_no_model_are_a_failure_with_the_reason():
@@ -261,6 +285,15 @@ def test_a_run_of_a_stranger_fills_no_memory(responder, monkeypatch):
         responder.policy(Frame(7, 1, 0, 0.0, np.ones((50, 4, 80))))
     (model,) = explore(responder, 5)  # the run with room is served as before
     assert model.topic is MODEL_IDENTIFIED
+
+
+def test_states_of_one_number_count_with_what_keeps_them(responder, monkeypatch):
+    monkeypatch.setattr("controller_node.responder.MAX_BYTES", 100_000)
+    responder.start(start(1, (1, 2, 0.1, 0)))
+    for k in range(400):
+        responder.state(Frame(RUN, 1, k, 0.0, np.ones((1, 1))))
+    (failure,) = responder.cost(Frame(RUN, 1, 399, 1.0, np.array([[1.0, 30.0, COMPLETED]])))
+    assert "more than 100000 bytes" in failure.reason
 
 
 def test_two_different_states_of_one_step_give_no_model_and_ask_for_the_episode_again(responder):

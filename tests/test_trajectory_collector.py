@@ -55,6 +55,25 @@ def test_trajectories_come_with_the_costs_in_the_batchs_order_over_several_episo
     assert result.target is not None
 
 
+def test_a_stranger_with_the_right_ids_fills_no_memory(monkeypatch):
+    monkeypatch.setattr("tuner_node.trajectory_collector.MAX_BYTES", 100_000)
+    served = dispatcher()
+    served.target(0, Frame(0, 0, 0, 0.0, np.ones(2)), 0.0)
+    ((_, start),) = starts(served.assign(observed(1), 0.0))
+    feed(served, 0, start)
+    forged, refused = Frame(RUN, start.episode, 0, 0.0, np.ones((1, 2)), plant=9), 0
+    for step in range(STEPS + 1, 2000):
+        try:
+            served.action(0, replace(forged, step=step))
+        except FrameError as error:
+            assert str(error).startswith("expected at most 100000 bytes of samples of one episode")
+            refused += 1
+    assert refused > 1500
+    assert served.pairs[0].samples.nbytes <= 100_000
+    served.cost(0, costs_of(start), 0.0)
+    assert served.result() is not None  # the plant's came before
+
+
 def test_a_late_sample_is_waited_for_and_a_lost_one_repeats_the_episode():
     served = dispatcher()
     served.target(0, Frame(0, 0, 0, 0.0, np.ones(2)), 0.0)

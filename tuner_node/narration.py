@@ -140,13 +140,19 @@ def closing_lines(problem: str, summary: Row, folder: object) -> list[str]:
     return [*lines, f"  results in {folder}"] if folder else lines
 
 
+def several_publishers(found: Mapping[str, Sequence[str]]) -> list[str]:
+    """Which topics had more than one publisher, and which these were; found: nodes by topic."""
+    return [
+        f"{len(nodes)} nodes published {topic}: {', '.join(nodes)}; expected one"
+        for topic, nodes in found.items()
+    ]
+
+
 def warnings(summary: Row) -> list[str]:
     """What is wrong with the outcome of a training, worst first."""
     lost, rollouts = summary["diverged"], summary["evaluation_rollouts"]
     costs = summary["costs"]
-    found = []
-    for topic, nodes in summary.get("several_publishers", {}).items():
-        found.append(f"{len(nodes)} nodes published {topic}: {', '.join(nodes)}; expected one")
+    found = several_publishers(summary.get("several_publishers", {}))
     if lost["lqt"] == rollouts:
         found.append(
             "every rollout of the first laws diverged; likely causes: an exploration that is too weak "

@@ -100,7 +100,8 @@ class TunerNode:
         if self._writer:
             self._writer.keep(now=self._loop.now(), force=True)
         if self._failure:
-            raise ConfigurationError(self._failure)
+            told = narration.several_publishers(self._all_several_publishers())
+            raise ConfigurationError("; ".join([self._failure, *told]))
         if self._session.stopped:
             self._log.info("stopped on request")
             return STOPPED
@@ -259,6 +260,11 @@ class TunerNode:
         seen = self._session.training.law_seen
         return {"nodes": sorted(found), "law": "affine" if seen else "not seen"}
 
+    def _all_several_publishers(self) -> dict[str, list[str]]:
+        """The nodes of every topic that has had more than one publisher."""
+        self._loop.introspection.look_at_publishers()
+        return self._several_publishers | self._loop.introspection.several_publishers
+
     def _finish(self) -> int:
         if self._writer:
             try:
@@ -266,8 +272,7 @@ class TunerNode:
                     {
                         "transport": "topics",
                         "controller": self._controller(),
-                        "several_publishers": self._several_publishers
-                        | self._loop.introspection.several_publishers,
+                        "several_publishers": self._all_several_publishers(),
                     }
                 )
             except OSError as error:

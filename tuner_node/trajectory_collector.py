@@ -10,11 +10,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.frames import Frame
+from loop_interfaces.frames import KEPT_ARRAY, Frame, FrameError
 from loop_interfaces.topics import COMPLETED
 from tuner_node.optimizers import Trajectory
 
 Array = NDArray[np.float64]
+MAX_BYTES = 2**30
+"""Bytes that are kept of the samples of one episode, whoever sends them."""
 
 
 @dataclass
@@ -27,18 +29,33 @@ class TrajectoryCollector:
     """Why the episode cannot be used, if two different samples came for one step."""
     used: bool = False
     """Whether the trajectories were taken: what comes now is only compared."""
+    nbytes: int = 0
+    """Size of the samples that are kept, and of what keeps them."""
     _samples: dict[str, dict[tuple[int, int], Array]] = field(
         default_factory=lambda: {"states": {}, "actions": {}}
     )
 
     def take(self, what: str, frame: Frame) -> None:
-        """Take a sample z_k ("states") or a_k ("actions"); repeated ones are equal."""
+        """Take a sample z_k ("states") or a_k ("actions"); repeated ones are equal.
+
+        Raises
+        ------
+        FrameError
+            There is no room for it.
+        """
         if (frame.run, frame.episode) != (self.run, self.episode):
             return
         known, key = self._samples[what], (frame.plant, frame.step)
         if key not in known:
-            if not self.used:
-                known[key] = frame.values.copy()
+            if self.used:
+                return
+            size = frame.values.nbytes + KEPT_ARRAY
+            if self.nbytes + size > MAX_BYTES:
+                raise FrameError(
+                    f"expected at most {MAX_BYTES} bytes of samples of one episode; if they are all "
+                    "of this run's plant, lower max_batch"
+                )
+            known[key], self.nbytes = frame.values.copy(), self.nbytes + size
         elif not np.array_equal(known[key], frame.values):
             self.contradiction = (
                 f"two different {what} came for step {frame.step} of episode {frame.episode}"

@@ -84,7 +84,7 @@ class Introspection:
             return
         # A steady period, though the housekeeping comes a little late each time.
         self._due = max(self._due + PERIOD, now + PERIOD / 2)
-        self._look_at_publishers()
+        self.look_at_publishers()
         namesakes, refused = self._namesakes(now), self._refused - self._reported
         self._reported = self._refused
         if refused:
@@ -155,7 +155,7 @@ class Introspection:
             message.header.stamp = self._node.get_clock().now().to_msg()
             publisher.publish(message)
 
-    def _look_at_publishers(self) -> None:
+    def look_at_publishers(self) -> None:
         """Warn of several publishers of one topic, and of one whose QoS is not compatible."""
         for topic, kind in self._topics.items():
             count = self._node.count_publishers(topic)

@@ -328,6 +328,38 @@ rclpy.spin(node)
 """
 
 
+def test_an_error_for_which_a_stranger_may_be_the_reason_names_the_stranger(loop, tmp_path):
+    start_pair(loop)
+    with operator(loop) as desk:
+        loop.start("-c", SECOND_PLANT, name="second")
+        until(lambda: "/second_plant" in desk.ask(nodes=None), LIMIT, "second plant")
+        tuner = start_tuner(loop, tmp_path / "run", iterations=100_000)
+        (line,) = loop.wait(tuner, LIMIT, code=1).strip().splitlines()[-1:]
+    assert "expected one plant and one controller in this namespace" in line
+    assert "; 2 nodes published /episode/cost: /pde_sim_node, /second_plant; expected one" in line
+
+
+SECOND_PLANT = """
+from dataclasses import replace
+import rclpy
+from std_msgs.msg import Float64MultiArray
+from loop_interfaces.frames import ArrayCodec
+from loop_interfaces.ros.endpoints import reader_qos, writer_qos
+from loop_interfaces.topics import COST
+rclpy.init()
+node = rclpy.create_node("second_plant")
+publisher = node.create_publisher(Float64MultiArray, "episode/cost", writer_qos(COST))
+costs, known = ArrayCodec(COST.labels), set()
+def cost_otherwise(message):
+    cost = costs.decode(message)
+    if (cost.run, cost.episode) not in known:
+        known.add((cost.run, cost.episode))
+        publisher.publish(costs.encode(replace(cost, values=cost.values * [2.0, 2.0, 1.0])))
+node.create_subscription(Float64MultiArray, "episode/cost", cost_otherwise, reader_qos(COST), raw=True)
+rclpy.spin(node)
+"""
+
+
 def resident(process: subprocess.Popen[bytes]) -> int:
     """Resident memory in kB."""
     for line in Path(f"/proc/{process.pid}/status").read_text().splitlines():

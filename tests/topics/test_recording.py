@@ -17,6 +17,7 @@ from rosbags.highlevel import AnyReader
 from loop_interfaces.frames import Frame
 from loop_interfaces.model_rows import pack
 from pdeloop.bags.info import describe
+from pdeloop.bags.mcap_messages import files, finished
 from pdeloop.bags.reader import Bag
 from pdeloop.bags.verify import verify
 from pdeloop.identification import identify_bag
@@ -280,15 +281,17 @@ def test_a_second_recording_of_a_run_gets_a_bag_of_its_own(loop, tmp_path):
     words = ("train", str(paced(tmp_path, 10.0)), "--iterations", str(iterations))
     run = loop.pdeloop(*words, "--out", str(out), "--record")
     until(lambda: adapted(out) >= 5, LIMIT, "iteration 5")
-    run.send_signal(signal.SIGINT)
+    run.send_signal(signal.SIGHUP)  # as a terminal that is closed does
     loop.wait(run, LIMIT, code=130)
+    bags = files(out / "bag")
+    assert bags and all(map(finished, bags))
     loop.wait(loop.pdeloop("train", "--resume", str(out), "--record"), LIMIT)
     assert_same_training(out, in_process(iterations=iterations))
     second = verify(out / "bag-2")
     assert (second.count, second.notes) == (0, []), second.text()
     both = verify(out)
     assert (both.count, both.notes) == (0, [])
-    assert len(both.incomplete) <= 1  # the one that Ctrl-C cut short
+    assert len(both.incomplete) <= 1  # the one that the signal cut short
     assert both.compared["policies"] == 2 + 2 * iterations + 30
 
 
