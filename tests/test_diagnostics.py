@@ -19,7 +19,7 @@ from controller_node.responder import Responder
 from loop_interfaces.diagnostics import Level, Rate, Status
 from loop_interfaces.frames import Frame
 from loop_interfaces.parameters import taken_by
-from loop_interfaces.ros.endpoints import writer_qos
+from loop_interfaces.ros.endpoints import reader_qos, writer_qos
 from loop_interfaces.ros.introspection import Introspection
 from loop_interfaces.topics import COST, STATE, TARGET, VOID
 from pde_sim_node.diagnostics import PlantDiagnostics
@@ -52,7 +52,7 @@ def test_a_publisher_whose_messages_do_not_arrive_is_named_with_its_topic():
     node.get_publishers_info_by_topic.return_value = there
     node.count_services.return_value = 1
     found = Introspection(node)
-    found.supervise("/target", TARGET)
+    found.supervise("/target", reader_qos(TARGET))
     found.round(1.0)
     ((said,), _) = node.get_logger().error.call_args
     assert said.startswith("/lab/mine publishes /target so that it does not arrive (QoS: Volatile")

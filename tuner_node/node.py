@@ -23,7 +23,7 @@ from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.parameters import TUNER, taken_by, with_budget
 from loop_interfaces.protocol import NO_CONTROLLER, STOPPED, ModelFailure
-from loop_interfaces.ros.endpoints import Sender, reader_qos, scoped
+from loop_interfaces.ros.endpoints import Sender, reader_qos, samples_qos, scoped
 from loop_interfaces.ros.introspection import full_name
 from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.node_main import ConfigurationError, node_main
@@ -134,8 +134,10 @@ class TunerNode:
                 loop.receive(topic, self._handler(handle, number), namespace)
             failed, qos = scoped(namespace, topics.MODEL_FAILED), reader_qos(topics.MODEL)
             node.create_subscription(String, failed, partial(self._on_failure, number), qos)
-            for topic in topics.ARRAYS:
-                loop.introspection.supervise(self._full_name(namespace, topic.name), topic)
+            supervised = {topic.name: reader_qos(topic) for topic in topics.ARRAYS}
+            supervised |= {topics.MODEL_FAILED: qos, topics.SAMPLES: samples_qos(1)}
+            for name, asked in supervised.items():
+                loop.introspection.supervise(self._full_name(namespace, name), asked)
         loop.introspection.report("training", self._diagnostics.report)
         loop.introspection.offer("~/pause", self._pause)
         loop.introspection.offer("~/resume", self._resume)

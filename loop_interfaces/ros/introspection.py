@@ -19,8 +19,6 @@ from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from std_srvs.srv import Trigger
 
 from loop_interfaces.diagnostics import ConditionTimer, Level, Status
-from loop_interfaces.ros.endpoints import reader_qos
-from loop_interfaces.topics import Topic
 
 NAMELESS = "_NODE_NAME_UNKNOWN_"
 """The graph's name for the node of an endpoint, before it has discovered the node."""
@@ -45,7 +43,7 @@ class Introspection:
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self._topics: dict[str, Topic] = {}
+        self._topics: dict[str, QoSProfile] = {}
         self._refused, self._reported, self._reason = 0, 0, ""
         self._publisher: Publisher | None = None
         self._diagnostics: Callable[[float], Status] = lambda now: Status(Level.OK, "")
@@ -62,9 +60,12 @@ class Introspection:
         self._known: dict[str, int] = {}
         """Publishers of a topic that were looked at."""
 
-    def supervise(self, name: str, topic: Topic) -> None:
-        """Check the publishers of a topic, by its full name: one other node should publish it."""
-        self._topics[name] = topic
+    def supervise(self, name: str, qos: QoSProfile) -> None:
+        """Check the publishers of a topic, by its full name: one other node should publish it.
+
+        qos: what this node's subscriber asks for.
+        """
+        self._topics[name] = qos
 
     def refuse(self, topic: str, reason: object, count: int = 1) -> None:
         """Count messages that were refused; they are reported with the next `round` that works."""
@@ -157,7 +158,7 @@ class Introspection:
 
     def look_at_publishers(self) -> None:
         """Warn of several publishers of one topic, and of one whose QoS is not compatible."""
-        for topic, kind in self._topics.items():
+        for topic, asked in self._topics.items():
             count = self._node.count_publishers(topic)
             if count < 2 and count == self._known.get(topic):
                 continue
@@ -168,7 +169,7 @@ class Introspection:
             ]
             self._known[topic] = len(there)
             for name, offered in there:
-                verdict, reason = qos_check_compatible(offered, reader_qos(kind))
+                verdict, reason = qos_check_compatible(offered, asked)
                 if verdict == QoSCompatibility.ERROR:
                     self._node.get_logger().error(
                         f"{name} publishes {topic} so that it does not arrive (QoS: "

@@ -22,7 +22,7 @@ from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
 
 from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.ros.endpoints import Receiver, SampleBatcher, Sender
+from loop_interfaces.ros.endpoints import Receiver, SampleBatcher, Sender, reader_qos
 from loop_interfaces.ros.observer import STUCK, SUSPENDED, WAIT, EventLoop
 from loop_interfaces.ros.sample_subscription import SampleSubscription
 from loop_interfaces.ros.suspend_watchdog import SuspendWatchdog
@@ -108,7 +108,7 @@ class NodeLoop(EventLoop):
         """Call `callback` with every frame of `topic`; a ValueError it raises refuses the message."""
         receiver = Receiver(self.node, topic, callback, namespace)
         self._receivers.append(receiver)
-        self.introspection.supervise(receiver.name, topic)
+        self.introspection.supervise(receiver.name, reader_qos(topic))
         return receiver
 
     def answer_fast(self, receiver: Receiver, sender: Sender, path: FastPath) -> None:

@@ -264,19 +264,23 @@ def test_a_strange_publisher_is_reported_by_name_and_changes_nothing(loop, tmp_p
     assert_same_training(out, in_process(iterations=40))
     assert "2 nodes publish /action: /controller_node, /stranger" in loop.output(running["plant"])
     told = json.loads((out / "result.json").read_text())["several_publishers"]
-    assert told == {"/action": ["/controller_node", "/stranger"]}
+    assert told == {
+        "/action": ["/controller_node", "/stranger"],
+        "/samples": ["/pde_sim_node", "/stranger"],
+    }
     stranger.kill()
 
 
 STRANGER = """
 import time
 import numpy as np, rclpy
-from std_msgs.msg import Float64MultiArray
+from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 from loop_interfaces.frames import ArrayCodec, Frame
-from loop_interfaces.ros.endpoints import writer_qos
+from loop_interfaces.ros.endpoints import samples_qos, writer_qos
 from loop_interfaces.topics import ACTION
 rclpy.init()
 node = rclpy.create_node("stranger")
+samples = node.create_publisher(UInt8MultiArray, "samples", samples_qos(1))
 publisher = node.create_publisher(Float64MultiArray, "action", writer_qos(ACTION))
 codec = ArrayCodec(ACTION.labels)
 k = 0
