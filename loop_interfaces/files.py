@@ -76,6 +76,13 @@ def make_folder(path: Path) -> None:
         sync_folder(folder.parent)
 
 
+def make_own_folder(path: Path) -> None:
+    """Make the folder `path` if it is not there. OSError if it is a link, which may lead anywhere."""
+    path.mkdir(exist_ok=True)
+    if path.is_symlink():
+        raise OSError(errno.ELOOP, "it is a symbolic link", str(path))
+
+
 def private_folder(path: Path) -> None:
     """Make `path` a folder that only this user can look into and write to.
 

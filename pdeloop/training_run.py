@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import importlib.util
 import itertools
+import os
 import sys
 import threading
 import time
@@ -16,6 +17,7 @@ from typing import Any
 
 import controller_node.fast_path
 import pde_sim_node.fast_path
+from loop_interfaces.files import make_own_folder
 from loop_interfaces.isolation import NETWORK, loopback_environment
 from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_equation, build_plant
@@ -150,7 +152,7 @@ def _train_over_topics(
             f"without ROS: pdeloop train --resume {folder} --in-process"
         )
     logs = folder / "logs"
-    logs.mkdir(exist_ok=True)
+    make_own_folder(logs)
     bags: list[Path] = []
 
     def command(node: LoopNode) -> list[str]:
@@ -211,4 +213,5 @@ def _train_over_topics(
 def unused(path: Path) -> Path:
     """`path`, or the first of path-2, path-3, ... that does not exist."""
     numbered = (path.with_name(f"{path.name}-{n}") for n in itertools.count(2))
-    return next(p for p in itertools.chain([path], numbered) if not p.exists())
+    # A link that leads nowhere is there, too.
+    return next(p for p in itertools.chain([path], numbered) if not os.path.lexists(p))

@@ -21,6 +21,7 @@ from loop_interfaces.files import FileError, open_own, private_folder, write_ato
 from pdeloop import domain, live
 from pdeloop.cli import FAILED, main
 from pdeloop.report.data import gather
+from pdeloop.training_run import unused
 from tests.small import SMALL
 from tuner_node import checkpoint
 from tuner_node.run_folder import RunFolder, RunFolderError
@@ -264,6 +265,26 @@ def test_a_link_in_a_run_folder_is_not_followed(run, tmp_path, name, capsys):
         assert "cannot write progress" in text.out and "it is a symbolic link" in text.out
 
 
+@pytest.mark.parametrize("name", ["logs", "logs/pde_sim_node.log"])
+def test_a_link_in_place_of_the_logs_is_refused_in_one_sentence(run, tmp_path, name, capsys):
+    (run / "result.json").unlink()
+    (tmp_path / "victims").mkdir()
+    victim = tmp_path / "victims" / "pde_sim_node.log"
+    victim.write_text("precious")
+    (run / name).parent.mkdir(exist_ok=True)
+    (run / name).symlink_to(victim if "/" in name else victim.parent)
+    assert main(["train", "--resume", str(run)]) == FAILED
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == f"pdeloop: it is a symbolic link ({run / name})"
+    assert victim.read_text() == "precious"
+    assert list(victim.parent.iterdir()) == [victim]
+
+
+def test_a_link_that_leads_nowhere_is_no_free_name_for_a_bag(tmp_path):
+    (tmp_path / "bag").symlink_to(tmp_path / "elsewhere")
+    assert unused(tmp_path / "bag") == tmp_path / "bag-2"
+
+
 def test_links_in_the_folder_of_the_domains_harm_nobody(tmp_path, monkeypatch):
     monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
     victim = tmp_path / "victim"
@@ -323,6 +344,28 @@ def test_a_report_stays_in_its_folder(run, capsys):
     for command in (["evaluate", str(run)], ["report", str(run)]):
         assert main(command) == FAILED
         assert "parameter 'problem' is '../../../escaped'" in capsys.readouterr().err
+
+
+def test_a_report_follows_no_link(run, tmp_path, capsys):
+    victims = tmp_path / "victims"
+    victims.mkdir()
+    (run / "report").symlink_to(victims)
+    assert main(["report", str(run)]) == FAILED
+    told = f"cannot write the report to {run / 'report'}: it is a symbolic link"
+    assert told in capsys.readouterr().err
+    assert list(victims.iterdir()) == []
+    (run / "report").unlink()
+    (run / "report").mkdir()
+    assert main(["report", str(run)]) == 0
+    names = [path.name for path in (run / "report").iterdir()]
+    assert len(names) > 2
+    for name in names:
+        (run / "report" / name).unlink()
+        (victims / name).write_text("precious")
+        (run / "report" / name).symlink_to(victims / name)
+    assert main(["report", str(run)]) == 0
+    assert all((victims / name).read_text() == "precious" for name in names)
+    assert not any((run / "report" / name).is_symlink() for name in names)
 
 
 def test_a_part_that_a_crash_left_is_replaced(tmp_path):

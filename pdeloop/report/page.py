@@ -8,6 +8,7 @@ DIR/report/index.html            the page (page.html.j2), with the figures insid
 from __future__ import annotations
 
 import base64
+import io
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ import jinja2
 import matplotlib
 from matplotlib.figure import Figure
 
+from loop_interfaces.files import make_own_folder, write_atomically
 from pdeloop.report import figures, learning
 from pdeloop.report.data import ProblemData, ReportData, gather
 from pdeloop.report.style import COLOURS, NAMES, STYLE
@@ -65,26 +67,31 @@ def report(folder: Path, out: Path | None) -> tuple[Path, list[str]]:
     target = out or folder / "report"
     page = target / "index.html"
     try:
-        target.mkdir(parents=True, exist_ok=True)
+        if out:
+            out.mkdir(parents=True, exist_ok=True)
+        else:
+            make_own_folder(target)
         with matplotlib.rc_context(STYLE):
             shared = [_save(target, *given) for given in _shared(data.problems)]
             own = [
                 [_save(target, *given) for given in _of_problem(problem)]
                 for problem in data.problems
             ]
-        page.write_text(_page(data, shared, own), encoding="utf-8")
+        write_atomically(page, _page(data, shared, own).encode())
     except OSError as error:
         raise RunFolderError(f"cannot write the report to {target}: {error.strerror}") from error
     return page, data.missing
 
 
 def _save(target: Path, name: str, heading: str, caption: str, figure: Figure) -> Picture:
-    figure.savefig(target / f"{name}.png")
+    png, svg = io.BytesIO(), io.BytesIO()
+    figure.savefig(png, format="png")
     figure.set_layout_engine("none")  # it is laid out, which takes as long as a drawing
-    figure.savefig(target / f"{name}.svg", metadata={"Date": None})
+    figure.savefig(svg, format="svg", metadata={"Date": None})
+    for kind, content in (("png", png), ("svg", svg)):
+        write_atomically(target / f"{name}.{kind}", content.getvalue())
     width = round(PIXELS_PER_INCH * figure.get_figwidth())
-    png = base64.b64encode((target / f"{name}.png").read_bytes()).decode()
-    return Picture(name, heading, caption, width, png)
+    return Picture(name, heading, caption, width, base64.b64encode(png.getvalue()).decode())
 
 
 Drawn = Iterator[tuple[str, str, str, Figure]]
