@@ -71,8 +71,6 @@ class Exploration:
         ended = cost.values[:, CostColumn.ENDED]
         if (ended == VOID).any() or not cost.step:
             return self._failure("the exploratory episode is void", retry=True)
-        if (ended != COMPLETED).any():
-            return self._failure(self._divergence(cost), retry=False)
         if self._unusable is not None:
             return self._unusable
         known = {step: z for (plant, step), z in self._states.items() if plant == cost.plant}
@@ -82,6 +80,8 @@ class Exploration:
                 "of the exploratory episode",
                 retry=True,
             )
+        if (ended != COMPLETED).any():
+            return self._failure(self._divergence(cost), retry=False)
         if target is None:  # as none of its states was answered, somebody else did
             return self._failure("the plant's target has not arrived", retry=True)
         n_a, n_s = self._settings.n_a, min(model_order(asdict(self._settings)), len(target))
