@@ -50,7 +50,8 @@ class ProjectedLaw:
         z_r = np.asarray(target, dtype=np.float64)
         if z_r.shape != (self._n_z,):
             raise ValueError(
-                f"target must have shape ({self._n_z},) like a state, but it has {z_r.shape}."
+                f"the model is of a state of {self._n_z} numbers, but the target has the shape "
+                f"{z_r.shape}; give a model of this plant"
             )
         if not np.isfinite(self._bases).all() or not np.isfinite(z_r).all():
             raise ValueError(

@@ -72,7 +72,8 @@ def identify(trajectories: Sequence[tuple[ArrayLike, ArrayLike]], *, n_s: int) -
     if steps < n_s + n_a:
         raise ValueError(
             f"a model of n_s = {n_s} modes and n_a = {n_a} inputs needs at least {n_s + n_a} steps, "
-            f"but there are {steps}; lower n_s or record a longer trajectory."
+            f"but there are {steps}; take more steps (a longer horizon), or a lower n_s where that is "
+            "enough."
         )
     # One thread: a threaded LAPACK rounds differently for another number of threads.
     with threadpool_limits(limits=1):

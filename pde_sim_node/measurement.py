@@ -117,7 +117,7 @@ class InstrumentedPlant(Plant):
     Raises
     ------
     ValueError
-        More sensors than grid points, or what `Plant` raises.
+        More sensors than grid points, more delays than steps, or what `Plant` raises.
     """
 
     def __init__(self, equation: Equation, *, instruments: Instruments, **grid: Any) -> None:
@@ -129,6 +129,10 @@ class InstrumentedPlant(Plant):
         first = n_x * np.arange(len(equation.components))
         self.positions = (first[:, None] + points).ravel()
         self._delays = instruments.sensor_delays if instruments.sensors else 1
+        if self._delays > self.horizon:
+            raise ValueError(
+                f"sensor_delays must be at most the horizon, {self.horizon} steps, got {self._delays}"
+            )
         self._scale = math.sqrt(n_x / (points.size * self._delays))
         self._forcing = instruments.process_noise * math.sqrt(
             self.sample_time * n_x / equation.length

@@ -174,6 +174,20 @@ def all_diverged(costs: Mapping[str, Array]) -> list[str]:
     return [name for name, table in costs.items() if (table >= DIVERGED_COST).all()]
 
 
+def beside_no_control(costs: Mapping[str, Array], seeds: Sequence[int]) -> str:
+    """Which seeds' adapted policies cost no less than no control, in words; empty if none does."""
+    means = {name: table.mean(axis=1) for name, table in costs.items()}
+    worse = [
+        str(seed)
+        for seed, none, own in zip(seeds, means["none"], means["adapted"], strict=True)
+        if own >= none
+    ]
+    if not worse:
+        return ""
+    which = f" for {'seed' if len(worse) == 1 else 'seeds'} {', '.join(worse)}" * (len(seeds) > 1)
+    return f"the adapted policy costs no less than no control{which}"
+
+
 def as_text(costs: Mapping[str, Array]) -> str:
     """The costs as text: mean and standard deviation over fields and seeds."""
     rows = [["controller", "mean cost", "std", "best", "worst", "diverged"]]

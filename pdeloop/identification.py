@@ -20,7 +20,7 @@ from loop_interfaces.model_rows import ModelRows, pack
 from loop_interfaces.parameters import as_recorded, model_order, table
 from loop_interfaces.spec import ParameterError
 from loop_interfaces.topics import COMPLETED, CostColumn
-from pdeloop.bags.episodes import RecordedEpisode
+from pdeloop.bags.episodes import RecordedEpisode, episode_name
 from pdeloop.bags.reader import Bag
 from pdeloop.data_file import read_measurements
 from recorder_node.bag import BagError
@@ -64,14 +64,14 @@ class Identified:
     def text(self) -> str:
         """The result for people."""
         known = self.summary()
-        used = ", ".join("/".join(map(str, source.values())) for source in self.sources[:6])
-        more = f" and {len(self.sources) - 6} more" if len(self.sources) > 6 else ""
+        used = "; ".join(map(_source_text, self.sources[:6]))
+        more = f"; and {len(self.sources) - 6} more" if len(self.sources) > 6 else ""
         trajectories = (
             "1 trajectory" if len(self.sources) == 1 else f"{len(self.sources)} trajectories"
         )
         lines = [
             f"reduced model of order {known['reduced_order']} from {self.steps} steps of "
-            f"{trajectories} ({'/'.join(self.sources[0])} {used}{more})",
+            f"{trajectories} ({used}{more})",
             f"  {known['n_z']} points, {known['n_a']} actuators, "
             f"spectral radius {known['spectral_radius']:.4f}",
         ]
@@ -83,6 +83,14 @@ class Identified:
         else:
             lines += ["", self.study.text()]
         return "\n".join(lines)
+
+
+def _source_text(source: Mapping[str, int]) -> str:
+    names = {
+        what: episode_name(number) if what == "episode" else number
+        for what, number in source.items()
+    }
+    return ", ".join(f"{what} {name}" for what, name in names.items())
 
 
 def identify_file(path: Path, given: Mapping[str, Any]) -> Identified:
@@ -112,7 +120,7 @@ def identify_bag(
     if any(e.exploratory for e in chosen):
         chosen = [e for e in chosen if e.exploratory]
     if not chosen:
-        which = "complete episode" if episode is None else f"complete episode {episode}"
+        which = "complete episode" + (f" {episode_name(episode)}" if episode is not None else "")
         raise BagError(f"{bag.path} holds no {which} to identify from (see pdeloop bag info)")
     target = bag.target()
     if target is None:

@@ -31,6 +31,8 @@ from rosbags.interfaces import QosDurability
 
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.topics import ACTION, COST, START, STATE
+from pdeloop.bags.episodes import episode_name, episode_number
+from pdeloop.bags.info import describe, info_text
 from pdeloop.bags.reader import Bag
 from pdeloop.bags.verify import verify
 from pdeloop.identification import identify_bag
@@ -176,6 +178,32 @@ def test_an_episode_is_found_by_its_number(tmp_path):
     assert states.shape == (6, 1, 16) and actions.shape == (5, 1, 4)
     assert np.array_equal(states[3], frame(3, 1, 16, episode=8).values)
     assert bag.parameters() == {RUN: {"n_z": 16}}
+
+
+def test_people_read_the_start_of_the_tuner_and_the_number_of_the_episode_since():
+    for number, name in ((7, "7"), (2**32 + 7, "1.7"), (3 * 2**32 + 10, "3.10")):
+        assert episode_name(number) == name
+        assert episode_number(name) == episode_number(str(number)) == number
+    with pytest.raises(ValueError, match="invalid literal"):
+        episode_number("1.7.2")
+
+
+def test_the_episodes_are_listed_with_their_costs_and_what_they_lack(tmp_path):
+    *_, head, first, second = info_text(describe(written(tmp_path, skip=3))).splitlines()
+    assert head.split() == ["episode", "environments", "seconds", "mean", "stage", "cost"]
+    assert first.split() == [
+        "7",
+        "1",
+        "0.01",
+        "1",
+        "exploratory,",
+        "lacks",
+        "1",
+        "of",
+        "6",
+        "states",
+    ]
+    assert second.split()[0] == "8"
 
 
 def test_a_lost_sample_makes_the_episode_incomplete(tmp_path):

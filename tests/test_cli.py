@@ -54,6 +54,11 @@ def train(out: Path, *more: str, problem: Path = SMALL) -> int:
             "n_a: 1\n    actuator_positions: [1.5]",
             "expected a list of numbers from 0 to 1",
         ),
+        (
+            "n_a: 4",
+            "n_a: 4\n    sensors: 2\n    sensor_delays: 31",
+            "sensor_delays must be at most the horizon, 30 steps, got 31",
+        ),
     ],
 )
 def test_a_bad_problem_is_refused(tmp_path, capsys, old, new, words):

@@ -12,6 +12,7 @@ import pytest
 
 from pde_sim_node.build import fingerprint
 from pdeloop.cli import main
+from pdeloop.evaluation import beside_no_control
 from tests.small import SMALL
 from tuner_node.run_folder import RunFolder
 
@@ -40,6 +41,17 @@ def test_a_run_says_who_controlled_and_evaluates_to_its_own_costs(finished, caps
     assert main(["evaluate", str(finished), "--json"]) == 0
     costs = json.loads(capsys.readouterr().out)
     assert costs == result["costs_by_field"]
+
+
+def test_a_policy_that_is_no_better_than_no_control_is_told_with_its_seed():
+    costs = {
+        "none": np.array([[4.0, 5.0], [4.0, 5.0]]),
+        "adapted": np.array([[1.0, 2.0], [1.0, 9.0]]),
+    }
+    words = "the adapted policy costs no less than no control"
+    assert beside_no_control(costs, (3, 4)) == f"{words} for seed 4"
+    assert beside_no_control({name: table[1:] for name, table in costs.items()}, (4,)) == words
+    assert beside_no_control({name: table[:1] for name, table in costs.items()}, (3,)) == ""
 
 
 def refused(capsys: Any, run: Path) -> str:

@@ -128,6 +128,13 @@ def test_the_closing_words_have_the_ranges_the_budget_and_the_folder():
     assert warnings(summary()) == [] and not failed(summary())
 
 
+def test_a_gain_on_a_law_that_is_worse_than_no_control_is_told_against_no_control():
+    costs = {"none": [4.0, 4.0], "lqt": [2.0, 30.0], "adapted": [1.0, 2.0]}
+    words = "no less than no control; the adapted one costs 62.5 % less than no control"
+    assert any(line.endswith(words) for line in closing_lines("kdv", summary(costs=costs), ""))
+    assert not any("no less" in line for line in closing_lines("kdv", summary(), ""))
+
+
 def test_what_adapted_nothing_is_no_gain():
     lines = closing_lines("kdv", summary(changed=[False, False]), "")
     assert not any("LQT;" in line or "% below" in line for line in lines)

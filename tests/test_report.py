@@ -154,15 +154,18 @@ def test_the_page_says_what_it_reports(folder, tab):
         "Object.fromEntries([...document.querySelectorAll('dl dt')].map("
         "(name) => [name.textContent, name.nextElementSibling.textContent]))"
     )
+    controllers = tab.ask("[...document.querySelectorAll('dd')].map((value) => value.textContent)")
     assert facts["Folder"] == str(folder)
     assert facts["Seeds"] == "0 to 1"
-    assert "32 numbers" in facts["Problem small"] and "numpy" in facts["Versions"]
+    assert (
+        facts["Problem"].startswith("small: a state of 32 numbers") and "numpy" in facts["Versions"]
+    )
     if is_run(folder):
         assert facts["Command"] == f"pdeloop train {folder}/parameters.yaml"
-        assert facts["Controller adapted"] == "gauss_newton, started from the LQT gains"
+        assert facts["Controller"] == "adapted: gauss-newton, started from the LQT gains"
     else:
         assert facts["Command"] == f"pdeloop study {folder}/study.json"
-        assert facts["Controller pure PO"] == "two_point, started from zero gains"
+        assert "pure PO: two-point, started from zero gains" in controllers
     words = tab.ask("document.body.innerText")
     for controller in ("none", "lqt", *controllers_of(folder)):
         assert CONTROLLERS[controller].name in words

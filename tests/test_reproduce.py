@@ -14,10 +14,27 @@ from pdeloop.cli import main
 from pdeloop.finished_run import reduction
 from pdeloop.in_process import LocalPair
 from pdeloop.reproduction import LEARNED, beside_the_paper, reproduction_in, runs_of
-from pdeloop.study.table import rows
+from pdeloop.study.table import beside_no_control, rows
 from tests.small import parameters, same_bits, train_here
 from tuner_node.batch import Batch
 from tuner_node.seeds import Purpose, derive
+
+
+def test_what_costs_no_less_than_no_control_is_named():
+    row = {"problem": "p", "variant": "lqt_po", "none": 4.0, "lqt": 2.0, "cost": 1.0, "worst": 1.5}
+    assert beside_no_control([row]) == []
+    poor = {**row, "lqt": 8.0}
+    words = "p: LQT costs 8, no less than no control (4); a share below it says little."
+    assert beside_no_control([poor, {**poor, "variant": "pure_po"}]) == [words]
+    assert beside_no_control([{**row, "worst": 4.5}]) == [
+        "p: LQT-PO in its worst seed costs 4.5, no less than no control (4)."
+    ]
+    assert beside_no_control([{**row, "cost": 4.0, "worst": 4.5}]) == [
+        "p: LQT-PO costs 4, no less than no control (4)."
+    ]
+    assert (
+        beside_no_control([{**row, "cost": None, "worst": None}]) == []
+    )  # the table says diverged
 
 
 def test_every_number_is_that_of_the_trainings(reproduction):

@@ -142,6 +142,20 @@ def rows_file(path, model, name="model"):
     return str(path)
 
 
+def test_a_given_model_of_another_plant_is_refused_with_the_sizes_of_both(tmp_path):
+    found = train_here(parameters(iterations=1, optimizer="two_point")).models
+    path = tmp_path / "model.npz"
+    np.savez(path, model=found, B=np.zeros((4, 3)))
+    values = parameters(model=str(path))
+    with pytest.raises(ValueError, match="has 3 actuators, the plant has 4"):
+        build_training(values)
+    values = parameters(model=rows_file(path, found), n_z=64)
+    with pytest.raises(ValueError, match="of a state of 32 numbers, but the target has"):
+        train_here(values)
+    with pytest.raises(ValueError, match="of a state of 32 numbers, the plant's has 64"):
+        train_here({**values, "optimizer": "gauss_newton"})
+
+
 @pytest.mark.parametrize("optimizer", ["two_point", "gauss_newton"])
 def test_a_given_model_is_the_warm_start_of_every_seed(tmp_path, optimizer):
     found = train_here(parameters(seed=3, iterations=2, optimizer="two_point")).models

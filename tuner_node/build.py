@@ -27,7 +27,9 @@ from tuner_node.training import Training
 def read_model(path: Path, n_a: int) -> NDArray[np.float64]:
     """The rows of the model that `pdeloop identify --out` wrote. ValueError if there is none."""
     try:
-        rows = read_arrays(path)["model"].astype(np.float64)
+        arrays = read_arrays(path)
+        rows = arrays["model"].astype(np.float64)
+        actuators = len(arrays["B"].T) if "B" in arrays else n_a
     except (KeyError, ValueError, TypeError) as error:
         raise ValueError(
             f"{path} holds no reduced model; expected a file of 'pdeloop identify --out' ({error})"
@@ -35,6 +37,11 @@ def read_model(path: Path, n_a: int) -> NDArray[np.float64]:
     if rows.ndim != 3 or len(rows) != 1 or not np.isfinite(rows).all():
         raise ValueError(
             f"the model in {path} must be one array of finite rows, got shape {rows.shape}"
+        )
+    if actuators != n_a:
+        raise ValueError(
+            f"the model in {path} has {actuators} actuators, the plant has {n_a}; identify one of this "
+            "plant"
         )
     model: NDArray[np.float64] = rows[0]
     try:

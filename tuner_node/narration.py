@@ -132,6 +132,13 @@ def closing_lines(problem: str, summary: Row, folder: object) -> list[str]:
         f"  mean stage cost with LQT         {cost('lqt')}",
         f"  mean stage cost after adaptation {cost('adapted')}",
     ]
+    none, lqt, adapted = (sum(summary["costs"][name]) for name in ("none", "lqt", "adapted"))
+    if comparable and not diverged["none"] and lqt >= none:
+        share = 100 * (1 - adapted / none)
+        lines.append(
+            "  the LQT law costs no less than no control; the adapted one costs "
+            f"{abs(share):.1f} % {'less' if share >= 0 else 'more'} than no control"
+        )
     if not any(summary["changed"]):
         lines.append("  nothing was adapted: the policies are those that the adaptation began with")
     elif not summary["improved"]:

@@ -234,12 +234,14 @@ class Training:
     def _given(self, identified: Array) -> list[dict[str, Any]]:
         """The given model instead of the identified ones, if it is one of this plant's size."""
         assert self.settings.model is not None
-        size = len(identified[0]) - identified.shape[2]
-        own = len(self.settings.model) - self.settings.model.shape[1]
+        n_a = self.settings.n_a
+        own, size = (
+            len(model_rows.unpack(rows, n_a).U) for rows in (self.settings.model, identified[0])
+        )
         if own != size:
             raise ValueError(
-                f"the given model is of a state of {own - 3 * self.settings.n_a - 1} numbers, the "
-                f"plant's has {size - 3 * self.settings.n_a - 1}; identify one of this plant"
+                f"the given model is of a state of {own} numbers, the plant's has {size}; "
+                "identify one of this plant"
             )
         self.budget.count("identify", self.pending)
         self._take_given_model(self.settings.model)

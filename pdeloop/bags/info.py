@@ -4,10 +4,15 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from pdeloop.bags.reader import Bag
+from pdeloop.output import aligned
+
+SHOWN = 40
+"""Episodes that are listed for people."""
 
 
 def describe(path: Path) -> dict[str, Any]:
@@ -37,6 +42,7 @@ def describe(path: Path) -> dict[str, Any]:
                 "namespace": episode.key[0],
                 "run": episode.key[1],
                 "episode": episode.number,
+                "name": episode.name,
                 "environments": episode.environments,
                 "exploratory": episode.exploratory,
                 "seconds": (episode.last - episode.first) / 1e9,
@@ -85,8 +91,30 @@ def info_text(content: dict[str, Any]) -> str:
         f"  {len(episodes)} episodes, {exploratory} of them exploratory, "
         f"{len(incomplete)} incomplete"
     )
-    lines += [
-        f"  episode {episode['episode']} lacks {', '.join(episode['missing'])}"
-        for episode in incomplete[:10]
-    ]
+    if episodes:
+        lines += ["", *(f"  {line}" for line in _listed(episodes))]
     return "\n".join(lines)
+
+
+def _listed(episodes: Sequence[dict[str, Any]]) -> list[str]:
+    """A line for each of the first episodes."""
+    several = len({episode["namespace"] for episode in episodes}) > 1
+    rows = [("episode", "environments", "seconds", "mean stage cost")]
+    notes = [""]
+    for episode in episodes[:SHOWN]:
+        costs = episode["mean_cost"]
+        spread = (
+            ""
+            if costs is None
+            else " to ".join(dict.fromkeys(f"{f(costs):.4g}" for f in (min, max)))
+        )
+        rows.append(
+            (episode["name"], str(episode["environments"]), f"{episode['seconds']:.2f}", spread)
+        )
+        found = ["exploratory"] if episode["exploratory"] else []
+        found += [f"lacks {what}" for what in episode["missing"]]
+        found += [f"of {episode['namespace']}"] if several else []
+        notes.append(", ".join(found))
+    lines = [f"{row}  {note}".rstrip() for row, note in zip(aligned(rows, 0), notes, strict=True)]
+    more = len(episodes) - SHOWN
+    return [*lines, f"and {more} more, which --json lists"] if more > 0 else lines

@@ -161,7 +161,7 @@ class _Run:
 
     def episode(self, episode: RecordedEpisode) -> None:
         """Check one episode."""
-        report, where = self._report, f"episode {episode.number}"
+        report, where = self._report, f"episode {episode.name}"
         for text in episode.contradictions:
             report.differs(f"{where}: {text}")
         if episode.void:
@@ -224,7 +224,7 @@ class _Run:
             return
         policies = None if episode.policy is None else episode.policy.values
         for i, key in enumerate(_keys(episode.start.values, policies, episode.start.step)):
-            place = f"episode {episode.number}, environment {i}"
+            place = f"episode {episode.name}, environment {i}"
             self._rollouts.setdefault(key, []).append(place)
         if episode.bases is not None:
             self._models[episode.bases.step] = episode.bases

@@ -45,7 +45,13 @@ def add(commands: Commands) -> None:
 
 
 def _evaluate(options: argparse.Namespace) -> int:
-    from pdeloop.evaluation import all_diverged, another_plant, as_text, evaluate
+    from pdeloop.evaluation import (
+        all_diverged,
+        another_plant,
+        as_text,
+        beside_no_control,
+        evaluate,
+    )
     from pdeloop.finished_run import load_run
 
     allow_equation(options)
@@ -59,6 +65,8 @@ def _evaluate(options: argparse.Namespace) -> int:
         print_json({name: table.tolist() for name, table in costs.items()})
     else:
         print(as_text(costs))
+    if worse := beside_no_control(costs, run.seeds):
+        print(f"WARNING: {worse}", file=sys.stderr)
     if lost := all_diverged(costs):
         raise RuntimeError(f"every rollout diverged of: {', '.join(lost)}")
     return 0

@@ -47,7 +47,7 @@ def add(commands: Commands) -> None:
         "or truncated DMDc [that of the run, or regression]",
     )
     add("--rank", type=int, metavar="P", help="p of the identification dmdc [that of the run]")
-    add("--episode", type=int, metavar="N", help="only this episode of the bag")
+    add("--episode", metavar="N", help="only this episode, as `pdeloop bag info` names it")
     add("--environment", type=int, metavar="M", help="only this environment of each episode")
     add("--state-weight", type=float, metavar="Q", help="q of Q = q I [that of the run, or 1]")
     add("--action-weight", type=float, metavar="R", help="r of R = r I [that of the run, or 1]")
@@ -73,7 +73,7 @@ def _identify(options: argparse.Namespace) -> int:
         found = identify_file(options.data, given)
     else:
         found = identify_bag(
-            options.bag, given, episode=options.episode, environment=options.environment
+            options.bag, given, episode=_episode(options.episode), environment=options.environment
         )
     if options.out is not None:
         save(found, options.out)
@@ -84,3 +84,14 @@ def _identify(options: argparse.Namespace) -> int:
     if options.out is not None:
         print(f"  written to {options.out}")
     return 0
+
+
+def _episode(name: str | None) -> int | None:
+    from pdeloop.bags.episodes import episode_number
+
+    try:
+        return None if name is None else episode_number(name)
+    except ValueError as error:
+        raise ParameterError(
+            f"--episode is {name}; expected one as `pdeloop bag info` names it, such as 1.17"
+        ) from error

@@ -62,9 +62,10 @@ def _monitor(options: argparse.Namespace) -> int:
         raise ParameterError(f"no run in {folder}; give the folder of one, or none")
     finder = Finder(folder, given_domain())
     if folder is not None and finder.find() is None:
-        raise ParameterError(
-            f"no loop works on the run in {folder}; a finished one is shown by: pdeloop report {folder}"
-        )
+        way = "continue it with: pdeloop train --resume"
+        if (folder / "result.json").exists():
+            way = "it is finished and is shown by: pdeloop report"
+        raise ParameterError(f"no loop works on the run in {folder}; {way} {folder}")
     from pdeloop.monitor.node import show_loops  # here, as it needs ROS
 
     page = Page(options.environment)

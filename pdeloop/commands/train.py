@@ -79,7 +79,7 @@ def add(commands: Commands) -> None:
 
 def _train(options: argparse.Namespace) -> int:
     from pdeloop.pairs import Transport
-    from pdeloop.training_run import begin, reopen, run
+    from pdeloop.training_run import begin, reopen, resolve, run
 
     recorded = options.record or options.record_or_stop
     if recorded:
@@ -110,5 +110,8 @@ def _train(options: argparse.Namespace) -> int:
             f"no problem given; expected one of {', '.join(shipped_problems())}, a YAML file, "
             "or --resume DIR"
         )
-    folder, values = begin(options.problem, {**given, **own}, options.out)
+    given |= own
+    if options.sensor_delays is not None and not resolve(options.problem, given)["sensors"]:
+        raise ParameterError("--sensor-delays goes with --sensors N, or a problem with sensors")
+    folder, values = begin(options.problem, given, options.out)
     return run(folder, values, transport, options.json)

@@ -12,7 +12,7 @@ import io
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jinja2
 import matplotlib
@@ -24,7 +24,7 @@ from pdeloop.report.data import ProblemData, ReportData, gather
 from pdeloop.report.style import COLOURS, NAMES, STYLE
 from pdeloop.reproduction import PAPER, beside_the_paper
 from pdeloop.study.run import ASKED
-from pdeloop.study.table import AVERAGES, CAVEAT, cost_text, reduction_texts
+from pdeloop.study.table import AVERAGES, CAVEAT, beside_no_control, cost_text, reduction_texts
 from pdeloop.study.table import figures as figures_of
 from tuner_node.budget import PURPOSES
 from tuner_node.run_folder import RunFolderError
@@ -130,10 +130,10 @@ def _of_problem(problem: ProblemData) -> Drawn:
             yield (
                 f"{name}-steps",
                 f"Steps of {NAMES['gauss_newton']}",  # no other optimiser judges its steps
-                f"Seed {seed}, steps accepted: {sum(judged)} of {len(judged)} (at {learning.EDGE:g} "
-                "stands what costs more or diverged). Below them the damping, which a rejection "
-                "raises, and the relative error of the best fitted model in predicting how measured "
-                "trajectories differ.",
+                f"Seed {seed}, steps accepted: {sum(judged)} of {len(judged)}. A candidate that "
+                f"diverged or cost more than {learning.EDGE:g} times as much is drawn at "
+                f"{learning.EDGE:g}. Below: the damping, which a rejection raises, and the relative "
+                "error of the best fitted model in predicting how measured trajectories differ.",
                 learning.steps(history, COLOURS[controller]),
             )
     if not problem.behaviours:
@@ -180,14 +180,17 @@ def _page(data: ReportData, shared: list[Picture], own: list[list[Picture]]) -> 
     )
     problems = data.problems
     names = ", ".join(problem.name for problem in problems)
+    table = [_figures(problem) for problem in problems]
     return environment.get_template("page.html.j2").render(
         title="Reproduction of the paper's experiment" if data.study else f"Training of {names}",
         facts=_facts(data),
         missing=data.missing,
         shared=shared,
         problems=list(zip(problems, own, strict=True)),
-        results=_results(problems),
-        caveat=CAVEAT if len(problems[0].first.seeds) > 1 else "",
+        results=_results(problems, table),
+        several=len(problems[0].first.seeds) > 1,
+        caveat=CAVEAT,
+        warnings=beside_no_control([row for rows in table for row in rows.values()]),
         paper=_beside_the_paper(problems),
         first_model=problems[0].first.values["identification_attempts"] == 1,
         budget=_budget(problems),
@@ -209,11 +212,11 @@ def _facts(data: ReportData) -> list[tuple[str, str]]:
     facts = [("Command", command)]
     for problem in data.problems:
         size = "a state of {n_z} numbers, {n_a} actuators, {horizon} steps of {sample_time:g} s"
-        facts.append((f"Problem {problem.name}", size.format(**problem.first.values)))
+        facts.append(("Problem", f"{problem.name}: {size.format(**problem.first.values)}"))
     for name, run in first.runs.items():
         start = "zero gains" if run.values["start"] == "zero" else "the LQT gains"
-        text = f"{run.values['optimizer']}, started from {start}"
-        facts.append((f"Controller {NAMES[name]}", text))
+        method = run.values["optimizer"].replace("_", "-")
+        facts.append(("Controller", f"{NAMES[name]}: {method}, started from {start}"))
     fields = "{evaluation_fields} initial fields drawn from seed {evaluation_seed}"
     versions = first.first.result.get("versions", {})
     return [
@@ -226,28 +229,34 @@ def _facts(data: ReportData) -> list[tuple[str, str]]:
     ]
 
 
-def _results(problems: Sequence[ProblemData]) -> Table:
-    """Costs, and how far they lie below LQT's."""
-    paper = ("the paper",) * any("lqt_po" in p.runs and p.name in PAPER for p in problems)
-    below = (f"{average}, %" for average in AVERAGES)
-    head = ("problem", "controller", "mean stage cost", "worst seed", *below, *paper)
-    found = []
-    for problem in problems:
-        known = {name: figures_of(run) for name, run in problem.runs.items()}
+def _figures(problem: ProblemData) -> dict[str, dict[str, Any]]:
+    """The row of each adapted controller, as in the table of a study."""
+    return {
+        name: {"problem": problem.name, "variant": name, **figures_of(run)}
+        for name, run in problem.runs.items()
+    }
+
+
+def _results(problems: Sequence[ProblemData], table: Sequence[dict[str, dict[str, Any]]]) -> Table:
+    """Costs, and how far they lie below LQT's: in one column where there is one seed."""
+    several = len(problems[0].first.seeds) > 1
+    paper = any("lqt_po" in p.runs and p.name in PAPER for p in problems)
+    below = [f"% below LQT, {average}" for average in AVERAGES] if several else ["% below LQT"]
+    head = ["problem", "controller", "mean stage cost", *["worst seed"] * several, *below]
+    head += ["% below LQT in the paper"] * paper
+    found: list[tuple[str, ...]] = []
+    for problem, known in zip(problems, table, strict=True):
         first = next(iter(known.values()))
         blank = ("",) * (len(head) - 3)
         for name in ("none", "lqt"):
             found.append((problem.name, NAMES[name], cost_text(first[name]), *blank))
         for name, own in known.items():
-            percent = f"{PAPER[problem.name]}" if name == "lqt_po" and problem.name in PAPER else ""
-            found.append(
-                (
-                    *(problem.name, NAMES[name], cost_text(own["cost"], own["interval"])),
-                    cost_text(own["worst"]),
-                    *reduction_texts(own["below_lqt_percent"]),
-                    *((percent,) if paper else ()),
-                )
-            )
+            row = [problem.name, NAMES[name], cost_text(own["cost"], own["interval"])]
+            row += [cost_text(own["worst"])] * several
+            row += reduction_texts(own["below_lqt_percent"])[: len(below)]
+            known_there = name == "lqt_po" and problem.name in PAPER
+            row += [f"{PAPER[problem.name]}" if known_there else ""] * paper
+            found.append(tuple(row))
     return head, found
 
 

@@ -91,8 +91,42 @@ def text(table: Sequence[Mapping[str, Any]]) -> str:
         row["diverged"] for row in table
     )
     return "\n".join(
-        [*aligned(costs, 2), "", *aligned(below, 2), CAVEAT, *([lost] if lost else [])]
+        [
+            *aligned(costs, 2),
+            "",
+            *aligned(below, 2),
+            CAVEAT,
+            *([lost] if lost else []),
+            *(f"WARNING: {sentence}" for sentence in beside_no_control(table)),
+        ]
     )
+
+
+def beside_no_control(table: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What costs no less than no control, which a share of LQT's cost does not show.
+
+    A sentence for each LQT law and each adapted controller, or for its worst seed.
+    """
+    found = []
+    for row in table:
+        none = row["none"]
+        if none is None:
+            continue
+        known = CONTROLLERS.get(row["variant"])
+        name = row["variant"] if known is None else known.name
+        for whose, cost, so in (
+            ("LQT", row["lqt"], "; a share below it says little"),
+            (name, row["cost"], ""),
+            (f"{name} in its worst seed", row["worst"], ""),
+        ):
+            if cost is not None and cost >= none:
+                found.append(
+                    f"{row['problem']}: {whose} costs {cost_text(cost)}, no less than no control "
+                    f"({cost_text(none)}){so}."
+                )
+                if whose == name:
+                    break
+    return list(dict.fromkeys(found))
 
 
 def cost_text(mean: float | None, between: Sequence[float] | None = None) -> str:

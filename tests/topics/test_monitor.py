@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import signal
 import subprocess
 from collections.abc import Iterator
@@ -218,6 +219,12 @@ def test_a_port_in_use_and_a_folder_without_a_loop_are_told_in_one_line(loop, re
     text = loop.wait(loop.pdeloop("monitor", str(tmp_path / "none")), LIMIT, code=1)
     (line,) = text.strip().splitlines()
     assert "no run in" in line
+    stopped = tmp_path / "stopped"
+    stopped.mkdir()
+    shutil.copy(recorded / "run.json", stopped)
+    text = loop.wait(loop.pdeloop("monitor", str(stopped)), LIMIT, code=1)
+    (line,) = text.strip().splitlines()
+    assert line.endswith(f"continue it with: pdeloop train --resume {stopped}")
     text = loop.wait(loop.pdeloop("monitor", str(recorded)), LIMIT, code=1)
     (line,) = text.strip().splitlines()
     assert line.endswith(f"is shown by: pdeloop report {recorded}")
