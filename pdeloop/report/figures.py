@@ -100,12 +100,19 @@ def _actions(ax: Axes, b: Behaviour, times: Array, largest: float) -> None:
 
 
 def gains(problem: ProblemData) -> Figure:
-    """The gains K_a and K_b of each controller: LQT's before, the adapted ones after learning."""
+    """The gains K_a and K_b of each controller: LQT's before, the adapted ones after learning.
+
+    K_b is left out where it is zero, as its target is.
+    """
     policies = {name: own for name, own in problem.policies.items() if name != "none"}
     n_a, n_s = problem.models[0].B.T.shape
-    figure = Figure(figsize=(6.4, 0.5 + len(policies) * max(1.1, 0.11 * n_a + 0.5)))
-    grid = figure.subplots(len(policies), 2, sharex=True, sharey=True, squeeze=False)
-    for part, symbol in enumerate(("$K_a$", "$K_b$")):
+    symbols = (
+        ["$K_a$", "$K_b$"] if any(own[:, n_s:].any() for own in policies.values()) else ["$K_a$"]
+    )
+    size = 3.2 * len(symbols), 0.5 + len(policies) * max(1.1, 0.11 * n_a + 0.5)
+    figure = Figure(figsize=size)
+    grid = figure.subplots(len(policies), len(symbols), sharex=True, sharey=True, squeeze=False)
+    for part, symbol in enumerate(symbols):
         blocks = {name: own[:, part * n_s : (part + 1) * n_s] for name, own in policies.items()}
         largest = max(float(np.abs(block).max()) for block in blocks.values()) or 1.0
         for ax, (name, block) in zip(grid[:, part], blocks.items(), strict=True):
