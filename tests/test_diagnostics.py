@@ -196,7 +196,8 @@ def test_a_controller_waits_answers_grows_stale_and_is_at_rest():
     controller.cost(Frame(RUN, 1, 0, 0.0, np.array([[0.5, 5.0, VOID]]), 9))
     assert health.report(20.0).message.startswith("no reduced model: the exploratory episode")
     controller.start(exploration(2))
-    controller.state(Frame(RUN, 2, 0, 0.0, np.ones((1, 8)), 9))
+    for step in range(6):
+        controller.state(Frame(RUN, 2, step, 0.0, np.ones((1, 8)), 9))
     assert health.report(21.0).level is Level.OK
     controller.cost(Frame(RUN, 2, 5, 0.0, np.array([[0.5, 5.0, 3.0]]), 9))
     controller.failure, kept = "", controller.failure
@@ -206,7 +207,7 @@ def test_a_controller_waits_answers_grows_stale_and_is_at_rest():
     assert health.report(23.0).level is Level.OK
     gone = health.report(28.0)
     assert gone.level is Level.STALE
-    assert gone.message == "no state for 7 s, after step 0 of episode 2, and no plant any more"
+    assert gone.message == "no state for 7 s, after step 5 of episode 2, and no plant any more"
     controller.failure = kept
     failed = health.report(28.0)
     assert failed.level is Level.ERROR

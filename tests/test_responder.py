@@ -136,6 +136,14 @@ def test_a_divergence_that_the_states_do_not_show_names_who_else_may_have_said_s
     assert failure.reason == told
 
 
+def test_a_divergence_of_which_states_are_missing_is_asked_for_again(responder):
+    responder.start(start(1, (1, 2, 0.1, 0)))
+    responder.state(Frame(RUN, 1, 0, 0.0, plant().reset(np.array([1]))))
+    (failure,) = responder.cost(Frame(RUN, 1, 30, 0.0, np.array([[1e9, 3e10, 0.0]])))
+    assert isinstance(failure, ModelFailure) and failure.retry
+    assert "holds 1 of the 31 states" in failure.reason
+
+
 def test_data_that_allow_no_model_are_a_failure_with_the_reason():
     responder = Responder(DesignSettings(4, 400, 1.0, 1.0))
     responder.target(target())
