@@ -109,7 +109,7 @@ def cma_es(values: Values, *, sigma: float, population: int) -> tuple[LocalPair,
     U, plant = unpack(training.models[0], values["n_a"]).U, pair.plant
     n_s = U.shape[1]
     s_r = U.T @ plant.target
-    rows = np.vstack([known.trajectory.states @ U for known in training.measured[0]])
+    rows = np.vstack([known.states @ U for known in training.measured[0]])
     rows = np.column_stack([rows, np.ones(len(rows))])
     F = rows.T @ rows / len(rows)
     F += 1e-3 * np.trace(F) / len(F) * np.eye(len(F))

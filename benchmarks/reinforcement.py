@@ -96,7 +96,7 @@ def run(
     training = warm_start(values, pair)
     assert training.models is not None
     plant, U = pair.plant, unpack(training.models[0], values["n_a"]).U
-    known = training.measured[0][-1].trajectory  # of the check of LQ tracking
+    known = training.measured[0][-1]  # of the check of LQ tracking
     scale = np.sqrt(np.mean(((known.states - plant.target) @ U) ** 2, axis=0))
     bound: float = reach * float(np.abs(known.actions).max())
 

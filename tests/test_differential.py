@@ -62,7 +62,7 @@ def test_burgers_is_recognised_and_simulated_where_fronts_cross_six_points_a_sam
     plant, training = pair.plant, warm_start(values, pair)
     context = training._context(0)
     assert context is not None
-    rollouts = [context.exploration, *(m.trajectory for m in context.measured)]
+    rollouts = [context.exploration, *context.measured]
     z, after = (
         np.concatenate([r.states[part] for r in rollouts]) for part in (slice(-1), slice(1, None))
     )
@@ -72,5 +72,5 @@ def test_burgers_is_recognised_and_simulated_where_fronts_cross_six_points_a_sam
         np.testing.assert_allclose(found / plant.sample_time, true, atol=0.1 * np.abs(true).max())
     q, r = context.state_weight, context.action_weight
     loop = Loop(context.U, context.target, q, r, context.horizon, 0.0)
-    measured = [(loop.theta(m.policy), m.trajectory.states[:-1]) for m in context.measured]
+    measured = [(loop.theta(m.policy), m.acted_from) for m in context.measured]
     assert mismatch(loop, model, measured, 1.0) < 0.01

@@ -30,7 +30,7 @@ from loop_interfaces.topics import COMPLETED, CostColumn
 from tuner_node import rollouts, training_state
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, TrainingSettings, batch_of
 from tuner_node.budget import Budget
-from tuner_node.optimizers import Context, Measured, Optimizer, Rollout, Trajectory
+from tuner_node.optimizers import Context, Optimizer, Record, Rollout, Trajectory
 from tuner_node.published_law import check_law
 from tuner_node.rollouts import CHECK, CONTROLLERS, EXPLORATION
 
@@ -68,7 +68,7 @@ class Training:
     explorations: list[Trajectory | None] = field(default_factory=list)
     """The exploratory trajectory of every seed, where the optimiser wants trajectories."""
     target: Array | None = None
-    measured: list[list[Measured]] = field(default_factory=list)
+    measured: list[list[Record]] = field(default_factory=list)
     """The rollouts of every seed's checks, where the optimiser wants trajectories."""
     worse: list[bool] = field(default_factory=list)
     """Whether the warm start of a seed was measured to be no better than no control."""
@@ -258,8 +258,9 @@ class Training:
         results = result.rollouts()
         self.budget.count("check", np.repeat(self.pending, CHECK))
         for (m, rollout), measured in zip(self._check_rollouts(), results, strict=True):
-            if measured.trajectory is not None and not measured.diverged:
-                kept = Measured(rollout.policy, measured.cost, measured.trajectory)
+            known = measured.trajectory
+            if known is not None and not measured.diverged:
+                kept = Record(rollout.policy, measured.cost, known.states, known.actions)
                 self.measured[m].append(kept)
         rows: list[dict[str, Any]] = []
         failed = []

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from loop_interfaces import model_rows
 from tuner_node.budget import PURPOSES
 from tuner_node.checkpoint import taken
-from tuner_node.optimizers import Measured, Trajectory
+from tuner_node.optimizers import Record, Trajectory
 
 if TYPE_CHECKING:
     from tuner_node.training import Training
@@ -37,7 +37,7 @@ def arrays_of(training: Training) -> Arrays:
         for i, rollout in enumerate(rollouts):
             name = f"measured{m}.{i}"
             arrays |= {f"{name}.policy": rollout.policy, f"{name}.cost": np.array(rollout.cost)}
-            arrays |= _trajectory_arrays(name, rollout.trajectory)
+            arrays |= _trajectory_arrays(name, rollout)
     for m, exploration in enumerate(training.explorations):
         if exploration is not None:
             arrays |= _trajectory_arrays(f"exploration{m}", exploration)
@@ -80,8 +80,8 @@ def fill(training: Training, arrays: Arrays) -> None:
         while (name := f"measured{m}.{len(training.measured[m])}") + ".policy" in arrays:
             policy = taken(arrays, f"{name}.policy", "f", (n_a, None))
             cost = float(taken(arrays, f"{name}.cost", "f", ()))
-            rollout = Measured(policy, cost, _taken_trajectory(arrays, name, n_a))
-            training.measured[m].append(rollout)
+            known = _taken_trajectory(arrays, name, n_a)
+            training.measured[m].append(Record(policy, cost, known.states, known.actions))
     _check(training)
     if training.phase in ("adapt", "evaluate", "done"):
         training.start_optimizers()
@@ -116,7 +116,7 @@ def _check(training: Training) -> None:
             raise ValueError(f"it has an exploration without states of {n_z} numbers")
 
 
-def _trajectory_arrays(name: str, trajectory: Trajectory) -> Arrays:
+def _trajectory_arrays(name: str, trajectory: Trajectory | Record) -> Arrays:
     return {f"{name}.states": trajectory.states, f"{name}.actions": trajectory.actions}
 
 

@@ -4,8 +4,8 @@
 from collections.abc import Callable
 
 from tuner_node.optimizers.base import Context as Context
-from tuner_node.optimizers.base import Measured as Measured
 from tuner_node.optimizers.base import Optimizer as Optimizer
+from tuner_node.optimizers.base import Record as Record
 from tuner_node.optimizers.base import Rollout as Rollout
 from tuner_node.optimizers.base import RolloutResult as RolloutResult
 from tuner_node.optimizers.base import State as State

@@ -72,12 +72,35 @@ class RolloutResult:
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
-    """A rollout to its end: policy, mean stage cost and trajectory."""
+class Record:
+    """A rollout that was measured, with its trajectory.
+
+    Attributes
+    ----------
+    policy : (n_a, 2 n_s) array
+    cost : float
+        Mean stage cost; infinite if it diverged.
+    states, actions : (L + 1, n_z) or (L, n_z), and (L, n_a) arrays
+        What can be learned from: all of the episode, or its samples before it ran away.
+    stamp : int
+        Its number among the rollouts of the optimiser, from 0; -1: from before the optimisation.
+    """
 
     policy: Array
     cost: float
-    trajectory: Trajectory
+    states: Array
+    actions: Array
+    stamp: int = -1
+
+    @property
+    def usable(self) -> bool:
+        """Whether the rollout came to its end."""
+        return bool(np.isfinite(self.cost))
+
+    @property
+    def acted_from(self) -> Array:
+        """The states that an action followed, (L, n_z)."""
+        return self.states[: len(self.actions)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +119,7 @@ class Context:
         T, the steps of an episode.
     exploration : Trajectory
         The exploratory trajectory that the reduced model was identified from.
-    measured : sequence of Measured
+    measured : sequence of Record
         Rollouts from before the optimisation: those that checked the first law, and no control.
     action_limit : float
         Magnitude at which actions saturate; 0 for none.
@@ -113,7 +136,7 @@ class Context:
     action_weight: float
     horizon: int
     exploration: Trajectory
-    measured: Sequence[Measured] = ()
+    measured: Sequence[Record] = ()
     action_limit: float = 0.0
     noise: float = 0.0
     sensors: int = 0

@@ -34,6 +34,7 @@ from tuner_node import oracle
 from tuner_node.optimizers.base import (
     Array,
     Context,
+    Record,
     Rollout,
     RolloutResult,
     Row,
@@ -44,7 +45,7 @@ from tuner_node.optimizers.base import (
     require_state,
 )
 from tuner_node.optimizers.proposals import Proposer
-from tuner_node.optimizers.trajectories import GROWING, Record, Records
+from tuner_node.optimizers.trajectories import GROWING, Records
 
 __all__ = ["GaussNewton"]
 

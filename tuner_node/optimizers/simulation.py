@@ -28,9 +28,8 @@ import numpy as np
 from scipy import linalg
 
 from loop_interfaces.field_models import FieldModel
-from tuner_node.optimizers.base import Array
+from tuner_node.optimizers.base import Array, Record
 from tuner_node.optimizers.sensitivity import ISOTROPY, Path, expand
-from tuner_node.optimizers.trajectories import Record
 
 # Inner steps, and the share of the objective below which a further one is not worth its time.
 _STEPS = 10

@@ -2,51 +2,18 @@
 """The trajectories an optimiser remembers, and how they survive a checkpoint."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from tuner_node.optimizers.base import Array, RolloutResult, State
+from tuner_node.optimizers.base import Array, Record, RolloutResult, State
 
 GROWING = (
     *("record_stamps", "record_costs", "record_policies", "record_lengths"),
     *("record_states", "record_actions"),
 )
 """Arrays of a state with a row a rollout, and with a row a sample."""
-
-
-@dataclass(frozen=True, eq=False)
-class Record:
-    """A rollout that was measured.
-
-    Attributes
-    ----------
-    stamp : int
-        Its number among all rollouts, from 0.
-    policy : (n_a, 2 n_s) array
-    cost : float
-        Mean stage cost; infinite if it diverged.
-    states, actions : (L + 1, n_z) or (L, n_z), and (L, n_a) arrays
-        What can be learned from: all of the episode, or its samples before it ran away.
-    """
-
-    stamp: int
-    policy: Array
-    cost: float
-    states: Array
-    actions: Array
-
-    @property
-    def usable(self) -> bool:
-        """Whether the rollout came to its end."""
-        return bool(np.isfinite(self.cost))
-
-    @property
-    def acted_from(self) -> Array:
-        """The states that an action followed, (L, n_z)."""
-        return self.states[: len(self.actions)]
 
 
 class Records:
@@ -81,7 +48,7 @@ class Records:
         """Remember a rollout; `keep` are the stamps that must not be forgotten."""
         states, actions = self.sound(result)
         cost = float(result.cost) if result.usable else float("inf")
-        record = Record(self.count, np.array(policy), cost, states, actions)
+        record = Record(np.array(policy), cost, states, actions, self.count)
         self._records[record.stamp] = record
         self.count += 1
         for stamp in list(self._records):
@@ -122,11 +89,11 @@ class Records:
         for i, stamp in enumerate(state["record_stamps"].astype(np.int64)):
             (z_end, a_end), (z_length, a_length) = ends[i], lengths[i]
             records[int(stamp)] = Record(
-                int(stamp),
                 state["record_policies"][i].astype(np.float64),
                 float(state["record_costs"][i].item()),
                 state["record_states"][z_end - z_length : z_end].astype(np.float64),
                 state["record_actions"][a_end - a_length : a_end].astype(np.float64),
+                int(stamp),
             )
         self._records = records
         self._limit = float(state["record_limit"].item())

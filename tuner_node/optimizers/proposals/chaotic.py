@@ -12,11 +12,10 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from loop_interfaces.field_models import FieldModel
-from tuner_node.optimizers.base import Array
+from tuner_node.optimizers.base import Array, Record
 from tuner_node.optimizers.fit import extended_basis
 from tuner_node.optimizers.proposals.proposal import LEAST_FALL, MODES, TRUST, Proposal
 from tuner_node.optimizers.simulation import Loop, improve, mismatch
-from tuner_node.optimizers.trajectories import Record
 
 # The error of a rollout is more than so many times that of its pieces; noise adds up more slowly.
 _GROWTH = 20.0

@@ -10,14 +10,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tuner_node.optimizers.base import Array
+from tuner_node.optimizers.base import Array, Record
 from tuner_node.optimizers.fit import LocalModel, extended_basis, fit
 from tuner_node.optimizers.proposals.proposal import LEAST_FALL, MODES, Proposal
 from tuner_node.optimizers.proposals.reproducing import steps_of
 from tuner_node.optimizers.selection import KAPPAS, LOCAL, RIDGES, Pair, choices, mismatches
 from tuner_node.optimizers.sensitivity import damped_step
 from tuner_node.optimizers.simulation import Loop
-from tuner_node.optimizers.trajectories import Record
 
 # Coordinates that the cubic part of a model acts on, at most.
 _CUBIC_MODES = 12

@@ -9,7 +9,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from tuner_node.optimizers.base import Array, Context
+from tuner_node.optimizers.base import Array, Context, Record
 from tuner_node.optimizers.proposals import chaotic, local, whole_field
 from tuner_node.optimizers.proposals.proposal import COMPARED, Proposal
 from tuner_node.optimizers.proposals.reproducing import (
@@ -21,7 +21,7 @@ from tuner_node.optimizers.proposals.reproducing import (
 )
 from tuner_node.optimizers.proposals.sensed import MOST_SENSORS, SensedProposals
 from tuner_node.optimizers.simulation import Loop
-from tuner_node.optimizers.trajectories import Record, denoised
+from tuner_node.optimizers.trajectories import denoised
 
 # The smallest weight of a rollout in the fit of a model of the whole field.
 _LEAST_WEIGHT = 0.05
@@ -65,14 +65,8 @@ class Proposer:
         self._noise = context.noise
         self._reproduced = REPRODUCED_NOISY if self._noise else REPRODUCED
         self._cleaned: WeakKeyDictionary[Record, Record] = WeakKeyDictionary()
-        before = [
-            Record(-1, np.zeros_like(policy), np.inf, states, actions),
-            *(
-                Record(-1, m.policy, m.cost, m.trajectory.states, m.trajectory.actions)
-                for m in context.measured
-            ),
-        ]
-        self._before = [self._clean(record) for record in before]
+        exploration = Record(np.zeros_like(policy), np.inf, states, actions)
+        self._before = [self._clean(record) for record in (exploration, *context.measured)]
         self._sensed: SensedProposals | None = None
         # One component, of which each sensor's last reading is the state.
         if context.sensors == target.size and target.size <= MOST_SENSORS:

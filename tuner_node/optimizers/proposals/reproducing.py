@@ -10,9 +10,8 @@ import numpy as np
 from loop_interfaces.field_models import FieldModel
 from loop_interfaces.field_models.convolution import fit_convolutions
 from loop_interfaces.field_models.differential import fit_differential
-from tuner_node.optimizers.base import Array
+from tuner_node.optimizers.base import Array, Record
 from tuner_node.optimizers.simulation import Loop, mismatch, mismatch_of_pieces
-from tuner_node.optimizers.trajectories import Record
 
 # A model has to reproduce the last rollouts up to this share of their error energy. With noise the
 # local models are further from the plant, and so may these be.

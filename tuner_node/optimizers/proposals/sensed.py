@@ -13,12 +13,11 @@ from functools import cached_property
 import numpy as np
 
 from loop_interfaces.field_models.sensed import SensedModel, fit_sensed, interpolated
-from tuner_node.optimizers.base import Array
+from tuner_node.optimizers.base import Array, Record
 from tuner_node.optimizers.fit import extended_basis
 from tuner_node.optimizers.proposals.proposal import COMPARED, TRUST, Proposal, spread
 from tuner_node.optimizers.selection import LOCAL
 from tuner_node.optimizers.simulation import Loop, improve
-from tuner_node.optimizers.trajectories import Record
 
 # More point sensors than this are taken for a field.
 MOST_SENSORS = 32

@@ -11,11 +11,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from loop_interfaces.field_models import FieldModel
-from tuner_node.optimizers.base import Array
+from tuner_node.optimizers.base import Array, Record
 from tuner_node.optimizers.fit import extended_basis
 from tuner_node.optimizers.proposals.proposal import MODES, TRUST, Proposal, spread
 from tuner_node.optimizers.simulation import Loop, improve
-from tuner_node.optimizers.trajectories import Record
 
 # Measured initial fields that a law is improved on, the newest.
 _FIELDS = 8
