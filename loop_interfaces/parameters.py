@@ -232,7 +232,6 @@ TUNER = _section(
 RECORDER = _section(
     "R",
     Spec("bag", "").means("new folder of the bag; empty: bags/ and the time"),
-    Spec("record_clock", True).means("record /clock, too"),
 )
 
 VIEWER = _section(

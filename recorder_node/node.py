@@ -29,11 +29,12 @@ from loop_interfaces.ros.message_types import message_class
 from loop_interfaces.ros.node_main import ConfigurationError, node_main
 from loop_interfaces.ros.observer import Observer
 from loop_interfaces.ros.parameters import declare, given_parameters
+from loop_interfaces.ros.peers import Peers
 from loop_interfaces.ros.sample_subscription import SampleSubscription, SerializedSubscription
 from loop_interfaces.samples import ACTION_KIND, CLOCK_KIND, STATE_KIND
 from loop_interfaces.topics import ACTION, RECORDER_STATUS, START, STATE
 from recorder_node.bag import BagError
-from recorder_node.peers import Peers
+from recorder_node.matching import Matching
 from recorder_node.recording import Recording
 from recorder_node.sources import CLOCK, DIAGNOSTICS, ROSOUT, Source, sources
 
@@ -63,7 +64,7 @@ class RecorderNode:
             for name in values["pairs"]
         ]
         self._sources = [source for name in self._namespaces for source in sources(name)]
-        self._sources += [DIAGNOSTICS, ROSOUT, *([CLOCK] if values["record_clock"] else [])]
+        self._sources += [DIAGNOSTICS, ROSOUT, CLOCK]
         folder = str(values["bag"]) or time.strftime("bags/%Y%m%d-%H%M%S")
         self._recording = Recording(Path(folder), self._sources)
         self._rate = Rate()
@@ -86,8 +87,8 @@ class RecorderNode:
             if source.array not in (STATE, ACTION) and source is not CLOCK:
                 self._subscribe(source)
         self._subscribe_samples()
-        self._peers = Peers(
-            node,
+        self._matching = Matching(
+            Peers(node),
             required=[f"{n}{topic.name}" for n in self._namespaces for topic in (STATE, ACTION)],
             others=[f"{n}{START.name}" for n in self._namespaces],
         )
@@ -107,13 +108,13 @@ class RecorderNode:
 
     def _subscribe_samples(self) -> None:
         """States and actions, and the time on /clock that goes with them, once for all pairs."""
-        clock = CLOCK in self._sources
         for number, absolute in enumerate(self._namespaces):
             namespace = absolute.rstrip("/") or "/"
             arrays = {s.array: s for s in self._sources if s.namespace == namespace}
             kinds = {STATE_KIND: arrays[STATE], ACTION_KIND: arrays[ACTION], CLOCK_KIND: CLOCK}
-            single = clock and number == 0
-            samples = SampleSubscription(self._node, namespace, clock=clock, single_clock=single)
+            samples = SampleSubscription(
+                self._node, namespace, clock=True, single_clock=number == 0
+            )
             self._samples.append((samples, kinds))
 
     def run(self) -> int:
@@ -177,11 +178,11 @@ class RecorderNode:
         now = time.monotonic()
         for samples, _ in self._samples:
             samples.poll()
-        self._peers.look(now)
+        self._matching.look(now)
         run = self._recording.run
-        if run and self._peers.changed(run):
-            self._recording.note(run, self._peers.parameters())
-        if self._status is None and self._peers.all_matched(now):
+        if run and self._matching.changed(run):
+            self._recording.note(run, self._matching.parameters())
+        if self._status is None and self._matching.complete(now):
             self._status = self._node.create_publisher(
                 String, RECORDER_STATUS, QoSProfile(depth=1, durability=LATCHED)
             )

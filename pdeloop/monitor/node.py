@@ -23,10 +23,9 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 
 from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.ros.introspection import NAMELESS, full_name
 from loop_interfaces.ros.node_main import ros_node
 from loop_interfaces.ros.observer import Observer
-from loop_interfaces.ros.parameters import RemoteParameters
+from loop_interfaces.ros.peers import Peers
 from pde_sim_node.equations import EQUATIONS
 from pdeloop.display import ProgressFile
 from pdeloop.live import Live
@@ -67,7 +66,7 @@ class MonitorNode:
         self._finder, self._given = finder, namespace is not None
         self._reader: LoopReader | None = None
         self._calls: list[ServiceCall] = []
-        self._asked: dict[bytes, RemoteParameters] = {}
+        self._peers = Peers(node)
         self._out: Path | None = None
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self._begin(namespace)
@@ -115,11 +114,8 @@ class MonitorNode:
                 self._serve(self._page.requests.get_nowait())
         with self._page.lock:
             self._calls = [call for call in self._calls if not call.poll(self._view.operation)]
-            for parameters in self._asked.values():
-                if parameters.values is None:
-                    parameters.poll()
-                    if parameters.values is not None:
-                        self._take_parameters(parameters.values)
+            for peer in self._peers.poll():
+                self._take_parameters(peer.values or {})
 
     def _serve(self, request: object) -> None:
         """Do what the page asks for."""
@@ -142,21 +138,13 @@ class MonitorNode:
         found = self._namespaces()
         if not self._given and found and self._namespace not in found:
             self._begin(found[0])
-        by_role: dict[str, list[Endpoint]] = {}
         prefix = (self._namespace or "").rstrip("/")
-        for role, topic in ROLES.items():
-            by_role[role] = []
-            for endpoint in self._node.get_publishers_info_by_topic(f"{prefix}/{topic}"):
-                if endpoint.node_name == NAMELESS:
-                    continue
-                name = full_name(endpoint)
-                process = bytes(endpoint.endpoint_gid)[:12]
-                by_role[role].append(Endpoint(name, process))
-                if role != "controller" and process not in self._asked:
-                    self._asked[process] = RemoteParameters(self._node, name)
-        alive = {endpoint.process for found in by_role.values() for endpoint in found}
-        for process in set(self._asked) - alive:
-            self._asked.pop(process).close()
+        topics = {role: f"{prefix}/{topic}" for role, topic in ROLES.items()}
+        there = self._peers.look(topics.values(), self._loop.now())
+        by_role = {
+            role: [Endpoint(peer.name, peer.process) for peer in there[topic] if peer.name]
+            for role, topic in topics.items()
+        }
         with self._page.lock:
             self._page.place["namespaces"] = found
             self._view.nodes.update(by_role)

@@ -1,0 +1,54 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Whether the nodes of the loop have discovered the recorder's subscriptions, and their parameters."""
+
+from __future__ import annotations
+
+from loop_interfaces.parameters import table
+from loop_interfaces.ros.peers import Peers
+
+PATIENCE = 3.0
+"""Seconds in which a node is expected to answer a request for its parameters."""
+
+
+class Matching:
+    """What the loop's nodes answer: that they have discovered us, and with which parameters.
+
+    required: full names of topics that somebody must publish; others: whose publishers, if there
+    are any, are asked, too.
+    """
+
+    def __init__(self, peers: Peers, required: list[str], others: list[str]) -> None:
+        self._peers, self._required, self._others = peers, required, others
+        self._lacking = True
+        self._known: object = None
+
+    def look(self, now: float) -> None:
+        """Look at the graph, ask who is new, take answers."""
+        found = self._peers.look([*self._others, *self._required], now)
+        self._lacking = not all(found[topic] for topic in self._required)
+        self._peers.poll()
+
+    def complete(self, now: float) -> bool:
+        """Whether every required topic has a publisher, and all of them have discovered us.
+
+        One that does not answer for a while has no parameter services to say so.
+        """
+        return not self._lacking and all(
+            peer.values is not None or now - peer.since > PATIENCE for peer in self._peers.known
+        )
+
+    def changed(self, run: int) -> bool:
+        """Whether `parameters` may have changed since the last call with the same run."""
+        answered = [peer.process for peer in self._peers.known if peer.values]
+        changed, self._known = (run, answered) != self._known, (run, answered)
+        return changed
+
+    def parameters(self) -> dict[str, object]:
+        """The loop's parameters, as far as its nodes have answered."""
+        known = {spec.name for spec in table()}
+        return {
+            name: value
+            for peer in self._peers.known
+            for name, value in (peer.values or {}).items()
+            if name in known or name.startswith("physical.")
+        }
