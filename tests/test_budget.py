@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from loop_interfaces.topics import StartColumn
 from pdeloop.cli import main
 from pdeloop.in_process import LocalPair
 from tests.small import SMALL, parameters, same_bits, train_here
-from tuner_node import checkpoint
+from tuner_node import checkpoint, training_state
 from tuner_node.batch import BatchResult
 from tuner_node.build import build_training
 from tuner_node.rollouts import CHECK
@@ -64,9 +65,11 @@ def test_a_training_ended_and_continued_after_each_of_its_batches_is_the_same(tm
     again = np.zeros_like(paid)
     for _ in range(batches):
         finish(parts, values, again, batches=1)
-        checkpoint.save(tmp_path / "checkpoint", parts.state())
+        checkpoint.save(tmp_path / "checkpoint", training_state.arrays_of(parts))
         parts = build_training(values)
-        assert checkpoint.restore(tmp_path / "checkpoint", parts.restore) == (True, [])
+        assert checkpoint.restore(
+            tmp_path / "checkpoint", partial(training_state.restore, parts)
+        ) == (True, [])
     assert parts.next_batch() is None
     assert parts.budget.by_purpose() == expected
     assert again.tolist() == paid.tolist()

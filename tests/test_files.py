@@ -23,7 +23,7 @@ from pdeloop.cli import FAILED, main
 from pdeloop.report.data import gather
 from pdeloop.training_run import unused
 from tests.small import SMALL
-from tuner_node import checkpoint
+from tuner_node import checkpoint, training_state
 from tuner_node.run_folder import RunFolder, RunFolderError
 
 OPTIMIZERS = ("two_point", "gauss_newton")
@@ -168,7 +168,9 @@ def test_forged_checkpoints_with_a_good_checksum_are_passed_over(run, capsys):
         path.write_bytes(content)
         checkpoint.previous(path).write_bytes(previous)
         training = build(values)
-        found, passed_over = checkpoint.restore(path, lambda arrays, t=training: t.restore(arrays))
+        found, passed_over = checkpoint.restore(
+            path, lambda arrays, t=training: training_state.restore(t, arrays)
+        )
         assert found and len(passed_over) <= 1
         training.next_batch()
     # And by the command, which goes on from the one before, to the same policy.

@@ -11,6 +11,7 @@ from loop_interfaces.frames import Frame
 from loop_interfaces.topics import MODEL, POLICY, START, StartColumn
 from pdeloop.in_process import LocalPair
 from tests.small import dispatcher_of, parameters, same_bits, train_here
+from tuner_node import training_state
 from tuner_node.batch import Batch
 from tuner_node.build import build_training
 from tuner_node.session import Session
@@ -115,7 +116,7 @@ def test_a_session_that_was_asked_to_stop_ends_with_its_iteration_and_can_be_con
     assert loop.iterations() <= done + 1
     assert loop.released
     continued = build_training(values())
-    continued.restore(loop.session.training.state())
+    training_state.restore(continued, training_state.arrays_of(loop.session.training))
     again = Loop(continued, incarnation=1)
     while not again.session.done:
         again.episode()

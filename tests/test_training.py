@@ -13,7 +13,7 @@ from loop_interfaces.model_rows import unpack
 from loop_interfaces.topics import COMPLETED, StartColumn
 from pdeloop.in_process import LocalPair, train
 from tests.small import parameters, same_bits, train_here
-from tuner_node import checkpoint
+from tuner_node import checkpoint, training_state
 from tuner_node.batch import BatchResult
 from tuner_node.build import build_training
 
@@ -187,7 +187,7 @@ def test_a_given_model_survives_a_restart(tmp_path):
     for _ in range(3):
         half.finish(pair.run(half.next_batch()))
     again = build_training(values)
-    again.restore(half.state())
+    training_state.restore(again, training_state.arrays_of(half))
     train(again, LocalPair(values), lambda row: None)
     assert same_bits(again.policies(), whole.policies())
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.frames import MAX_ID
-from tuner_node import checkpoint
+from tuner_node import checkpoint, training_state
 from tuner_node.run_folder import RunFolder, RunIdentity
 from tuner_node.training import Training
 
@@ -60,7 +60,7 @@ class RunWriter:
             return
         began = time.monotonic()
         try:
-            arrays = self._training.state() | {"run": np.array(self.identity.run)}
+            arrays = training_state.arrays_of(self._training) | {"run": np.array(self.identity.run)}
             checkpoint.save(self._folder.checkpoint, arrays)
             self._changed = False
         except OSError as error:
@@ -83,7 +83,7 @@ class RunWriter:
         def take(arrays: dict[str, NDArray[Any]]) -> None:
             if int(arrays.pop("run", np.array(-1))) != self.identity.run:
                 raise ValueError("belongs to another run")
-            self._training.restore(arrays)
+            training_state.restore(self._training, arrays)
 
         found, passed_over = checkpoint.restore(self._folder.checkpoint, take)
         instead = "using an older checkpoint" if found else "beginning again from the start"

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from loop_interfaces import model_rows
 from loop_interfaces.topics import COMPLETED, CostColumn
-from tuner_node import rollouts, training_state
+from tuner_node import rollouts
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, TrainingSettings, batch_of
 from tuner_node.budget import Budget
 from tuner_node.optimizers import Context, Optimizer, Record, Rollout, Trajectory
@@ -183,25 +183,6 @@ class Training:
     def progress(self) -> dict[str, list[int]]:
         """Rollouts of each seed: paid so far, and the budget."""
         return {"rollouts": self.budget.paid.tolist(), "budget": self.budget.total.tolist()}
-
-    def state(self) -> dict[str, NDArray[Any]]:
-        """Everything a checkpoint must hold, as arrays."""
-        return training_state.arrays_of(self)
-
-    def restore(self, arrays: dict[str, NDArray[Any]]) -> None:
-        """Continue from `state()`.
-
-        Raises
-        ------
-        ValueError
-            Those are not the arrays of a training with these settings; nothing has changed.
-        """
-        restored = Training(self.settings, self.make_optimizer)
-        try:
-            training_state.fill(restored, arrays)
-        except (ValueError, LookupError, TypeError, OverflowError) as error:
-            raise ValueError(f"does not fit this training ({error})") from error
-        vars(self).update(vars(restored))
 
     def _identified(self, models: Array) -> list[dict[str, Any]]:
         if len(models) == self.settings.seeds:  # perhaps of another order than before

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,16 +13,14 @@ from loop_interfaces import model_rows
 from tuner_node.budget import PURPOSES
 from tuner_node.checkpoint import taken
 from tuner_node.optimizers import Record, Trajectory
-
-if TYPE_CHECKING:
-    from tuner_node.training import Training
+from tuner_node.training import Training
 
 PHASES = (*PURPOSES, "done")
 Arrays = dict[str, NDArray[Any]]
 
 
 def arrays_of(training: Training) -> Arrays:
-    """Everything that `fill` needs."""
+    """Everything that a checkpoint must hold."""
     arrays: Arrays = {
         "phase": np.array(training.phase),
         "plant": np.array(training.plant),
@@ -49,14 +47,24 @@ def arrays_of(training: Training) -> Arrays:
     return arrays
 
 
-def fill(training: Training, arrays: Arrays) -> None:
-    """Bring a new training to the state of `arrays_of`.
+def restore(training: Training, arrays: Arrays) -> None:
+    """Continue from `arrays_of`.
 
     Raises
     ------
-    ValueError, LookupError, TypeError, OverflowError
-        The arrays are not those of a training with these settings.
+    ValueError
+        Those are not the arrays of a training with these settings; nothing has changed.
     """
+    restored = Training(training.settings, training.make_optimizer)
+    try:
+        _fill(restored, arrays)
+    except (ValueError, LookupError, TypeError, OverflowError) as error:
+        raise ValueError(f"does not fit this training ({error})") from error
+    vars(training).update(vars(restored))
+
+
+def _fill(training: Training, arrays: Arrays) -> None:
+    """Bring a new training to that state; an error of any of these kinds if the arrays do not fit."""
     seeds, n_a = training.settings.seeds, training.settings.n_a
     training.phase = str(taken(arrays, "phase", "U", ()))
     training.budget.restore(taken(arrays, "budget", "i", training.budget.state().shape))

@@ -8,7 +8,7 @@ import pickle
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 from unittest import mock
 from weakref import WeakKeyDictionary
@@ -37,6 +37,7 @@ from pde_sim_node.lockstep import Lockstep, Timing
 from pde_sim_node.plant import Plant
 from tests.simulation.disk import Disk
 from tests.small import parameters
+from tuner_node import training_state
 from tuner_node.build import build_dispatcher, build_training
 from tuner_node.optimizers.proposals import Proposer
 from tuner_node.run_folder import RunIdentity
@@ -258,7 +259,7 @@ class TunerProcess(Process):
         super().__init__(history, name, "tuner", rate, EVERY_PAIR)
         given = {**history.values, "pairs": [""] * history.plan.pairs}
         training = build_training(given)
-        disk.restart(training.restore, power=power, rot=rot)
+        disk.restart(partial(training_state.restore, training), power=power, rot=rot)
         self._disk = disk
         self.dispatcher = build_dispatcher(given, training, RunIdentity(run, incarnation))
         self._changed = False
@@ -313,7 +314,7 @@ class TunerProcess(Process):
         for pair, publication in sent:
             self.history.send(self, publication, pair)
         if self._changed and (session.stopped or self.history.rng.random() < 0.5):
-            self._disk.save(session.training.state())
+            self._disk.save(training_state.arrays_of(session.training))
             self._changed = False
 
     def _report(self, row: Any) -> None:
