@@ -10,6 +10,7 @@ import os
 import shutil
 import zipfile
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -168,9 +169,7 @@ def test_forged_checkpoints_with_a_good_checksum_are_passed_over(run, capsys):
         path.write_bytes(content)
         checkpoint.previous(path).write_bytes(previous)
         training = build(values)
-        found, passed_over = checkpoint.restore(
-            path, lambda arrays, t=training: training_state.restore(t, arrays)
-        )
+        found, passed_over = checkpoint.restore(path, partial(training_state.restore, training))
         assert found and len(passed_over) <= 1
         training.next_batch()
     # And by the command, which goes on from the one before, to the same policy.

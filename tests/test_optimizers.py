@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from loop_interfaces.parameters import TUNER
 from tuner_node import oracle
-from tuner_node.optimizers import OPTIMIZERS, GaussNewton, Optimizer, RolloutResult, TwoPoint
+from tuner_node.optimizers import GaussNewton, Optimizer, RolloutResult, TwoPoint
 
 SHAPE = (2, 6)
 N_A, N_S = 2, 3
@@ -196,6 +197,6 @@ def test_refuses_bad_policies() -> None:
         TwoPoint(POLICY * np.inf, **settings)
 
 
-def test_the_registry_knows_every_optimiser_by_its_name() -> None:
-    assert all(cls.name == name for name, cls in OPTIMIZERS.items())  # type: ignore[attr-defined]
-    assert set(OPTIMIZERS.values()) == {TwoPoint, GaussNewton}
+def test_the_parameter_knows_every_optimiser_by_its_name() -> None:
+    (spec,) = (spec for spec in TUNER if spec.name == "optimizer")
+    assert set(spec.choices) == {TwoPoint.name, GaussNewton.name}

@@ -17,7 +17,7 @@ from loop_interfaces.spec import ParameterError
 from tuner_node.batch import UNKNOWN_PLANT, TrainingSettings
 from tuner_node.dispatch import Dispatcher
 from tuner_node.exploration import least_variance
-from tuner_node.optimizers import NEED_TRAJECTORIES, OPTIMIZERS, Context, Optimizer, TwoPoint
+from tuner_node.optimizers import Context, GaussNewton, Optimizer, TwoPoint
 from tuner_node.optimizers.gauss_newton import FIELDS
 from tuner_node.rollouts import CHECK, EXPLORATION
 from tuner_node.run_folder import RunIdentity
@@ -51,12 +51,6 @@ def read_model(path: Path, n_a: int) -> NDArray[np.float64]:
     if not basis.any(axis=0).all():
         raise ValueError(f"the model in {path} has modes that are zero; identify one anew")
     return model
-
-
-def first_step(values: Mapping[str, Any]) -> int:
-    """Rollouts that the optimiser needs to change the policy once."""
-    # Gauss-Newton measures the policy it begins with, and then the first candidate.
-    return {"two_point": 2, "gauss_newton": 2 * FIELDS}[values["optimizer"]]
 
 
 def check_budget(values: Mapping[str, Any], trajectories: bool, step: int) -> None:
@@ -95,19 +89,25 @@ def build_training(values: Mapping[str, Any]) -> Training:
             "the models of a batch have one order"
         )
     from_zero = values["start"] == "zero"
-    options: dict[str, Any] = {
-        "learning_rate": values["learning_rate_from_zero" if from_zero else "learning_rate"],
-        "smoothing_radius": values["smoothing_radius"],
-    }
+    learning_rate = values["learning_rate_from_zero" if from_zero else "learning_rate"]
+    trajectories = values["optimizer"] == GaussNewton.name
 
     def make_optimizer(
         policy: NDArray[np.float64], seed: int, context: Context | None, rollouts: int
     ) -> Optimizer:
-        kind = OPTIMIZERS[values["optimizer"]]
-        return kind(policy, seed=seed, rollouts=rollouts, context=context, **options)
+        if trajectories:
+            assert context is not None
+            return GaussNewton(policy, seed=seed, rollouts=rollouts, context=context)
+        return TwoPoint(
+            policy,
+            seed=seed,
+            rollouts=rollouts,
+            learning_rate=learning_rate,
+            smoothing_radius=values["smoothing_radius"],
+        )
 
-    trajectories = values["optimizer"] in NEED_TRAJECTORIES
-    step = first_step(values)
+    # To change the policy once, Gauss-Newton measures the one that it begins with and a candidate.
+    step = 2 * FIELDS if trajectories else 2
     check_budget(values, trajectories, step)
     given = {
         item.name: values[item.name] for item in fields(TrainingSettings) if item.name in values

@@ -1,8 +1,6 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Optimisers of a policy behind one interface: see `tuner_node.optimizers.base`."""
 
-from collections.abc import Callable
-
 from tuner_node.optimizers.base import Context as Context
 from tuner_node.optimizers.base import Optimizer as Optimizer
 from tuner_node.optimizers.base import Record as Record
@@ -12,8 +10,3 @@ from tuner_node.optimizers.base import State as State
 from tuner_node.optimizers.base import Trajectory as Trajectory
 from tuner_node.optimizers.gauss_newton import GaussNewton as GaussNewton
 from tuner_node.optimizers.two_point import TwoPoint as TwoPoint
-
-# The names that parameters and the command line use.
-OPTIMIZERS: dict[str, Callable[..., Optimizer]] = {cls.name: cls for cls in (TwoPoint, GaussNewton)}
-NEED_TRAJECTORIES = tuple(cls.name for cls in (TwoPoint, GaussNewton) if cls.needs_trajectories)
-"""The optimisers whose results must carry their trajectories."""

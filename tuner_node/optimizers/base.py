@@ -58,7 +58,7 @@ class RolloutResult:
         Mean stage cost; of no meaning if the rollout diverged.
     diverged : bool
     trajectory : Trajectory, optional
-        Required by optimisers with `needs_trajectories`.
+        Required by optimisers that learn from trajectories.
     """
 
     cost: float
@@ -153,10 +153,6 @@ class Optimizer(Protocol):
     @property
     def name(self) -> str:
         """The name that selects this optimiser."""
-
-    @property
-    def needs_trajectories(self) -> bool:
-        """Whether results must carry their trajectory."""
 
     @property
     def policy(self) -> Array:

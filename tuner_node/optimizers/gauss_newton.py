@@ -12,8 +12,8 @@ step
    differences of trajectories (`selection`),
 2. solves (H + lambda D) d = -g with the averaged Gauss-Newton curvature (`sensitivity`),
 3. rolls out theta + d on the M fields of the moment, one by one, giving up as soon as the mean is
-   clearly above the incumbent's, accepts it if the mean over all fields fell, and adapts lambda,
-   An incumbent that diverges is halved instead,
+   clearly above the incumbent's, accepts it if the mean over all fields fell, and adapts lambda;
+   an incumbent that diverges is halved instead,
 4. after an acceptance replaces the oldest field, so that the policy does not fit M fields, or adds one
    if the step was small.
 
@@ -152,12 +152,9 @@ class GaussNewton:
         M, initial fields that judge a policy: more fit the distribution better, at M rollouts a
         step. They grow to twice as many, one after each accepted step that gains less than 2 % of the
         cost: a short step needs more of them to be judged.
-    learning_rate, smoothing_radius : float, optional
-        Not used; every optimiser takes them.
     """
 
     name = "gauss_newton"
-    needs_trajectories = True
 
     def __init__(
         self,
@@ -167,8 +164,6 @@ class GaussNewton:
         rollouts: int,
         context: Context,
         fields: int = FIELDS,
-        learning_rate: float | None = None,
-        smoothing_radius: float | None = None,
     ) -> None:
         require_positive(rollouts=rollouts, fields=fields)
         self._now = Progress.begin(checked_policy(policy0), fields)

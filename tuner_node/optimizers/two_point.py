@@ -22,7 +22,6 @@ from numpy.typing import ArrayLike, NDArray
 from tuner_node import oracle
 from tuner_node.optimizers.base import (
     Array,
-    Context,
     Rollout,
     RolloutResult,
     Row,
@@ -49,12 +48,9 @@ class TwoPoint:
         eta, for the mean stage cost. Too large: rollouts diverge and it halves itself.
     smoothing_radius : float
         r. Too large: the estimate is that of a smoother cost, and rollouts diverge.
-    context : Context, optional
-        Not used; every optimiser takes it.
     """
 
     name = "two_point"
-    needs_trajectories = False
 
     def __init__(
         self,
@@ -64,7 +60,6 @@ class TwoPoint:
         rollouts: int,
         learning_rate: float,
         smoothing_radius: float = 0.1,
-        context: Context | None = None,
     ) -> None:
         require_positive(
             rollouts=rollouts, learning_rate=learning_rate, smoothing_radius=smoothing_radius
