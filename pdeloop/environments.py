@@ -52,6 +52,11 @@ class Environment(gymnasium.Env[Array, Array]):
         Subtracted from the reward of the step that diverges.
     parameters
         As of `pdeloop.problem`: n_z, horizon, measurement_noise, action_limit, sensors, ...
+
+    Raises
+    ------
+    ValueError
+        There is no such problem or parameter, or a value is out of range.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # as the base class declares it
@@ -125,6 +130,11 @@ class VectorEnvironment(VectorEnv[Array, Array, NDArray[Any]]):
         As of `Environment`.
     num_envs
         M.
+
+    Raises
+    ------
+    ValueError
+        num_envs is no whole number of 1 or more, or what `Environment` refuses.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012
