@@ -133,10 +133,12 @@ class Training:
 
     def _check_steps(self, result: BatchResult) -> None:
         """Raise ValueError if a trajectory to the end has not as many steps as those before."""
-        known = [kept.trajectory for own in self.measured for kept in own]
-        known += [explored for explored in self.explorations if explored is not None]
-        known += [r.trajectory for r in result.rollouts() if r.trajectory and not r.diverged]
-        steps = sorted({len(trajectory.actions) for trajectory in known})
+        known = [kept.actions for own in self.measured for kept in own]
+        known += [explored.actions for explored in self.explorations if explored is not None]
+        known += [
+            r.trajectory.actions for r in result.rollouts() if r.trajectory and not r.diverged
+        ]
+        steps = sorted({len(actions) for actions in known})
         if len(steps) > 1:
             raise ValueError(
                 f"rollouts of this run ended after {' and '.join(map(str, steps))} steps, expected one "
