@@ -194,7 +194,7 @@ TUNER = _section(
     Spec("identification_attempts", 3, 1, 1000).means(
         "exploratory episodes a seed may use until its LQT law beats no control on a sampled "
         "field, which the adaptation begins with if none does; 1: take the first, unchecked, as "
-        "the paper does"
+        "the paper does; gauss_newton with few sensors explores once and compares the law itself"
     ),
     Spec("evaluation_fields", 10, 1, 1000, group="budget and method").means(
         "sampled initial fields of the closing evaluation"

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -106,6 +107,33 @@ def test_improves_a_plant_that_is_not_linear() -> None:
     while not optimizer.done:
         optimizer.tell(measure(plant, optimizer.ask()))
     assert mean_cost(plant, optimizer.policy) < 0.95 * start
+
+
+@pytest.mark.parametrize(
+    ("law", "rollouts", "better"),
+    [((50.0, 50.0, 120.0), 3, True), ((50.0, 90.0, 120.0), 3, False), ((50.0, 210.0), 2, False)],
+)
+def test_with_sensors_the_first_law_has_to_beat_no_control_on_all_fields(
+    law: tuple[float, ...], rollouts: int, better: bool
+) -> None:
+    """One field of three is dear without control; the law is given up when it cannot win any more."""
+    plant = Plant()
+    optimizer = make(plant, context=replace(plant.context(), sensors=N_S))
+    none, first = optimizer.ask(), plant.best
+    assert len(none) == 3 and not any(asked.policy.any() for asked in none)
+    results = measure(plant, none)
+    optimizer.tell(
+        [
+            replace(result, cost=cost)
+            for result, cost in zip(results, (34.0, 34.0, 185.0), strict=True)
+        ]
+    )
+    for cost in law:
+        (asked,) = optimizer.ask()
+        assert same_bits(asked.policy, 0.6 * first)
+        row = optimizer.tell([replace(plant.run(asked.policy, asked.field_seed), cost=cost)])
+    assert row["accepted"] is better and row["rollouts"] == 3 + rollouts
+    assert same_bits(optimizer.policy, 0.6 * first if better else np.zeros_like(first))
 
 
 def test_asks_are_pure_rows_are_json_and_the_budget_is_kept() -> None:

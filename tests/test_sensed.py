@@ -18,24 +18,68 @@ SENSORS = 8
 FIELD = 11
 
 
+def _fitted(problem: pdeloop.Problem, seed: int) -> tuple[SensedModel, Array, float]:
+    """From an exploration and a rollout without control."""
+    plant = problem.plant()
+    explored, actions = problem.explore(seed)
+    uncontrolled = rollout(plant, lambda k, y: np.zeros((1, plant.n_a)), [FIELD])
+    readings = np.stack([explored[:-1], uncontrolled.states[:-1, 0]])
+    positions = problem.values["actuator_positions"] or _equally_spaced(plant.n_a)
+    with threadpool_limits(1):
+        return fit_sensed(
+            readings,
+            [actions, uncontrolled.actions[:, 0]],
+            np.array(positions),
+            problem.values["measurement_noise"] * _scale(problem),
+        )
+
+
+def _scale(problem: pdeloop.Problem) -> float:
+    """What the published readings are multiplied by."""
+    return float(np.sqrt(problem.values["n_z"] / SENSORS))
+
+
+def _equally_spaced(n_a: int) -> Array:
+    return (np.arange(n_a) + 0.5) / n_a
+
+
 def test_the_kdv_equation_is_found_from_eight_sensors() -> None:
     """u_t = -u_xxx + 3 (u^2)_x on a domain of length 20; the soliton is not seen in the beginning."""
     problem = pdeloop.problem("kdv", sensors=SENSORS)
     plant = problem.plant()
-    explored, actions = problem.explore(1000)
-    uncontrolled = rollout(plant, lambda k, y: np.zeros((1, plant.n_a)), [FIELD])
-    scale = np.sqrt(plant.x.size / SENSORS)
-    readings = np.stack([explored[:-1], uncontrolled.states[:-1, 0]]) / scale
-    with threadpool_limits(1):
-        model, fields, error = fit_sensed(readings, [actions, uncontrolled.actions[:, 0]])
+    model, fields, error = _fitted(problem, 1000)
     assert error < 1e-5
     transport, diffusion, dispersion, quadratic = _coefficients(model)
     assert dispersion == pytest.approx(-1 / 20**3, rel=0.02)
-    assert quadratic == pytest.approx(3 / 20, rel=0.02)
+    assert quadratic * _scale(problem) == pytest.approx(3 / 20, rel=0.02)
     assert abs(transport) < 1e-3 and abs(diffusion) < 5e-5
     plant.reset([FIELD])
-    true = plant.states[0, :: plant.x.size // fields.shape[1]]
+    true = _scale(problem) * plant.states[0, :: plant.x.size // fields.shape[1]]
     assert np.linalg.norm(fields[1] - true) < 0.01 * np.linalg.norm(true)
+
+
+@pytest.mark.parametrize("seed", [1000, 1001])
+def test_noise_does_not_hide_the_allen_cahn_equation(seed: int) -> None:
+    """0.1 is a tenth of the field; u_t = 0.0025 u_xx + 5 u - 5 u^3 on a domain of length 2."""
+    problem = pdeloop.problem("allen-cahn", sensors=SENSORS, measurement_noise=0.1)
+    model, _, error = _fitted(problem, seed)
+    assert error < 2e-3
+    small, none = 1e-3, np.zeros(model.B.shape[1])
+    still = model.step(np.zeros(len(model.B)), none)
+    growth = (model.step(np.full(len(model.B), small), none) - still) / small
+    assert np.mean(growth) == pytest.approx(np.exp(0.05), rel=0.03)
+
+
+def test_actuators_need_not_be_equally_spaced() -> None:
+    positions = [0.1, 0.22, 0.55, 0.9]
+    problem = pdeloop.problem(
+        "allen-cahn", sensors=SENSORS, n_a=4, actuator_positions=positions, exploration_variance=4.0
+    )
+    model, _, error = _fitted(problem, 1000)
+    assert error < 1e-4
+    x = np.arange(len(model.B)) / len(model.B)
+    effect = np.abs(model.B)
+    np.testing.assert_allclose(x @ effect / effect.sum(axis=0), positions, atol=0.02)
 
 
 def _coefficients(model: SensedModel) -> Array:
@@ -64,7 +108,7 @@ def _coefficients(model: SensedModel) -> Array:
 @pytest.fixture
 def model() -> SensedModel:
     shared = np.array([2.0, 1.0, 1.5, -3.0, 0.2, 0.5, -0.1, 0.1, 5.0, -1.0, 0.5, 2.0])
-    return SensedModel.of(shared, SENSORS, 5)
+    return SensedModel.of(shared, SENSORS, _equally_spaced(5))
 
 
 def test_jacobians_are_the_derivatives_of_a_step(model: SensedModel) -> None:

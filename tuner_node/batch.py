@@ -97,9 +97,11 @@ class TrainingSettings:
     """Whether rollouts get seeds of the plant's noise."""
     action_limit: float = 0.0
     measurement_noise: float = 0.0
-    """Standard deviation of the noise on every number of the states; 0 also with point sensors."""
+    """Standard deviation of the noise on every number of the states."""
     sensors: int = 0
     """Point sensors whose readings the states are; 0: the states are whole."""
+    actuator_positions: Sequence[float] = ()
+    """Centres of the actuators as shares of the domain; none: equally spaced."""
     model: Array | None = None
     """Rows of a reduced model to start from instead of identifying one."""
 

@@ -1,6 +1,7 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A training from resolved parameters."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -106,6 +107,10 @@ def build_training(values: Mapping[str, Any]) -> Training:
             smoothing_radius=values["smoothing_radius"],
         )
 
+    # One at every point measures the whole state.
+    sensors = values["sensors"] if values["sensors"] < values["n_z"] else 0
+    if sensors and trajectories:  # Gauss-Newton compares the first law itself
+        values = {**values, "identification_attempts": 1}
     # To change the policy once, Gauss-Newton measures the one that it begins with and a candidate.
     step = 2 * FIELDS if trajectories else 2
     check_budget(values, trajectories, step)
@@ -117,13 +122,15 @@ def build_training(values: Mapping[str, Any]) -> Training:
         steps=values["horizon"],
         sample_time=values["sample_time"],
         width=values["actuator_width"],
-        n_z=values["sensors"] or values["n_z"],
+        n_z=values["n_z"],
     )
+    # The published readings are scaled (docs/robustness.md).
+    readings = values["sensors"] * values["sensor_delays"] or values["n_z"]
+    scale = math.sqrt(values["n_z"] / readings)
     given |= {
         "exploration_variance": max(values["exploration_variance"], variance),
-        # One at every point measures the whole state.
-        "sensors": values["sensors"] if values["sensors"] < values["n_z"] else 0,
-        "measurement_noise": 0.0 if values["sensors"] else values["measurement_noise"],
+        "sensors": sensors,
+        "measurement_noise": values["measurement_noise"] * scale,
         "model": read_model(Path(values["model"]), values["n_a"]) if values["model"] else None,
     }
     settings = TrainingSettings(

@@ -311,6 +311,7 @@ class Training:
             action_limit=self.settings.action_limit,
             noise=self.settings.measurement_noise,
             sensors=self.settings.sensors,
+            actuator_positions=self.settings.actuator_positions,
         )
 
     def _asked(self) -> list[list[Rollout]]:

@@ -41,7 +41,8 @@ _TERMS = ((1, 0), (1, 1), (1, 2), (1, 3), (2, 0), (2, 1), (3, 0))
 _COEFFICIENTS = len(_TERMS) + 1
 # b, x_0, s and w.
 _ACTUATORS = 4
-_SHARED = _COEFFICIENTS + _ACTUATORS
+SHARED = _COEFFICIENTS + _ACTUATORS
+"""Unknowns that all rollouts share."""
 # The wavenumber and the number of samples that give the coefficients and actuators their units.
 _WAVENUMBER = 2.0 * np.pi * 8
 _TIME = 100.0
@@ -54,18 +55,19 @@ _FASTEST_GROWTH = 0.5
 # First values of the dispersion c_13, in its unit: no descent leads from waves that run one way
 # to waves that run the other.
 _DISPERSIONS = (0.0, -20.0, 20.0, -10.0, 10.0, -30.0, 30.0)
-# An error with which none of the others is tried, and the number of rollouts that are fitted then.
+# An error with which none of the others is tried.
 _ENOUGH = 1e-5
-_CALMEST = 2
 # Shares of the rollouts that are fitted one after the other, and the most steps for each.
-_FIRST = (0.05, 0.1, 0.2, 0.4, 1.0)
-_LATER = (0.4, 1.0)
+_SHARES = (0.2, 0.4, 1.0)
 _ITERATIONS, _LAST_ITERATIONS = 20, 60
 _COMPARED = 100
-# Ridges, on the readings' scale: of the shared unknowns, and of Fourier coefficients, which grows with
-# the wavenumber.
-_SHARED_RIDGE = 1e-5
+# Ridges, on the readings' scale: of the shared unknowns, of those that move and widen the actuators
+# as long as no equation is known, and of Fourier coefficients, which grows with the wavenumber. With
+# noise there come those of a normal prior, with these standard deviations: of the shared unknowns, and
+# of Fourier coefficients relative to the readings.
+_SHARED_RIDGE, _PLACE_RIDGE = 1e-5, 1e-3
 _FIELD_RIDGE, _FIELD_RIDGE_WAVE = 1e-3, 4.0
+_SHARED_DEVIATION, _FIELD_DEVIATION = 10.0, 0.5
 _DAMPING = (1e-2, 1e-9, 1e4)
 _LEAST_GAIN = 1e-3
 _DIFFERENCE = 1e-5
@@ -92,25 +94,28 @@ class SensedModel:
     ----------
     shared : (12,) array
         The unknowns that all rollouts share, in their units.
+    centres : (n_a,) array
+        x_i, as it was declared.
     B : (n, n_a) array
         What the actions do in a sampling time.
     """
 
     shared: Array
+    centres: Array
     B: Array
 
     name = "sensed"
     components = 1
 
     @classmethod
-    def of(cls, shared: Array, sensors: int, n_a: int) -> SensedModel:
+    def of(cls, shared: Array, sensors: int, centres: Array) -> SensedModel:
         """With the grid for so many sensors."""
         n = grid_points(sensors)
-        return cls(shared, np.fft.irfft(_Equation(shared, n, n_a).actuators, n).T)
+        return cls(shared, centres, np.fft.irfft(_Equation(shared, n, centres).actuators, n).T)
 
     @cached_property
     def _equation(self) -> _Equation:
-        return _Equation(self.shared, *self.B.shape)
+        return _Equation(self.shared, len(self.B), self.centres)
 
     def step(self, z: Array, a: Array) -> Array:
         """The field after a sampling time from z (..., n), with the actions a (..., n_a)."""
@@ -132,7 +137,7 @@ class SensedModel:
 class _Equation:
     """The equation in Fourier space, for unknowns of any shape (..., 12)."""
 
-    def __init__(self, shared: Array, n: int, n_a: int) -> None:
+    def __init__(self, shared: Array, n: int, centres: Array) -> None:
         self.n, waves = n, np.arange(n // 2 + 1)
         derivative = 2j * np.pi * waves
         self._kept = waves < n // 2
@@ -147,8 +152,9 @@ class _Equation:
         self._whole = self._half**2
         self._constant = n / _TIME * shared[..., _COEFFICIENTS - 1]
         b, x_0, s, w = np.moveaxis(shared[..., _COEFFICIENTS:, None, None], -3, 0) / _TIME
+        n_a = len(centres)
         own = np.arange(n_a)[:, None]
-        places = (own + 0.5) / n_a + x_0 + (own - 0.5 * (n_a - 1)) * s / n_a
+        places = centres[:, None] + x_0 + (own - 0.5 * (n_a - 1)) * s / n_a
         width = (0.5 + w) / n_a
         # Smooth towards the grid's last wavenumber, so that the edges of an actuator do not ring.
         shape = width * np.sinc(waves * width) * np.exp(-((waves / (0.45 * n)) ** 8))
@@ -156,7 +162,7 @@ class _Equation:
 
     def force(self, a: Array) -> Spectrum:
         """The constant, and the effect of the actions (..., n_a)."""
-        force: Spectrum = np.sum(a[..., None] * self.actuators, axis=-2)
+        force: Spectrum = (a[..., None, :] @ self.actuators)[..., 0, :]
         force[..., 0] += self._constant
         return force
 
@@ -183,7 +189,11 @@ class _Equation:
 
 
 def fit_sensed(
-    readings: Sequence[Array], actions: Sequence[Array], start: SensedModel | None = None
+    readings: Sequence[Array],
+    actions: Sequence[Array],
+    centres: Array,
+    noise: float = 0.0,
+    start: Array | None = None,
 ) -> tuple[SensedModel, Array, float]:
     """Fit the equation and the initial fields of rollouts.
 
@@ -191,46 +201,61 @@ def fit_sensed(
     ----------
     readings, actions : sequences of (T, n_y) and (T, n_a) arrays
         Of rollouts of one length: y_k and a_k.
-    start : SensedModel, optional
-        Where to begin; from several equations, with no actuators, if there is none.
+    centres : (n_a,) array
+        Of the actuators, as shares of the domain.
+    noise : float
+        Standard deviation of the noise on every reading.
+    start : (12,) array, optional
+        The shared unknowns to begin with; from several equations, with no actuators, if there are none.
 
     Returns
     -------
     SensedModel, (rollouts, n) array and float
         The one with the least error, its initial fields, and the error: the mean of
-        |y_k^model - y_k|^2, relative to that of |y_k|^2.
+        |y_k^model - y_k|^2 without what noise has in it, relative to that of |y_k|^2.
     """
     y, a = np.stack(readings), np.stack(actions)
-    begun = _first_guess(y, a) if start is None else start.shared
-    problem = _Problem(y, a)
-    error, shared, fields = problem.fit(begun, problem.interpolated(), _LATER)
-    model = SensedModel.of(shared, y.shape[2], a.shape[2])
+    problem = _Problem(y, a, centres, noise)
+    fields = problem.interpolated()
+    if start is None:
+        calmest = np.argsort(np.sum(y * y, axis=(1, 2)), kind="stable").tolist()
+        acted = [m for m in calmest if a[m].any()]
+        pair = list(dict.fromkeys([*acted[:1], *calmest]))[:2]
+        shared, fields[pair] = _first_guess(_Problem(y[pair], a[pair], centres, noise))
+    else:
+        shared = start
+    error, shared, fields = problem.fit(shared, fields)
+    model = SensedModel.of(shared, y.shape[2], centres)
     n = len(model.B)
-    return model, np.fft.irfft(_spectrum(fields, n), n), error
+    return model, np.fft.irfft(_spectrum(fields, n), n), max(error - problem.noise, 0.0)
 
 
-def _first_guess(y: Array, a: Array) -> Array:
-    """The unknowns that rollouts y (R, T, n_y) and a (R, T, n_a) share, from the calmest of them."""
-    calmest = np.argsort(np.sum(y * y, axis=(1, 2)), kind="stable")[:_CALMEST]
-    problem = _Problem(y[calmest], a[calmest])
-    least, best = np.inf, np.zeros(_SHARED)
+def _first_guess(problem: _Problem) -> tuple[Array, Array]:
+    """The best unknowns of a few rollouts, shared and fields, from several equations."""
+    problem.place_ridge = _PLACE_RIDGE
+    least, best = np.inf, (np.zeros(SHARED), problem.interpolated())
     for dispersion in _DISPERSIONS:
-        first = np.zeros(_SHARED)
+        first = np.zeros(SHARED)
         first[_TERMS.index((1, 3))] = dispersion
-        error, shared, _ = problem.fit(first, problem.interpolated(), _FIRST)
+        error, *unknowns = problem.fit(first, problem.interpolated())
         if error < least:
-            least, best = error, shared
-        if least <= _ENOUGH:
+            least, best = error, (unknowns[0], unknowns[1])
+        if least <= _ENOUGH + problem.noise:
             break
     return best
 
 
 class _Problem:
-    """Readings y (R, T, n_y) and actions a (R, T, n_a), and the least squares problem."""
+    """Readings y (R, T, n_y) and actions a (R, T, n_a), and the least squares problem.
 
-    def __init__(self, y: Array, a: Array) -> None:
-        self.y, self.a = y, a
+    noise becomes what the noise has in the mean square of the readings, as a share of it.
+    """
+
+    def __init__(self, y: Array, a: Array, centres: Array, noise: float) -> None:
+        self.y, self.a, self._centres = y, a, centres
         self._size = float(np.sqrt(np.mean(y * y))) or 1.0
+        self.noise = (noise / self._size) ** 2
+        self.place_ridge = 0.0
         sensors = y.shape[2]
         self._n = grid_points(sensors)
         waves = np.arange(self._n // 2 + 1)
@@ -249,34 +274,39 @@ class _Problem:
         z = np.fft.rfft(fields)[:, : _WAVES + 1] / self._n
         return np.hstack([z.real, z.imag[:, 1:]])
 
-    def fit(
-        self, shared: Array, fields: Array, shares: Sequence[float]
-    ) -> tuple[float, Array, Array]:
+    def fit(self, shared: Array, fields: Array) -> tuple[float, Array, Array]:
         """The error per reading, relative to their size, and the unknowns."""
-        error = np.inf
-        for share in shares:
+        for share in _SHARES:
             steps = max(2, round(share * self.y.shape[1]))
-            error, shared, fields = self._descend(shared, fields, steps)
-        return error, shared, fields
+            moved = self._descend(shared, fields, steps)
+            # What fits the beginning may overflow later.
+            if np.isfinite(self._error(*moved)):
+                shared, fields = moved
+        return self._error(shared, fields), shared, fields
 
-    def _descend(self, shared: Array, fields: Array, steps: int) -> tuple[float, Array, Array]:
+    def _error(self, shared: Array, fields: Array) -> float:
+        with np.errstate(over="ignore", invalid="ignore"):
+            residuals = self._residuals(shared[None], fields[None], self.y.shape[1])
+            error = float(np.sum(residuals**2))
+        return error if np.isfinite(error) else np.inf
+
+    def _descend(self, shared: Array, fields: Array, steps: int) -> tuple[Array, Array]:
         damping, least, most = _DAMPING
-        ridge = self._ridge()
+        ridge = self._ridge(steps)
         x = np.concatenate([shared, fields.ravel()])
 
         def parts(x: Array) -> tuple[Array, Array]:
-            return x[:_SHARED], x[_SHARED:].reshape(fields.shape)
+            return x[:SHARED], x[SHARED:].reshape(fields.shape)
 
-        def objective(x: Array) -> tuple[float, float]:
+        def objective(x: Array) -> float:
             shared, fields = parts(x)
             residual = self._residuals(shared[None], fields[None], steps)
-            error = float(np.sum(residual**2))
-            total = error + float(np.sum(ridge * x * x))
-            return (total if np.isfinite(total) else np.inf), error
+            total = float(np.sum(residual**2) + np.sum(ridge * x * x))
+            return total if np.isfinite(total) else np.inf
 
         # Unknowns on the way to a good model may overflow: their error is then infinite.
         with np.errstate(over="ignore", invalid="ignore"):
-            now, error = objective(x)
+            now = objective(x)
             for _ in range(_ITERATIONS if steps < self.y.shape[1] else _LAST_ITERATIONS):
                 residual, J = self._linearised(*parts(x), steps)
                 if not np.isfinite(J).all():
@@ -287,28 +317,34 @@ class _Problem:
                 while damping < most:
                     damped = H + np.diag(damping * np.diag(H) + 1e-12)
                     moved = x - np.linalg.solve(damped, g)
-                    value, own = objective(moved)
+                    value = objective(moved)
                     if value < now:
-                        x, now, error = moved, value, own
+                        x, now = moved, value
                         damping = max(damping / 5.0, least)
                         break
                     damping *= 5.0
                 if not now < (1.0 - _LEAST_GAIN) * before:
                     break
-        shared, fields = parts(x)
-        return (error if np.isfinite(now) else np.inf), shared, fields
+        return parts(x)
 
-    def _ridge(self) -> Array:
-        rollouts = len(self.y)
-        own = _FIELD_RIDGE * (1.0 + (self._waves / _FIELD_RIDGE_WAVE) ** 2) / self._size
-        return np.concatenate(
-            [np.full(_SHARED, _SHARED_RIDGE**2), np.tile(own**2 / rollouts, rollouts)]
-        )
+    def _ridge(self, steps: int) -> Array:
+        rollouts, _, sensors = self.y.shape
+        weight = self.noise / (len(range(0, steps, self._stride(steps))) * sensors * rollouts)
+        shared = np.full(SHARED, _SHARED_RIDGE**2 + weight / _SHARED_DEVIATION**2)
+        shared[_COEFFICIENTS + 1 :] += self.place_ridge**2
+        field = _FIELD_RIDGE**2 / rollouts + weight / _FIELD_DEVIATION**2
+        rising = (1.0 + (self._waves / _FIELD_RIDGE_WAVE) ** 2) ** 2 / self._size**2
+        return np.concatenate([shared, np.tile(field * rising, rollouts)])
+
+    @staticmethod
+    def _stride(steps: int) -> int:
+        """Of so many steps every how many-th is compared."""
+        return -(-steps // _COMPARED)
 
     def _residuals(self, shared: Array, fields: Array, steps: int) -> Array:
         """Errors of the readings for unknowns (P, 12) and (P, R, 33), each as a share of the whole."""
-        n_a, stride = self.a.shape[2], -(-steps // _COMPARED)
-        equation = _Equation(shared[:, None], self._n, n_a)
+        stride = self._stride(steps)
+        equation = _Equation(shared[:, None], self._n, self._centres)
         z = _spectrum(fields, self._n)
         residuals = []
         for k in range(steps):
@@ -322,16 +358,16 @@ class _Problem:
     def _linearised(self, shared: Array, fields: Array, steps: int) -> tuple[Array, Array]:
         """Residuals (r,) and their derivatives (unknowns, r). A field moves its own rollout alone."""
         rollouts, own = fields.shape
-        count = 1 + _SHARED + own
+        count = 1 + SHARED + own
         all_shared, all_fields = np.tile(shared, (count, 1)), np.tile(fields, (count, 1, 1))
-        all_shared[1 : 1 + _SHARED] += _DIFFERENCE * np.eye(_SHARED)
-        all_fields[1 + _SHARED :] += _DIFFERENCE * np.eye(own)[:, None]
+        all_shared[1 : 1 + SHARED] += _DIFFERENCE * np.eye(SHARED)
+        all_fields[1 + SHARED :] += _DIFFERENCE * np.eye(own)[:, None]
         residuals = self._residuals(all_shared, all_fields, steps)
         changes = (residuals[1:] - residuals[0]) / _DIFFERENCE
-        J = np.zeros((_SHARED + rollouts * own, *residuals[0].shape))
-        J[:_SHARED] = changes[:_SHARED]
+        J = np.zeros((SHARED + rollouts * own, *residuals[0].shape))
+        J[:SHARED] = changes[:SHARED]
         for m in range(rollouts):
-            J[_SHARED + m * own : _SHARED + (m + 1) * own, m] = changes[_SHARED:, m]
+            J[SHARED + m * own : SHARED + (m + 1) * own, m] = changes[SHARED:, m]
         return residuals[0].ravel(), J.reshape(len(J), -1)
 
 

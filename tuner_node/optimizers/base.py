@@ -128,6 +128,8 @@ class Context:
     sensors : int
         n_y, point sensors at (j + 1/2) / n_y of a periodic domain, of whose last readings the states
         consist; 0: the states are whole.
+    actuator_positions : sequence of float
+        Centres of the actuators as shares of the domain; none: equally spaced.
     """
 
     U: Array
@@ -140,6 +142,11 @@ class Context:
     action_limit: float = 0.0
     noise: float = 0.0
     sensors: int = 0
+    actuator_positions: Sequence[float] = ()
+
+    def actuator_centres(self, n_a: int) -> Array:
+        """Centres of the n_a actuators as shares of the domain, (n_a,)."""
+        return np.array(self.actuator_positions or (np.arange(n_a) + 0.5) / n_a)
 
 
 class Optimizer(Protocol):

@@ -168,6 +168,11 @@ class GaussNewton:
         require_positive(rollouts=rollouts, fields=fields)
         self._now = Progress.begin(checked_policy(policy0), fields)
         self._proposer = Proposer(context, self._now.policy)
+        self._sensors = context.sensors
+        # One field says little with few sensors: the law has to beat no control on all of them.
+        if self._sensors and self._now.policy.any():
+            self._now.policy[:] = 0.0
+            self._now.proposed = True
         self._seed = seed
         self._budget = rollouts
         self._field_count = fields
@@ -227,14 +232,17 @@ class GaussNewton:
             row["cost"] = cost
         row["rollouts"] = self._records.count
         row["damping"] = now.damping
-        if decided and not now.missing.size:
+        if decided and not now.missing.size and not now.proposed:
             self._propose(row)
         return row
 
     def state(self) -> State:
         """The policies, the decisions that are pending, and the remembered trajectories."""
+        sensed = self._proposer.sensed
+        equation = {"equation": sensed.equation.copy()} if sensed else {}
         return {
             **self._now.arrays(),
+            **equation,
             "seed": np.array(self._seed),
             "field_count": np.array(self._field_count),
             **self._records.state(len(self._proposer.loop.U), *self._now.policy.shape),
@@ -250,6 +258,8 @@ class GaussNewton:
         if missing := now.referred - {record.stamp for record in self._records.all()}:
             raise ValueError(f"the checkpoint refers to rollouts that it lacks: {sorted(missing)}.")
         self._now = now
+        if self._proposer.sensed:
+            self._proposer.sensed.equation = state["equation"].astype(np.float64)
 
     def _rollout(self, policy: Array, slot: int) -> Rollout:
         return Rollout(policy.copy(), oracle.field_seed(self._seed, int(self._now.fields[slot])))
@@ -266,15 +276,22 @@ class GaussNewton:
         ran = now.trials != _NONE
         trial = self._mean_cost(now.trials[ran])
         incumbent = self._mean_cost(now.incumbents[ran])
-        if trial >= _ABORT * incumbent or (ran.all() and trial >= incumbent):
-            now.damping = min(4.0 * now.damping, _DAMPING[2])
+        # The first law with sensors says nothing about the models.
+        from_model = not self._sensors or now.fall > 0.0
+        if self._sensors:
+            lost = ran.sum() * trial >= ran.size * self._mean_cost(now.incumbents)
+        else:
+            lost = trial >= _ABORT * incumbent or (ran.all() and trial >= incumbent)
+        if lost:
+            if from_model:
+                now.damping = min(4.0 * now.damping, _DAMPING[2])
             now.others = now.trials.copy()
             now.accepted = False
         elif ran.all():
             fall = incumbent - trial
-            if fall > 0.5 * now.fall:
+            if from_model and fall > 0.5 * now.fall:
                 now.damping = max(now.damping / 3.0, _DAMPING[0])
-            elif fall <= 0.2 * now.fall:
+            elif from_model and fall <= 0.2 * now.fall:
                 now.damping *= 2.0
             now.policy = now.candidate.copy()
             now.others, now.incumbents = now.incumbents, now.trials.copy()

@@ -55,6 +55,8 @@ class Loop:
         T, the steps of an episode.
     action_limit : float
         0: none.
+    noise : float
+        Standard deviation of what a simulation adds to U^T z; 0: nothing.
     """
 
     U: Array
@@ -63,6 +65,7 @@ class Loop:
     action_weight: float
     horizon: int
     action_limit: float
+    noise: float = 0.0
 
     @cached_property
     def s_r(self) -> Array:
@@ -89,16 +92,25 @@ class Loop:
             moved[:, n_s:] += np.outer(step[:, n_s], self.s_r / float(np.sum(self.s_r * self.s_r)))
         return moved
 
+    def noise_of(self, count: int) -> Array:
+        """What is added to U^T z of so many fields, (T, count, n_s); the same for every law."""
+        size = self.horizon, count, self.U.shape[1]
+        return self.noise * np.random.default_rng(0).standard_normal(size)
+
     def simulate(self, model: FieldModel, theta: Array, fields: Array) -> Simulation:
         """Roll theta = [K b] (n_a, n_s + 1) out on the model from the fields (F, n_z)."""
         K, b = theta[:, :-1], self.one * theta[:, -1]
         z = np.empty((self.horizon + 1, *fields.shape))
         a = np.empty((self.horizon, len(fields), len(theta)))
         z[0] = fields
+        noise = self.noise_of(len(fields)) if self.noise else None
         # A law or a model that is unstable overflows: its cost is then not finite.
         with np.errstate(over="ignore", invalid="ignore"):
             for k in range(self.horizon):
-                a[k] = z[k] @ self.U @ K.T + b
+                s = z[k] @ self.U
+                if noise is not None:
+                    s += noise[k]
+                a[k] = s @ K.T + b
                 if self.action_limit:
                     np.clip(a[k], -self.action_limit, self.action_limit, out=a[k])
                 z[k + 1] = model.step(z[k], a[k])
@@ -272,10 +284,13 @@ def _expansion(
     gradient, curvature = np.zeros(theta.size), np.zeros((theta.size, theta.size))
     energy = np.zeros((n_f, n_f))
     B = V.T @ model.B
+    noise = loop.noise_of(count) if loop.noise else None
     with np.errstate(over="ignore", invalid="ignore"):
         for i in range(count):
             states = simulation.states[:, i]
             path = loop.path(states, simulation.actions[:, i], theta[:, :-1], V)
+            if noise is not None:
+                path.features[:, :-1] += noise[:, i]
             expansion = expand(
                 path,
                 model.jacobians(states, V),

@@ -20,6 +20,7 @@ from tuner_node.optimizers.proposals.reproducing import (
     steps_of,
 )
 from tuner_node.optimizers.proposals.sensed import MOST_SENSORS, SensedProposals
+from tuner_node.optimizers.selection import LOCAL
 from tuner_node.optimizers.simulation import Loop
 from tuner_node.optimizers.trajectories import denoised
 
@@ -40,6 +41,8 @@ class Proposer:
     ----------
     loop : Loop
         The closed loop and its cost.
+    sensed : SensedProposals or None
+        None where the states are not one reading of each of a few sensors.
     """
 
     def __init__(self, context: Context, policy: Array) -> None:
@@ -62,15 +65,18 @@ class Proposer:
             )
         weights = context.state_weight, context.action_weight
         self.loop = Loop(U, target, *weights, context.horizon, context.action_limit)
-        self._noise = context.noise
+        # Few readings cannot be cleaned; what is fitted to them knows of their noise.
+        self._noise = 0.0 if context.sensors else context.noise
         self._reproduced = REPRODUCED_NOISY if self._noise else REPRODUCED
         self._cleaned: WeakKeyDictionary[Record, Record] = WeakKeyDictionary()
         exploration = Record(np.zeros_like(policy), np.inf, states, actions)
         self._before = [self._clean(record) for record in (exploration, *context.measured)]
-        self._sensed: SensedProposals | None = None
+        self.sensed: SensedProposals | None = None
         # One component, of which each sensor's last reading is the state.
         if context.sensors == target.size and target.size <= MOST_SENSORS:
-            self._sensed = SensedProposals(self.loop, self._before, self._reproduced)
+            centres = context.actuator_centres(n_a)
+            dearest = LOCAL * self.loop.cost_of(self._before[0])
+            self.sensed = SensedProposals(self.loop, centres, context.noise, dearest)
 
     def propose(
         self,
@@ -105,8 +111,8 @@ class Proposer:
             [] if accepted else [(i, o) for i, o in zip(incumbents, others, strict=True) if o]
         )
         policy = incumbents[0].policy
-        if self._sensed is not None:
-            proposal = self._sensed.propose(data, policy, damping)
+        if self.sensed is not None:
+            proposal = self.sensed.propose(data, policy, damping)
             if proposal is not None:
                 return proposal
         # A rollout counts less in a fit, the more it costs above the incumbent's.

@@ -8,15 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cached_property
 
 import numpy as np
 
-from loop_interfaces.field_models.sensed import SensedModel, fit_sensed, interpolated
+from loop_interfaces.field_models.sensed import SHARED, SensedModel, fit_sensed, interpolated
 from tuner_node.optimizers.base import Array, Record
 from tuner_node.optimizers.fit import extended_basis
 from tuner_node.optimizers.proposals.proposal import COMPARED, TRUST, Proposal, spread
-from tuner_node.optimizers.selection import LOCAL
+from tuner_node.optimizers.proposals.reproducing import REPRODUCED
 from tuner_node.optimizers.simulation import Loop, improve
 
 # More point sensors than this are taken for a field.
@@ -30,21 +29,34 @@ class SensedProposals:
     ----------
     loop : Loop
         Its states are one reading of each sensor.
-    before : sequence of Record
-        What is known before the first rollout, the exploratory trajectory first.
-    reproduced : float
-        The relative error of the readings up to which the model is used.
+    centres : (n_a,) array
+        Of the actuators, as shares of the domain.
+    noise : float
+        Standard deviation of the noise on every reading.
+    dearest : float
+        Mean stage cost of a rollout above which it is not fitted.
+
+    Attributes
+    ----------
+    equation : (12,) array
+        The unknowns that the rollouts share, as they were fitted last; zero before.
     """
 
-    def __init__(self, loop: Loop, before: Sequence[Record], reproduced: float) -> None:
-        self._loop, self._before, self._reproduced = loop, before, reproduced
+    def __init__(self, loop: Loop, centres: Array, noise: float, dearest: float) -> None:
+        self._loop, self._centres, self._noise, self._dearest = loop, centres, noise, dearest
+        self.equation: Array = np.zeros(SHARED)
 
     def propose(self, data: Sequence[Record], policy: Array, damping: float) -> Proposal | None:
         """A law improved on the model, or None if the model does not reproduce the readings."""
         rollouts = self._chosen(data)
-        model, fields, error = _fit(rollouts, self._first_model)
-        if not error <= self._reproduced:
+        starts = (self.equation, None) if self.equation.any() else (None,)
+        for start in starts:
+            model, fields, error = self._fit(rollouts, start)
+            if error <= REPRODUCED:
+                break
+        else:
             return None
+        self.equation = model.shared
         loop, (sensors, n_s) = self._loop, self._loop.U.shape
         n = fields.shape[1]
         U = np.zeros((n, n_s))
@@ -54,6 +66,7 @@ class SensedProposals:
             U=U,
             target=interpolated(loop.target),
             state_weight=loop.state_weight * sensors / n,
+            noise=self._noise,
         )
         own = dict(zip((record.states[0].tobytes() for record in rollouts), fields, strict=True))
         improved = improve(
@@ -67,23 +80,20 @@ class SensedProposals:
         candidate = loop.moved(policy, improved.theta - loop.theta(policy))
         return Proposal(candidate, improved.fall, 1, 0.0, error, model.name)
 
-    @cached_property
-    def _first_model(self) -> SensedModel:
-        """From what is known before the first rollout, so that it is the same in a resumed training."""
-        return _fit(self._chosen(self._before), None)[0]
-
     def _chosen(self, records: Sequence[Record]) -> list[Record]:
         """Whole rollouts, the newest, each once, and none that went far away."""
-        loop, most = self._loop, LOCAL * self._loop.cost_of(self._before[0])
+        loop = self._loop
         whole = {
             record.states.tobytes(): record
             for record in records
-            if len(record.actions) == loop.horizon and loop.cost_of(record) <= most
+            if len(record.actions) == loop.horizon and loop.cost_of(record) <= self._dearest
         }
         return list(whole.values())[-COMPARED:]
 
-
-def _fit(rollouts: Sequence[Record], start: SensedModel | None) -> tuple[SensedModel, Array, float]:
-    """The model, the initial fields, and the relative error of the readings."""
-    readings = [record.acted_from for record in rollouts]
-    return fit_sensed(readings, [record.actions for record in rollouts], start)
+    def _fit(
+        self, rollouts: Sequence[Record], start: Array | None
+    ) -> tuple[SensedModel, Array, float]:
+        """The model, the initial fields, and the relative error of the readings."""
+        readings = [record.acted_from for record in rollouts]
+        actions = [record.actions for record in rollouts]
+        return fit_sensed(readings, actions, self._centres, self._noise, start)
