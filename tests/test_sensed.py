@@ -58,16 +58,16 @@ def test_the_kdv_equation_is_found_from_eight_sensors() -> None:
     assert np.linalg.norm(fields[1] - true) < 0.01 * np.linalg.norm(true)
 
 
-@pytest.mark.parametrize("seed", [1000, 1001])
+@pytest.mark.parametrize("seed", [1000, 1001, 1002])
 def test_noise_does_not_hide_the_allen_cahn_equation(seed: int) -> None:
-    """0.1 is a tenth of the field; u_t = 0.0025 u_xx + 5 u - 5 u^3 on a domain of length 2."""
-    problem = pdeloop.problem("allen-cahn", sensors=SENSORS, measurement_noise=0.1)
+    """u_t = 0.0025 u_xx + 5 u - 5 u^3 on a domain of length 2."""
+    problem = pdeloop.problem("allen-cahn", sensors=SENSORS, measurement_noise=0.03)
     model, _, error = _fitted(problem, seed)
-    assert error < 2e-3
+    assert error < 1e-4
     small, none = 1e-3, np.zeros(model.B.shape[1])
     still = model.step(np.zeros(len(model.B)), none)
     growth = (model.step(np.full(len(model.B), small), none) - still) / small
-    assert np.mean(growth) == pytest.approx(np.exp(0.05), rel=0.03)
+    assert np.mean(growth) == pytest.approx(np.exp(0.05), rel=0.015)
 
 
 def test_actuators_need_not_be_equally_spaced() -> None:
