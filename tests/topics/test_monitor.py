@@ -95,7 +95,9 @@ def test_the_page_shows_a_running_loop_and_survives_a_restart_of_the_plant(loop,
     page.until(f"{ROLLOUTS} >= 3", LIMIT)
     assert page.ask("document.querySelector('#problem').textContent") == "small"
     for role in ("plant", "controller", "tuner"):
-        assert "there" in card(page, role) and present(page, role) == "true"
+        # The graph is read once a second, and a node may be heard before.
+        page.wait_for(lambda role=role: present(page, role) == "true", LIMIT, role)
+        assert "there" in card(page, role)
     before = page.ask(ROLLOUTS)
     episode = page.ask(FIELD)
 

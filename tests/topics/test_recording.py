@@ -88,12 +88,12 @@ def test_verify_finds_a_single_bit_that_was_changed(recorded, tmp_path, topic):
     episodes = list(Bag(copy).episodes())
     exploratory, adapting = episodes[0], episodes[4]
     frame, words = {
-        "state": (adapting.states[17], f"z_17 of episode {adapting.number}"),
-        "action": (adapting.actions[12], f"a_12 of episode {adapting.number}"),
-        "policy": (adapting.policy, f"policy of episode {adapting.number}"),
-        "cost": (adapting.cost, f"cost of episode {adapting.number}"),
-        "model": (exploratory.model, f"model of episode {exploratory.number}"),
-        "start": (adapting.start, f"of episode {adapting.number}"),
+        "state": (adapting.states[17], f"z_17 of episode {adapting.name}"),
+        "action": (adapting.actions[12], f"a_12 of episode {adapting.name}"),
+        "policy": (adapting.policy, f"policy of episode {adapting.name}"),
+        "cost": (adapting.cost, f"cost of episode {adapting.name}"),
+        "model": (exploratory.model, f"model of episode {exploratory.name}"),
+        "start": (adapting.start, f"of episode {adapting.name}"),
     }[topic]
     rewrite(copy, frame)
     report = verify(copy)
