@@ -75,11 +75,11 @@ def steps(history: Rows, colour: str) -> Figure:
     middle.step(used, damping, "o-", where="post", color="0.25", ms=3, lw=1)
     plain_log(middle, float(np.max(damping) / np.min(damping)))
     middle.set_ylabel("damping $\\lambda$")
-    mismatch = _column(proposed, "mismatch")
+    mismatch = np.maximum(_column(proposed, "mismatch"), 1e-16)  # exact up to rounding, or to noise
     bottom.plot(_column(proposed, "rollouts"), mismatch, "o-", color="0.25", ms=3, lw=1)
     bottom.axhline(1.0, color="0.6", linestyle=":", linewidth=1)
     bottom.set_title("dotted: no prediction at all", loc="right", fontsize=8, color="0.4", pad=2)
-    low = max(min(0.4, 0.5 * float(np.nanmin(mismatch))), 1e-16)  # exact up to rounding
+    low = min(0.4, 0.5 * float(np.nanmin(mismatch)))
     plain_log(bottom, 2.6 / low)
     bottom.set_ylim(low, 2.6)
     bottom.set_ylabel("model error E")
@@ -95,9 +95,10 @@ def _candidates(ax: Axes, decided: Rows, proposed: Rows, colour: str) -> None:
     used, relative = _column(decided, "rollouts"), _column(decided, "relative_cost")
     heights = np.where(relative < EDGE, relative, EDGE)
     accepted = np.array([bool(row["accepted"]) for row in decided])
-    # The step that was decided is the last one proposed before.
-    last = np.searchsorted(_column(proposed, "rollouts"), used) - 1
-    predicted = (1 - _column(proposed, "predicted_fall") / _column(proposed, "cost"))[last]
+    # The step that was decided is the last one proposed before; a first law is none.
+    last = np.searchsorted(_column(proposed, "rollouts"), used)
+    falls = _column(proposed, "predicted_fall") / _column(proposed, "cost")
+    predicted = 1 - np.concatenate([[np.nan], falls])[last]
     ax.axhline(1.0, color="0.6", linestyle=":", linewidth=1)
     ax.plot(used, predicted, "D", ms=4, color="0.5", mfc="none", label="predicted")
     for which, marker, tint, label in (
