@@ -196,8 +196,8 @@ class Responder:
         """Answer the states of an episode's environments, (M, n_z).
 
         They are kept while something that the answer needs has not come, but not two different ones of
-        one step. A second, different state of
-        an exploratory episode takes back the models that came of the first.
+        one step. A second, different state of an exploratory episode takes back the models that came
+        of the first.
 
         Raises
         ------

@@ -2,12 +2,12 @@
 """A partial differential equation of a field of which a few points are measured.
 
     dz/dt = sum_pj c_pj d^j(z^p)/dx^j + c + B a,        B_i(x) = b 1[|x - x_i| < w/2],
-                                                         x_i = (i + 1/2) / n_a + x_0 + i s / n_a
+                                        x_i = p_i + x_0 + (i - (n_a - 1) / 2) s / n_a
 
-on a periodic domain of length 1, with time in sampling times. Neither the equation nor the actuators
-depend on where on the domain something happens, so that they have a dozen unknowns, however fine the
-grid. The fields in which the rollouts begin are unknown, too: a few Fourier coefficients each. All of
-them are fitted at once to the readings y_k = z_k(sensors) of whole rollouts,
+on a periodic domain of length 1, with time in sampling times and the declared centres p_i of the
+actuators. Nothing else depends on where on the domain something happens, so that there are a dozen
+unknowns, however fine the grid. The fields in which the rollouts begin are unknown, too: a few Fourier
+coefficients each. All of them are fitted at once to the readings y_k = z_k(sensors) of whole rollouts,
 
     min  mean over rollouts and steps |y_k^model - y_k|^2 + a small ridge,
 
@@ -221,7 +221,9 @@ def fit_sensed(
         calmest = np.argsort(np.sum(y * y, axis=(1, 2)), kind="stable").tolist()
         acted = [m for m in calmest if a[m].any()]
         pair = list(dict.fromkeys([*acted[:1], *calmest]))[:2]
-        shared, fields[pair] = _first_guess(_Problem(y[pair], a[pair], centres, noise))
+        shared, fields[pair] = _first_guess(
+            _Problem(y[pair], a[pair], centres, noise, _PLACE_RIDGE)
+        )
     else:
         shared = start
     error, shared, fields = problem.fit(shared, fields)
@@ -232,7 +234,6 @@ def fit_sensed(
 
 def _first_guess(problem: _Problem) -> tuple[Array, Array]:
     """The best unknowns of a few rollouts, shared and fields, from several equations."""
-    problem.place_ridge = _PLACE_RIDGE
     least, best = np.inf, (np.zeros(SHARED), problem.interpolated())
     for dispersion in _DISPERSIONS:
         first = np.zeros(SHARED)
@@ -251,11 +252,13 @@ class _Problem:
     noise becomes what the noise has in the mean square of the readings, as a share of it.
     """
 
-    def __init__(self, y: Array, a: Array, centres: Array, noise: float) -> None:
+    def __init__(
+        self, y: Array, a: Array, centres: Array, noise: float, place_ridge: float = 0.0
+    ) -> None:
         self.y, self.a, self._centres = y, a, centres
         self._size = float(np.sqrt(np.mean(y * y))) or 1.0
         self.noise = (noise / self._size) ** 2
-        self.place_ridge = 0.0
+        self._place_ridge = place_ridge
         sensors = y.shape[2]
         self._n = grid_points(sensors)
         waves = np.arange(self._n // 2 + 1)
@@ -331,7 +334,7 @@ class _Problem:
         rollouts, _, sensors = self.y.shape
         weight = self.noise / (len(range(0, steps, self._stride(steps))) * sensors * rollouts)
         shared = np.full(SHARED, _SHARED_RIDGE**2 + weight / _SHARED_DEVIATION**2)
-        shared[_COEFFICIENTS + 1 :] += self.place_ridge**2
+        shared[_COEFFICIENTS + 1 :] += self._place_ridge**2
         field = _FIELD_RIDGE**2 / rollouts + weight / _FIELD_DEVIATION**2
         rising = (1.0 + (self._waves / _FIELD_RIDGE_WAVE) ** 2) ** 2 / self._size**2
         return np.concatenate([shared, np.tile(field * rising, rollouts)])

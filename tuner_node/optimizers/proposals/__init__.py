@@ -1,7 +1,8 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The next policy to try, a pure function of the remembered trajectories.
+"""The next policy to try, a function of the remembered trajectories.
 
-One of four kinds, the first that applies:
+With few sensors also of the equation that was fitted before, with which the next fit begins. It is one
+of four kinds, the first that applies:
 
 1. `sensed`: there are few point sensors, and a model of the field between them reproduces their
    readings.

@@ -75,8 +75,8 @@ class Proposer:
         # One component, of which each sensor's last reading is the state.
         if context.sensors == target.size and target.size <= MOST_SENSORS:
             centres = context.actuator_centres(n_a)
-            dearest = LOCAL * self.loop.cost_of(self._before[0])
-            self.sensed = SensedProposals(self.loop, centres, context.noise, dearest)
+            largest_cost = LOCAL * self.loop.cost_of(self._before[0])
+            self.sensed = SensedProposals(self.loop, centres, context.noise, largest_cost)
 
     def propose(
         self,

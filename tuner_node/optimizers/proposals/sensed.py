@@ -33,7 +33,7 @@ class SensedProposals:
         Of the actuators, as shares of the domain.
     noise : float
         Standard deviation of the noise on every reading.
-    dearest : float
+    largest_cost : float
         Mean stage cost of a rollout above which it is not fitted.
 
     Attributes
@@ -42,8 +42,9 @@ class SensedProposals:
         The unknowns that the rollouts share, as they were fitted last; zero before.
     """
 
-    def __init__(self, loop: Loop, centres: Array, noise: float, dearest: float) -> None:
-        self._loop, self._centres, self._noise, self._dearest = loop, centres, noise, dearest
+    def __init__(self, loop: Loop, centres: Array, noise: float, largest_cost: float) -> None:
+        self._loop, self._centres, self._noise = loop, centres, noise
+        self._largest_cost = largest_cost
         self.equation: Array = np.zeros(SHARED)
 
     def propose(self, data: Sequence[Record], policy: Array, damping: float) -> Proposal | None:
@@ -86,7 +87,7 @@ class SensedProposals:
         whole = {
             record.states.tobytes(): record
             for record in records
-            if len(record.actions) == loop.horizon and loop.cost_of(record) <= self._dearest
+            if len(record.actions) == loop.horizon and loop.cost_of(record) <= self._largest_cost
         }
         return list(whole.values())[-COMPARED:]
 
