@@ -10,6 +10,7 @@ Messages, order and parameters: docs/interfaces.md. What it does is in tuner_nod
 
 import contextlib
 import sys
+import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -42,6 +43,8 @@ from tuner_node.session import Session
 LINGER = 0.5
 """Seconds in which the last messages, and the answer to a request to stop, are taken: when a writer
 is gone, its readers lose what they have not taken yet."""
+NAMES_KNOWN = 1.0
+"""Seconds to wait at the end for the names of publishers, which are discovered after them."""
 PROGRESS_PERIOD = 2.0
 """Seconds between two lines on how far the adaptation is."""
 ABSENCE_REPORT = 5.0
@@ -264,7 +267,9 @@ class TunerNode:
 
     def _all_several_publishers(self) -> dict[str, list[str]]:
         """The nodes of every topic that has had more than one publisher."""
-        self._loop.introspection.look_at_publishers()
+        introspection, deadline = self._loop.introspection, time.monotonic() + NAMES_KNOWN
+        while not introspection.look_at_publishers() and time.monotonic() < deadline:
+            sleep_for(0.05)
         return self._several_publishers | self._loop.introspection.several_publishers
 
     def _finish(self) -> int:

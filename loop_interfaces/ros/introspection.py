@@ -156,8 +156,15 @@ class Introspection:
             message.header.stamp = self._node.get_clock().now().to_msg()
             publisher.publish(message)
 
-    def look_at_publishers(self) -> None:
-        """Warn of several publishers of one topic, and of one whose QoS is not compatible."""
+    def look_at_publishers(self) -> bool:
+        """Warn of several publishers of one topic, and of one whose QoS is not compatible.
+
+        Returns
+        -------
+        bool
+            Whether every publisher's name is known; it is discovered a little after the publisher.
+        """
+        all_named = True
         for topic, asked in self._topics.items():
             count = self._node.count_publishers(topic)
             if count < 2 and count == self._known.get(topic):
@@ -168,6 +175,7 @@ class Introspection:
                 if endpoint.node_name != NAMELESS  # one that was just started again may be
             ]
             self._known[topic] = len(there)
+            all_named &= len(there) == count
             for name, offered in there:
                 verdict, reason = qos_check_compatible(offered, asked)
                 if verdict == QoSCompatibility.ERROR:
@@ -186,6 +194,7 @@ class Introspection:
                     "only messages of this run, episode, step and plant count",
                     throttle_duration_sec=10.0,
                 )
+        return all_named
 
     def _namesakes(self, now: float) -> int:
         """How many other nodes have had this one's full name for a while; says so.
