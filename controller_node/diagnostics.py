@@ -3,6 +3,7 @@
 
 from controller_node.responder import Responder
 from loop_interfaces.diagnostics import ConditionTimer, Level, Rate, Status
+from loop_interfaces.episodes import episode_name
 
 SILENT = 5.0
 """Seconds without a state, within an episode, after which what is known of the plant is old."""
@@ -62,7 +63,7 @@ class ControllerDiagnostics:
             )
         if responder.failure:
             return Level.ERROR, f"no reduced model: {responder.failure}"
-        where = f"step {responder.step} of episode {responder.episode}"
+        where = f"step {responder.step} of episode {episode_name(responder.episode)}"
         gone = self.plants == 0 and responder.answered > 0
         if not responder.under_way and not gone:
             return Level.OK, "no episode under way"

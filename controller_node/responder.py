@@ -18,6 +18,7 @@ from controller_node.exploration import Exploration
 from controller_node.identification import DesignSettings
 from controller_node.policy import ProjectedLaw
 from loop_interfaces import model_rows
+from loop_interfaces.episodes import episode_name
 from loop_interfaces.frames import KEPT_ARRAY, Frame, FrameError
 from loop_interfaces.protocol import Counters, ModelFailure, Publication
 from loop_interfaces.signature import NOT_SIGNED, digest_of, signature
@@ -178,8 +179,8 @@ class Responder:
                 return self._answer_pending()
             run.disputed, run.answering = frame.episode, None
             raise FrameError(
-                f"two different policies came for episode {frame.episode}, which is therefore not "
-                "answered; expected one tuner"
+                f"two different policies came for episode {episode_name(frame.episode)}, which is "
+                "therefore not answered; expected one tuner"
             )
         run.policy, run.answering = replace(frame, values=frame.values.copy()), None
         return self._answer_pending()

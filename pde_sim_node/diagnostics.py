@@ -4,6 +4,7 @@
 import numpy as np
 
 from loop_interfaces.diagnostics import Level, Rate, Status
+from loop_interfaces.episodes import episode_name
 from loop_interfaces.topics import VOID, CostColumn
 from pde_sim_node.lockstep import Lockstep
 
@@ -55,7 +56,7 @@ class PlantDiagnostics:
 
     def _state(self) -> tuple[Level, str]:
         lockstep = self._lockstep
-        where = f"step {lockstep.step} of episode {lockstep.episode}"
+        where = f"step {lockstep.step} of episode {episode_name(lockstep.episode)}"
         if lockstep.overdue():
             return Level.WARN, f"no action for {where}; is the controller running?"
         if lockstep.paused:
@@ -65,7 +66,7 @@ class PlantDiagnostics:
         costs = lockstep.last_cost
         if lockstep.run and costs is not None and (costs[:, CostColumn.ENDED] == VOID).any():
             why = lockstep.contradiction or "nobody answered a state"
-            return Level.ERROR, f"episode {lockstep.episode} is void: {why}"
+            return Level.ERROR, f"episode {episode_name(lockstep.episode)} is void: {why}"
         return Level.OK, "between two episodes" if lockstep.run else "no run; ready for one"
 
 

@@ -32,6 +32,7 @@ from enum import Enum, auto
 import numpy as np
 
 from loop_interfaces import topics
+from loop_interfaces.episodes import episode_name
 from loop_interfaces.frames import MAX_VALUES, Frame, FrameError, digest
 from loop_interfaces.protocol import Counters, Publication
 from loop_interfaces.samples import MAX_TIME
@@ -367,7 +368,7 @@ class Lockstep:
             return []
         if signed != episode.signature and not np.array_equal(rows, episode.rows):
             raise FrameError(
-                f"episode {frame.episode} was started with other seeds; "
+                f"episode {episode_name(frame.episode)} was started with other seeds; "
                 "a new episode needs a new number"
             )
         self.counters["starts repeated"] += 1

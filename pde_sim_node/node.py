@@ -16,6 +16,7 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
 from loop_interfaces.affinity import pin_process
+from loop_interfaces.episodes import episode_name
 from loop_interfaces.files import FileError
 from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
@@ -209,8 +210,9 @@ class PlantNode:
         if self._fast_path:
             self._fast_path.suspended = self._clock_wanted
         if self._lockstep.overdue():
+            episode = episode_name(self._lockstep.episode)
             self._node.get_logger().warning(
-                f"no action for step {self._lockstep.step} of episode {self._lockstep.episode}; "
+                f"no action for step {self._lockstep.step} of episode {episode}; "
                 "is the controller running?",
                 throttle_duration_sec=5.0,
             )

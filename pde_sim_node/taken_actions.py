@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from loop_interfaces.episodes import episode_name
 from loop_interfaces.frames import Frame, FrameError, digest
 from loop_interfaces.signature import NOT_SIGNED, signature_in
 from loop_interfaces.topics import START_COLUMNS, VOID, CostColumn
@@ -140,11 +141,13 @@ class TakenActions:
 def two_actions(action: Frame) -> str:
     """That another action than this one was taken, in words."""
     return (
-        f"two different actions came for step {action.step} of episode {action.episode}; "
+        f"two different actions came for step {action.step} of episode {episode_name(action.episode)}; "
         "expected one controller, which answers a repeated state with the same action"
     )
 
 
 def two_starts(start: Frame) -> str:
     """That another start than this one was taken, in words."""
-    return f"two different starts came for episode {start.episode}; expected one tuner"
+    return (
+        f"two different starts came for episode {episode_name(start.episode)}; expected one tuner"
+    )

@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 
 from controller_node.identification import DesignSettings, design
 from controller_node.order import OrderStudy, study_orders
+from loop_interfaces.episodes import episode_name
 from loop_interfaces.model_rows import ModelRows, pack
 from loop_interfaces.parameters import as_recorded, model_order, table
 from loop_interfaces.spec import ParameterError
 from loop_interfaces.topics import COMPLETED, CostColumn
-from pdeloop.bags.episodes import RecordedEpisode, episode_name
+from pdeloop.bags.episodes import RecordedEpisode
 from pdeloop.bags.reader import Bag
 from pdeloop.data_file import read_measurements
 from recorder_node.bag import BagError

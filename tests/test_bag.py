@@ -29,9 +29,9 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability
 
+from loop_interfaces.episodes import episode_name, episode_number
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.topics import ACTION, COST, START, STATE
-from pdeloop.bags.episodes import episode_name, episode_number
 from pdeloop.bags.info import describe, info_text
 from pdeloop.bags.reader import Bag
 from pdeloop.bags.verify import verify

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from loop_interfaces.episodes import episode_name
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import ModelFailure
 from loop_interfaces.topics import COMPLETED, POLICY, START, VOID
@@ -152,7 +153,9 @@ def test_a_cost_that_is_taken_back_after_it_was_used_ends_the_run():
     served.cost(0, costs_of(first), 0.0)
     assert served.result() is not None
     ((_, second),) = starts(served.assign(batch(2), 1.0))
-    with pytest.raises(DispatchError, match=f"took back the cost of episode {first.episode}"):
+    with pytest.raises(
+        DispatchError, match=f"took back the cost of episode {episode_name(first.episode)}"
+    ):
         served.cost(0, void_of(first), 1.0)
     served.cost(0, costs_of(second), 1.0)
     with pytest.raises(DispatchError, match=r"two different messages on episode/cost"):
@@ -251,7 +254,7 @@ def test_an_exploratory_episode_is_done_with_its_model_and_fails_with_its_reason
     with pytest.raises(DispatchError, match="no reduced model: p is too large"):
         served.failure(0, ModelFailure(RUN, last.episode, False, "p is too large"), 0.0)
     with pytest.raises(
-        DispatchError, match=f"took back the model of episode {again.episode}.*two st"
+        DispatchError, match=f"took back the model of episode {episode_name(again.episode)}.*two st"
     ):
         served.failure(0, ModelFailure(RUN, again.episode, False, "two states came"), 0.0)
     for known in (start, again):  # a controller that was started anew has lost the states

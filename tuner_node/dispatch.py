@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from loop_interfaces import topics
+from loop_interfaces.episodes import EPISODES_PER_START, episode_name
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import Counters, ModelFailure, Publication
 from loop_interfaces.signature import digest_of
@@ -35,7 +36,6 @@ from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult
 from tuner_node.pair import Chunk, DispatchError, Pair, PairPublication
 
 Array = NDArray[np.float64]
-EPISODES_PER_INCARNATION = 2**32
 SAMPLE_GRACE = 0.5
 """Seconds after its cost within which the last samples of an episode must have come in."""
 MAX_TARGETS = 64
@@ -146,7 +146,7 @@ class Dispatcher:
         self.sim_time = max(self.sim_time, frame.time)
         known.last_heard = now
         if (frame.values[:, CostColumn.ENDED] == VOID).any():
-            void = f"the plant declared episode {known.episode} void"
+            void = f"the plant declared episode {episode_name(known.episode)} void"
             self._retry(known, f"{void}: no action came, or different starts or actions")
         else:
             known.take_answer(topics.COST.name, frame)
@@ -253,9 +253,9 @@ class Dispatcher:
             used = (topics.MODEL_IDENTIFIED.name, failure.episode) in known.answers
             if used and not failure.retry:  # with `retry` it has only lost the states since
                 raise DispatchError(
-                    f"the controller took back the model of episode {failure.episode}, which this run "
-                    f"has used, because {failure.reason}; stop who else publishes state and start a "
-                    "new run"
+                    f"the controller took back the model of episode {episode_name(failure.episode)}, "
+                    f"which this run has used, because {failure.reason}; stop who else publishes state "
+                    "and start a new run"
                 )
             return []
         if not failure.retry:
@@ -279,14 +279,15 @@ class Dispatcher:
                 self._collect(pair)
                 if pair.pending_cost is not None and now - pair.pending_since > SAMPLE_GRACE:
                     lost = pair.lost_samples(len(self._targets.get(pair.pending_cost.plant, ())))
-                    self._retry(pair, f"the tuner missed {lost} samples of episode {pair.episode}")
+                    episode = episode_name(pair.episode)
+                    self._retry(pair, f"the tuner missed {lost} samples of episode {episode}")
                 elif self._batch is not None:
                     pair.release_if_done(self._batch)
             elif pair.missing:  # not silent: the latched topics serve it when it is back
                 pair.last_heard = now
             elif now >= pair.paused_until and now - pair.last_heard > self.episode_timeout:
                 silent = f"pair {pair.number} was silent for {self.episode_timeout:g} s"
-                self._retry(pair, f"{silent} in episode {pair.episode}")
+                self._retry(pair, f"{silent} in episode {episode_name(pair.episode)}")
             else:
                 if now < pair.paused_until:  # not silent either
                     pair.last_heard = now
@@ -377,7 +378,7 @@ class Dispatcher:
                 self._reclaim_from_absent()
             if self._waiting:
                 self._issued += 1
-                episode = self.incarnation * EPISODES_PER_INCARNATION + self._issued
+                episode = self.incarnation * EPISODES_PER_START + self._issued
                 pair.begin(self._waiting.pop(0), self.run, episode, now)
                 publications += self._request(pair, now, again=False)
         return publications
@@ -388,7 +389,7 @@ class Dispatcher:
             if pair.missing and pair.chunk is not None:
                 self.notes.append(
                     f"pair {pair.number} lost its {' and '.join(pair.missing)} in episode "
-                    f"{pair.episode}; another pair starts it again with the same seeds"
+                    f"{episode_name(pair.episode)}; another pair starts it again with the same seeds"
                 )
                 self.counters["episodes taken over"] += 1
                 self._waiting.append(pair.drop())

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.episodes import episode_name
 from loop_interfaces.frames import Frame, FrameError, digest
 from loop_interfaces.protocol import Publication
 from loop_interfaces.signature import NOT_SIGNED, signature, signature_in
@@ -131,14 +132,15 @@ class Pair:
         void = topic == COST.name and bool((answer.values[:, -1:] == VOID).any())
         if taken is not None and not void and digest(answer.values) != taken:
             raise DispatchError(
-                f"two different messages on {topic} answer episode {answer.episode}; expected one "
-                "plant and one controller in this namespace: stop the other and start a new run"
+                f"two different messages on {topic} answer episode {episode_name(answer.episode)}; "
+                "expected one plant and one controller in this namespace: stop the other and start a "
+                "new run"
             )
         if taken is not None and void and not self.runs(answer.episode) and not paused:
             raise DispatchError(
-                f"the plant took back the cost of episode {answer.episode}, which this run has used, "
-                "because different starts or actions came: stop the second tuner or controller and "
-                "start a new run"
+                f"the plant took back the cost of episode {episode_name(answer.episode)}, which this "
+                "run has used, because different starts or actions came: stop the second tuner or "
+                "controller and start a new run"
             )
 
     def check_signature(self, model: Frame, design: int) -> None:
@@ -160,8 +162,8 @@ class Pair:
             )
         if cost.plant != plant:
             raise FrameError(
-                f"the cost of episode {cost.episode} comes from a plant with other parameters "
-                f"(fingerprint {cost.plant}) than this run's ({plant}); stop that plant"
+                f"the cost of episode {episode_name(cost.episode)} comes from a plant with other "
+                f"parameters (fingerprint {cost.plant}) than this run's ({plant}); stop that plant"
             )
 
     def sample(self, what: str, frame: Frame, width: int) -> None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.episodes import episode_name
 from loop_interfaces.frames import KEPT_ARRAY, Frame, FrameError
 from loop_interfaces.topics import COMPLETED
 from tuner_node.optimizers import Trajectory
@@ -58,7 +59,8 @@ class TrajectoryCollector:
             known[key], self.nbytes = frame.values.copy(), self.nbytes + size
         elif not np.array_equal(known[key], frame.values):
             self.contradiction = (
-                f"two different {what} came for step {frame.step} of episode {frame.episode}"
+                f"two different {what} came for step {frame.step} of episode "
+                f"{episode_name(frame.episode)}"
             )
 
     def lost(self, plant: int, steps: int, n_z: int) -> int:

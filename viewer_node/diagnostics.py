@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from loop_interfaces.diagnostics import Level, Rate, Status
+from loop_interfaces.episodes import episode_name
 from viewer_node.loop_view import SILENT, LoopView
 
 
@@ -19,7 +20,7 @@ class ViewerDiagnostics:
         view, current, quiet = self._view, self._view.current, self._view.quiet(now)
         level, message = Level.OK, "nothing seen yet"
         if current is not None:
-            message = f"step {current.last} of episode {current.key[1]}"
+            message = f"step {current.last} of episode {episode_name(current.key[1])}"
             if quiet is not None and quiet > SILENT:
                 level, message = Level.STALE, f"nothing heard for {quiet:.0f} s"
         return Status(

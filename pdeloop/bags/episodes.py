@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.episodes import episode_name
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import ModelFailure
 from loop_interfaces.topics import (
@@ -28,7 +29,6 @@ from loop_interfaces.topics import (
     StartColumn,
 )
 from recorder_node.sources import Source
-from tuner_node.dispatch import EPISODES_PER_INCARNATION
 
 Array = NDArray[np.float64]
 SETTLING, MODEL_SETTLING = 0.3, 10.0
@@ -41,21 +41,6 @@ Key = tuple[str, int, int]
 """(namespace, run, episode)"""
 _ONCE = {START: "start", POLICY: "policy", COST: "cost", MODEL_IDENTIFIED: "model"}
 """The messages that there are once an episode, and the attributes that hold them."""
-
-
-def episode_name(number: int) -> str:
-    """How an episode's number is written for people: 2.17 is the 17th after the tuner's second start.
-
-    Another tuner may count from 1 as it likes; such a number is its own name.
-    """
-    start, index = divmod(number, EPISODES_PER_INCARNATION)
-    return f"{start}.{index}" if start else str(index)
-
-
-def episode_number(name: str) -> int:
-    """The number of the episode that `episode_name` writes so. ValueError if it is none."""
-    start, _, index = name.rpartition(".")
-    return int(start or 0) * EPISODES_PER_INCARNATION + int(index)
 
 
 @dataclass

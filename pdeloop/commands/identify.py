@@ -87,7 +87,7 @@ def _identify(options: argparse.Namespace) -> int:
 
 
 def _episode(name: str | None) -> int | None:
-    from pdeloop.bags.episodes import episode_number
+    from loop_interfaces.episodes import episode_number
 
     try:
         return None if name is None else episode_number(name)
