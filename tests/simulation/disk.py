@@ -44,7 +44,7 @@ class Disk:
     def __init__(self, rng: random.Random) -> None:
         self._rng = rng
         self._saved: list[Arrays] = []
-        self._number = 0
+        self._number = self._found = 0
 
     def save(self, arrays: Arrays) -> None:
         """Take a checkpoint; its arrays may change later."""
@@ -64,7 +64,8 @@ class Disk:
         """
         if not self._saved:
             return
-        during = self._rng.random() < 0.5
+        # Within the last save, unless it was found before: then it is on the disk.
+        during = self._rng.random() < 0.5 and self._number > self._found
         left = self._left(during, power)
         if rot and left:
             name = self._rng.choice(sorted(left))
@@ -82,7 +83,7 @@ class Disk:
             written = 0 if during else written - 1
         assert number >= written, f"checkpoint {written} was written, {number} was found"
         self._saved = [state for state in self._saved if state["number"] <= number]
-        self._number = number
+        self._number = self._found = number
         if found:
             take(found[0])
 
