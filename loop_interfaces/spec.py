@@ -96,12 +96,16 @@ class Spec:
             text += f", at most {_plain(self.maximum)}"
         return text
 
-    def check(self, value: Any) -> Value:
-        """`value` in the parameter's type; raises ParameterError naming value and range."""
+    def check(self, value: Any, called: str = "") -> Value:
+        """`value` in the parameter's type; raises ParameterError naming value and range.
+
+        called: what the user calls it, if not by the parameter's name.
+        """
         good: Value | None = self._coerce(value)
         if good is None:
+            called = called or f"parameter '{self.name}'"
             raise ParameterError(
-                f"parameter '{self.name}' is {value!r}; expected {self.range}"
+                f"{called} is {value!r}; expected {self.range}"
                 + (f" ({self.unit})" if self.unit else "")
             )
         return good

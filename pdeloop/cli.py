@@ -54,7 +54,11 @@ def run(
 ) -> int:
     """Exit code of the command in `arguments`. Every error a user can cause is one line on stderr."""
     try:
-        options = make_parser().parse_args(arguments)
+        parser = make_parser()
+        options, unknown = parser.parse_known_args(arguments)
+        if unknown:
+            asked = f"{parser.prog} {getattr(options, 'name', '')}".strip()
+            parser.error(f"unrecognized arguments: {' '.join(unknown)}; see `{asked} --help`")
         code: int = options.command(options)
         sys.stdout.flush()  # here, where it can still be said that nobody reads
         return code
@@ -105,7 +109,7 @@ def parser() -> argparse.ArgumentParser:
         epilog="example: pdeloop train burgers (every command has an example in its --help)",
     )
     root.add_argument("--version", action="version", version=f"pdeloop {_version()}")
-    commands = root.add_subparsers(required=True, metavar="COMMAND")
+    commands = root.add_subparsers(required=True, metavar="COMMAND", dest="name")
     for name in COMMANDS:
         # Imported here, where `main` catches Ctrl-C: it takes most of a short command's time.
         importlib.import_module(f"pdeloop.commands.{name}").add(commands)

@@ -228,3 +228,17 @@ def test_a_file_that_expands_without_end_is_refused(tmp_path, capsys):
     text = "/**:\n  ros__parameters:\n" + "".join(f"    {line}\n" for line in levels)
     (tmp_path / "bomb.yaml").write_text(text)
     assert "more than 10000 parameters" in error_of(capsys, "train", str(tmp_path / "bomb.yaml"))
+
+
+def test_an_option_that_is_not_known_names_the_commands_help(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["train", str(SMALL), "--horizon", "2"])
+    assert end.value.code == 2
+    assert (
+        "unrecognized arguments: --horizon 2; see `pdeloop train --help`" in capsys.readouterr().err
+    )
+
+
+def test_an_error_names_the_flag(capsys, tmp_path):
+    line = error_of(capsys, "evaluate", str(tmp_path), "--fields", "0")
+    assert line == "pdeloop: --fields is 0; expected a whole number from 1 to 1000"

@@ -55,8 +55,8 @@ def _evaluate(options: argparse.Namespace) -> int:
     from pdeloop.finished_run import load_run
 
     allow_equation(options)
-    DEFAULTS["evaluation_fields"].check(options.fields)
-    DEFAULTS["evaluation_seed"].check(options.seed)
+    DEFAULTS["evaluation_fields"].check(options.fields, "--fields")
+    DEFAULTS["evaluation_seed"].check(options.seed, "--seed")
     run = load_run(options.folder)
     costs = evaluate(run, fields=options.fields, seed=options.seed, mean_field=options.mean_field)
     if note := another_plant(run):
