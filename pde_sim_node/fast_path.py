@@ -30,16 +30,19 @@ from loop_interfaces.samples import ACTION_KIND, NO_TIME, SAMPLE_HEADER, STATE_K
 from loop_interfaces.signature import NOT_SIGNED
 from loop_interfaces.topics import STATE
 from pde_sim_node.lockstep import Lockstep
-from pde_sim_node.solver.step_context import step_code
 
 if TYPE_CHECKING:
     from loop_interfaces.ros.endpoints import SampleBatcher
 
 PLAN = plan_type(
-    ("code", np.int64),  # of a step of the plant, see ParallelStep.begin_compiled
-    ("context", np.int64),
-    ("states", np.int64),  # addresses
+    # Addresses of the plant's compiled step, and of what it is called with.
+    ("code", np.int64),  # see solver.batch_step.environments_of
+    ("step_plan", np.int64),
+    ("states", np.int64),
     ("actions", np.int64),
+    ("totals", np.int64),
+    ("diverged_step", np.int64),
+    ("batch", np.int64),
     ("step", np.int64),  # k, of the states
     ("values", np.int64),  # numbers of all states
     ("log", np.int64),  # address of room for the actions that were applied
@@ -82,7 +85,8 @@ def advance(plan: Any, head: int, message: int, length: int) -> bool:
         number = load_unaligned(head, FIRST + i)
         write(plan.actions, i, number)
         write(plan.log, plan.steps * numbers + i, number)
-    call_c(plan.code, (plan.context,))
+    z, a, c, ended = plan.states, plan.actions, plan.totals, plan.diverged_step
+    call_c(plan.code, (plan.step_plan, z, a, c, ended, 0, plan.batch, plan.step))
     plan.steps += 1
     plan.step += 1
     plan.time += plan.sample_time
@@ -97,7 +101,6 @@ handler = fast_handler(PLAN, advance)
 def load_compiled() -> None:
     """Load what is compiled, or compile it."""
     channel.load_compiled()
-    step_code()
     handler()
 
 
@@ -124,12 +127,12 @@ class PlantFastPath(FastPath):
             return False
         if not self.expect(state, action, state.values.shape):
             return False
-        code = plant.parallel.begin_compiled()
-        if code is None:
+        if plant.parallel.shared:
             return False
-        plan["code"], plan["context"] = code
-        plan["states"], plan["actions"] = plant.states.ctypes.data, plant.actions.ctypes.data
-        plan["step"] = plant.step_index
+        plan["code"], plan["step_plan"] = plant.parallel.code, plant.parallel.plans.ctypes.data
+        for name in ("states", "actions", "totals", "diverged_step"):
+            plan[name] = getattr(plant, name).ctypes.data
+        plan["batch"], plan["step"] = plant.batch, plant.step_index
         if self._log.shape[1] != plant.actions.size:
             self._log = np.zeros((max(LOG // plant.actions.size, 1), plant.actions.size))
         plan["values"], plan["log"] = state.values.size, self._log.ctypes.data
@@ -143,7 +146,7 @@ class PlantFastPath(FastPath):
 
     def synchronise(self, answers: int, last: float) -> None:
         plan = self.plan
-        self._plant.step_index = self._plant.parallel.end_compiled()
+        self._plant.step_index = int(plan["step"])
         if answers:
             self._lockstep.advance_counters([digest(row) for row in self._log[:answers]], last)
         self._batcher.commit(plan["batches"], self._lengths, answers)

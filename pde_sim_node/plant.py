@@ -176,7 +176,7 @@ class Plant:
         )
         self._allocate(1)
         all_finite(self.actions)
-        self.parallel.step()
+        self.parallel.step(0)
         seconds = time.perf_counter() - began
         self.compiled_in_seconds = seconds if compilations() > before else 0.0
         self._allocate(0)
@@ -201,9 +201,7 @@ class Plant:
         self._bind()
 
     def _bind(self) -> None:
-        self.parallel.bind(
-            self.states, self.actions, self.totals, self.diverged_step, self.step_index
-        )
+        self.parallel.bind(self.states, self.actions, self.totals, self.diverged_step)
 
     def reset(
         self, seeds: ArrayLike, noise: NDArray[np.int64] | None = None
@@ -233,7 +231,6 @@ class Plant:
         if self.batch != len(fields):
             self._allocate(len(fields))
         self.step_index = 0
-        self._bind()
         self.totals.fill(0.0)
         self.diverged_step.fill(-1)
         self.states[:] = fields
@@ -309,7 +306,7 @@ class Plant:
         self.actions[:] = actions
         if not all_finite(self.actions):
             raise ValueError("actions must be finite, got NaN or infinity")
-        self.parallel.step()
+        self.parallel.step(self.step_index)
         self.step_index += 1
         return self.states
 
@@ -347,8 +344,8 @@ class Plant:
                 f"got {new.shape} and {held.shape}"
             )
         costs, diverged_step = np.zeros(batch), np.full(batch, -1, dtype=np.int64)
-        self.parallel.bind(new, held, costs, diverged_step, 0)
-        self.parallel.step()
+        self.parallel.bind(new, held, costs, diverged_step)
+        self.parallel.step(0)
         self._bind()
         return new, costs
 

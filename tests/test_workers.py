@@ -66,10 +66,10 @@ from tests.test_workers import P1, rollout
 workers.use_cores(range(3))
 plant = Plant(Burgers(), **P1)
 few = rollout(plant, range(2))
-assert plant.parallel.begin_compiled() is not None
+assert not plant.parallel.shared
 assert threading.active_count() == 1
 many = rollout(plant, range(16))
-assert plant.parallel.begin_compiled() is None
+assert plant.parallel.shared
 assert threading.active_count() == 3
 if child := os.fork():
     print(os.waitpid(child, 0)[1])

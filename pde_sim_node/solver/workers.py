@@ -1,20 +1,18 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The compiled step of a batch of environments, shared out to the threads of a pool."""
 
+import ctypes
 import os
 from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.affinity import join_solver, usable_cores
-from loop_interfaces.jit import native
-from loop_interfaces.jit.cache import cached_njit
-from pde_sim_node.solver import step_context
 from pde_sim_node.solver.memory import Constants, aligned
-from pde_sim_node.solver.step_context import STEP_CONTEXT, advance, step_code
 
 SHARED_POINTS = 90_000
 """Grid points, in all stages, from which on a step is shared: some 190 microseconds of one thread. A
@@ -23,10 +21,8 @@ COMPILED_POINTS = 120_000
 """Below this a step is compiled code alone where that saves the way through the interpreter."""
 
 
-@cached_njit(step_context, native)
-def advance_part(contexts: NDArray[np.void], plan: int, first: int, last: int) -> None:
-    """Advance the environments first, ..., last - 1 of the STEP_CONTEXT in an array."""
-    advance(contexts[0], plan, first, last)
+ENVIRONMENTS = ctypes.CFUNCTYPE(None, *[ctypes.c_ssize_t] * 8)
+"""The type of the compiled step; a call leaves the interpreter's lock to others."""
 
 
 class ParallelStep:
@@ -45,6 +41,8 @@ class ParallelStep:
 
     Attributes
     ----------
+    code : int
+        As given, for compiled code that calls it.
     constants : array
         The memory that the plans have the address of.
     plans : structured array
@@ -62,10 +60,7 @@ class ParallelStep:
         self.plans = np.repeat(plan, threads)
         self.plans["scratch"] = [area.ctypes.data for area in self._scratch]
         self._points_per_step = points_per_step
-        self._contexts = np.zeros(1, STEP_CONTEXT)
-        self._context = self._contexts[0]
-        self._context["code"], self._context["plan"] = code, self.plans.ctypes.data
-        advance_part(self._contexts, self.plans.ctypes.data, 0, 0)  # load or compile it
+        self.code, self._environments = code, ENVIRONMENTS(code)
 
     def bind(
         self,
@@ -73,48 +68,33 @@ class ParallelStep:
         actions: NDArray[np.float64],
         totals: NDArray[np.float64],
         diverged_step: NDArray[np.int64],
-        k: int,
     ) -> None:
-        """Work on these arrays from now on, contiguous and writable; k: step of the states."""
+        """Work on these arrays from now on, contiguous and writable."""
         self._arrays = states, actions, totals, diverged_step  # kept alive
-        context, batch = self._context, len(states)
-        names = "states", "actions", "totals", "diverged_step"
-        for name, array in zip(names, self._arrays, strict=True):
-            context[name] = array.ctypes.data
-        context["batch"], context["step"] = batch, k
+        batch, places = len(states), [array.ctypes.data for array in self._arrays]
         self._points = batch * self._points_per_step
         parts = min(len(self.plans), batch) if self._points >= SHARED_POINTS else 1
         edges = [batch * part // parts for part in range(parts + 1)]
-        addresses = (self.plans[part : part + 1].ctypes.data for part in range(parts))
-        self._parts = list(zip(addresses, edges[:-1], edges[1:], strict=True))
+        self._parts = [
+            (self.plans[part : part + 1].ctypes.data, *places, first, last)
+            for part, (first, last) in enumerate(pairwise(edges))
+        ]
 
-    def step(self) -> None:
-        """Advance all environments in place."""
+    @property
+    def shared(self) -> bool:
+        """Whether the threads of the pool are better than compiled code that one thread calls."""
+        return len(self._parts) > 1 and self._points >= COMPILED_POINTS
+
+    def step(self, k: int) -> None:
+        """Advance all environments in place; k: step of the states."""
         own, *others = self._parts
-        begun = [solver_threads.pool().submit(advance_part, self._contexts, *it) for it in others]
-        advance_part(self._contexts, *own)
+        begun = [solver_threads.pool().submit(self._environments, *it, k) for it in others]
+        self._environments(*own, k)
         for part, it in zip(begun, others, strict=True):
             if part.cancel():  # its thread has not woken up: its core is busy
-                advance_part(self._contexts, *it)
+                self._environments(*it, k)
             else:
                 part.result()
-        self._context["step"] += 1
-
-    def begin_compiled(self) -> tuple[int, int] | None:
-        """Let compiled code make the steps until `end_compiled`.
-
-        Returns
-        -------
-        Addresses of a C function that makes one, and of what it is called with; None where several
-        threads are better, which have to be called from Python.
-        """
-        if len(self._parts) > 1 and self._points >= COMPILED_POINTS:
-            return None
-        return step_code(), self._contexts.ctypes.data
-
-    def end_compiled(self) -> int:
-        """Python makes the steps again; the step k of the states now."""
-        return int(self._context["step"])
 
 
 class SolverThreads:
