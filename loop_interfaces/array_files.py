@@ -2,6 +2,7 @@
 """NumPy's .npz files, read without trusting them. No ROS import."""
 
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -12,6 +13,7 @@ from loop_interfaces.files import FileError, open_ordinary
 
 MAX_ARRAY_BYTES = 2**30
 """Of all arrays in a file of policies or models."""
+Arrays = Mapping[str, NDArray[Any]]
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -50,3 +52,31 @@ def unpack_arrays(file: BinaryIO, most: int) -> dict[str, NDArray[Any]]:
         raise
     except Exception as error:  # zipfile and NumPy raise some twenty kinds on damaged files
         raise FileError(f"holds no arrays ({type(error).__name__}: {error})") from error
+
+
+def taken(
+    arrays: Arrays,
+    name: str,
+    kind: str,
+    shape: tuple[int | None, ...],
+    *,
+    finite: bool = True,
+) -> NDArray[Any]:
+    """The array of this name, of this NumPy kind and shape (None: of any length), or a FileError.
+
+    finite: whether infinity is refused as well as NaN in floating-point numbers.
+    """
+    if name not in arrays:
+        raise FileError(f"it has no array '{name}'")
+    array = arrays[name]
+    fits = array.ndim == len(shape) and all(
+        expected in (None, length) for expected, length in zip(shape, array.shape, strict=True)
+    )
+    if array.dtype.kind != kind or not fits:
+        raise FileError(
+            f"expected '{name}' of kind {kind!r} and shape {shape}, "
+            f"got {array.dtype.kind!r} and {array.shape}"
+        )
+    if kind == "f" and (not np.isfinite(array).all() if finite else np.isnan(array).any()):
+        raise FileError(f"'{name}' is not finite")
+    return array

@@ -63,7 +63,7 @@ def run(
         sys.stdout.flush()  # here, where it can still be said that nobody reads
         return code
     except (ValueError, RuntimeError) as error:
-        # RunFolderError, CheckpointError, ParameterError, DomainError, NodeError and the plant's
+        # RunFolderError, FileError, ParameterError, DomainError, NodeError and the plant's
         # and controller's refusals.
         return _failed(str(error))
     except ModuleNotFoundError as error:

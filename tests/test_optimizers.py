@@ -158,13 +158,9 @@ def test_a_restored_training_ends_with_the_same_bits() -> None:
 
 def test_refuses_a_foreign_checkpoint_and_stays_as_it_was() -> None:
     optimizer = two_point()
-    with pytest.raises(ValueError, match="seed = 4, but this training has seed = 3"):
-        optimizer.restore(two_point(seed=4).state())
-    with pytest.raises(ValueError, match="smoothing_radius"):
-        optimizer.restore(two_point(smoothing_radius=0.5).state())
-    with pytest.raises(ValueError, match="holds"):
+    with pytest.raises(ValueError, match="no array 'tells'"):
         optimizer.restore({"policy": POLICY})
-    with pytest.raises(ValueError, match=r"has shape \(2, 4\)"):
+    with pytest.raises(ValueError, match=r"got 'f' and \(2, 4\)"):
         optimizer.restore(optimizer.state() | {"policy": POLICY[:, :4]})
     with pytest.raises(ValueError, match="finite"):
         optimizer.restore(optimizer.state() | {"policy": POLICY * np.nan})

@@ -10,22 +10,17 @@ start, and comes to the same result.
 import contextlib
 import hashlib
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.array_files import unpack_arrays
-from loop_interfaces.files import open_ordinary, sync_folder, write_part
+from loop_interfaces.array_files import Arrays, unpack_arrays
+from loop_interfaces.files import FileError, open_ordinary, sync_folder, write_part
 
 MAGIC = b"pdeloop-checkpoint 1 "
-Arrays = Mapping[str, NDArray[Any]]
-
-
-class CheckpointError(ValueError):
-    """A file that is no usable checkpoint; the text says what is wrong with it."""
 
 
 def previous(path: Path) -> Path:
@@ -83,37 +78,16 @@ def restore(path: Path, take: Callable[[dict[str, NDArray[Any]]], None]) -> tupl
     return False, passed_over
 
 
-def taken(arrays: Arrays, name: str, kind: str, shape: tuple[int | None, ...]) -> NDArray[Any]:
-    """The array of this name, of this NumPy kind and shape (None: of any length), or a ValueError.
-
-    Floating-point numbers must be finite.
-    """
-    if name not in arrays:
-        raise CheckpointError(f"it has no array '{name}'")
-    array = arrays[name]
-    fits = array.ndim == len(shape) and all(
-        expected in (None, length) for expected, length in zip(shape, array.shape, strict=True)
-    )
-    if array.dtype.kind != kind or not fits:
-        raise CheckpointError(
-            f"expected '{name}' of kind {kind!r} and shape {shape}, "
-            f"got {array.dtype.kind!r} and {array.shape}"
-        )
-    if kind == "f" and not np.isfinite(array).all():
-        raise CheckpointError(f"'{name}' is not finite")
-    return array
-
-
 def _read(path: Path) -> dict[str, NDArray[Any]]:
     try:
         with open_ordinary(path) as file:
             head = file.readline(len(MAGIC) + 65)
             if not (head.startswith(MAGIC) and head.endswith(b"\n")):
-                raise CheckpointError("is not a checkpoint of pdeloop")
+                raise FileError("is not a checkpoint of pdeloop")
             if hashlib.file_digest(file, "sha256").hexdigest().encode() != head[len(MAGIC) : -1]:
-                raise CheckpointError("is damaged: its checksum does not match")
+                raise FileError("is damaged: its checksum does not match")
             body = file.tell() - len(head)
             file.seek(len(head))
             return unpack_arrays(file, body)  # they are stored as they are
     except OSError as error:
-        raise CheckpointError(f"cannot be read: {error.strerror or error}") from error
+        raise FileError(f"cannot be read: {error.strerror or error}") from error

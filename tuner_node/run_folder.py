@@ -27,12 +27,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces import model_rows
-from loop_interfaces.array_files import read_arrays
+from loop_interfaces.array_files import read_arrays, taken
 from loop_interfaces.files import make_folder, open_own, read_json, write_atomically
 from loop_interfaces.frames import MAX_ID
 from loop_interfaces.parameters import EXECUTION, PLANT, RECORDER, VIEWER, as_recorded, table
 from loop_interfaces.spec import ParameterError, check, read_yaml, yaml_text
-from tuner_node import checkpoint
 from tuner_node.results import check_result, policy_arrays, summarise, versions
 from tuner_node.training import Training
 
@@ -209,13 +208,13 @@ class RunFolder:
         n_a, seeds = values["n_a"], values["seeds"]
         try:
             arrays = read_arrays(path)
-            model = checkpoint.taken(arrays, "model", "f", (seeds, None, None))
+            model = taken(arrays, "model", "f", (seeds, None, None))
             law = (seeds, n_a, 2 * model.shape[2])
             for rows in model:
                 model_rows.unpack(rows, n_a)
             return {
-                "policy": checkpoint.taken(arrays, "policy", "f", law),
-                "lqt": checkpoint.taken(arrays, "lqt", "f", law),
+                "policy": taken(arrays, "policy", "f", law),
+                "lqt": taken(arrays, "lqt", "f", law),
                 "model": model,
             }
         except ValueError as error:

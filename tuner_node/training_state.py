@@ -10,9 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces import model_rows
+from loop_interfaces.array_files import taken
 from tuner_node.budget import PURPOSES
-from tuner_node.checkpoint import taken
-from tuner_node.optimizers import Record, Trajectory
+from tuner_node.optimizers.trajectories import (
+    record_arrays,
+    taken_record,
+    taken_trajectory,
+    trajectory_arrays,
+)
 from tuner_node.training import Training
 
 PHASES = (*PURPOSES, "done")
@@ -33,12 +38,10 @@ def arrays_of(training: Training) -> Arrays:
     }
     for m, rollouts in enumerate(training.measured):
         for i, rollout in enumerate(rollouts):
-            name = f"measured{m}.{i}"
-            arrays |= {f"{name}.policy": rollout.policy, f"{name}.cost": np.array(rollout.cost)}
-            arrays |= _trajectory_arrays(name, rollout)
+            arrays |= record_arrays(f"measured{m}.{i}", rollout)
     for m, exploration in enumerate(training.explorations):
         if exploration is not None:
-            arrays |= _trajectory_arrays(f"exploration{m}", exploration)
+            arrays |= trajectory_arrays(f"exploration{m}", exploration)
     for name in ("models", "target", "evaluation", "ended"):
         if (array := getattr(training, name)) is not None:
             arrays[name] = array
@@ -74,22 +77,20 @@ def _fill(training: Training, arrays: Arrays) -> None:
     training.pending = taken(arrays, "pending", "i", (None,)).tolist()
     training.history = json.loads(str(taken(arrays, "history", "U", ())))
     training.worse = taken(arrays, "worse", "b", (seeds,)).tolist()
+    n_z = None
     if "models" in arrays:
         training.models = taken(arrays, "models", "f", (seeds, None, None))
-        training.warm_starts()
+        n_z = len(model_rows.unpack(training.models[0], n_a).U)
     if "target" in arrays:
-        training.target = taken(arrays, "target", "f", (None,))
+        training.target = taken(arrays, "target", "f", (n_z,))
     if "evaluation" in arrays:
         training.evaluation = taken(arrays, "evaluation", "f", training.evaluation_shape)
         training.ended = taken(arrays, "ended", "f", training.evaluation_shape)
     for m in range(seeds):
         if f"exploration{m}.states" in arrays:
-            training.explorations[m] = _taken_trajectory(arrays, f"exploration{m}", n_a)
+            training.explorations[m] = taken_trajectory(arrays, f"exploration{m}", n_z, n_a)
         while (name := f"measured{m}.{len(training.measured[m])}") + ".policy" in arrays:
-            policy = taken(arrays, f"{name}.policy", "f", (n_a, None))
-            cost = float(taken(arrays, f"{name}.cost", "f", ()))
-            known = _taken_trajectory(arrays, name, n_a)
-            training.measured[m].append(Record(policy, cost, known.states, known.actions))
+            training.measured[m].append(taken_record(arrays, name, n_z, (n_a, None)))
     _check(training)
     if training.phase in ("adapt", "evaluate", "done"):
         training.start_optimizers()
@@ -114,21 +115,6 @@ def _check(training: Training) -> None:
         raise ValueError("it has no evaluation")
     if not pending and phase in ("identify", "check"):
         raise ValueError("it has no seed to identify")
-    if not training.settings.trajectories or training.models is None or phase == "identify":
-        return
-    n_z = len(model_rows.unpack(training.models[0], training.settings.n_a).U)
-    if training.target is None or training.target.shape != (n_z,):
-        raise ValueError(f"it has no target of {n_z} numbers")
-    for known in training.explorations:
-        if known is None or known.states.shape != (len(known.actions) + 1, n_z):
-            raise ValueError(f"it has an exploration without states of {n_z} numbers")
-
-
-def _trajectory_arrays(name: str, trajectory: Trajectory | Record) -> Arrays:
-    return {f"{name}.states": trajectory.states, f"{name}.actions": trajectory.actions}
-
-
-def _taken_trajectory(arrays: Arrays, name: str, n_a: int) -> Trajectory:
-    """The trajectory of that name; ValueError if there is none with n_a actuators."""
-    states = taken(arrays, f"{name}.states", "f", (None, None))
-    return Trajectory(states, taken(arrays, f"{name}.actions", "f", (None, n_a)))
+    explored = training.target is not None and None not in training.explorations
+    if training.settings.trajectories and phase != "identify" and not explored:
+        raise ValueError("it has no target, or not all explorations")

@@ -213,39 +213,3 @@ def require_results(results: Sequence[RolloutResult], expected: int) -> None:
         )
     if len(results) != expected:
         raise ValueError(f"tell needs one result per rollout, {expected}, but got {len(results)}.")
-
-
-def require_state(
-    state: Mapping[str, NDArray[np.generic]],
-    own: Mapping[str, NDArray[np.generic]],
-    fixed: Sequence[str],
-    growing: Sequence[str] = (),
-) -> None:
-    """Raise ValueError unless `state` could be a later one of `own`.
-
-    It has the same keys, with arrays of the same types and shapes, and agrees in the `fixed` ones. Of
-    the `growing` ones there may be any number.
-    """
-    if set(state) != set(own):
-        raise ValueError(
-            f"a checkpoint of this optimiser holds {sorted(own)}, but this one holds "
-            f"{sorted(state)}."
-        )
-    for key in fixed:
-        if not np.array_equal(state[key], own[key]):
-            raise ValueError(
-                f"the checkpoint was written with {key} = {state[key]}, but this training has "
-                f"{key} = {own[key]}; continue with the same parameters or start anew."
-            )
-    for key, array in own.items():
-        free = int(key in growing)
-        given = state[key]
-        if given.dtype.kind != array.dtype.kind or given.ndim != array.ndim:
-            raise ValueError(f"'{key}' of the checkpoint is of another type than this training's.")
-        if given.shape[free:] != array.shape[free:]:
-            raise ValueError(
-                f"'{key}' of the checkpoint has shape {given.shape}, but this training's has "
-                f"{array.shape}."
-            )
-        if given.dtype.kind == "f" and np.isnan(given).any():
-            raise ValueError(f"'{key}' of the checkpoint must be finite, but there is NaN in it.")

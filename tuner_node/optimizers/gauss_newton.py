@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
+from loop_interfaces.array_files import Arrays, taken
 from tuner_node import oracle
 from tuner_node.optimizers.base import (
     Array,
@@ -42,10 +43,9 @@ from tuner_node.optimizers.base import (
     checked_policy,
     require_positive,
     require_results,
-    require_state,
 )
 from tuner_node.optimizers.proposals import Proposer
-from tuner_node.optimizers.trajectories import GROWING, Records
+from tuner_node.optimizers.trajectories import Records
 
 __all__ = ["GaussNewton"]
 
@@ -110,14 +110,16 @@ class Progress:
         """A copy of everything, as a checkpoint holds it."""
         return {field.name: np.array(getattr(self, field.name)) for field in fields(self)}
 
-    @classmethod
-    def of(cls, arrays: Mapping[str, NDArray[np.generic]]) -> Progress:
-        """From `arrays`, of the right types and shapes; a ValueError if they do not fit each other."""
-        if len({arrays[name].shape for name in _STAMPS}) > 1:
+    def later(self, arrays: Arrays) -> Progress:
+        """From the `arrays` of a later state of this optimisation; a ValueError if they are none."""
+        given: dict[str, Any] = {}
+        for name, own in self.arrays().items():
+            shape = (None,) if name in _STAMPS else own.shape
+            array = taken(arrays, name, own.dtype.kind, shape)
+            given[name] = array.copy() if shape else array.item()
+        if len({given[name].size for name in _STAMPS}) > 1:
             raise ValueError("the fields of the checkpoint do not add up.")
-        require_positive(damping=float(arrays["damping"].item()))
-        given: dict[str, Any] = {field.name: arrays[field.name] for field in fields(cls)}
-        return cls(**{name: v.copy() if v.ndim else v.item() for name, v in given.items()})
+        return Progress(**given)
 
     @property
     def missing(self) -> Stamps:
@@ -243,23 +245,18 @@ class GaussNewton:
         return {
             **self._now.arrays(),
             **equation,
-            "seed": np.array(self._seed),
-            "field_count": np.array(self._field_count),
-            **self._records.state(len(self._proposer.loop.U), *self._now.policy.shape),
+            **self._records.state(),
         }
 
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
-        """Continue from a checkpoint with the same seed and number of fields."""
-        require_state(state, self.state(), ("seed", "field_count"), (*_STAMPS, *GROWING))
-        for name in ("policy", "candidate"):
-            checked_policy(state[name])
-        now = Progress.of(state)
-        self._records.restore(state)
+        """Continue from a checkpoint of an optimiser with the same arguments."""
+        now, sensed = self._now.later(state), self._proposer.sensed
+        self._records.restore(state, len(self._proposer.loop.U), self._now.policy.shape)
         if missing := now.referred - {record.stamp for record in self._records.all()}:
             raise ValueError(f"the checkpoint refers to rollouts that it lacks: {sorted(missing)}.")
         self._now = now
-        if self._proposer.sensed:
-            self._proposer.sensed.equation = state["equation"].astype(np.float64)
+        if sensed:
+            sensed.equation = taken(state, "equation", "f", sensed.equation.shape).copy()
 
     def _rollout(self, policy: Array, slot: int) -> Rollout:
         return Rollout(policy.copy(), oracle.field_seed(self._seed, int(self._now.fields[slot])))

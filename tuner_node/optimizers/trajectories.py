@@ -1,19 +1,41 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The trajectories an optimiser remembers, and how they survive a checkpoint."""
 
-from collections.abc import Mapping
-
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 
-from tuner_node.optimizers.base import Array, Record, RolloutResult, State
+from loop_interfaces.array_files import Arrays, taken
+from tuner_node.optimizers.base import Array, Record, RolloutResult, State, Trajectory
 
-GROWING = (
-    *("record_stamps", "record_costs", "record_policies", "record_lengths"),
-    *("record_states", "record_actions"),
-)
-"""Arrays of a state with a row a rollout, and with a row a sample."""
+
+def trajectory_arrays(name: str, trajectory: Trajectory | Record) -> State:
+    """A trajectory as arrays of a checkpoint."""
+    return {f"{name}.states": trajectory.states, f"{name}.actions": trajectory.actions}
+
+
+def taken_trajectory(arrays: Arrays, name: str, n_z: int | None, n_a: int) -> Trajectory:
+    """The trajectory of that name, or a ValueError. n_z: None if it is not known."""
+    states = taken(arrays, f"{name}.states", "f", (None, n_z))
+    actions = taken(arrays, f"{name}.actions", "f", (None, n_a))
+    if len(states) - len(actions) not in (0, 1):
+        raise ValueError(f"'{name}' has {len(states)} states and {len(actions)} actions")
+    return Trajectory(states, actions)
+
+
+def record_arrays(name: str, record: Record) -> State:
+    """A measured rollout as arrays of a checkpoint."""
+    own: State = {f"{name}.policy": record.policy, f"{name}.cost": np.array(record.cost)}
+    return own | trajectory_arrays(name, record)
+
+
+def taken_record(
+    arrays: Arrays, name: str, n_z: int | None, shape: tuple[int, int | None], stamp: int = -1
+) -> Record:
+    """The rollout of that name with a policy of this shape, or a ValueError."""
+    policy = taken(arrays, f"{name}.policy", "f", shape)
+    cost = float(taken(arrays, f"{name}.cost", "f", (), finite=False))
+    known = taken_trajectory(arrays, name, n_z, shape[0])
+    return Record(policy, cost, known.states, known.actions, stamp)
 
 
 class Records:
@@ -56,48 +78,23 @@ class Records:
                 del self._records[stamp]
         return record
 
-    def state(self, n_z: int, n_a: int, gains: int) -> State:
-        """The remembered rollouts as arrays; the episodes one after the other."""
-        records = self.all()
-        return {
-            "record_stamps": np.array([r.stamp for r in records], dtype=np.int64),
-            "record_costs": np.array([r.cost for r in records], dtype=np.float64),
-            "record_policies": np.array([r.policy for r in records]).reshape(-1, n_a, gains),
-            "record_lengths": np.array(
-                [(len(r.states), len(r.actions)) for r in records], dtype=np.int64
-            ).reshape(-1, 2),
-            "record_states": np.concatenate([np.empty((0, n_z)), *(r.states for r in records)]),
-            "record_actions": np.concatenate([np.empty((0, n_a)), *(r.actions for r in records)]),
-            "record_count": np.array(self.count),
-            "record_limit": np.array(self._limit),
+    def state(self) -> State:
+        """The remembered rollouts as arrays."""
+        arrays: State = {
+            "stamps": np.array(sorted(self._records), dtype=np.int64),
+            "count": np.array(self.count),
+            "limit": np.array(self._limit),
         }
+        for record in self._records.values():
+            arrays |= record_arrays(f"record{record.stamp}", record)
+        return arrays
 
-    def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
-        """Remember what a `state` remembers; a ValueError if it does not add up."""
-        lengths = state["record_lengths"].astype(np.int64)
-        rollouts = {len(state[name]) for name in GROWING[:4]}
-        samples = [len(state["record_states"]), len(state["record_actions"])]
-        if (
-            len(rollouts) > 1
-            or (lengths < 0).any()
-            or not set(lengths[:, 0] - lengths[:, 1]) <= {0, 1}
-            or lengths.sum(axis=0).tolist() != samples
-        ):
-            raise ValueError("the remembered rollouts of the checkpoint do not add up.")
-        ends = np.cumsum(lengths, axis=0)
-        records = {}
-        for i, stamp in enumerate(state["record_stamps"].astype(np.int64)):
-            (z_end, a_end), (z_length, a_length) = ends[i], lengths[i]
-            records[int(stamp)] = Record(
-                state["record_policies"][i].astype(np.float64),
-                float(state["record_costs"][i].item()),
-                state["record_states"][z_end - z_length : z_end].astype(np.float64),
-                state["record_actions"][a_end - a_length : a_end].astype(np.float64),
-                int(stamp),
-            )
-        self._records = records
-        self._limit = float(state["record_limit"].item())
-        self.count = int(state["record_count"].item())
+    def restore(self, arrays: Arrays, n_z: int, shape: tuple[int, int]) -> None:
+        """Remember what a `state` does; a ValueError if it is none. shape: of the policies."""
+        count, limit = taken(arrays, "count", "i", ()), taken(arrays, "limit", "f", ())
+        stamps = taken(arrays, "stamps", "i", (None,)).tolist()
+        self._records = {s: taken_record(arrays, f"record{s}", n_z, shape, s) for s in stamps}
+        self.count, self._limit = int(count), float(limit)
 
     def sound(self, result: RolloutResult) -> tuple[Array, Array]:
         """The states and actions that can be learned from, or a ValueError."""

@@ -19,6 +19,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from loop_interfaces.array_files import taken
 from tuner_node import oracle
 from tuner_node.optimizers.base import (
     Array,
@@ -29,7 +30,6 @@ from tuner_node.optimizers.base import (
     checked_policy,
     require_positive,
     require_results,
-    require_state,
 )
 
 
@@ -125,22 +125,22 @@ class TwoPoint:
         return row
 
     def state(self) -> State:
-        """The policy, the steps and the learning rate, with the parameters they belong to."""
+        """The policy, the steps and the learning rate."""
         return {
             "policy": self._policy.copy(),
             "tells": np.array(self._tells),
             "learning_rate": np.array(self._learning_rate),
-            "seed": np.array(self._seed),
-            "smoothing_radius": np.array(self._radius),
         }
 
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
-        """Continue from a checkpoint with the same seed and radius."""
-        require_state(state, self.state(), ("seed", "smoothing_radius"))
-        policy, learning_rate = checked_policy(state["policy"]), state["learning_rate"].item()
-        require_positive(learning_rate=float(learning_rate))
-        self._policy, self._learning_rate = policy, float(learning_rate)
-        self._tells = int(state["tells"].item())
+        """Continue from a checkpoint of an optimiser with the same arguments."""
+        policy = taken(state, "policy", "f", self._policy.shape).copy()
+        tells, learning_rate = (
+            taken(state, "tells", "i", ()),
+            taken(state, "learning_rate", "f", ()),
+        )
+        self._policy, self._tells = policy, int(tells)
+        self._learning_rate = float(learning_rate)
 
     def _field_seed(self) -> int:
         return oracle.field_seed(self._seed, self._tells)
