@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from controller_node.identification import DesignSettings, design_each
 from controller_node.policy import excitation
 from loop_interfaces.frames import KEPT_ARRAY, Frame
-from loop_interfaces.parameters import model_order
 from loop_interfaces.protocol import ModelFailure, Publication
 from loop_interfaces.signature import design_digest, digest_of, signature
 from loop_interfaces.topics import COMPLETED, MODEL_IDENTIFIED, VOID, CostColumn, StartColumn
@@ -84,21 +83,16 @@ class Exploration:
             return self._failure(self._divergence(cost), retry=False)
         if target is None:  # as none of its states was answered, somebody else did
             return self._failure("the plant's target has not arrived", retry=True)
-        n_a, n_s = self._settings.n_a, min(model_order(asdict(self._settings)), len(target))
-        if cost.step < n_s + n_a:
-            return self._failure(
-                f"the exploratory episode ended at step {cost.step}, but a model of n_s = {n_s} "
-                f"modes and n_a = {n_a} inputs needs at least {n_s + n_a} steps; lower reduced_order "
-                "or raise the horizon, and if that is long enough, stop the other node that "
-                "publishes episode/cost",
-                retry=False,
-            )
         states = np.stack([known[k] for k in range(cost.step + 1)])
         actions = np.stack([self.actions(k) for k in range(cost.step)])
         try:
             rows = design_each(states, actions, target, self._settings)
         except ValueError as error:
-            return self._failure(str(error), retry=False)
+            return self._failure(
+                f"{error} (The exploratory episode ended at step {cost.step}: if the horizon is "
+                "longer, stop the other node that publishes episode/cost.)",
+                retry=False,
+            )
         time = self._signature() or cost.time
         return Publication(MODEL_IDENTIFIED, replace(cost, step=0, time=time, values=rows))
 

@@ -106,9 +106,10 @@ def test_a_void_exploration_forged_into_a_completed_one_names_who_else_may_have_
     (failure,) = responder.cost(Frame(RUN, 1, 1, 0.0, np.array([[0.5, 0.5, COMPLETED]])))
     assert isinstance(failure, ModelFailure) and not failure.retry
     assert failure.reason == (
-        "the exploratory episode ended at step 1, but a model of n_s = 4 modes and n_a = 4 inputs "
-        "needs at least 8 steps; lower reduced_order or raise the horizon, and if that is long "
-        "enough, stop the other node that publishes episode/cost"
+        "a model of n_s = 4 modes and n_a = 4 inputs needs at least 8 steps, but there are 1; take "
+        "more steps (a longer horizon), or a lower n_s where that is enough. (The exploratory "
+        "episode ended at step 1: if the horizon is longer, stop the other node that publishes "
+        "episode/cost.)"
     )
 
 
