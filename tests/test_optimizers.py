@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from loop_interfaces.parameters import TUNER
-from tuner_node import oracle
 from tuner_node.optimizers import GaussNewton, Optimizer, RolloutResult, TwoPoint
+from tuner_node.optimizers.two_point import direction
+from tuner_node.seeds import field_seed
 
 SHAPE = (2, 6)
 N_A, N_S = 2, 3
@@ -37,7 +38,7 @@ def test_two_point_is_the_papers_iteration() -> None:
     optimizer = two_point(smoothing_radius=0.2)
     policy = POLICY.copy()
     for k in range(12):
-        theta, field = oracle.direction(3, k, SHAPE), oracle.field_seed(3, k)
+        theta, field = direction(3, k, SHAPE), field_seed(3, k)
         plus, minus = policy + 0.2 * theta, policy - 0.2 * theta
         asked = optimizer.ask()
         assert np.array_equal(asked[0].policy, plus)

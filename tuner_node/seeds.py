@@ -14,6 +14,11 @@ import numpy as np
 
 from loop_interfaces.parameters import MAX_SEED
 
+# Large constants: NumPy pads a short seed sequence with zeros, so [seed, stream, 0] would equal the
+# [seed, step] of another user of the same seed if the stream were a small number.
+DIRECTION_STREAM = 0x5448455441  # "THETA"
+_FIELD_STREAM = 0x4649454C44  # "FIELD"
+
 
 class Purpose(IntEnum):
     """What a seed is for; the numbers are part of the results' reproducibility."""
@@ -37,3 +42,8 @@ def derive(seed: int, purpose: Purpose, index: int = 0) -> int:
 def evaluation_noise(seed: int, fields: int) -> list[int]:
     """A seed for every field of an evaluation."""
     return [derive(seed, Purpose.EVALUATION_NOISE, i) for i in range(fields)]
+
+
+def field_seed(seed: int, index: int) -> int:
+    """The seed of an optimiser's initial field of this number, in [0, 2^53)."""
+    return int(np.random.default_rng([seed, _FIELD_STREAM, index]).integers(MAX_SEED + 1))

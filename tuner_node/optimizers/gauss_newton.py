@@ -31,7 +31,6 @@ from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
 from loop_interfaces.array_files import Arrays, taken
-from tuner_node import oracle
 from tuner_node.optimizers.base import (
     Array,
     Context,
@@ -46,6 +45,7 @@ from tuner_node.optimizers.base import (
 )
 from tuner_node.optimizers.proposals import Proposer
 from tuner_node.optimizers.trajectories import Records
+from tuner_node.seeds import field_seed
 
 __all__ = ["GaussNewton"]
 
@@ -259,7 +259,7 @@ class GaussNewton:
             sensed.equation = taken(state, "equation", "f", sensed.equation.shape).copy()
 
     def _rollout(self, policy: Array, slot: int) -> Rollout:
-        return Rollout(policy.copy(), oracle.field_seed(self._seed, int(self._now.fields[slot])))
+        return Rollout(policy.copy(), field_seed(self._seed, int(self._now.fields[slot])))
 
     def _add(self, policy: Array, result: RolloutResult) -> Record:
         return self._records.add(policy, result, self._now.referred)

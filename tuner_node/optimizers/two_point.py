@@ -1,17 +1,21 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Descent along two-point estimates of the gradient, which need costs alone; the paper's method.
 
-Each step draws one direction Theta and one initial field, measures the rollouts pi +- r Theta on it,
-and steps along the estimate of `tuner_node.oracle`,
+Each step draws one direction Theta with |Theta|_F = 1 and one initial field, measures the rollouts
+pi +- r Theta on it, and steps along the estimate
 
-    pi <- pi - eta (n_a n_s / r) (J(pi + r Theta) - J(pi - r Theta)) Theta.
+    g = (n_a n_s / r) (J(pi + r Theta) - J(pi - r Theta)) Theta,        pi <- pi - eta g.
 
-A step with a diverged rollout, or that would not be finite, is not taken and halves eta from then on.
+With d = 2 n_a n_s entries, E[d Theta Theta^T] = I for a uniform direction, so g = d (J+ - J-) / (2 r)
+Theta estimates the gradient of J without bias, up to the smoothing. A step with a diverged rollout, or
+that would not be finite, is not taken and halves eta from then on. Sums are elementwise (no BLAS), so
+that a policy is the same to the last bit on every run.
 
 References
 ----------
 Zhang, Mowlavi, Benosman, Basar, "Policy Optimization for PDE Control with a Warm Start",
 arXiv:2403.01005, section IV.
+Spall, "Introduction to Stochastic Search and Optimization", chapter 7.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,7 +24,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from loop_interfaces.array_files import taken
-from tuner_node import oracle
 from tuner_node.optimizers.base import (
     Array,
     Rollout,
@@ -31,6 +34,7 @@ from tuner_node.optimizers.base import (
     require_positive,
     require_results,
 )
+from tuner_node.seeds import DIRECTION_STREAM, field_seed
 
 
 class TwoPoint:
@@ -111,7 +115,7 @@ class TwoPoint:
             plus, minus = (float(result.cost) for result in results)
             # Finite costs can still be so large that the step overflows.
             with np.errstate(over="ignore", invalid="ignore"):
-                estimate = oracle.gradient(plus, minus, self._direction(), self._radius)
+                estimate = gradient(plus, minus, self._direction(), self._radius)
                 policy = self._policy - self._learning_rate * estimate
                 norm = float(np.sqrt(np.sum(estimate * estimate)))
             if np.isfinite(plus + minus):
@@ -143,8 +147,21 @@ class TwoPoint:
         self._learning_rate = float(learning_rate)
 
     def _field_seed(self) -> int:
-        return oracle.field_seed(self._seed, self._tells)
+        return field_seed(self._seed, self._tells)
 
     def _direction(self) -> Array:
-        n_a, columns = self._policy.shape
-        return oracle.direction(self._seed, self._tells, (n_a, columns))
+        return direction(self._seed, self._tells, self._policy.shape)
+
+
+def direction(seed: int, iteration: int, shape: tuple[int, ...]) -> Array:
+    """Theta of an iteration, uniform on the sphere of unit Frobenius norm; shape: of a policy."""
+    theta: Array = np.random.default_rng([seed, DIRECTION_STREAM, iteration]).standard_normal(shape)
+    theta /= np.sqrt(np.sum(theta * theta))
+    return theta
+
+
+def gradient(cost_plus: float, cost_minus: float, direction: Array, radius: float) -> Array:
+    """The two-point estimate (n_a n_s / r) (J+ - J-) Theta, shape (n_a, 2 n_s)."""
+    n_a, columns = direction.shape
+    estimate: Array = n_a * (columns // 2) / radius * (cost_plus - cost_minus) * direction
+    return estimate
