@@ -1,8 +1,9 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`python -m benchmarks environments`: environment-steps a second of the Gymnasium environments.
 
-In Gymnasium's vector environments, in one process (sync) and in a process each (async), beside those of
-controlgym's environment of the same equation, grid, actuators and steps, under constant actions.
+The batch of `VectorEnvironment` beside Gymnasium's own vector environments of as many single ones, in
+one process (sync) and in a process each (async), and beside those of controlgym's environment of the
+same equation, grid, actuators and steps, under constant actions.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from benchmarks.kernel import KEEP_MEMORY
 from benchmarks.processes import machine, table
 from pdeloop.environments import environment_id
 
-MODES = ("sync", "async")
+MODES = {"vector_entry_point": "batch", "sync": "sync", "async": "async"}
 SECONDS = 0.5
 """Of a measurement."""
 LIMIT = 1.0
@@ -54,13 +55,13 @@ def run(
             )
             for mode in MODES
         }
-        rates: dict[str, list[float]] = {mode: [] for mode in MODES}
+        rates: dict[str, list[float]] = {name: [] for name in MODES.values()}
         try:
             for turn in range(-1, turns):  # the first one is to warm up
                 for mode, envs in made.items():
                     rate = _rate(envs, SECONDS)
                     if turn >= 0:
-                        rates[mode].append(rate)
+                        rates[MODES[mode]].append(rate)
                 if controlgym is not None and turn >= 0:
                     for mode, rate in _rates_of_controlgym(controlgym, problem, count).items():
                         rates.setdefault(f"controlgym {mode}", []).append(rate)

@@ -21,12 +21,10 @@ import json
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from numpy.typing import NDArray
 
 from benchmarks.baselines import BUDGETS, TEST, VALIDATION, pairs
@@ -34,7 +32,7 @@ from benchmarks.methods import evaluation_fields, training_field
 from benchmarks.warm_start import warm_start
 from loop_interfaces.files import make_folder, write_atomically
 from loop_interfaces.model_rows import unpack
-from pdeloop.environments import Environment
+from pdeloop.environments import VectorEnvironment
 from pdeloop.episode import Law, projected_law, rollout
 from pdeloop.in_process import LocalPair
 from pdeloop.training_run import resolve
@@ -112,9 +110,8 @@ def run(
 
     lqt = measured(projected_law(plant, U, training.starts()[0]), VALIDATION)
     unit = float(np.mean(lqt))
-    make = partial(Environment, problem, divergence_penalty=PENALTY * unit)
-    source = SyncVectorEnv([make] * environments, autoreset_mode=AutoresetMode.SAME_STEP)
-    first: list[int | None] = [training_field(values, m) for m in range(environments)]
+    source = VectorEnvironment(problem, num_envs=environments, divergence_penalty=PENALTY * unit)
+    first = [training_field(values, m) for m in range(environments)]
     episodes = batch_of_episodes(source, first, observe, bound, unit / reward)
     agent = make_agent(algorithm, episodes, seed, plant.horizon, constants)
 
@@ -163,13 +160,16 @@ def make_agent(
 
 
 def batch_of_episodes(
-    source: SyncVectorEnv,
-    first: list[int | None],
+    source: VectorEnvironment,
+    first: Sequence[int],
     observe: Callable[[Array], Array],
     bound: float,
     unit: float,
 ) -> Any:
-    """The environments as a VecEnv of stable-baselines3; `ended` counts the episodes."""
+    """The batch as a VecEnv of stable-baselines3, which begins anew in the step that ends an episode.
+
+    `ended` counts the episodes. One that diverges begins anew a step later than the library thinks.
+    """
     from gymnasium.spaces import Box
     from stable_baselines3.common.vec_env import VecEnv
 
@@ -187,17 +187,19 @@ def batch_of_episodes(
         def step_async(self, actions: Array) -> None:
             self._actions = bound * np.clip(np.asarray(actions, dtype=float), -1.0, 1.0)
 
-        def step_wait(self) -> tuple[Array, NDArray[Any], NDArray[Any], list[dict[str, Any]]]:
-            states, rewards, terminated, truncated, also = source.step(self._actions)
-            ended: NDArray[Any] = terminated | truncated
+        def step_wait(self) -> tuple[Array, Array, Array, list[dict[str, Any]]]:
+            states, rewards, terminated, truncated, _ = source.step(self._actions)
+            seen, ended = observe(states), terminated | truncated
             infos: list[dict[str, Any]] = [{} for _ in ended]
             for m in np.flatnonzero(ended):
                 infos[m] = {
-                    "terminal_observation": observe(also["final_obs"][m][np.newaxis])[0],
+                    "terminal_observation": seen[m],
                     "TimeLimit.truncated": bool(truncated[m] and not terminated[m]),
                 }
             self.ended += int(ended.sum())
-            return observe(states), (rewards / unit).astype(np.float32), ended, infos
+            if ended.all():
+                seen = observe(source.reset()[0])
+            return seen, (rewards / unit).astype(np.float32), ended, infos
 
         def close(self) -> None:
             source.close()

@@ -153,9 +153,17 @@ class InstrumentedPlant(Plant):
         super().reset(seeds)
         if noise is None:
             noise = np.zeros(self.batch, dtype=np.int64)
-        drawn = np.full(self.batch, MEAN_FIELD) if np.ndim(seeds) == 2 else np.asarray(seeds)
-        self._seeds = [(int(n), int(s)) for n, s in zip(noise, drawn, strict=True)]
+        drawn = field_seeds(seeds)
+        self._seeds = [(int(n), s) for n, s in zip(noise, drawn, strict=True)]
         self._published = np.tile(self._measure(), (1, self._delays))
+        return self._published
+
+    def restart(self, environments: NDArray[np.intp], seeds: ArrayLike) -> NDArray[np.float64]:
+        """As `Plant.restart`; the noise of a step stays that of this step of the episode."""
+        super().restart(environments, seeds)
+        for m, seed in zip(environments.tolist(), field_seeds(seeds), strict=True):
+            self._seeds[m] = self._seeds[m][0], seed
+        self._published[environments] = np.tile(self._measure()[environments], (1, self._delays))
         return self._published
 
     def step(self, actions: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -193,6 +201,12 @@ class InstrumentedPlant(Plant):
                 )
         y *= self._scale
         return y
+
+
+def field_seeds(seeds: ArrayLike) -> list[int]:
+    """What the noise takes for the seeds of initial fields; given fields have none."""
+    given = np.asarray(seeds)
+    return [MEAN_FIELD] * len(given) if given.ndim == 2 else given.tolist()
 
 
 def sensor_positions(n_x: int, sensors: int) -> NDArray[np.int64]:

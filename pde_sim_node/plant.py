@@ -236,6 +236,26 @@ class Plant:
         self.states[:] = fields
         return self.states
 
+    def restart(self, environments: NDArray[np.intp], seeds: ArrayLike) -> NDArray[np.float64]:
+        """Begin again in some environments of an episode that goes on, and ends for all together.
+
+        Parameters
+        ----------
+        environments : (m,) int
+            Which of the M.
+        seeds : (m,) int, or (m, n_z)
+            Their initial fields, as of `reset`.
+
+        Returns
+        -------
+        (M, n_z)
+            The states now, as `step` returns them.
+        """
+        self.states[environments] = self._initial_fields(np.asarray(seeds))
+        self.totals[environments] = 0.0
+        self.diverged_step[environments] = -1
+        return self.states
+
     def _initial_fields(self, seeds: NDArray[Any]) -> NDArray[np.float64]:
         """The fields that seeds stand for, or that are given."""
         if seeds.ndim == 2:
