@@ -66,8 +66,6 @@ class PlantNode:
         values = declare_parameters(node)
         pin_process(values["pin"])
         plant = build_plant(values)
-        if plant.compiled_in_seconds > 0.0:
-            node.get_logger().info(f"compiled the kernel in {plant.compiled_in_seconds:.1f} s")
         if type(plant) is Plant:  # what instruments do to a step is not compiled
             load_compiled()  # before there is a publisher: a peer that discovers one expects answers
         domain = node.context.get_domain_id()

@@ -1,7 +1,6 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The plant: M sampled PDEs side by side, each z_{k+1} = f(z_k, a_k)."""
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loop_interfaces.jit.native import compilations
 from loop_interfaces.topics import COMPLETED
 from pde_sim_node.actuators import actuator_supports
 from pde_sim_node.arguments import grid_points, internal_steps, positive, whole
@@ -118,8 +116,6 @@ class Plant:
         k, steps of the episode so far.
     parallel : ParallelStep
         The compiled step and the threads that do it.
-    compiled_in_seconds : float
-        Time the constructor spent on compiling the kernel; 0.0 if it was compiled before.
 
     Raises
     ------
@@ -161,7 +157,6 @@ class Plant:
         self.field_target = self._checked("target", result_of(equation.target, self.x))
         self.target = self.field_target
         make_step = exact_step if isinstance(equation, LinearEquation) else etdrk4_step
-        began, before = time.perf_counter(), compilations()
         self.parallel: ParallelStep = make_step(
             StepSettings(
                 equation=equation,
@@ -174,12 +169,8 @@ class Plant:
                 bound=self.divergence_bound,
             )
         )
-        self._allocate(1)
-        all_finite(self.actions)
-        self.parallel.step(0)
-        seconds = time.perf_counter() - began
-        self.compiled_in_seconds = seconds if compilations() > before else 0.0
         self._allocate(0)
+        all_finite(self.actions)  # now, and not in the first step: load or compile it
 
     def __repr__(self) -> str:
         return (

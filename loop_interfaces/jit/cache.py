@@ -30,10 +30,6 @@ def inlined_njit(function: F) -> F:
     return compiled
 
 
-CACHED: list[Any] = []
-"""All functions that `cached_njit` has made."""
-
-
 def named_by_sources(function: F, *sources: ModuleType | Callable[..., Any]) -> F:
     """The function, with a name on disk that belongs to it and to what it is made of."""
     function.__qualname__ += f"-{fingerprint(function, *sources)}"
@@ -45,7 +41,6 @@ def cached_njit(*sources: ModuleType | Callable[..., Any]) -> Callable[[F], F]:
 
     def compiled(function: F) -> F:
         made: F = numba.njit(named_by_sources(function, *sources), cache=True, nogil=True)
-        CACHED.append(made)
         return made
 
     return compiled

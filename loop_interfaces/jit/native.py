@@ -14,7 +14,7 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 
-from loop_interfaces.jit.cache import CACHED, jit, named_by_sources
+from loop_interfaces.jit.cache import jit, named_by_sources
 from loop_interfaces.jit.simd import intrinsic, read_word
 
 CLOCK = np.dtype(
@@ -80,9 +80,6 @@ class MachineCode:
         The modules, or functions of them, that it calls: when one of them changes, it is compiled anew.
     """
 
-    compiled = 0
-    """How many of them were compiled in this process."""
-
     def __init__(
         self,
         function: Callable[..., Any],
@@ -97,7 +94,6 @@ class MachineCode:
         if self._code is None:
             function = named_by_sources(self._function, *self._sources)
             self._code = numba.cfunc(self._signature, cache=True)(function)
-            MachineCode.compiled += not self._code.cache_hits
         address: int = self._code.address
         return address
 
@@ -110,12 +106,6 @@ def machine_code(signature: Any, *sources: ModuleType) -> Callable[..., MachineC
 def pointer_to(record: np.dtype[Any]) -> Any:
     """The type of the address of such a record in a signature."""
     return types.CPointer(numba.from_dtype(record))  # type: ignore[no-untyped-call]
-
-
-def compilations() -> int:
-    """How many functions were compiled in this process because they were not on disk."""
-    misses = (int(sum(function.stats.cache_misses.values())) for function in CACHED)
-    return MachineCode.compiled + sum(misses)
 
 
 def address_of(function: Any) -> int:
