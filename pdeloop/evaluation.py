@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from loop_interfaces.model_rows import pack
 from loop_interfaces.parameters import noisy
 from loop_interfaces.topics import CostColumn
-from pde_sim_node.build import build_equation, fingerprint
+from pde_sim_node.build import build_equation
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.finished_run import FinishedRun
 from pdeloop.in_process import LocalPair
@@ -88,26 +88,6 @@ def another_loop(run: FinishedRun) -> str:
                 f"{_text(there)} in its closing evaluation, and {_text(own)} here"
             )
     return ""
-
-
-def another_plant(run: FinishedRun) -> str:
-    """Whether a run's plant has the fingerprint of the built-in one.
-
-    The fingerprint covers the source of the equation, so a plant with another one may still compute
-    the same costs.
-
-    Returns
-    -------
-    str
-        That it has another one, in words; empty if it has not.
-    """
-    own = fingerprint(run.values)
-    if run.result.get("plant", own) == own:
-        return ""
-    return (
-        f"the run's plant has the fingerprint {run.result['plant']}, the built-in one {own}: its "
-        "parameters or the source of its equation are others"
-    )
 
 
 def mean_costs(

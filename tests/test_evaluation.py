@@ -10,11 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pde_sim_node.build import fingerprint
 from pdeloop.cli import main
 from pdeloop.evaluation import beside_no_control
 from tests.small import SMALL
-from tuner_node.run_folder import RunFolder
 
 COSTS = ("none", "lqt", "adapted")
 
@@ -82,17 +80,6 @@ def test_another_plant_is_refused(run, capsys):
         content = {**arrays, "model": np.ones((2, 57, 4))}
     np.savez(run / "policy.npz", **content)
     assert "had another plant than the built-in one" in refused(capsys, run)
-
-
-def test_a_plant_with_another_fingerprint_is_told(run, capsys):
-    values = RunFolder(run).values()
-    result = json.loads((run / "result.json").read_text())
-    assert result["plant"] == fingerprint(values)
-    (run / "result.json").write_text(json.dumps(result | {"plant": 7}))
-    assert main(["evaluate", str(run), "--fields", "1", "--json"]) == 0
-    shown = capsys.readouterr()
-    assert "the run's plant has the fingerprint 7, the built-in one " in shown.err
-    assert set(json.loads(shown.out)) == {*COSTS}
 
 
 def test_rounding_of_another_machine_is_not_another_plant(run, capsys):

@@ -45,13 +45,7 @@ def add(commands: Commands) -> None:
 
 
 def _evaluate(options: argparse.Namespace) -> int:
-    from pdeloop.evaluation import (
-        all_diverged,
-        another_plant,
-        as_text,
-        beside_no_control,
-        evaluate,
-    )
+    from pdeloop.evaluation import all_diverged, as_text, beside_no_control, evaluate
     from pdeloop.finished_run import load_run
 
     allow_equation(options)
@@ -59,8 +53,6 @@ def _evaluate(options: argparse.Namespace) -> int:
     DEFAULTS["evaluation_seed"].check(options.seed, "--seed")
     run = load_run(options.folder)
     costs = evaluate(run, fields=options.fields, seed=options.seed, mean_field=options.mean_field)
-    if note := another_plant(run):
-        print(f"WARNING: {note}; these are costs of the built-in one", file=sys.stderr)
     if options.json:
         print_json({name: table.tolist() for name, table in costs.items()})
     else:

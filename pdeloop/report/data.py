@@ -18,7 +18,7 @@ from loop_interfaces.model_rows import ModelRows, unpack
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD, Plant
 from pdeloop.episode import rollout
-from pdeloop.evaluation import another_loop, another_plant
+from pdeloop.evaluation import another_loop
 from pdeloop.finished_run import FinishedRun, field_means, load_run
 from pdeloop.in_process import LocalPair
 from pdeloop.reproduction import reproduction_in, runs_of
@@ -200,10 +200,6 @@ def _problem(runs: Mapping[str, FinishedRun], curves: Sequence[Curve], shown: in
     if not curves:
         data.missing.append(
             "Training curves: LQT diverged, or every rollout of the adaptation did, or there was none."
-        )
-    if note := another_plant(data.first):
-        data.missing.append(
-            f"The run's own plant: {note}. The fields shown are of the built-in one."
         )
     if reason := another_loop(data.first):
         data.missing.append(
