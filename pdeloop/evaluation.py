@@ -149,23 +149,18 @@ def _text(costs: Array) -> str:
     return "diverged" if (costs >= DIVERGED_COST).any() else f"{costs.mean():.4g}"
 
 
-def all_diverged(costs: Mapping[str, Array]) -> list[str]:
-    """The controllers of which no rollout came to its end."""
-    return [name for name, table in costs.items() if (table >= DIVERGED_COST).all()]
+def outcome(costs: Mapping[str, Array], first: int) -> dict[str, Any]:
+    """The entries of a result.json by which a training is judged (`narration.warnings`, `failed`).
 
-
-def beside_no_control(costs: Mapping[str, Array], seeds: Sequence[int]) -> str:
-    """Which seeds' adapted policies cost no less than no control, in words; empty if none does."""
-    means = {name: table.mean(axis=1) for name, table in costs.items()}
-    worse = [
-        str(seed)
-        for seed, none, own in zip(seeds, means["none"], means["adapted"], strict=True)
-        if own >= none
-    ]
-    if not worse:
-        return ""
-    which = f" for {'seed' if len(worse) == 1 else 'seeds'} {', '.join(worse)}" * (len(seeds) > 1)
-    return f"the adapted policy costs no less than no control{which}"
+    first: the seed of the first row.
+    """
+    return {
+        "costs": {name: table.mean(axis=1).tolist() for name, table in costs.items()},
+        "diverged": {name: int((table >= DIVERGED_COST).sum()) for name, table in costs.items()},
+        "evaluation_rollouts": costs["none"].size,
+        "seed": first,
+        "seeds": len(costs["none"]),
+    }
 
 
 def as_text(costs: Mapping[str, Array]) -> str:

@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.cli import main
-from pdeloop.evaluation import beside_no_control
+from pdeloop.evaluation import outcome
 from tests.small import SMALL
+from tuner_node.narration import failed, warnings
 
 COSTS = ("none", "lqt", "adapted")
 
@@ -46,10 +48,13 @@ def test_a_policy_that_is_no_better_than_no_control_is_told_with_its_seed():
         "none": np.array([[4.0, 5.0], [4.0, 5.0]]),
         "adapted": np.array([[1.0, 2.0], [1.0, 9.0]]),
     }
-    words = "the adapted policy costs no less than no control"
-    assert beside_no_control(costs, (3, 4)) == f"{words} for seed 4"
-    assert beside_no_control({name: table[1:] for name, table in costs.items()}, (4,)) == words
-    assert beside_no_control({name: table[:1] for name, table in costs.items()}, (3,)) == ""
+    costs["lqt"] = costs["none"]
+    words = "after adaptation the cost is not below that without control"
+    assert warnings(outcome(costs, 3)) == [f"{words} for seed 4"]
+    assert warnings(outcome({name: table[1:] for name, table in costs.items()}, 4)) == [words]
+    assert warnings(outcome({name: table[:1] for name, table in costs.items()}, 3)) == []
+    lost = {**costs, "none": np.full((2, 2), DIVERGED_COST)}
+    assert not failed(outcome(lost, 3)) and failed(outcome({**costs, "adapted": lost["none"]}, 3))
 
 
 def refused(capsys: Any, run: Path) -> str:
@@ -101,7 +106,7 @@ def test_policies_that_diverge_are_no_success(run, capsys):
     (run / "result.json").write_text(json.dumps(result))
     assert main(["evaluate", str(run)]) == 1
     shown = capsys.readouterr()
-    assert "every rollout diverged of: adapted" in shown.err
+    assert "WARNING: every rollout of the adapted policies diverged" in shown.err
     assert "1e+09" not in shown.out
 
 

@@ -45,8 +45,9 @@ def add(commands: Commands) -> None:
 
 
 def _evaluate(options: argparse.Namespace) -> int:
-    from pdeloop.evaluation import all_diverged, as_text, beside_no_control, evaluate
+    from pdeloop.evaluation import as_text, evaluate, outcome
     from pdeloop.finished_run import load_run
+    from tuner_node import narration
 
     allow_equation(options)
     DEFAULTS["evaluation_fields"].check(options.fields, "--fields")
@@ -57,8 +58,7 @@ def _evaluate(options: argparse.Namespace) -> int:
         print_json({name: table.tolist() for name, table in costs.items()})
     else:
         print(as_text(costs))
-    if worse := beside_no_control(costs, run.seeds):
-        print(f"WARNING: {worse}", file=sys.stderr)
-    if lost := all_diverged(costs):
-        raise RuntimeError(f"every rollout diverged of: {', '.join(lost)}")
-    return 0
+    summary = outcome(costs, run.seeds[0])
+    for text in narration.warnings(summary):
+        print(f"WARNING: {text}", file=sys.stderr)
+    return int(narration.failed(summary))
