@@ -14,21 +14,18 @@ from numba import carray, types  # type: ignore[attr-defined, unused-ignore]
 
 from loop_interfaces.jit.cache import jit
 from loop_interfaces.jit.native import MachineCode, pointer_to
-from loop_interfaces.jit.simd import fma, load, read, read_word, splat, store, write, write_word
+from loop_interfaces.jit.simd import fma, lane_sum, load, read, read_word, splat, write, write_word
 
 
 @jit
-def stage_cost(state: int, action: int, w: int, plan: Any, c: int) -> float:
+def stage_cost(state: int, action: int, plan: Any, c: int) -> float:
     """q |z - z_r|^2 + r |a|^2 of one environment."""
     lanes = splat(0.0)
     whole = plan.n_z // 8 * 8
     for i in range(0, whole, 8):
         error = load(state, i) - load(c, plan.target + i)
         lanes = fma(error, error, lanes)
-    store(w, plan.next, lanes)
-    state_part, action_part = 0.0, 0.0
-    for i in range(8):
-        state_part += read(w, plan.next + i)
+    state_part, action_part = lane_sum(lanes), 0.0
     for i in range(whole, plan.n_z):
         state_part += (read(state, i) - read(c, plan.target + i)) ** 2
     for j in range(plan.n_a):
@@ -77,7 +74,7 @@ def environments_of(plan: Any, advance: Callable[..., None], *sources: ModuleTyp
             if read_word(diverged_step, i) >= 0:
                 continue
             state, action = states + 8 * plan.n_z * i, actions + 8 * plan.n_a * i
-            total = read(totals, i) + stage_cost(state, action, w, plan, c)
+            total = read(totals, i) + stage_cost(state, action, plan, c)
             write(totals, i, total)
             advance(state, action, w, d, plan, c, e)
             if not accept(total, state, w, plan):

@@ -135,7 +135,6 @@ def exact_step(settings: StepSettings) -> ParallelStep:
             "z1": plane,
             "z2": plane,
             "x": max(n_x // 2, modes) + WIDTH,
-            "next": WIDTH,
             "spectra": components * modes,
             "state": whole_lanes(n_z),
         },

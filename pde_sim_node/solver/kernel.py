@@ -60,6 +60,7 @@ PLAN = step_plan_type(
     ("f", np.int64),  # f1 + 4 f2 + f3
     ("supports", np.int64),  # their spectra, n_a by modes
     # Offsets in w.
+    ("next", np.int64),
     ("b", np.int64),
     ("c", np.int64),
     ("qf", np.int64),

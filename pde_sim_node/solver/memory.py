@@ -98,7 +98,6 @@ def step_plan_type(*own: tuple[str, Any]) -> np.dtype[np.void]:
             ("x", np.int64),  # the spectrum to be transformed next, zero above the modes
             ("z1", np.int64),
             ("z2", np.int64),
-            ("next", np.int64),
             ("state", np.int64),
             *own,
         ]
