@@ -116,8 +116,7 @@ def identify_bag(
     one; otherwise the exploratory episodes, or all if there are none.
     """
     bag = Bag(path)
-    recorded = bag.episodes() if episode is None else bag.find(episode)
-    chosen = [e for e in recorded if _usable(e)]
+    chosen = [e for e in bag.episodes() if episode in (None, e.number) and _usable(e)]
     if any(e.exploratory for e in chosen):
         chosen = [e for e in chosen if e.exploratory]
     if not chosen:

@@ -172,7 +172,7 @@ def test_the_hash_of_a_type_is_that_of_the_installed_ros(source):
 def test_an_episode_is_found_by_its_number(tmp_path):
     bag = Bag(written(tmp_path))
     assert [(e.number, e.missing) for e in bag.episodes()] == [(7, []), (8, [])]
-    (found,) = bag.find(8)
+    (found,) = (episode for episode in bag.episodes() if episode.number == 8)
     assert found.missing == []
     states, actions = found.trajectory()
     assert states.shape == (6, 1, 16) and actions.shape == (5, 1, 4)

@@ -64,10 +64,6 @@ class Bag:
         for file in self.files:
             yield from read(file)
 
-    def find(self, episode: int) -> Iterator[RecordedEpisode]:
-        """The episodes of this number; there may be one in each namespace."""
-        return (found for found in self.episodes() if found.number == episode)
-
     def target(self) -> Array | None:
         """The target z_r, which is among the first messages of a bag; None if it has none."""
         for message in self.messages():
