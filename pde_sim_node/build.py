@@ -11,8 +11,8 @@ from typing import Any
 from loop_interfaces.frames import MAX_ID
 from loop_interfaces.parameters import ACTUATORS, INSTRUMENTS
 from pde_sim_node.equations import Equation, configured_equation
-from pde_sim_node.measurement import InstrumentedPlant, Instruments
-from pde_sim_node.plant import Plant
+from pde_sim_node.measurement import InstrumentedPlant
+from pde_sim_node.plant import Instruments, Plant
 
 
 def build_equation(values: Mapping[str, Any]) -> Equation:

@@ -37,7 +37,6 @@ Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 20
 """
 
 import math
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
@@ -45,7 +44,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pde_sim_node.equations import Equation
-from pde_sim_node.plant import MEAN_FIELD, Plant
+from pde_sim_node.plant import MEAN_FIELD, Instruments, Plant
 
 
 class Noise(IntEnum):
@@ -53,25 +52,6 @@ class Noise(IntEnum):
 
     MEASUREMENT = 0
     PROCESS = 1
-
-
-@dataclass(frozen=True, kw_only=True)
-class Instruments:
-    """Noise of the measurement, forcing of the field, limit of the actions, sensors and delays.
-
-    See loop_interfaces.parameters.INSTRUMENTS; 0 is none of it.
-    """
-
-    measurement_noise: float = 0.0
-    process_noise: float = 0.0
-    action_limit: float = 0.0
-    sensors: int = 0
-    sensor_delays: int = 1
-
-    @property
-    def ideal(self) -> bool:
-        """Whether there is nothing between the field and the controller."""
-        return self == Instruments(sensor_delays=self.sensor_delays)
 
 
 def standard_normal(

@@ -33,7 +33,6 @@ from pde_sim_node.diagnostics import PlantDiagnostics
 from pde_sim_node.equations import configured_equation
 from pde_sim_node.fast_path import PlantFastPath, load_compiled
 from pde_sim_node.lockstep import Lockstep, Timing
-from pde_sim_node.plant import Plant
 from pde_sim_node.run_record import RunRecord
 
 
@@ -66,7 +65,7 @@ class PlantNode:
         values = declare_parameters(node)
         pin_process(values["pin"])
         plant = build_plant(values)
-        if type(plant) is Plant:  # what instruments do to a step is not compiled
+        if plant.instruments.ideal:  # what instruments do to a step is not compiled
             load_compiled()  # before there is a publisher: a peer that discovers one expects answers
         domain = node.context.get_domain_id()
         self._run_record = RunRecord(node.get_fully_qualified_name(), domain)
@@ -105,7 +104,7 @@ class PlantNode:
         loop.receive(START, self._on_start)
         self._actions = actions = loop.receive(ACTION, self._on_action)
         self._fast_path: PlantFastPath | None = None
-        if type(self._lockstep.plant) is Plant:
+        if self._lockstep.plant.instruments.ideal:
             self._fast_path = PlantFastPath(self._lockstep, actions.codec, self._batcher)
             loop.answer_fast(actions, self._senders[STATE], self._fast_path)
         loop.introspection.report("lock-step", self._diagnostics.report)

@@ -56,6 +56,25 @@ class EpisodeCosts:
         return np.column_stack([self.mean, self.total, ended.astype(np.float64)])
 
 
+@dataclass(frozen=True, kw_only=True)
+class Instruments:
+    """Noise of the measurement, forcing of the field, limit of the actions, sensors and delays.
+
+    See loop_interfaces.parameters.INSTRUMENTS; 0 is none of it.
+    """
+
+    measurement_noise: float = 0.0
+    process_noise: float = 0.0
+    action_limit: float = 0.0
+    sensors: int = 0
+    sensor_delays: int = 1
+
+    @property
+    def ideal(self) -> bool:
+        """Whether there is nothing between the field and the controller."""
+        return self == Instruments(sensor_delays=self.sensor_delays)
+
+
 class Plant:
     """M environments of one equation, advanced in lock-step.
 
@@ -116,12 +135,16 @@ class Plant:
         k, steps of the episode so far.
     parallel : ParallelStep
         The compiled step and the threads that do it.
+    instruments : Instruments
+        What stands between the field and the controller: nothing; see InstrumentedPlant.
 
     Raises
     ------
     ValueError
         A parameter has no usable value; the message names it and what would be right.
     """
+
+    instruments = Instruments()
 
     def __init__(
         self,

@@ -33,7 +33,6 @@ from numpy.typing import NDArray
 
 import pdeloop
 from loop_interfaces.problem import shipped_problems
-from pde_sim_node.measurement import InstrumentedPlant
 from pde_sim_node.plant import DIVERGED_COST, Plant
 
 __all__ = ["Environment", "VectorEnvironment", "environment_id"]
@@ -253,13 +252,11 @@ def penalty(given: float) -> float:
 
 def spaces(plant: Plant) -> tuple[Space[Any], Space[Any]]:
     """Of an observation (state_size,) and of an action (n_a,)."""
-    bound, limit = plant.divergence_bound, 0.0
-    if isinstance(plant, InstrumentedPlant):
-        limit = plant.instruments.action_limit
-        if plant.instruments.measurement_noise or plant.instruments.sensors:
-            bound = np.inf
+    own = plant.instruments
+    bound = np.inf if own.measurement_noise or own.sensors else plant.divergence_bound
+    limit = own.action_limit or np.inf
     observation = Box(-bound, bound, (plant.state_size,), np.float64)
-    return observation, Box(-(limit or np.inf), limit or np.inf, (plant.n_a,), np.float64)
+    return observation, Box(-limit, limit, (plant.n_a,), np.float64)
 
 
 def environment_id(problem: str) -> str:

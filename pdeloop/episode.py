@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from controller_node.policy import ProjectedLaw
-from pde_sim_node.measurement import InstrumentedPlant
 from pde_sim_node.plant import MEAN_FIELD, EpisodeCosts, Plant
 
 __all__ = ["EpisodeRecord", "Law", "finite_array", "mean_field_cost", "projected_law", "rollout"]
@@ -102,7 +101,7 @@ def rollout(
     batch, kept = len(z), plant.horizon if keep else -1
     states = np.empty((kept + 1, *z.shape))
     actions = np.empty((max(kept, 0), batch, plant.n_a))
-    own = isinstance(plant, InstrumentedPlant)
+    own = not plant.instruments.ideal
     fields = np.empty((kept + 1, batch, plant.n_z)) if own else states
     for k in range(plant.horizon + 1):
         if keep:
@@ -165,8 +164,7 @@ def projected_law(plant: Plant, U: ArrayLike, policy: ArrayLike) -> Law:
     basis = finite_array("U", U, basis.shape)
     gains = np.asarray(policy, dtype=np.float64)
     gains = finite_array("policy", policy, (*gains.shape[:-2], plant.n_a, 2 * basis.shape[1]))
-    limit = plant.instruments.action_limit if isinstance(plant, InstrumentedPlant) else 0.0
-    projected, batch = ProjectedLaw([basis], plant.target, limit), 0
+    projected, batch = ProjectedLaw([basis], plant.target, plant.instruments.action_limit), 0
 
     def actions(k: int, states: Array) -> Array:
         nonlocal batch

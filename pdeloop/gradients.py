@@ -18,7 +18,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pde_sim_node.measurement import InstrumentedPlant
 from pde_sim_node.plant import EpisodeCosts, Plant
 from pde_sim_node.solver.adjoint import adjoint_of
 from pdeloop.episode import EpisodeRecord, Law, finite_array, rollout
@@ -83,7 +82,7 @@ class Gradients:
     """
 
     def __init__(self, plant: Plant) -> None:
-        if isinstance(plant, InstrumentedPlant):
+        if not plant.instruments.ideal:
             raise ValueError(
                 "exact gradients are of a plant without noise, limits and sensors: leave "
                 "measurement_noise, process_noise, action_limit and sensors at 0"

@@ -17,12 +17,11 @@ from pde_sim_node.equations import Equation
 from pde_sim_node.lockstep import Lockstep, Timing
 from pde_sim_node.measurement import (
     InstrumentedPlant,
-    Instruments,
     Noise,
     sensor_positions,
     standard_normal,
 )
-from pde_sim_node.plant import Plant
+from pde_sim_node.plant import Instruments, Plant
 from pdeloop.in_process import LocalPair, train
 from tests.small import parameters, same_bits, train_here
 from tuner_node.build import build_training
