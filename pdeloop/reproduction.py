@@ -75,18 +75,22 @@ def runs_of(study: Study, folder: Path, problem: str) -> dict[str, FinishedRun]:
     }
 
 
-def beside_the_paper(problem: str, below: Mapping[str, Any] | None) -> str:
-    """How LQT-PO relates to the paper's figure; empty where the paper has none.
+def beside_the_paper(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """How LQT-PO relates to the paper's figure: a sentence for each problem that the paper has.
 
-    below: its `below_lqt_percent` in the row of a study's table.
+    rows: of a study's table.
     """
-    paper = PAPER.get(problem)
-    if paper is None or below is None:
-        return ""
-    start = f"{problem}: the paper reports {paper:.1f} % below LQT for LQT-PO"
-    if below["ratio_interval"] is None:
-        return f"{start}, over six seeds; one seed cannot be compared with that."
     averages = {"ratio of the means": "ratio_interval", "mean of the ratios": "mean_interval"}
-    within = [name for name, key in averages.items() if below[key][0] <= paper <= below[key][1]]
-    place = f"within the interval of the {' and that of the '.join(within)}"
-    return f"{start}, which lies {place if within else 'outside both intervals'} here."
+    found = []
+    for row in rows:
+        paper, below = PAPER.get(row["problem"]), row["below_lqt_percent"]
+        if row["variant"] != "lqt_po" or paper is None or below is None:
+            continue
+        start = f"{row['problem']}: the paper reports {paper:.1f} % below LQT for LQT-PO"
+        if below["ratio_interval"] is None:
+            found.append(f"{start}, over six seeds; one seed cannot be compared with that.")
+            continue
+        within = [name for name, key in averages.items() if below[key][0] <= paper <= below[key][1]]
+        place = f"within the interval of the {' and that of the '.join(within)}"
+        found.append(f"{start}, which lies {place if within else 'outside both intervals'} here.")
+    return found

@@ -122,8 +122,11 @@ def test_a_reduction_leaves_out_seeds_that_diverged_and_knows_no_interval_of_one
     ],
 )
 def test_the_table_says_where_the_papers_figure_lies(ratio, mean, words):
-    found = {"ratio_interval": ratio, "mean_interval": mean}
-    assert words in beside_the_paper("burgers", found)
+    below = {"ratio_interval": ratio, "mean_interval": mean}
+    row = {"problem": "burgers", "variant": "lqt_po", "below_lqt_percent": below}
+    others = {**row, "problem": "wave"}, {**row, "variant": "pure_po"}
+    (sentence,) = beside_the_paper([row, *others, {**row, "below_lqt_percent": None}])
+    assert words in sentence
 
 
 def test_an_interrupted_reproduction_continues_to_the_same_bits(reproduction, tmp_path, capsys):

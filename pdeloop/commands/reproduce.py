@@ -4,9 +4,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import (
@@ -52,7 +51,7 @@ def add(commands: Commands) -> None:
 
 
 def _reproduce(options: argparse.Namespace) -> int:
-    from pdeloop.reproduction import reproduction_in, study_of
+    from pdeloop.reproduction import beside_the_paper, reproduction_in, study_of
 
     allow_equation(options)
     names = ("seeds", "iterations", "seed", "identification_attempts")
@@ -66,15 +65,4 @@ def _reproduce(options: argparse.Namespace) -> int:
         there = None if options.problems or given else reproduction_in(folder)
         return there or study_of(options.problems, given)
 
-    return carry_out("reproduce", options, study_in, _remarks)
-
-
-def _remarks(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    from pdeloop.reproduction import beside_the_paper
-
-    found = (
-        beside_the_paper(row["problem"], row["below_lqt_percent"])
-        for row in rows
-        if row["variant"] == "lqt_po"
-    )
-    return [sentence for sentence in found if sentence]
+    return carry_out("reproduce", options, study_in, beside_the_paper)

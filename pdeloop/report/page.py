@@ -181,6 +181,7 @@ def _page(data: ReportData, shared: list[Picture], own: list[list[Picture]]) -> 
     problems = data.problems
     names = ", ".join(problem.name for problem in problems)
     table = [_figures(problem) for problem in problems]
+    rows = [row for known in table for row in known.values()]
     return environment.get_template("page.html.j2").render(
         title="Reproduction of the paper's experiment" if data.study else f"Training of {names}",
         facts=_facts(data),
@@ -190,8 +191,8 @@ def _page(data: ReportData, shared: list[Picture], own: list[list[Picture]]) -> 
         results=_results(problems, table),
         several=len(problems[0].first.seeds) > 1,
         caveat=CAVEAT,
-        warnings=beside_no_control([row for rows in table for row in rows.values()]),
-        paper=_beside_the_paper(problems),
+        warnings=beside_no_control(rows),
+        paper=beside_the_paper(rows),
         first_model=problems[0].first.values["identification_attempts"] == 1,
         budget=_budget(problems),
     )
@@ -258,16 +259,6 @@ def _results(problems: Sequence[ProblemData], table: Sequence[dict[str, dict[str
             row += [f"{PAPER[problem.name]}" if known_there else ""] * paper
             found.append(tuple(row))
     return head, found
-
-
-def _beside_the_paper(problems: Sequence[ProblemData]) -> list[str]:
-    """A sentence on LQT-PO for each problem that the paper has."""
-    found = [
-        beside_the_paper(problem.name, figures_of(problem.runs["lqt_po"])["below_lqt_percent"])
-        for problem in problems
-        if "lqt_po" in problem.runs
-    ]
-    return [sentence for sentence in found if sentence]
 
 
 def _budget(problems: Sequence[ProblemData]) -> Table:
