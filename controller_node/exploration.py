@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller_node.identification import DesignSettings, design_each
-from controller_node.policy import excitation
+from controller_node.policy import excitations
 from loop_interfaces.frames import KEPT_ARRAY, Frame
 from loop_interfaces.protocol import ModelFailure, Publication
 from loop_interfaces.signature import design_digest, digest_of, signature
-from loop_interfaces.topics import COMPLETED, MODEL_IDENTIFIED, VOID, CostColumn, StartColumn
+from loop_interfaces.topics import COMPLETED, MODEL_IDENTIFIED, VOID, CostColumn
 
 Array = NDArray[np.float64]
 
@@ -31,16 +31,14 @@ class Exploration:
         self.outcomes: dict[int, Publication | ModelFailure] = {}
         self.nbytes = 0
         self._start, self._settings = start, settings
-        seeds, variances = start.values[:, [StartColumn.EXCITATION, StartColumn.VARIANCE]].T
-        self._draws = list(zip(seeds.astype(int).tolist(), variances.tolist(), strict=True))
         self._states: dict[tuple[int, int], Array] = {}
         """By plant and step."""
         self._unusable: ModelFailure | None = None
 
     def actions(self, step: int) -> Array:
         """The actions of all environments in a step, (M, n_a)."""
-        n_a, limit = self._settings.n_a, self._settings.action_limit
-        return np.stack([excitation(s, step, n_a, v, limit) for s, v in self._draws])
+        settings = self._settings
+        return excitations(self._start.values, step, settings.n_a, settings.action_limit)
 
     def lacks(self, state: Frame) -> bool:
         """Whether the state is to be kept. Two different ones of a step make the episode unusable."""

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from controller_node.law import LAW, control, padded
 from loop_interfaces.jit.simd import whole_lanes
+from loop_interfaces.topics import StartColumn
 
 Array = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
@@ -164,6 +165,12 @@ class ProjectedLaw:
         actions: Array = np.empty(shape)
         control(self._plan, z, actions)
         return actions
+
+
+def excitations(rows: Array, step: int, n_a: int, action_limit: float = 0.0) -> Array:
+    """The exploratory actions of a step, (M, n_a); rows (M, 4) or (M, 5): of `episode/start`."""
+    drawn = rows[:, [StartColumn.EXCITATION, StartColumn.VARIANCE]].tolist()
+    return np.stack([excitation(int(s), step, n_a, v, action_limit) for s, v in drawn])
 
 
 def excitation(seed: int, step: int, n_a: int, variance: float, action_limit: float = 0.0) -> Array:

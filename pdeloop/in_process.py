@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller_node.identification import DesignSettings, design_each
-from controller_node.policy import ProjectedLaw, excitation
+from controller_node.policy import ProjectedLaw, excitations
 from loop_interfaces import model_rows
 from loop_interfaces.topics import CostColumn, StartColumn, noise_seeds
 from pde_sim_node.build import build_plant, fingerprint
@@ -102,9 +102,7 @@ class LocalPair:
             law.set(batch.policies, batch.rows[:, StartColumn.MODEL].astype(np.int64))
             return lambda k, states: law.actions(states)
         n_a, limit = self._settings.n_a, self._settings.action_limit
-        columns = batch.rows[:, [StartColumn.EXCITATION, StartColumn.VARIANCE]]
-        drawn = [(int(seed), float(variance)) for seed, variance in columns]
-        return lambda k, states: np.stack([excitation(s, k, n_a, v, limit) for s, v in drawn])
+        return lambda k, states: excitations(batch.rows, k, n_a, limit)
 
 
 def train(
