@@ -95,10 +95,11 @@ class DifferentialModel:
         return points
 
     def jacobians(self, z: Array, V: Array) -> Array:
-        """V^T (d step / dz) V, (T, r, r), at the states z (T, n_z); V (n_z, r) is orthonormal.
+        """About V^T (d step / dz) V, (T, r, r), at the states z (T, n_z); V (n_z, r) is orthonormal.
 
         The equation is linearised at z and projected; what it does in a sampling time is the
-        Runge-Kutta polynomial of its substeps.
+        Runge-Kutta polynomial of its substeps. So a front stays where it is in z: `transposed` follows
+        it.
         """
         n_z, rows = len(V), np.fft.rfft(V.T, axis=1)
         # V^T M_p, as correlations: the transform of the transpose is the conjugate. The quadratic part
@@ -117,6 +118,27 @@ class DifferentialModel:
             jacobians = jacobians @ jacobians
         return jacobians
 
+    def transposed(self, z: Array, a: Array, p: Array) -> tuple[Array, Array]:
+        """(d step / dz)^T p and (d step / da)^T p of vectors p (..., n_z), at z and a as in `step`.
+
+        The adjoint equation -dp/dt = M_1^T * p + 2 z (M_2^T * p), backwards along the field's path
+        with its substeps, in each of which z is its mean.
+        """
+        n_z, path = z.shape[-1], self.path(z, a)
+        h = 1.0 / (len(path) - 1)
+        # The transform of the transpose is the conjugate.
+        linear, quadratic = np.conj(self.symbols)
+        now = np.fft.rfft(p, axis=-1)
+        mean = np.zeros_like(now)
+        for start, end in zip(path[-2::-1], path[:0:-1], strict=True):
+            field, later = _finer(0.5 * (start + end), n_z), now
+            for divisor in (4.0, 3.0, 2.0, 1.0):
+                product = np.fft.rfft(field * _finer(quadratic * now, n_z), axis=-1)
+                now = later + h / divisor * (linear * now + product[..., : now.shape[-1]])
+            mean += 0.5 * h * (now + later)
+        own, on_way = (np.fft.irfft(values, n_z, axis=-1) for values in (now, mean))
+        return own, on_way @ self.B
+
     def _substeps(self, z: Array) -> int:
         linear, quadratic = np.abs(self.symbols)
         fastest = (linear + 2.0 * np.abs(z).max(initial=0.0) * quadratic).max()
@@ -124,7 +146,13 @@ class DifferentialModel:
 
 
 def fit_differential(z: Array, a: Array, after: Array) -> DifferentialModel:
-    """Fit the equation by least squares, every sample relative to how much changes in it.
+    """Fit the equation by weighted least squares.
+
+    A sample counts relative to how much changes in it, |z_{k+1} - z_k|, but those in which less changes
+    than in the mean of all relative to that mean: where the field rests, what is left is the error of
+    the integration. So the residuals e_k have the weights
+
+        sum_k (|e_k| / max(|z_{k+1} - z_k|, mean_j |z_{j+1} - z_j|))^2.
 
     z, a, after : (N, n_z), (N, n_a), (N, n_z) arrays with z_k, a_k and z_{k+1}, of any number of
     trajectories.
@@ -133,14 +161,15 @@ def fit_differential(z: Array, a: Array, after: Array) -> DifferentialModel:
     z, a, after = z[some], a[some], after[some]
     n_z = z.shape[1]
     before, end = np.fft.rfft(z, axis=1), np.fft.rfft(after, axis=1)
-    size = np.linalg.norm(after - z, axis=1)
+    change = np.linalg.norm(after - z, axis=1)
+    size = np.maximum(change, change.mean())
     model: DifferentialModel | None = None
     # A model that is unstable overflows: samples where it does are left out.
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(_PASSES):
             path = model.path(z, a) if model else [before] * (_INTERPOLATED + 1)
             missing = end - path[-1]
-            sound = np.isfinite(missing).all(axis=1) & (size > 0.0)
+            sound = np.isfinite(missing).all(axis=1) & (change > 0.0)
             root = 1.0 / size[sound, None]
             means = [0.0j * missing[sound] for _ in range(_DEGREE)]
             for j, point in enumerate(path):

@@ -28,12 +28,14 @@ import numpy as np
 from scipy import linalg
 
 from loop_interfaces.field_models import FieldModel
+from loop_interfaces.field_models.differential import DifferentialModel
 from tuner_node.optimizers.base import Array, Record
 from tuner_node.optimizers.sensitivity import ISOTROPY, Path, expand
 
-# Inner steps, and the share of the objective below which a further one is not worth its time.
+# Inner steps, and the share of the objective below which a further one is not worth its time: in few
+# coordinates the gradient is no better, while the adjoint one leads on where steps are small.
 _STEPS = 10
-_LEAST_GAIN = 1e-3
+_LEAST_GAIN, _LEAST_GAIN_ADJOINT = 1e-3, 1e-4
 # Damping of the inner steps: first, factor after a fall and after a rise, largest.
 _INNER = (1.0, 0.1, 10.0, 1e4)
 _WORST = 2.0
@@ -250,6 +252,7 @@ def improve(
         return simulation.cost + damping * float(np.sum((moved @ trust) * moved))
 
     value = objective(now, theta)
+    least = _LEAST_GAIN_ADJOINT if isinstance(model, DifferentialModel) else _LEAST_GAIN
     for _ in range(_STEPS):
         pull = 2.0 * damping * ((theta - start) @ trust)
         matrix = curvature + 2.0 * np.kron(np.eye(len(theta)), inner * region + damping * trust)
@@ -269,7 +272,7 @@ def improve(
         theta, now = candidate, simulation
         path.append(theta)
         inner *= fewer
-        if gain < _LEAST_GAIN * value:
+        if gain < least * value:
             break
         gradient, curvature, region = _expansion(loop, model, theta, now, V)
     return Improvement(theta, first.cost - now.cost, path)
@@ -278,7 +281,10 @@ def improve(
 def _expansion(
     loop: Loop, model: FieldModel, theta: Array, simulation: Simulation, V: Array
 ) -> tuple[Array, Array, Array]:
-    """Gradient, Gauss-Newton curvature, and r (F + isotropic part), averaged over the fields."""
+    """Gradient, Gauss-Newton curvature, and r (F + isotropic part), averaged over the fields.
+
+    The curvature and, but for a differential model, the gradient are those in the coordinates V.
+    """
     n_f = theta.shape[1]
     count = simulation.states.shape[1]
     gradient, curvature = np.zeros(theta.size), np.zeros((theta.size, theta.size))
@@ -303,5 +309,35 @@ def _expansion(
             gradient += expansion.gradient / count
             curvature += expansion.curvature / count
             energy += path.features.T @ path.features / (len(path.features) * count)
+        if isinstance(model, DifferentialModel):
+            gradient = adjoint_gradient(loop, model, theta, simulation)
     energy[np.diag_indices(n_f)] += ISOTROPY * np.trace(energy) / n_f
     return gradient, curvature, loop.action_weight * energy
+
+
+def adjoint_gradient(
+    loop: Loop, model: DifferentialModel, theta: Array, simulation: Simulation
+) -> Array:
+    """The gradient of the simulated cost in theta, in all coordinates.
+
+    With g_k the derivative of T J in a_k, and p_k that in z_k, p_T = 0,
+
+        g_k = 2 r a_k + (d step / da)^T p_{k+1},
+        p_k = 2 q (z_k - z_r) + (d step / dz)^T p_{k+1} + U K^T g_k.
+
+    Near the optimum of a loop with steep fronts the one in fewer coordinates is no descent any more.
+    """
+    K, (horizon, count) = theta[:, :-1], simulation.states.shape[:2]
+    noise = loop.noise_of(count)
+    gradient, p = np.zeros_like(theta), np.zeros_like(simulation.states[0])
+    for k in reversed(range(horizon)):
+        z, a = simulation.states[k], simulation.actions[k]
+        through, g = model.transposed(z, a, p)
+        g = g + 2.0 * loop.action_weight * a
+        if loop.action_limit:
+            g = g * (np.abs(a) < loop.action_limit)
+        gradient[:, :-1] += g.T @ (z @ loop.U + noise[k])
+        gradient[:, -1] += loop.one * g.sum(axis=0)
+        p = 2.0 * loop.state_weight * (z - loop.target) + through + g @ K @ loop.U.T
+    mean: Array = gradient.reshape(-1) / (horizon * count)
+    return mean
