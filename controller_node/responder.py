@@ -7,7 +7,7 @@ keeps nothing that the latched topics do not give it back after a restart, excep
 exploratory episode: if it missed some, it says so and the episode is run again.
 """
 
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -20,7 +20,7 @@ from controller_node.policy import ProjectedLaw
 from loop_interfaces import model_rows
 from loop_interfaces.episodes import episode_name
 from loop_interfaces.frames import KEPT_ARRAY, Frame, FrameError
-from loop_interfaces.protocol import Counters, ModelFailure, Publication
+from loop_interfaces.protocol import ModelFailure, Publication
 from loop_interfaces.signature import NOT_SIGNED, digest_of, signature
 from loop_interfaces.topics import ACTION, COMPLETED, MAX_GAIN, CostColumn, StartColumn, start_rows
 
@@ -97,7 +97,8 @@ class Responder:
         self._served = (-1, -1)
         """Run and plant of the last answer."""
         self._pending: Frame | None = None
-        self.counters = Counters()
+        self.counters: Counter[str] = Counter()
+        """Events, counted by name."""
         self.answered = 0
         self.episode = self.step = -1
         """Of the last answer."""

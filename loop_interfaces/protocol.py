@@ -8,7 +8,6 @@ time), messages come out, and the node's only job is to move them. So every faul
 from __future__ import annotations
 
 import json
-from collections import Counter
 from dataclasses import dataclass
 
 from loop_interfaces.frames import Frame
@@ -59,10 +58,3 @@ class ModelFailure:
             )
         except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
             raise ValueError(f"expected the JSON of a model failure, got {text[:80]!r}") from error
-
-
-class Counters(Counter[str]):
-    """Counts of messages that were dropped, late, repeated or foreign, by reason."""
-
-    def summary(self) -> str:
-        return ", ".join(f"{count} {reason}" for reason, count in sorted(self.items()))

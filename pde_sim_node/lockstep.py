@@ -25,6 +25,7 @@ wait for the plant.
 """
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
@@ -34,7 +35,7 @@ import numpy as np
 from loop_interfaces import topics
 from loop_interfaces.episodes import episode_name
 from loop_interfaces.frames import MAX_VALUES, Frame, FrameError, digest
-from loop_interfaces.protocol import Counters, Publication
+from loop_interfaces.protocol import Publication
 from loop_interfaces.samples import MAX_TIME
 from loop_interfaces.signature import signature
 from loop_interfaces.topics import VOID, CostColumn, StartColumn, Topic, noise_seeds, start_rows
@@ -101,7 +102,8 @@ class Lockstep:
         signed_run: int = 0,
     ) -> None:
         self.plant = plant
-        self.counters = Counters()
+        self.counters: Counter[str] = Counter()
+        """Events, counted by name."""
         self.run = 0
         self.episode = -1
         self.time = 0.0

@@ -21,6 +21,7 @@ part): an answer to an earlier tuner's episode is recognised.
 
 import itertools
 import math
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -29,7 +30,7 @@ from numpy.typing import ArrayLike, NDArray
 from loop_interfaces import topics
 from loop_interfaces.episodes import EPISODES_PER_START, episode_name
 from loop_interfaces.frames import Frame, FrameError
-from loop_interfaces.protocol import Counters, ModelFailure, Publication
+from loop_interfaces.protocol import ModelFailure, Publication
 from loop_interfaces.signature import digest_of
 from loop_interfaces.topics import START_COLUMNS, VOID, CostColumn, Topic
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult
@@ -84,7 +85,8 @@ class Dispatcher:
         self.max_attempts = max_attempts
         self.plant, self.action_limit, self.design = plant, action_limit, design
         self.pairs = [Pair(number) for number in range(pairs)]
-        self.counters = Counters()
+        self.counters: Counter[str] = Counter()
+        """Events, counted by name."""
         self.notes: list[str] = []
         """Why episodes were started again, in words."""
         self.sim_time = 0.0

@@ -22,8 +22,8 @@ def test_plant_and_controller_answer_with_the_bytes_of_the_ordinary_path(loop: P
 
 RESTLESS = """
 import gc, math, sys, time
+from collections import Counter
 from loop_interfaces.fast_path.handler import FastPath
-from loop_interfaces.protocol import Counters
 from loop_interfaces.ros.node_loop import NodeLoop
 from {0}.node import main
 interrupted, disarm, run = [], FastPath.disarm, NodeLoop.run
@@ -39,7 +39,7 @@ def counted(self):
     return count
 FastPath.disarm, NodeLoop.run = counted, restless
 code = main()
-counters = [found for found in gc.get_objects() if isinstance(found, Counters)]
+counters = [found for found in gc.get_objects() if isinstance(found, Counter)]
 repeated = sum(found["states repeated"] for found in counters)
 print("interrupted", len(interrupted), "times,", repeated, "repeated")
 sys.exit(code)
