@@ -12,6 +12,9 @@ from loop_interfaces.field_models.sensed import SensedModel, fit_sensed, grid_po
 from pdeloop.episode import rollout
 from tests.small import same_bits
 from tuner_node.optimizers import Context, GaussNewton, Rollout, RolloutResult, Trajectory
+from tuner_node.optimizers.base import Record
+from tuner_node.optimizers.proposals.sensed import SensedProposals
+from tuner_node.optimizers.simulation import Loop
 
 Array = np.ndarray
 SENSORS = 8
@@ -133,6 +136,17 @@ def test_readings_are_interpolated_by_the_lowest_wavenumbers() -> None:
     sensors = (np.arange(SENSORS) + 0.5) / SENSORS
     field = interpolated(np.cos(2 * np.pi * sensors) + 0.5)
     np.testing.assert_allclose(field, np.cos(2 * np.pi * np.arange(n) / n) + 0.5, atol=1e-12)
+
+
+def test_readings_that_no_equation_explains_make_no_proposal_and_no_start_of_the_next() -> None:
+    rng = np.random.default_rng(0)
+    states, actions = rng.standard_normal((2, 25, 4)), rng.standard_normal((2, 24, 2))
+    records = [Record(np.zeros((2, 8)), 1.0, *pair) for pair in zip(states, actions, strict=True)]
+    loop = Loop(np.eye(4), np.zeros(4), 1.0, 1.0, horizon=24, action_limit=0.0)
+    proposals = SensedProposals(loop, _equally_spaced(2), noise=0.0, largest_cost=np.inf)
+    with threadpool_limits(1):
+        assert proposals.propose(records, records[0].policy, damping=1.0) is None
+    assert not proposals.equation.any()
 
 
 def test_gauss_newton_controls_with_few_sensors_and_continues_with_the_same_bits() -> None:
