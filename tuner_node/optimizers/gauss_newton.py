@@ -273,8 +273,8 @@ class GaussNewton:
         ran = now.trials != _NONE
         trial = self._mean_cost(now.trials[ran])
         incumbent = self._mean_cost(now.incumbents[ran])
-        # Halved gains and the first law with sensors say nothing about the models.
-        from_model = now.fall > 0.0
+        # The first law with sensors says nothing about the models.
+        from_model = not self._sensors or now.fall > 0.0
         if self._sensors:
             lost = ran.sum() * trial >= ran.size * self._mean_cost(now.incumbents)
         else:
