@@ -19,12 +19,8 @@ Array = NDArray[np.float64]
 class Exploration:
     """The exploratory episode that a start begins.
 
-    Attributes
-    ----------
-    outcomes : dict
-        What came out of it, by plant; filled in by the responder.
-    nbytes : int
-        Size of the states that are kept, and of what keeps them.
+    outcomes: what came out of it, by plant, filled in by the responder; nbytes: size of the states
+    that are kept, and of what keeps them.
     """
 
     def __init__(self, start: Frame, settings: DesignSettings) -> None:

@@ -174,21 +174,10 @@ def excitations(rows: Array, step: int, n_a: int, action_limit: float = 0.0) -> 
 
 
 def excitation(seed: int, step: int, n_a: int, variance: float, action_limit: float = 0.0) -> Array:
-    """The exploratory action of one step, drawn from N(0, variance I).
+    """The exploratory action (n_a,) of one step, drawn from N(0, variance I) and saturated.
 
     A pure function of (seed, step), so that a step that is answered twice gets the same action
     twice.
-
-    Parameters
-    ----------
-    seed, step : int
-        Not negative.
-    n_a : int
-        Number of actuators.
-    variance : float
-        Variance of every entry, not its standard deviation.
-    action_limit : float
-        Magnitude at which an entry saturates; 0 for none.
     """
     if seed < 0 or step < 0 or n_a < 1:
         raise ValueError(

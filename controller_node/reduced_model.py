@@ -89,12 +89,8 @@ class ReducedModel:
 class Steps:
     """The steps of one or more trajectories, a row each.
 
-    Attributes
-    ----------
-    before, after : (N, n_z) arrays
-        z_k and z_{k+1}: the transposes of Z and Z'.
-    inputs : (N, n_a) array
-        a_k: the transpose of Y.
+    before, after (N, n_z): z_k and z_{k+1}, the transposes of Z and Z'; inputs (N, n_a): a_k, that
+    of Y.
     """
 
     before: Array
@@ -105,10 +101,7 @@ class Steps:
 def steps_of(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> Steps:
     """The steps of trajectories (states (N + 1, n_z), actions (N, n_a)) of one plant, pooled.
 
-    Raises
-    ------
-    ValueError
-        Shapes that do not fit, NaN or infinity.
+    ValueError for shapes that do not fit, NaN and infinity.
     """
     befores, afters, inputs = [], [], []
     for trajectory in trajectories:

@@ -36,14 +36,8 @@ a run that has no room alone is refused, and an exploratory episode without room
 class Answering:
     """What answers the states of an episode of a plant: made with its first one.
 
-    Attributes
-    ----------
-    plant, episode : int
-        Whose states.
-    law : ProjectedLaw or None
-        None where the controller explores.
-    signature : float
-        What the actions carry, see loop_interfaces.signature.
+    law: None where the controller explores; signature: what the actions carry, see
+    loop_interfaces.signature.
     """
 
     plant: int
@@ -137,12 +131,8 @@ class Responder:
     def start(self, frame: Frame) -> Sequence[Publication | ModelFailure]:
         """Take the start of an episode: whether it explores, and which model each environment uses.
 
-        Repeated, it is answered with what came out of an exploration.
-
-        Raises
-        ------
-        FrameError
-            Its rows are none of a start, or there is no room for another run.
+        Repeated, it is answered with what came out of an exploration. FrameError for rows that are
+        none of a start, and where there is no room for another run.
         """
         rows = start_rows(frame)
         if not len(rows):
@@ -161,10 +151,8 @@ class Responder:
     def policy(self, frame: Frame) -> list[Publication | ModelFailure]:
         """Take the policies [K_a K_b] of an episode's environments, (M, n_a, 2 n_s).
 
-        Raises
-        ------
-        FrameError
-            Of another number of actuators, beyond MAX_GAIN, or other ones than came before.
+        FrameError for another number of actuators, gains beyond MAX_GAIN, or other ones than came
+        before.
         """
         n_a = self._settings.n_a
         if frame.values.shape[1] != n_a:
@@ -197,14 +185,10 @@ class Responder:
     def state(self, frame: Frame) -> list[Publication | ModelFailure]:
         """Answer the states of an episode's environments, (M, n_z).
 
-        They are kept while something that the answer needs has not come, but not two different ones of
-        one step. A second, different state of an exploratory episode takes back the models that came
-        of the first.
-
-        Raises
-        ------
-        ValueError
-            The state does not fit the start, or the policies and models do not fit it.
+        They are kept while something that the answer needs has not come, but not two different ones
+        of one step. A second, different state of an exploratory episode takes back the models that
+        came of the first. ValueError for a state that does not fit the start, and policies or
+        models that do not fit it.
         """
         answering = self._answering(frame)
         taken_back: list[ModelFailure] = []
@@ -252,10 +236,7 @@ class Responder:
     def cost(self, frame: Frame) -> list[Publication | ModelFailure]:
         """Take the end of an episode; of an exploratory one give the models, or why there are none.
 
-        Raises
-        ------
-        FrameError
-            The costs are not of the episode's shape.
+        FrameError for costs that are not of the episode's shape.
         """
         self._ended = (frame.run, frame.episode)
         if frame.values.shape[1] == len(CostColumn) and len(frame.values):

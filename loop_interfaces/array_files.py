@@ -17,13 +17,7 @@ Arrays = Mapping[str, NDArray[Any]]
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of the npz file `path`.
-
-    Raises
-    ------
-    FileError
-        It cannot be read, holds no arrays, objects, or more than MAX_ARRAY_BYTES.
-    """
+    """The arrays of an npz file. FileError for none, objects, or more than MAX_ARRAY_BYTES."""
     try:
         with open_ordinary(path) as file:
             return unpack_arrays(file, MAX_ARRAY_BYTES)

@@ -23,12 +23,8 @@ class FileError(ValueError):
 def write_atomically(path: Path, *content: bytes | memoryview) -> None:
     """Replace `path` by `content`, so that a crash at any moment leaves the old or the new file.
 
-    The content is on the disk before the name points to it, and the name before this returns.
-
-    Raises
-    ------
-    OSError
-        A full or broken disk, or no permission; at `path` is the old file or the new one.
+    The content is on the disk before the name points to it, and the name before this returns. After
+    an OSError, of a full disk or no permission, the old or the new file is there.
     """
     write_part(path, *content).replace(path)
     sync_folder(path.parent)
@@ -86,12 +82,7 @@ def make_own_folder(path: Path) -> None:
 def private_folder(path: Path) -> None:
     """Make `path` a folder that only this user can look into and write to.
 
-    Raises
-    ------
-    FileError
-        Something else is there: a link, a file, or a folder of another user.
-    OSError
-        It cannot be made.
+    FileError where something else is there: a link, a file, or a folder of another user.
     """
     try:
         path.mkdir(mode=0o700)

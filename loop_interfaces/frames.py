@@ -47,16 +47,8 @@ class FrameError(ValueError):
 class Frame:
     """One array of the loop with its header. Never changed once it is made: take `replace`.
 
-    (Not declared frozen, which makes a frame four times as slow to make, and every round makes four.)
-
-    Attributes
-    ----------
-    run, episode, step, plant : int
-        In [0, 2^53).
-    time : float
-        Simulated time in s, or a signature.
-    values : array
-        float64, one axis for each label of its topic.
+    (Not declared frozen, which makes a frame four times as slow to make, and every round makes
+    four.) time: simulated, in s, or a signature; values: one axis for each label of the topic.
     """
 
     run: int
@@ -87,15 +79,8 @@ class _Layout:
 
 
 class ArrayCodec:
-    """Encodes and decodes the arrays of one topic.
+    """Encodes and decodes the arrays of one topic; labels: the names of the axes, in order.
 
-    Parameters
-    ----------
-    labels : tuple of str
-        The names of the axes, in order (`layout.dim[i].label`).
-
-    Examples
-    --------
     >>> codec = ArrayCodec(("env", "actuator"))
     >>> raw = codec.encode(Frame(run=7, episode=1, step=0, time=0.5, values=np.ones((1, 2))))
     >>> frame = codec.decode(raw)
@@ -136,11 +121,8 @@ class ArrayCodec:
     def decode(self, raw: bytes) -> Frame:
         """The frame in the CDR bytes `raw`; its values are a view of them.
 
-        Raises
-        ------
-        FrameError
-            The bytes are no Float64MultiArray of these axes, an id is not a whole number in [0, 2^53),
-            or a number is NaN or infinite.
+        FrameError for bytes that are no Float64MultiArray of these axes, an id that is not a whole
+        number in [0, 2^53), and NaN or infinity.
         """
         layout = self._last
         # A peer of ours sends the same prefix each time; ordinary message objects leave padding

@@ -26,13 +26,7 @@ Array = NDArray[np.float64]
 class ModelRows:
     """A reduced model, its warm-start gains and its target.
 
-    Attributes
-    ----------
-    A : (n_s, n_s) array
-    B : (n_s, n_a) array
-    U : (n_z, n_s) array
-    K_a, K_b : (n_a, n_s) arrays
-    s_r : (n_s,) array
+    A (n_s, n_s), B (n_s, n_a), U (n_z, n_s), K_a and K_b (n_a, n_s), s_r (n_s,).
     """
 
     A: Array
@@ -54,15 +48,8 @@ def pack(model: ModelRows) -> Array:
 
 
 def unpack(rows: Array, n_a: int) -> ModelRows:
-    """The model in `rows`.
+    """The model in `rows`. ValueError where their number leaves no room for U.
 
-    Raises
-    ------
-    ValueError
-        The number of rows leaves no room for U.
-
-    Examples
-    --------
     >>> gains = np.ones((1, 2))
     >>> model = ModelRows(np.eye(2), np.ones((2, 1)), np.eye(4)[:, :2], gains, gains, np.ones(2))
     >>> pack(model).shape, unpack(pack(model), n_a=1).U.shape

@@ -16,16 +16,9 @@ from loop_interfaces.frames import Frame, FrameError
 
 @dataclass(frozen=True)
 class Topic:
-    """One topic of arrays.
+    """One topic of arrays: its relative name, and the names of its axes.
 
-    Attributes
-    ----------
-    name : str
-        Relative topic name.
-    labels : tuple of str
-        Names of the axes.
-    latched : bool
-        Transient local: a node that starts late or again receives the last message.
+    latched: transient local, so that a node that starts late or again receives the last message.
     """
 
     name: str
@@ -64,10 +57,8 @@ _WHOLE_NUMBERS = {
 def start_rows(frame: Frame) -> NDArray[np.float64]:
     """The rows of an `episode/start`, (M, 4) or (M, 5); none at the end of a run.
 
-    Raises
-    ------
-    FrameError
-        They are not as StartColumn says, or some environments of the episode explore and others do not.
+    FrameError where they are not as StartColumn says, or only some environments of the episode
+    explore.
     """
     rows = frame.values
     if rows.shape[1] not in (START_COLUMNS, len(StartColumn)):

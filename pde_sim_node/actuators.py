@@ -19,28 +19,9 @@ def actuator_supports(
     shape: str,
     positions: Sequence[float],
 ) -> NDArray[np.float64]:
-    """Phi_j(x_i), (n_x, n_a).
+    """Phi_j(x_i), (n_x, n_a), at the grid points x (n_x,); the arguments are those of `Plant`.
 
-    Parameters
-    ----------
-    equation
-        The PDE.
-    x
-        Grid points, (n_x,).
-    n_a
-        Number of actuators.
-    width
-        Of one actuator, as a fraction of the domain.
-    shape
-        "equation", "indicator" or "gaussian", see `Plant`.
-    positions
-        Centres of the actuators as fractions of the domain; none: equally spaced, or as the equation
-        has them.
-
-    Raises
-    ------
-    ValueError
-        They do not fit each other or the equation.
+    ValueError where they do not fit each other or the equation.
     """
     if shape not in ("equation", "indicator", "gaussian"):
         raise ValueError(f"actuator_shape must be equation, indicator or gaussian, got {shape!r}")

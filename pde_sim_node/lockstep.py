@@ -77,19 +77,11 @@ class Timing:
 
 
 class Lockstep:
-    """One plant serving the episodes of one run at a time.
+    """One plant serving the episodes of one run at a time. `now` is any monotonic time in s.
 
-    Parameters
-    ----------
-    plant : Plant
-        What is stepped.
-    timing : Timing
-        See there. `now` is any monotonic time in s.
-    fingerprint : int
-        Of the plant's parameters, see build.fingerprint.
-    paused_run, signed_run : int
-        The runs in which this plant was paused, and had a controller that signs, when its process
-        ended; 0: none.
+    fingerprint: of the plant's parameters, see build.fingerprint; paused_run, signed_run: the runs
+    in which this plant was paused, and had a controller that signs, when its process ended; 0:
+    none.
     """
 
     def __init__(

@@ -57,19 +57,7 @@ class Noise(IntEnum):
 def standard_normal(
     noise_seed: int, field_seed: int, step: int, kind: Noise, size: int
 ) -> NDArray[np.float64]:
-    """Independent numbers from N(0, 1): a pure function of the arguments.
-
-    Parameters
-    ----------
-    noise_seed, step : int
-        Not negative.
-    field_seed : int
-        At least -1.
-    kind : Noise
-        What they are for.
-    size : int
-        How many.
-    """
+    """Independent numbers from N(0, 1): a pure function of the arguments; field_seed may be -1."""
     key = np.array([noise_seed, field_seed + 1], dtype=np.uint64)
     # The draws of one call count in the low words: no two calls ever share a counter.
     counter = np.array([0, 0, step, int(kind)], dtype=np.uint64)
@@ -79,25 +67,12 @@ def standard_normal(
 
 
 class InstrumentedPlant(Plant):
-    """A plant behind its instruments.
+    """A plant behind its instruments; grid: the other parameters of `Plant`.
 
     As `Plant`, but `reset` and `step` return what is measured, `target` is the target of that, and
     actions saturate. `states` are the true fields. An environment is forced only after a step that
-    did not diverge, and it has diverged, too, if the forcing takes it beyond the bound.
-
-    Parameters
-    ----------
-    equation
-        The PDE.
-    instruments
-        What stands between the field and the controller.
-    grid
-        The other parameters of `Plant`.
-
-    Raises
-    ------
-    ValueError
-        More sensors than grid points, more delays than steps, or what `Plant` raises.
+    did not diverge, and it has diverged, too, if the forcing takes it beyond the bound. ValueError
+    for more sensors than grid points, and more delays than steps.
     """
 
     def __init__(self, equation: Equation, *, instruments: Instruments, **grid: Any) -> None:

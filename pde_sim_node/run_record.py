@@ -17,13 +17,7 @@ FOLDER = Path(tempfile.gettempdir()) / f"pdeloop-plants-{os.getuid()}"
 class RunRecord:
     """The runs in which a plant is paused, and has a controller that signs; 0 for none.
 
-    Parameters
-    ----------
-    name : str
-        Full name of its node.
-    domain : int
-    folder : Path
-        Made when it is needed, for this user alone.
+    name: full name of the plant's node; folder: made when it is needed, for this user alone.
     """
 
     def __init__(self, name: str, domain: int, folder: Path = FOLDER) -> None:

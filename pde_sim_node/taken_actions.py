@@ -27,18 +27,10 @@ REMEMBERED = 16
 
 @dataclass
 class Episode:
-    """What is remembered of an episode.
+    """What is remembered of an episode: the rows of its start, and of its actions what follows.
 
-    Attributes
-    ----------
-    rows : array
-        Of its start.
-    signature : float
-        What its actions carry if the controller signs.
-    taken : list of int
-        A digest of the action that was taken at each step.
-    cost : Frame or None
-        What it came to, once it has ended.
+    signature: what they carry if the controller signs; taken: a digest of the one that was taken at
+    each step; cost: what they came to, once it has ended.
     """
 
     rows: np.ndarray
@@ -81,10 +73,7 @@ class TakenActions:
     def contradiction(self, action: Frame) -> str:
         """Why the episode cannot be relied on any more, as this action of it has come; else empty.
 
-        Raises
-        ------
-        FrameError
-            The run's controller signs, and the action is not signed for this episode.
+        FrameError where the run's controller signs, and the action is not signed for this episode.
         """
         if not self.is_signed(action):
             if self.signs is False:

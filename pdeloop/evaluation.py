@@ -32,24 +32,9 @@ def evaluate(
 ) -> dict[str, Array]:
     """Costs of no control, LQT and the adapted policy of a run, with the built-in plant and law.
 
-    Parameters
-    ----------
-    run : FinishedRun
-        Whose policies and models they are.
-    fields, seed : int
-        How many initial fields are drawn, from which seed.
-    mean_field : bool
-        Use the mean of the initial distribution instead.
-
-    Returns
-    -------
-    dict of (training seeds, fields) array
-        Mean stage costs by controller: none, lqt, adapted.
-
-    Raises
-    ------
-    ValueError
-        The run had another plant or law, or its equation is code that is not allowed.
+    The fields are drawn from the seed, or it is the mean one of their distribution. Returns mean
+    stage costs (training seeds, fields) by controller. ValueError where the run had another plant
+    or law, or its equation is code that is not allowed.
     """
     build_equation(run.values)  # refuses code that the user has not named
     if reason := another_loop(run):
@@ -59,14 +44,9 @@ def evaluate(
 
 
 def another_loop(run: FinishedRun) -> str:
-    """Whether a run's costs are those of the built-in plant and law.
+    """Why a run's costs are not those of the built-in plant and law, in words; empty if they are.
 
     The closing evaluation is computed again for that, for its first seed.
-
-    Returns
-    -------
-    str
-        That they are not, in words with the costs; empty if they are.
     """
     try:
         pair = _pair(run)

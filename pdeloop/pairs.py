@@ -26,19 +26,10 @@ PAIRS = Spec("pairs", 1, 1, MAX_PAIRS).means("plants with a controller each")
 
 @dataclass(frozen=True)
 class LoopNode:
-    """A node of a run.
+    """A node of a run: name of its process, package, and parameters beside those of the problem.
 
-    Attributes
-    ----------
-    name : str
-        Of its process.
-    package : str
-    parameters : dict
-        Beside those of the problem.
-    namespace : str
-        Relative to that of the run; empty: the run's own.
-    cores : sequence of int
-        The cores that all its threads may use; empty: any.
+    namespace: relative to that of the run, empty: the run's own; cores: those that all its threads
+    may use, empty: any.
     """
 
     name: str
@@ -113,18 +104,8 @@ def pair_nodes(cores: Sequence[int | None]) -> list[LoopNode]:
 class Transport:
     """How a training is carried out; nothing of this changes its results.
 
-    Attributes
-    ----------
-    in_process : bool
-        Without ROS.
-    recorder : {"none", "start", "required"}
-        Whether it is recorded, as the tuner's parameter says it.
-    network : bool
-        Let the messages leave this machine.
-    pairs : int
-        Of plant and controller.
-    view : bool
-        With a viewer_node of the first pair.
+    in_process: without ROS; recorder: as the tuner's parameter says it; network: let the messages
+    leave this machine; pairs: of plant and controller; view: with a viewer_node of the first pair.
     """
 
     in_process: bool = False

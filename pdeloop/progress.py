@@ -14,18 +14,10 @@ PERIOD = 5.0
 
 
 class Progress:
-    """Shows how much of a task is done.
+    """Shows how much of a task is done; title, unit: a word for the task, and for what is counted.
 
-    On a terminal a bar, which leaves no trace. Elsewhere a line for every tenth of the work, and for
-    the first news after some seconds without one; what was said already is no news.
-
-    Parameters
-    ----------
-    console : Console
-    title : str
-        A word for the task.
-    unit : str
-        What is counted.
+    On a terminal a bar, which leaves no trace. Elsewhere a line for every tenth of the work, and
+    for the first news after some seconds without one; what was said already is no news.
     """
 
     def __init__(self, console: Console, title: str, unit: str) -> None:

@@ -28,11 +28,6 @@ def study_of(problems: Sequence[str], options: Mapping[str, Any]) -> Study:
 
     The paper counts iterations of two rollouts each, after exploration and check; Gauss-Newton has
     that many rollouts with exploration and check.
-
-    Raises
-    ------
-    StudyError
-        A problem is not there, or two have the same name.
     """
     rest = {**DEFAULTS, **options}
     first, seeds, iterations = (rest.pop(name) for name in ("seed", "seeds", "iterations"))
@@ -54,13 +49,7 @@ def study_of(problems: Sequence[str], options: Mapping[str, Any]) -> Study:
 
 
 def reproduction_in(folder: Path) -> Study | None:
-    """The reproduction in `folder`; None if it holds something else.
-
-    Raises
-    ------
-    StudyError
-        The study there cannot be read.
-    """
+    """The reproduction in `folder`; None if it holds something else."""
     if not (folder / ASKED).exists():
         return None
     study = kept(folder)

@@ -40,16 +40,9 @@ class NodeError(RuntimeError):
 class Child:
     """One node: how it is started and how its life went.
 
-    Attributes
-    ----------
-    command : function
-        Gives the words of its command; called before each start.
-    optional : bool
-        The others go on without it when it ends by itself, or dies too often.
-    cores : sequence of int
-        The cores that it may use; empty: any.
-    ended : bool
-        It is optional, and has ended for good.
+    command: gives its words, before each start; optional: the others go on without it when it ends
+    by itself, or dies too often; cores: those that it may use, empty: any; ended: it is optional,
+    and has ended for good.
     """
 
     name: str

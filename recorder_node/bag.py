@@ -73,20 +73,7 @@ def _jazzy() -> Any:
 
 
 class BagWriter:
-    """Writes one bag.
-
-    Parameters
-    ----------
-    path : Path
-        A new folder.
-    channels : iterable of Channel
-        The topics to be written.
-
-    Raises
-    ------
-    BagError
-        By every method, when the folder is there already or the disk refuses.
-    """
+    """Writes one bag into a new folder. BagError where it is there already or the disk refuses."""
 
     def __init__(self, path: Path, channels: Iterable[Channel]) -> None:
         if path.exists():

@@ -22,20 +22,7 @@ PARAMETERS = "parameters.json"
 
 
 class Recording(BagWriter):
-    """A bag of the messages that `take` is given, with the nodes' parameters beside it.
-
-    Parameters
-    ----------
-    path : Path
-        A new folder.
-    what : sequence of Source
-        The topics to be recorded.
-
-    Raises
-    ------
-    BagError
-        By every method, when the folder is there already or the disk refuses.
-    """
+    """A bag of the messages that `take` is given, with the nodes' parameters beside it."""
 
     def __init__(self, path: Path, what: Sequence[Source]) -> None:
         super().__init__(path, [source.channel for source in what])

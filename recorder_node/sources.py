@@ -17,16 +17,10 @@ _NAMES = sorted([*(topic.name for topic in ARRAYS), MODEL_FAILED], key=len, reve
 
 @dataclass(frozen=True)
 class Source:
-    """A topic that is recorded.
+    """A topic that is recorded: what it is in the bag, and its entry in loop_interfaces.topics.
 
-    Attributes
-    ----------
-    channel : Channel
-        What it is in the bag.
-    array : Topic or None
-        Its entry in loop_interfaces.topics; None for a topic without arrays.
-    namespace : str
-        That of its pair; '' for what belongs to no pair.
+    array: None for a topic without arrays; namespace: that of its pair, '' for what belongs to no
+    pair.
     """
 
     channel: Channel
@@ -59,8 +53,6 @@ def sources(namespace: str) -> list[Source]:
 def source_of(name: str) -> Source | None:
     """The topic of a pair with this full `name`; None for any other topic.
 
-    Examples
-    --------
     >>> found = source_of("/left/episode/cost")
     >>> found.namespace, found.array.name
     ('/left', 'episode/cost')

@@ -20,14 +20,9 @@ UNKNOWN_PLANT = -1
 class Batch:
     """Rollouts wanted together; any split into episodes gives the same results.
 
-    Attributes
-    ----------
-    rows : (R, 4) array, or (R, 5) with noise
-        The columns of `episode/start`.
-    policies : (R, n_a, 2 n_s) array, or None
-        None for an exploratory batch, whose result is a model for each row.
-    trajectories : bool
-        Whether the result must have the trajectories.
+    rows (R, 4), or (R, 5) with noise: the columns of `episode/start`; policies (R, n_a, 2 n_s),
+    None for an exploratory batch, whose result is a model for each row; trajectories: whether the
+    result has them.
     """
 
     rows: Array
@@ -41,18 +36,10 @@ class Batch:
 
 @dataclass(frozen=True)
 class BatchResult:
-    """Results of a batch.
+    """Results of a batch of R rollouts.
 
-    Attributes
-    ----------
-    costs : (R, 3) array
-        As CostColumn says.
-    models : (R, rows, n_s) array, or None
-        After an exploration.
-    plant : int
-        Fingerprint of the plant.
-    trajectories, target
-        Where the batch asked for trajectories; target : (n_z,) array.
+    costs (R, 3): as CostColumn says; models (R, rows, n_s): after an exploration; plant: its
+    fingerprint; trajectories and target (n_z,): where the batch asked for trajectories.
     """
 
     costs: Array

@@ -23,18 +23,9 @@ Counts = NDArray[np.int64]
 class Budget:
     """Rollouts of several seeds.
 
-    Parameters
-    ----------
-    seeds : int
-        S, how many there are.
-    rollouts : int
-        What each of them may pay before the closing evaluation; 0: `adaptation` besides what its
-        explorations and checks take.
-    adaptation : int
-        Rollouts of the adaptation, where `rollouts` is 0.
+    rollouts: what each seed may pay before the closing evaluation; 0: `adaptation` besides what its
+    explorations and checks take.
 
-    Examples
-    --------
     >>> budget = Budget(seeds=2, rollouts=80)
     >>> budget.count("identify", [0, 1])
     >>> budget.count("identify", [1])

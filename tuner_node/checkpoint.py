@@ -31,10 +31,7 @@ def previous(path: Path) -> Path:
 def save(path: Path, arrays: Arrays) -> None:
     """Write a checkpoint and keep the one before.
 
-    Raises
-    ------
-    OSError
-        A full or broken disk; the one before is then at `path`, or at `previous(path)`.
+    After an OSError, of a full or broken disk, the one before is at `path`, or at `previous(path)`.
     """
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)  # type: ignore[arg-type]
@@ -47,22 +44,11 @@ def save(path: Path, arrays: Arrays) -> None:
 
 
 def restore(path: Path, take: Callable[[dict[str, NDArray[Any]]], None]) -> tuple[bool, list[str]]:
-    """Call `take` with the newest usable checkpoint.
+    """Call `take` with the newest usable checkpoint: that at `path`, or the one before it.
 
-    Parameters
-    ----------
-    path : Path
-        The checkpoint; the one before it is tried after it, and an unfinished one is ignored.
-    take : callable
-        Goes on from the arrays, or raises ValueError where it cannot, having changed nothing.
-
-    Returns
-    -------
-    found : bool
-        Whether there was a usable one.
-    passed_over : list of str
-        A sentence for each that was not usable. It is set aside as `NAME.damaged`, so that the next
-        `save` does not take it for the checkpoint to keep.
+    take: goes on from the arrays, or raises ValueError where it cannot, having changed nothing.
+    Returns whether there was a usable one, and a sentence for each that was not. Those are set
+    aside as `NAME.damaged`, so that the next `save` does not take them for the checkpoint to keep.
     """
     passed_over: list[str] = []
     for candidate in (path, previous(path)):

@@ -50,20 +50,11 @@ PAUSE_LEASE = 10.0
 class Dispatcher:
     """Serves one batch at a time. `now` is any monotonic time in s.
 
-    Parameters
-    ----------
-    run, incarnation : int
-        Id of the run, in every message; starts of its tuner so far.
-    n_a, pairs : int
-        Numbers of actuators and of pairs.
-    max_batch, episode_timeout, max_attempts
-        See loop_interfaces.parameters.TUNER; they may be set later.
-    plant : int
-        Fingerprint of the plant that this run is about; that of the first cost, if not known.
-    action_limit : float
-        Magnitude at which actions saturate; 0: none.
-    design : int
-        Digest of how the run's models are identified, see loop_interfaces.signature; 0: not known.
+    run, incarnation: id of the run, in every message, and starts of its tuner so far; pairs: how
+    many; max_batch, episode_timeout, max_attempts: see loop_interfaces.parameters.TUNER, they may
+    be set later; plant: fingerprint of the one that this run is about, that of the first cost if
+    not known; design: digest of how the run's models are identified, see loop_interfaces.signature,
+    0: not known.
     """
 
     def __init__(
@@ -225,10 +216,8 @@ class Dispatcher:
     def model(self, pair: int, frame: Frame, now: float) -> list[PairPublication]:
         """Take the reduced models of an exploratory episode.
 
-        Raises
-        ------
-        FrameError
-            They are of another shape or plant, or signed by a controller with other parameters.
+        FrameError for another shape or plant, and the signature of a controller with other
+        parameters.
         """
         if frame.run == self.run and self.design:
             self.pairs[pair].check_signature(frame, self.design)

@@ -18,39 +18,16 @@ def least_variance(
 
         var = 2 sigma^2 / (accuracy^2 N dt^2 w n_z)
 
-    One input of size 1 moves the w n_z grid points of its actuator by dt in one step, so that a column
-    of B has the squared norm dt^2 w n_z. In orthonormal coordinates the residual of the regression
-    has the variance 2 sigma^2, of the noise before and after the step, where the plant keeps most of
-    its state over a step; N white inputs of variance var then give every entry of B the variance
-    2 sigma^2 / (N var).
+    One input of size 1 moves the w n_z grid points of its actuator by dt in one step, so that a
+    column of B has the squared norm dt^2 w n_z. In orthonormal coordinates the residual of the
+    regression has the variance 2 sigma^2, of the noise before and after the step, where the plant
+    keeps most of its state over a step; N white inputs of variance var then give every entry of B
+    the variance 2 sigma^2 / (N var). Ljung, "System Identification: Theory for the User", 2nd ed.,
+    chapter 9.
 
-    Parameters
-    ----------
-    noise : float
-        sigma, standard deviation of the noise on every number of the state.
-    steps : int
-        N, steps of the exploratory episode.
-    sample_time : float
-        dt in s.
-    width : float
-        w, width of an actuator as a share of the domain.
-    n_z : int
-        Grid points.
-    accuracy : float
-        Wanted standard error of an entry of B, relative to the norm of its column.
+    noise: sigma, standard deviation of the noise on every number of the state; width: w, that of an
+    actuator as a share of the domain.
 
-    Returns
-    -------
-    float
-        0 without noise.
-
-    References
-    ----------
-    Ljung, "System Identification: Theory for the User", 2nd ed., chapter 9 (covariance of least
-    squares).
-
-    Examples
-    --------
     >>> round(least_variance(noise=0.03, steps=80, sample_time=0.01, width=0.05, n_z=256), 3)
     8.681
     """

@@ -13,16 +13,9 @@ _TOGETHER = ("designed", "checked", "evaluated")
 
 
 class Narration:
-    """Sentences for the rows of progress.jsonl.
+    """Sentences for the rows of progress.jsonl, of so many seeds from the first, `seed`, on.
 
     Of several seeds mean and range are shown, in one line for all of them.
-
-    Parameters
-    ----------
-    seed : int
-        The first of them.
-    seeds : int
-        How many there are.
     """
 
     def __init__(self, seed: int, seeds: int) -> None:

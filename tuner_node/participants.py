@@ -16,14 +16,8 @@ SECOND_TUNER_GRACE = 6.0
 class Publishers:
     """How many publishers there are of the topics that tell who is there.
 
-    Attributes
-    ----------
-    plants, controllers : sequence of int
-        Of `episode/cost` and `model/identified`, by pair.
-    tuners : dict of str to int
-        Of each `episode/start`, this tuner's own among them.
-    recorders : int
-        Of `recorder/status`.
+    plants, controllers: of `episode/cost` and `model/identified`, by pair; tuners: of each
+    `episode/start`, this tuner's own among them; recorders: of `recorder/status`.
     """
 
     plants: Sequence[int]
@@ -35,10 +29,7 @@ class Publishers:
 class Participants:
     """Reports to a session's dispatcher who is missing, and refuses who should not be there.
 
-    Parameters
-    ----------
-    recorder : {"none", "start", "required"}
-        As the tuner's parameter of this name.
+    recorder: the tuner's parameter of this name.
     """
 
     def __init__(self, session: Session, recorder: str) -> None:
@@ -50,10 +41,7 @@ class Participants:
     def update(self, there: Publishers, now: float) -> list[PairPublication]:
         """What is to be sent, now that these publishers are there (now: monotonic s).
 
-        Raises
-        ------
-        DispatchError
-            The recording is required and its recorder has gone, or another tuner publishes.
+        DispatchError where a required recorder has gone, or another tuner publishes.
         """
         self._refuse_second_tuner(there.tuners, now)
         absent = ["recorder"] if self._awaits_recorder(there.recorders > 0) else []

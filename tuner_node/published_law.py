@@ -19,21 +19,9 @@ def check_law(
     seen: Sequence[Trajectory | None],
     action_limit: float = 0.0,
 ) -> None:
-    """See that a_k = K_a U^T z_k + K_b s_r all along in rollouts of one model.
+    """See that a_k = K_a U^T z_k + K_b s_r all along in rollouts of one model; a ValueError if not.
 
-    Parameters
-    ----------
-    asked, seen : sequences of Rollout and Trajectory
-        The policies [K_a K_b], and what was measured under them.
-    model : ModelRows
-        Its U and s_r.
-    action_limit : float
-        Magnitude at which an action saturates; 0: none.
-
-    Raises
-    ------
-    ValueError
-        The actions are others; the text says what to do.
+    asked, seen: the policies, and what was measured under them; action_limit: 0: none.
     """
     for rollout, trajectory in zip(asked, seen, strict=True):
         assert trajectory is not None

@@ -193,10 +193,7 @@ class RunFolder:
     def policies(self) -> dict[str, NDArray[Any]]:
         """The arrays of policy.npz: `policy`, `lqt`, `model`.
 
-        Raises
-        ------
-        RunFolderError
-            They cannot be read, or are not those of a run with these parameters.
+        RunFolderError where they cannot be read, or are not those of a run with these parameters.
         """
         path = self.path / "policy.npz"
         if not path.exists():
@@ -224,13 +221,7 @@ class RunFolder:
             ) from error
 
     def result(self) -> dict[str, Any]:
-        """The content of result.json.
-
-        Raises
-        ------
-        RunFolderError
-            It cannot be read, or is not that of a run with these parameters.
-        """
+        """The content of result.json. RunFolderError unless it is that of this run."""
         path = self.path / "result.json"
         values = self.values()
         try:

@@ -51,13 +51,7 @@ def arrays_of(training: Training) -> Arrays:
 
 
 def restore(training: Training, arrays: Arrays) -> None:
-    """Continue from `arrays_of`.
-
-    Raises
-    ------
-    ValueError
-        Those are not the arrays of a training with these settings; nothing has changed.
-    """
+    """Continue from `arrays_of`. ValueError, and nothing changed, if those are of another training."""
     restored = Training(training.settings, training.make_optimizer)
     try:
         _fill(restored, arrays)

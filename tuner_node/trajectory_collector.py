@@ -37,13 +37,7 @@ class TrajectoryCollector:
     )
 
     def take(self, what: str, frame: Frame) -> None:
-        """Take a sample z_k ("states") or a_k ("actions"); repeated ones are equal.
-
-        Raises
-        ------
-        FrameError
-            There is no room for it.
-        """
+        """Take a sample z_k ("states") or a_k ("actions"). FrameError if there is no room for it."""
         if (frame.run, frame.episode) != (self.run, self.episode):
             return
         known, key = self._samples[what], (frame.plant, frame.step)

@@ -32,14 +32,7 @@ Handler = Callable[[Frame, float], None]
 class LoopReader:
     """Subscribes to what a view shows: the latched topics, and the samples while `listen` says so.
 
-    Parameters
-    ----------
-    node : Node
-        Whose subscriptions they are.
-    namespace : str
-        Of the pair; empty: the node's own.
-    view : LoopView
-        What is read goes there.
+    namespace: of the pair; empty: the node's own. What is read goes to the view.
     """
 
     def __init__(self, node: Node, namespace: str, view: LoopView) -> None:

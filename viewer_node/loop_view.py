@@ -36,18 +36,9 @@ COSTS = {"none": "cost_no_control", "lqt": "cost_lqt", "adapted": "cost"}
 class LoopView:
     """Follows the loop of one plant and controller.
 
-    Parameters
-    ----------
-    only : int, optional
-        The run to follow; any by default.
-    curve_from_topics : bool
-        Whether the learning curve comes from the costs on the topics.
-    horizon : int
-        Steps of an episode, as far as known.
-    weights : (float, float)
-        q and r of the stage cost, as far as known.
-    components : sequence of str
-        Names of the components of the state.
+    only: the run to follow, any by default; curve_from_topics: whether the learning curve comes
+    from the costs on the topics; horizon, weights: steps of an episode, q and r, as far as known;
+    components: their names.
     """
 
     def __init__(

@@ -26,15 +26,10 @@ MAX_MODELS = 4
 class Rollouts:
     """The rollouts of a finished episode, one for each of its M environments.
 
-    Attributes
-    ----------
-    explores
-        Whether it was an exploration.
-    controllers : (M,)
-        'none', 'lqt' or 'adapted', the keys of loop_interfaces.controllers; empty for an exploration,
-        and if the policy is not known.
-    mean, completed, models : (M,)
-        Mean stage costs, whether they did not diverge, and the indices of the reduced models.
+    explores: whether it was an exploration; controllers (M,): 'none', 'lqt' or 'adapted', the keys
+    of loop_interfaces.controllers, empty for an exploration and if the policy is not known; mean
+    (M,): stage costs; completed (M,): whether they did not diverge; models (M,): indices of the
+    reduced models.
     """
 
     explores: bool

@@ -240,17 +240,11 @@ def load_compiled() -> None:
 
 
 class RclChannel:
-    """A subscription of rclpy that is answered on a publisher of rclpy.
+    """A subscription of rclpy that is answered on a publisher of rclpy; for the node's own thread.
 
-    All methods are for the node's own thread.
-
-    Parameters
-    ----------
-    handle
-        Address of machine code ``int handle(void *plan, const void *message, intptr_t length)``. It
-        fills in the answer and returns 1, or leaves the message alone and returns 0.
-    plan
-        Address that it is called with.
+    handle: address of machine code ``int handle(void *plan, const void *message, intptr_t
+    length)``, which fills in the answer and returns 1, or leaves the message alone and returns 0;
+    plan: the address that it is called with.
     """
 
     def __init__(self, handle: int, plan: int) -> None:

@@ -39,16 +39,10 @@ def fast_handler(
 ) -> MachineCode:
     """Machine code that handles the messages of a channel, see `RclChannel`.
 
-    Parameters
-    ----------
-    plan
-        Type of the record that it is called with, see `plan_type`.
-    answer
-        A function answer(plan, head, message, length) that can be compiled: it fills in the answer to
-        the message with its header at the address `head`, and returns True, or leaves the message
-        alone and returns False.
-    sources
-        The modules that `answer` calls: when one of them changes, it is compiled anew.
+    plan: type of the record that it is called with, see `plan_type`. answer(plan, head, message,
+    length), which can be compiled, fills in the answer to the message with its header at the
+    address `head`, and returns True, or leaves the message alone and returns False. sources: the
+    modules that `answer` calls; when one of them changes, it is compiled anew.
     """
 
     def handle(plans: Any, message: int, length: int) -> int:

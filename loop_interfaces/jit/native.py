@@ -70,14 +70,8 @@ def store_release(typing_context: Any, address: Any, word: Any) -> Any:
 class MachineCode:
     """A C function that is loaded from disk, or compiled, when its address is first asked for.
 
-    Parameters
-    ----------
-    function
-        What to compile.
-    signature
-        Its types, for numba.cfunc.
-    sources
-        The modules, or functions of them, that it calls: when one of them changes, it is compiled anew.
+    signature: its types, for numba.cfunc; sources: the modules, or functions of them, that it
+    calls: when one of them changes, it is compiled anew.
     """
 
     def __init__(

@@ -159,10 +159,8 @@ class Introspection:
     def look_at_publishers(self) -> bool:
         """Warn of several publishers of one topic, and of one whose QoS is not compatible.
 
-        Returns
-        -------
-        bool
-            Whether every publisher's name is known; it is discovered a little after the publisher.
+        Returns whether every publisher's name is known; it is discovered a little after the
+        publisher.
         """
         all_named = True
         for topic, asked in self._topics.items():

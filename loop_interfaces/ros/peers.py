@@ -16,16 +16,9 @@ from loop_interfaces.ros.parameters import RemoteParameters
 class Peer:
     """A process that publishes a topic of the loop.
 
-    Attributes
-    ----------
-    process : bytes
-        The first 12 bytes of the ids of its endpoints.
-    since : float
-        When it was first seen (monotonic s).
-    name : str
-        Full name of its node, empty until that is discovered.
-    parameters : RemoteParameters, optional
-        What it was asked for, once its name is known.
+    process: the first 12 bytes of the ids of its endpoints; since: when it was first seen
+    (monotonic s); name: full name of its node, empty until that is discovered; parameters: what it
+    was asked for then.
     """
 
     process: bytes

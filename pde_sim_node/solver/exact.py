@@ -113,10 +113,7 @@ propagate = environments_of(LINEAR_PLAN, advance, native, simd, fft, spectra)
 def exact_step(settings: StepSettings) -> ParallelStep:
     """The step z_{k+1} = f(z_k, a_k) of a `LinearEquation`, made ready.
 
-    Raises
-    ------
-    ValueError
-        The equation's operator has the wrong shape or is not finite, or E overflows.
+    ValueError for an operator of the wrong shape or that is not finite, and where E overflows.
     """
     equation, n_x, n_z = settings.equation, settings.n_x, settings.target.size
     time = settings.steps * settings.integration_time

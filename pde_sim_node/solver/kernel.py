@@ -155,13 +155,8 @@ def etdrk4_step(settings: StepSettings) -> ParallelStep:
     """The step z_{k+1} = f(z_k, a_k) of a semilinear equation, made ready.
 
     The nonlinearity is dealiased on a grid of at least 3/2 n_z points; exactly that where 3/2 n_z
-    is 16 * 2^i * 3^j, else the next such number.
-
-    Raises
-    ------
-    ValueError
-        The equation's operators have the wrong shape or are not finite, or its nonlinearity does
-        not compile.
+    is 16 * 2^i * 3^j, else the next such number. ValueError for operators of the wrong shape or
+    that are not finite, and a nonlinearity that does not compile.
     """
     n_z, steps = settings.n_x, settings.steps
     fine = fine_length(n_z)

@@ -17,22 +17,10 @@ from pde_sim_node.solver.spectra import TRANSFORM
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StepSettings:
-    """A sampling time of a plant.
+    """A sampling time of a plant, as `Plant` has it; `steps` are the internal ones.
 
-    Attributes
-    ----------
-    equation
-        The PDE, with c components.
-    supports : (n_x, n_a)
-        Phi_j(x_i).
-    target : (c n_x,)
-        State of the stage cost.
-    integration_time, steps
-        Length and number of the internal steps.
-    state_weight, action_weight
-        Weights of the stage cost.
-    bound
-        Magnitude beyond which a state has diverged.
+    supports (n_x, n_a): Phi_j(x_i); target (c n_x,): state of the stage cost, of c components;
+    bound: magnitude beyond which a state has diverged.
     """
 
     equation: Equation

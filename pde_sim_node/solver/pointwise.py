@@ -32,12 +32,8 @@ def all_finite(values: NDArray[np.float64]) -> bool:
 def pointwise_loop(function: Callable[[float], float]) -> int:
     """Address of the machine code of u[i] = function(u[i]), a void (*)(double *, intp).
 
-    It is the same one for the same function.
-
-    Raises
-    ------
-    ValueError
-        Numba cannot compile the function for a float64, or it returns something else.
+    It is the same one for the same function. ValueError where Numba cannot compile the function for
+    a float64, or it returns something else.
     """
     # A plain function in the closure keeps the key on disk the same in every process; a dispatcher
     # would not.

@@ -100,11 +100,8 @@ class ParallelStep:
 class SolverThreads:
     """The threads that share the steps of this process's plants, started on first use.
 
-    Attributes
-    ----------
-    cores : collection of int
-        Where they may be: those that the process was started on, as this is read at import, before a
-        node is pinned. There are as many threads, with the one that asks for a step.
+    cores: where they may be, those that the process was started on, as this is read at import,
+    before a node is pinned. There are as many threads, with the one that asks for a step.
     """
 
     def __init__(self) -> None:

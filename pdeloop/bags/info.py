@@ -16,18 +16,7 @@ SHOWN = 40
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """What is in the bag at `path`.
-
-    Returns
-    -------
-    dict
-        The content of `pdeloop bag info --json`: topics, episodes, runs, times (ns), sizes.
-
-    Raises
-    ------
-    BagError
-        There is none, or it cannot be read.
-    """
+    """What is in the bag at `path`: the content of `pdeloop bag info --json`."""
     bag = Bag(path)
     counts: Counter[tuple[str, str]] = Counter()
     first, last = None, None

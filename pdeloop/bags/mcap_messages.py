@@ -45,13 +45,7 @@ class Message:
 
 
 def read(path: Path) -> Iterator[Message]:
-    """The messages of the file at `path` in the order in which they were written.
-
-    Raises
-    ------
-    BagError
-        It cannot be read, is none or is damaged; one sentence.
-    """
+    """The messages of a file in the order in which they were written. BagError if it is damaged."""
     types: dict[int, str] = {}
     channels: dict[int, Channel] = {}
     try:

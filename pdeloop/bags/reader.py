@@ -27,18 +27,7 @@ Array = NDArray[np.float64]
 
 
 class Bag:
-    """A recorded bag.
-
-    Parameters
-    ----------
-    path : Path
-        Its folder, or a run's folder with a bag in it.
-
-    Raises
-    ------
-    BagError
-        There is none, or, by every method, it cannot be read.
-    """
+    """A recorded bag: a folder, or one in a run's folder. BagError where it cannot be read."""
 
     def __init__(self, path: Path) -> None:
         if not path.is_dir():

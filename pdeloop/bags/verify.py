@@ -91,25 +91,11 @@ class Report:
 
 
 def verify(*paths: Path, parameters: Path | None = None) -> Report:
-    """Recompute what was recorded.
+    """Recompute what was recorded in the folders of bags, or of runs with all their bags.
 
-    Parameters
-    ----------
-    paths : Path
-        Folders of bags, or of runs with all their bags; several bags of one run are one.
-    parameters : Path, optional
-        A parameter file to use instead of what the bags say.
-
-    Returns
-    -------
-    Report
-
-    Raises
-    ------
-    BagError
-        A bag cannot be read.
-    ParameterError
-        The parameters do not describe a plant of this version.
+    Several bags of one run are one. parameters: a file to use instead of what the bags say.
+    BagError for a bag that cannot be read, ParameterError for parameters that describe no plant of
+    this version.
     """
     bags = [bag for path in paths for bag in bags_of(path)]
     report = Report(", ".join(str(bag.path) for bag in bags))

@@ -18,23 +18,10 @@ _TEMPLATES = Path(__file__).parent / "template"
 
 
 def write(name: str, into: Path) -> tuple[list[Path], str]:
-    """Write class, YAML and test of a PDE into a new folder.
+    """Write class, YAML and test of a PDE into a new folder; the files, and what --equation names.
 
-    Parameters
-    ----------
-    name
-        Of the problem and its folder: small letters, digits, '-' and '_'.
-    into
-        Where the folder goes.
-
-    Returns
-    -------
-    The files, and what --equation has to name.
-
-    Raises
-    ------
-    ParameterError
-        Not such a name, a shipped problem's, or the folder is there.
+    name: of the problem and its folder, small letters, digits, '-' and '_'; into: where the folder
+    goes. ParameterError for another name, a shipped problem's, and a folder that is there.
     """
     if len(name) > 60 or not _NAME.fullmatch(name):
         raise ParameterError(

@@ -68,16 +68,8 @@ def carry_out(
 ) -> int:
     """Train what is missing, as the flags of `add_execution` say; returns the exit code.
 
-    Parameters
-    ----------
-    name : str
-        Of the command.
-    options : Namespace
-        With the flags of `add_execution`.
-    study_in : callable
-        The study for a folder.
-    remarks : callable
-        Lines that follow the table, from its rows.
+    name: of the command; study_in: the study for a folder; remarks: lines that follow the table,
+    from its rows.
     """
     from rich.console import Console
 

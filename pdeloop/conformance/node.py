@@ -69,13 +69,7 @@ class RosWire:
 
 
 def check_node(kind: str, *, n_a: int, patience: float, network: bool) -> Iterator[Finding]:
-    """What is found of the plant, controller or tuner in this ROS domain.
-
-    Raises
-    ------
-    ConfigurationError
-        There is no node to be made here.
-    """
+    """What is found of the plant, controller or tuner in this ROS domain."""
     if not network:
         keep_on_this_machine()
     check = CHECKS[kind]

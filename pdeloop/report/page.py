@@ -44,24 +44,10 @@ class Picture(NamedTuple):
 
 
 def report(folder: Path, out: Path | None) -> tuple[Path, list[str]]:
-    """Write the report of the run or reproduction in `folder`.
+    """Write the report of the run or reproduction in `folder` to `out`, DIR/report if not given.
 
-    Parameters
-    ----------
-    folder, out
-        The run or reproduction; where the report goes, DIR/report if not given.
-
-    Returns
-    -------
-    page
-        Path of the page.
-    missing
-        A sentence for each thing that cannot be shown.
-
-    Raises
-    ------
-    RunFolderError
-        There is nothing to report, or the report cannot be written.
+    Returns the path of the page, and a sentence for each thing that cannot be shown. RunFolderError
+    where there is nothing to report, or the report cannot be written.
     """
     data = gather(folder)
     target = out or folder / "report"

@@ -25,18 +25,9 @@ class StudyError(ValueError):
 class Study:
     """Trainings of every problem, by every variant, with every seed.
 
-    Parameters
-    ----------
-    problems : dict of str to str
-        Shipped name or YAML file of each problem, by the problem's name.
-    seeds : tuple of int
-        Seeds of the trainings; each is a training of its own.
-    variants : dict of str to dict
-        Parameters that a variant sets, by the variant's name.
-    settings : dict
-        Parameters that all trainings set.
-    curves : bool
-        Keep the cost of every policy that a training has, on the evaluation fields.
+    problems: shipped name or YAML file of each problem, by its name; variants: the parameters that
+    each sets; settings: those that all trainings set; curves: keep the cost of every policy that a
+    training has, on the evaluation fields.
     """
 
     problems: Mapping[str, str]
@@ -49,13 +40,6 @@ class Study:
     def of(cls, content: object, folder: Path = Path()) -> Study:
         """The study that a file describes; relative paths in it are taken relative to `folder`.
 
-        Raises
-        ------
-        StudyError
-            Something is missing, unknown or of another kind.
-
-        Examples
-        --------
         >>> Study.of({"problems": ["kdv"], "seeds": 2, "variants": {"default": {}}}).seeds
         (0, 1)
         """
@@ -111,13 +95,7 @@ class Study:
         }
 
     def trainings(self) -> dict[str, dict[str, Any]]:
-        """The resolved parameters of every training, by its folder PROBLEM/VARIANT/SEED.
-
-        Raises
-        ------
-        ValueError
-            A training cannot be built from its parameters.
-        """
+        """The resolved parameters of every training, by its folder PROBLEM/VARIANT/SEED."""
         found: dict[str, dict[str, Any]] = {}
         for problem, file in self.problems.items():
             for variant, table in self.variants.items():

@@ -55,11 +55,8 @@ def _begin() -> None:
 def cluster(address: str) -> Iterator[Executor]:
     """The workers of the Dask scheduler at `address` (tcp://HOST:PORT).
 
-    Raises
-    ------
-    StudyError
-        That is no address, no scheduler answers there, it or a worker has another version of Dask,
-        there are no workers, or one has no pdeloop.
+    StudyError where that is no address, no scheduler answers there, it or a worker has another
+    version of Dask, there are no workers, or one has no pdeloop.
     """
     from distributed import Client
     from distributed.versions import VersionMismatchWarning
@@ -97,18 +94,7 @@ def cluster(address: str) -> Iterator[Executor]:
 
 
 def no_worker(pool: Executor) -> str:
-    """That a Dask cluster has no worker left, in words; empty if it has, and for other executors.
-
-    Parameters
-    ----------
-    pool : Executor
-        Of `processes` or `cluster`, or any other.
-
-    Returns
-    -------
-    str
-        With the command that starts a worker; its trainings go on then.
-    """
+    """That a Dask cluster has no worker left, in words; empty if it has, and for other executors."""
     client = getattr(pool, "client", None)
     with contextlib.suppress(OSError):  # no scheduler, either: the trainings fail
         if client is not None and not client.scheduler_info()["workers"]:

@@ -49,13 +49,7 @@ class Failure(NamedTuple):
 
 
 def keep(folder: Path, study: Study) -> None:
-    """Begin a study in `folder`, or check that the one there is this one.
-
-    Raises
-    ------
-    StudyError
-        There is another one, or the folder cannot be written.
-    """
+    """Begin a study in `folder`. StudyError if there is another one, or it cannot be written."""
     try:
         if (folder / ASKED).exists():
             if kept(folder) != study:

@@ -56,29 +56,12 @@ def require_environment(expected: Mapping[str, str] | None) -> dict[str, str]:
 def train_one(
     parameters: Mapping[str, Any], expected: Mapping[str, str] | None = None, curves: bool = False
 ) -> dict[str, bytes]:
-    """Train in this process.
+    """Train in this process: a function of the resolved parameters alone.
 
-    Parameters
-    ----------
-    parameters : dict
-        Resolved parameters.
-    expected : dict, optional
-        The `environment` in which alone the result may be computed; None: any.
-    curves : bool
-        With the cost of every policy that the training has.
-
-    Returns
-    -------
-    dict of str to bytes
-        Content of each of `FILES`, before them that of `CURVE`; `environment` is an entry of
-        result.json. The same bytes for the same parameters in the same environment.
-
-    Raises
-    ------
-    EnvironmentMismatchError
-        This process has another environment.
-    ValueError, RuntimeError
-        The training cannot be carried out.
+    expected: the `environment` in which alone the result may be computed, None: any; curves: with
+    the cost of every policy that the training has. Returns the content of each of `FILES`, before
+    them that of `CURVE`; `environment` is an entry of result.json. EnvironmentMismatchError in
+    another environment; ValueError or RuntimeError for a training that cannot be carried out.
     """
     here = require_environment(expected)
     with _ONE_AT_A_TIME, TemporaryDirectory(prefix="pdeloop-") as place:
@@ -111,13 +94,9 @@ def curve(
 ) -> bytes:
     """The costs of every policy that a training of one seed had, as in its closing evaluation.
 
-    These rollouts belong to no budget.
-
-    Returns
-    -------
-    bytes
-        An .npz file: `policies` (N, n_a, 2 n_s), at the start and after every batch of the
-        adaptation, their `costs` (N, fields), and the `rollouts` (N,) that were paid until then.
+    These rollouts belong to no budget. An .npz file: `policies` (N, n_a, 2 n_s), at the start and
+    after every batch of the adaptation, their `costs` (N, fields), and the `rollouts` (N,) that
+    were paid until then.
     """
     laws = np.stack(policies)
     distinct, which = np.unique(laws, axis=0, return_inverse=True)

@@ -39,14 +39,9 @@ def taken_record(
 
 
 class Records:
-    """The last rollouts, and older ones that are still referred to.
+    """The last `memory` rollouts, and older ones that are still referred to.
 
-    Parameters
-    ----------
-    memory : int
-        How many rollouts to remember.
-    limit : float
-        A diverged rollout counts until a state exceeds this magnitude.
+    limit: a diverged rollout counts until a state exceeds this magnitude.
     """
 
     def __init__(self, memory: int, limit: float) -> None:

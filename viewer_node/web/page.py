@@ -161,12 +161,7 @@ class Page:
     def updates(self, sent: dict[str, object], now: float) -> list[str | bytes]:
         """The messages that are new to a page.
 
-        Parameters
-        ----------
-        sent
-            The version of each part that the page has; it is brought up to date.
-        now
-            Monotonic time in s.
+        sent: the version of each part that the page has; it is brought up to date.
         """
         with self.lock:
             new = []
