@@ -45,15 +45,11 @@ class ControllerNode:
         self._responder = responder
         self._diagnostics = ControllerDiagnostics(responder)
         load_compiled()  # before there is a publisher: a peer that discovers one expects answers
-        self._wire(node, loop)
+        self.join(node, loop)
         order = model_order(values) or "suggested by the data"
         node.get_logger().info(f"{values['problem']}: tracking law, order {order}")
 
     def join(self, node: Node, loop: NodeLoop) -> None:
-        declare(node, taken_by("controller_node"), given_parameters(node))
-        self._wire(node, loop)
-
-    def _wire(self, node: Node, loop: NodeLoop) -> None:
         responder = self._responder
         self._node, self._loop = node, loop
         self._senders = {

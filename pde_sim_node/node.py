@@ -8,7 +8,6 @@ Messages, order and parameters: docs/interfaces.md. The protocol is pde_sim_node
 """
 
 import sys
-from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
@@ -36,12 +35,9 @@ from pde_sim_node.lockstep import Lockstep, Timing
 from pde_sim_node.run_record import RunRecord
 
 
-def declare_parameters(node: Node, changed: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """The plant's parameters, with the chosen equation's own under `physical.`.
-
-    changed: live ones as they were set meanwhile, when the network is joined again.
-    """
-    given = {**given_parameters(node), **(changed or {})}
+def declare_parameters(node: Node) -> dict[str, Any]:
+    """The plant's parameters, with the chosen equation's own under `physical.`."""
+    given = given_parameters(node)
     physical = {name: value for name, value in given.items() if name.startswith("physical.")}
     values = declare(node, taken_by("pde_sim_node"), given)
     specs = [
@@ -78,18 +74,14 @@ class PlantNode:
         )
         self._diagnostics = PlantDiagnostics(self._lockstep)
         self._paced = self._lockstep.pacer is not None
-        self._changed: dict[str, Any] = {}
-        self._wire(node, loop, publish_clock=values["publish_clock"])
+        self._timed: bool = values["publish_clock"]
+        self.join(node, loop)
         node.get_logger().info(
             f"{values['problem']}: {plant.n_z} points, {plant.n_a} actuators, "
             f"{plant.horizon} steps of {values['sample_time']:g} s"
         )
 
     def join(self, node: Node, loop: NodeLoop) -> None:
-        values = declare_parameters(node, self._changed)
-        self._wire(node, loop, publish_clock=values["publish_clock"])
-
-    def _wire(self, node: Node, loop: NodeLoop, *, publish_clock: bool) -> None:
         self._node, self._loop = node, loop
         self._batcher = loop.batcher
         self._senders = {
@@ -98,8 +90,8 @@ class PlantNode:
             TARGET: loop.sender(TARGET),
             PAUSED: loop.sender(PAUSED),
         }
-        self._clock = node.create_publisher(Clock, "/clock", 1) if publish_clock else None
-        self._batcher.timed = publish_clock
+        self._clock = node.create_publisher(Clock, "/clock", 1) if self._timed else None
+        self._batcher.timed = self._timed
         self._clock_wanted = False
         loop.receive(START, self._on_start)
         self._actions = actions = loop.receive(ACTION, self._on_action)
@@ -155,7 +147,6 @@ class PlantNode:
 
     def _adjust(self, values: dict[str, Any]) -> None:
         self._report_pace()
-        self._changed = values
         self._send(self._lockstep.adjust(self._loop.now(), Timing(**values)))
         self._paced = self._lockstep.pacer is not None
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -58,7 +57,7 @@ class RecorderNode:
     """Moves serialised messages from the topics into the recording."""
 
     def __init__(self, node: Node, loop: Observer) -> None:
-        values = self._declare(node)
+        values = declare(node, taken_by("recorder_node"), given_parameters(node))
         self._namespaces = [
             node.resolve_topic_name(scoped(name, "state")).removesuffix("state")
             for name in values["pairs"]
@@ -68,18 +67,11 @@ class RecorderNode:
         folder = str(values["bag"]) or time.strftime("bags/%Y%m%d-%H%M%S")
         self._recording = Recording(Path(folder), self._sources)
         self._rate = Rate()
-        self._wire(node, loop)
+        self.join(node, loop)
         self._log.info(f"recording to {self._recording.path}")
 
     def join(self, node: Node, loop: Observer) -> None:
-        """Go on with the same bag on a new node; what was missed shows as incomplete episodes."""
-        self._declare(node)
-        self._wire(node, loop)
-
-    def _declare(self, node: Node) -> dict[str, Any]:
-        return declare(node, taken_by("recorder_node"), given_parameters(node))
-
-    def _wire(self, node: Node, loop: Observer) -> None:
+        """Wire the topics; after a suspension, what was missed shows as incomplete episodes."""
         self._node, self._loop, self._log = node, loop, node.get_logger()
         self._others: list[tuple[Source, SerializedSubscription]] = []
         self._samples: list[tuple[SampleSubscription, dict[int, Source]]] = []

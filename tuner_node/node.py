@@ -51,12 +51,9 @@ ABSENCE_REPORT = 5.0
 """Seconds between two reports of a missing plant or controller."""
 
 
-def declare_parameters(node: Node, changed: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """The tuner's parameters, and the problem's, which together define the training.
-
-    changed: live ones as they were set meanwhile, when the network is joined again.
-    """
-    given = {**given_parameters(node), **(changed or {})}
+def declare_parameters(node: Node) -> dict[str, Any]:
+    """The tuner's parameters, and the problem's, which together define the training."""
+    given = given_parameters(node)
     values = with_budget(declare(node, taken_by("tuner_node"), given))
     # The equation's own parameters are the plant's to check; here they only identify the run.
     return values | {name: value for name, value in given.items() if name.startswith("physical.")}
@@ -79,7 +76,6 @@ class TunerNode:
         self._diagnostics = TunerDiagnostics(self._session)
         self._participants = Participants(self._session, values["recorder"])
         self._pairs: list[str] = values["pairs"]
-        self._changed: dict[str, Any] = {}
         self._failure: str | None = None
         self._several_publishers: dict[str, list[str]] = {}
         self._wire(node, loop)
@@ -112,7 +108,6 @@ class TunerNode:
         return 130
 
     def join(self, node: Node, loop: NodeLoop) -> None:
-        declare_parameters(node, self._changed)
         self._several_publishers |= self._loop.introspection.several_publishers
         self._wire(node, loop)
 
@@ -171,7 +166,6 @@ class TunerNode:
         )
 
     def _adjust(self, values: dict[str, Any]) -> None:
-        self._changed = values
         for name, value in values.items():
             setattr(self._session.dispatcher, name, value)
 

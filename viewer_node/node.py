@@ -46,25 +46,17 @@ class ViewerNode:
     """Reads the loop's topics into the view, and publishes what it shows."""
 
     def __init__(self, node: Node, loop: Observer) -> None:
-        self._changed: dict[str, Any] = {}
-        values = self._declare(node)
+        values = declare(node, taken_by("viewer_node"), given_parameters(node))
         self._length = float(values["length"])
         weights = float(values["state_weight"]), float(values["action_weight"])
         self._view = LoopView(horizon=values["horizon"], weights=weights, curve_from_topics=False)
         self._diagnostics = ViewerDiagnostics(self._view)
         self._due = loop.now()
         self._adjust({spec.name: values[spec.name] for spec in VIEWER})
-        self._wire(node, loop)
+        self.join(node, loop)
         node.get_logger().info(f"{values['problem']}: views at {values['view_rate']:g} Hz")
 
     def join(self, node: Node, loop: Observer) -> None:
-        self._declare(node)
-        self._wire(node, loop)
-
-    def _declare(self, node: Node) -> dict[str, Any]:
-        return declare(node, taken_by("viewer_node"), {**given_parameters(node), **self._changed})
-
-    def _wire(self, node: Node, loop: Observer) -> None:
         self._node, self._loop = node, loop
         self._reader = LoopReader(node, "", self._view)
         self._reader.listen(True)
@@ -91,7 +83,6 @@ class ViewerNode:
             self._show(now)
 
     def _adjust(self, values: dict[str, Any]) -> None:
-        self._changed = values
         self._period = 1.0 / values["view_rate"]
         self._view.environment = values["view_environment"]
 

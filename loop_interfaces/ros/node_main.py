@@ -17,6 +17,7 @@ from rclpy.utilities import remove_ros_args, try_shutdown
 
 from loop_interfaces.isolation import PROFILE, is_confined, outside_sockets
 from loop_interfaces.ros.node_loop import NodeLoop
+from loop_interfaces.ros.parameters import take_over
 
 CRASHED = 70
 """Exit code after a bug; 1 means that the node was asked for something it cannot do."""
@@ -70,7 +71,7 @@ class NodeBody(Protocol):
     """What a node does: made with its parameters and topics, then run."""
 
     def join(self, node: Node, loop: Any) -> None:
-        """Declare the parameters and wire the topics on a new `node`; what was learnt stays."""
+        """Wire the topics on another `node`, which has the parameters of the one before."""
 
     def run(self) -> int:
         """Work until the loop stops; returns the exit code, of no meaning if it was suspended."""
@@ -91,12 +92,14 @@ def node_main(
     try:
         _refuse_other_words(name, args)
         body: NodeBody | None = None
+        former: Node | None = None
         while True:
             with ros_node(name, args, make_loop) as (node, loop):
                 try:
-                    if body is None:
+                    if body is None or former is None:
                         body = make(node, loop)
                     else:
+                        take_over(node, former)
                         body.join(node, loop)
                         node.get_logger().warning("was suspended; joined the network again")
                 except ValueError as error:
@@ -104,6 +107,7 @@ def node_main(
                 code = body.run()
                 if not loop.suspended:
                     return code
+                former = node
     except ConfigurationError as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 1

@@ -51,6 +51,15 @@ def declare(node: Node, specs: Iterable[Spec], given: dict[str, Any]) -> dict[st
     return values
 
 
+def take_over(node: Node, former: Node) -> None:
+    """Declare the parameters of a node that is no more, with the values that they had last."""
+    for name, parameter in former._parameters.items():
+        if not node.has_parameter(name):
+            node.declare_parameter(
+                name, parameter.value, former.describe_parameter(name), ignore_override=True
+            )
+
+
 def on_change(node: Node, specs: Iterable[Spec], apply: Callable[[dict[str, Any]], None]) -> None:
     """Let the live ones of `specs` be set, in their range; apply(values) gets all live values then.
 
