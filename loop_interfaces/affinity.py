@@ -36,13 +36,6 @@ def join_solver(cores: Collection[int]) -> None:
             os.sched_setaffinity(0, others or cores)
 
 
-def helps_solver(process: int, thread: int) -> bool:
-    """Whether a thread is one of those."""
-    with contextlib.suppress(OSError):
-        return Path(f"/proc/{process}/task/{thread}/comm").read_text().strip() == SOLVER
-    return False
-
-
 def pin_process(core: int) -> None:
     """Keep every thread of this process on one core; threads made later stay there, too. -1: on any.
 

@@ -128,23 +128,24 @@ def open_ordinary(path: Path) -> BufferedReader:
     return os.fdopen(descriptor, "rb")
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """The object in a JSON file.
-
-    Raises
-    ------
-    FileError
-        It cannot be read, is too large, or holds no JSON object.
-    """
+def read_bounded(path: Path, most: int) -> bytes:
+    """The content of a file. FileError if it cannot be read, or has more than `most` bytes."""
     try:
         with open_ordinary(path) as file:
-            text = file.read(MAX_JSON_BYTES + 1)
+            content = file.read(most + 1)
     except OSError as error:
-        raise FileError(f"{path} cannot be read: {error.strerror}") from error
-    if len(text) > MAX_JSON_BYTES:
-        raise FileError(f"{path} is larger than {MAX_JSON_BYTES} bytes")
+        raise FileError(f"{path} cannot be read: {error.strerror or error}") from error
+    if len(content) > most:
+        raise FileError(f"{path} is larger than {most} bytes")
+    return content
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The object in a JSON file. FileError if there is none."""
     try:
-        content = json.loads(text)
+        content = json.loads(read_bounded(path, MAX_JSON_BYTES))
+    except FileError:
+        raise
     except (ValueError, RecursionError) as error:
         raise FileError(f"{path} is no JSON: {error}") from error
     if not isinstance(content, dict):

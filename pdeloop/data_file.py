@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.array_files import read_arrays
-from loop_interfaces.files import FileError, open_ordinary
+from loop_interfaces.files import FileError, read_bounded
 
 __all__ = ["Measurements", "read_measurements"]
 
@@ -136,13 +136,7 @@ def _npz(path: Path) -> Measurements:
 
 
 def _csv(path: Path) -> Measurements:
-    try:
-        with open_ordinary(path) as file:
-            raw = file.read(MAX_TEXT_BYTES + 1)
-    except OSError as error:
-        raise FileError(f"{path} cannot be read: {error.strerror or error}") from error
-    if len(raw) > MAX_TEXT_BYTES:
-        raise FileError(f"{path} is larger than {MAX_TEXT_BYTES} bytes; take an .npz file")
+    raw = read_bounded(path, MAX_TEXT_BYTES)
     lines = csv.reader(io.StringIO(raw.decode("utf-8-sig", errors="replace"), newline=""))
     try:
         return _table(line for line in lines if line)

@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
 from pathlib import Path
+
+from loop_interfaces.affinity import SOLVER
 
 ROOT = Path(__file__).resolve().parent.parent
 LIMIT = 600.0
@@ -25,3 +28,10 @@ def python(*words: object, **environment: str) -> subprocess.CompletedProcess[st
     )
     assert done.returncode == 0, done.stderr
     return done
+
+
+def helps_solver(process: int, thread: int) -> bool:
+    """Whether a thread is one of those that help a plant with its step."""
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{process}/task/{thread}/comm").read_text().strip() == SOLVER
+    return False

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tuner_node.optimizers.fit import LocalModel, extended_basis, fit
-from tuner_node.optimizers.selection import KAPPAS, Pair, choices, mismatches
+from tuner_node.optimizers.selection import KAPPAS, Comparison, choices, mismatches
 from tuner_node.optimizers.sensitivity import Path, damped_step, expand, predict_difference
 
 R, N_A, N_S, STEPS = 4, 2, 3, 12
@@ -204,7 +204,7 @@ def test_forgetting_shortens_the_memory_of_the_sensitivities() -> None:
 def test_the_true_model_has_the_smallest_mismatch() -> None:
     true, wrong = planted(), planted(7)
     change = 1e-5 * np.ones_like(THETA)
-    pair = Pair(roll(true, THETA, START), roll(true, THETA + change, START), change)
+    pair = Comparison(roll(true, THETA, START), roll(true, THETA + change, START), change)
     errors = mismatches([wrong, true], [pair], STEPS)
     assert errors.shape == (2, len(KAPPAS))
     assert errors[1, 0] < 1e-4 < errors[0, 0]
@@ -216,7 +216,7 @@ def test_an_exploding_model_is_the_worst_not_an_error() -> None:
     true = planted()
     exploding = replace(true, linear=1e200 * np.eye(R))
     change = 1e-3 * np.ones_like(THETA)
-    pair = Pair(roll(true, THETA, START), roll(true, THETA + change, START), change)
+    pair = Comparison(roll(true, THETA, START), roll(true, THETA + change, START), change)
     assert mismatches([exploding], [pair], STEPS)[0, 0] == 2.0
     step, fall = damped_step(
         [exploding],

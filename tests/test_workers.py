@@ -13,12 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loop_interfaces.affinity import helps_solver
 from pde_sim_node.equations import Burgers
 from pde_sim_node.plant import Plant
 from pde_sim_node.solver import workers
 from pde_sim_node.solver.workers import SolverThreads, use_cores
-from tests.interpreter import ROOT, python
+from tests.interpreter import ROOT, helps_solver, python
 
 several = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
 P1 = {

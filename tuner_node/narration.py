@@ -4,7 +4,7 @@
 The tuner logs these lines, and `pdeloop train` shows them.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 Row = Mapping[str, Any]
@@ -80,9 +80,8 @@ class Narration:
             return _spread([None if n else row[name] for n, row in zip(lost, rows, strict=True)])
 
         if event == "designed":
-            orders = _range([row["reduced_order"] for row in rows])
-            radii = [row["spectral_radius"] for row in rows]
-            radius = " to ".join(dict.fromkeys(f"{f(radii):.4f}" for f in (min, max)))
+            orders = span([row["reduced_order"] for row in rows])
+            radius = span((row["spectral_radius"] for row in rows), ".4f")
             return [f"  {who}: reduced model of order {orders}, spectral radius {radius}"]
         if event == "evaluated":
             costs = f"cost {cost('none')} without control, {cost('lqt')} with LQT, "
@@ -189,16 +188,15 @@ def _spread(costs: Sequence[float | None]) -> str:
     lost = len(costs) - len(known)
     if not known:
         return "diverged"
-    text = f"{sum(known) / len(known):.4g}"
-    low, high = f"{min(known):.4g}", f"{max(known):.4g}"
-    if low != high:
-        text += f" ({low} to {high})"
+    text, between = f"{sum(known) / len(known):.4g}", span(known, ".4g")
+    if " to " in between:
+        text += f" ({between})"
     return text + (f" and {lost} diverged" if lost else "")
 
 
 def _budget(rollouts: Sequence[Mapping[str, int]]) -> str:
     """How many rollouts a seed took, and what for."""
-    spent = {name: _range([seed[name] for seed in rollouts]) for name in rollouts[0]}
+    spent = {name: span([seed[name] for seed in rollouts]) for name in rollouts[0]}
     each = " a seed" if len(rollouts) > 1 else ""
     return (
         f"{spent['total']} rollouts{each} (exploration {spent['exploration']}, "
@@ -206,9 +204,14 @@ def _budget(rollouts: Sequence[Mapping[str, int]]) -> str:
     )
 
 
-def _range(counts: Sequence[int]) -> str:
-    low, high = min(counts), max(counts)
-    return str(low) if low == high else f"{low} to {high}"
+def span(values: Iterable[float], form: str = "") -> str:
+    """From the least to the largest, in words; one number where both are written alike.
+
+    >>> span([3, 5]), span([0.1, 0.12], ".1f")
+    ('3 to 5', '0.1')
+    """
+    known = list(values)
+    return " to ".join(dict.fromkeys(format(f(known), form) for f in (min, max)))
 
 
 def _listed(seeds: Sequence[int]) -> str:

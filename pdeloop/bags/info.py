@@ -10,6 +10,7 @@ from typing import Any
 
 from pdeloop.bags.reader import Bag
 from pdeloop.output import aligned
+from tuner_node.narration import span
 
 SHOWN = 40
 """Episodes that are listed for people."""
@@ -92,11 +93,7 @@ def _listed(episodes: Sequence[dict[str, Any]]) -> list[str]:
     notes = [""]
     for episode in episodes[:SHOWN]:
         costs = episode["mean_cost"]
-        spread = (
-            ""
-            if costs is None
-            else " to ".join(dict.fromkeys(f"{f(costs):.4g}" for f in (min, max)))
-        )
+        spread = "" if costs is None else span(costs, ".4g")
         rows.append(
             (episode["name"], str(episode["environments"]), f"{episode['seconds']:.2f}", spread)
         )

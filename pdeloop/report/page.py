@@ -27,6 +27,7 @@ from pdeloop.study.run import ASKED
 from pdeloop.study.table import AVERAGES, CAVEAT, beside_no_control, cost_text, reduction_texts
 from pdeloop.study.table import figures as figures_of
 from tuner_node.budget import PURPOSES
+from tuner_node.narration import span
 from tuner_node.run_folder import RunFolderError
 
 PIXELS_PER_INCH = 115
@@ -254,10 +255,5 @@ def _budget(problems: Sequence[ProblemData]) -> Table:
         for name, run in problem.runs.items():
             if run.rollouts:
                 spent = [[seed[purpose] for seed in run.rollouts] for purpose in PURPOSES.values()]
-                rows.append((problem.name, NAMES[name], *map(_range, spent)))
+                rows.append((problem.name, NAMES[name], *map(span, spent)))
     return ("problem", "controller", *PURPOSES.values()), rows
-
-
-def _range(counts: Sequence[int]) -> str:
-    low, high = min(counts), max(counts)
-    return str(low) if low == high else f"{low} to {high}"

@@ -13,9 +13,9 @@ import pytest
 from benchmarks import pairs as bench_pairs
 from benchmarks.hosts import can_make_hosts, hosts
 from benchmarks.processes import bench
-from loop_interfaces.affinity import helps_solver
 from pdeloop.in_process import LocalPair, train
 from pdeloop.training_run import resolve
+from tests.interpreter import helps_solver
 from tests.loop_harness import Processes, until
 from tests.small import SMALL, parameters, train_here
 from tests.small_loop import LIMIT, adapted, assert_same_training

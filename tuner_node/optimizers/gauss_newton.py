@@ -64,7 +64,7 @@ _STAMPS = ("fields", "incumbents", "trials", "others")
 
 
 @dataclass(eq=False)
-class Progress:
+class SearchState:
     """Where an optimisation stands, apart from the rollouts that it remembers.
 
     Attributes
@@ -100,7 +100,7 @@ class Progress:
     tells: int = 0
 
     @classmethod
-    def begin(cls, policy: Array, count: int) -> Progress:
+    def begin(cls, policy: Array, count: int) -> SearchState:
         """Before the first rollout, with so many fields."""
         incumbents, trials, others = np.full((3, count), _NONE, dtype=np.int64)
         numbers = np.arange(count, dtype=np.int64)
@@ -110,7 +110,7 @@ class Progress:
         """A copy of everything, as a checkpoint holds it."""
         return {field.name: np.array(getattr(self, field.name)) for field in fields(self)}
 
-    def later(self, arrays: Arrays) -> Progress:
+    def later(self, arrays: Arrays) -> SearchState:
         """From the `arrays` of a later state of this optimisation; a ValueError if they are none."""
         given: dict[str, Any] = {}
         for name, own in self.arrays().items():
@@ -119,7 +119,7 @@ class Progress:
             given[name] = array.copy() if shape else array.item()
         if len({given[name].size for name in _STAMPS}) > 1:
             raise ValueError("the fields of the checkpoint do not add up.")
-        return Progress(**given)
+        return SearchState(**given)
 
     @property
     def missing(self) -> Stamps:
@@ -168,7 +168,7 @@ class GaussNewton:
         fields: int = FIELDS,
     ) -> None:
         require_positive(rollouts=rollouts, fields=fields)
-        self._now = Progress.begin(checked_policy(policy0), fields)
+        self._now = SearchState.begin(checked_policy(policy0), fields)
         self._proposer = Proposer(context, self._now.policy)
         self._sensors = context.sensors
         # One field says little with few sensors: the law has to beat no control on all of them.

@@ -37,7 +37,7 @@ _WORST = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
+class Comparison:
     """Two measured trajectories, and by how much theta differs, (n_a, n_s + 1)."""
 
     first: Path
@@ -45,7 +45,7 @@ class Pair:
     change: Array
 
 
-def mismatches(models: Sequence[LocalModel], pairs: Sequence[Pair], horizon: int) -> Array:
+def mismatches(models: Sequence[LocalModel], pairs: Sequence[Comparison], horizon: int) -> Array:
     """E of every model and kappa, (models, kappas); zeros without pairs."""
     errors = np.zeros((len(models), len(KAPPAS)))
     if not pairs:

@@ -14,7 +14,7 @@ from tuner_node.optimizers.base import Array, Record
 from tuner_node.optimizers.fit import LocalModel, extended_basis, fit
 from tuner_node.optimizers.proposals.proposal import LEAST_FALL, MODES, Proposal
 from tuner_node.optimizers.proposals.reproducing import steps_of
-from tuner_node.optimizers.selection import KAPPAS, LOCAL, RIDGES, Pair, choices, mismatches
+from tuner_node.optimizers.selection import KAPPAS, LOCAL, RIDGES, Comparison, choices, mismatches
 from tuner_node.optimizers.sensitivity import damped_step
 from tuner_node.optimizers.simulation import Loop
 
@@ -42,7 +42,7 @@ def propose(
     """
     V = extended_basis(loop.U, [record.states for record in data], max(MODES, loop.U.shape[1]))
     models = _fit(data, shares, V, len(incumbents))
-    errors = mismatches(models, _pairs(loop, V, incumbents, others), loop.horizon)
+    errors = mismatches(models, _comparisons(loop, V, incumbents, others), loop.horizon)
     paths = [loop.path_of(record, V) for record in incumbents if len(record.actions)]
     policy, least = incumbents[0].policy, LEAST_FALL * loop.mean_cost_of(incumbents)
     proposal = None
@@ -79,9 +79,9 @@ def _fit(
     return fit(x, a, after - x, weight, RIDGES, leading=min(_CUBIC_MODES, V.shape[1]))
 
 
-def _pairs(
+def _comparisons(
     loop: Loop, V: Array, incumbents: Sequence[Record], others: Sequence[Record | None]
-) -> list[Pair]:
+) -> list[Comparison]:
     """Pairs of whole rollouts: two fields, and two policies on one field."""
     chosen = []
     for i, record in enumerate(incumbents):
@@ -91,7 +91,7 @@ def _pairs(
         if other is not None and record.usable and other.cost < LOCAL * record.cost:
             chosen.append((record, other))
     return [
-        Pair(
+        Comparison(
             loop.path_of(first, V),
             loop.path_of(second, V),
             loop.theta(second.policy) - loop.theta(first.policy),
