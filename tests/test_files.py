@@ -7,6 +7,7 @@ import hashlib
 import io
 import json
 import os
+import re
 import shutil
 import zipfile
 from collections.abc import Callable, Iterator
@@ -156,7 +157,9 @@ def test_forged_checkpoints_with_a_good_checksum_are_passed_over(run, capsys):
     previous = checkpoint.previous(path).read_bytes()
     rng = np.random.default_rng(0)
     wrong: list[bytes] = []
-    for name, array in good.items():
+    # One rollout of many: all are read alike.
+    for name in {re.sub(r"\d+", "", name): name for name in good}.values():
+        array = good[name]
         wrong.append(sealed({k: v for k, v in good.items() if k != name}))
         others = [a for a in arrays_like(array) if a.shape != array.shape or a.dtype != array.dtype]
         wrong += [

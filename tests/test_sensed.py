@@ -148,7 +148,7 @@ def test_readings_that_no_equation_explains_make_no_proposal_and_no_start_of_the
 
 
 def test_gauss_newton_controls_with_few_sensors_and_continues_with_the_same_bits() -> None:
-    problem = pdeloop.problem("allen-cahn", sensors=SENSORS, horizon=24)
+    problem = pdeloop.problem("allen-cahn", sensors=SENSORS, horizon=16)
     plant = problem.plant()
     explored, actions = problem.explore(0)
     U = np.eye(SENSORS)
