@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
 from functools import partial
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,7 @@ import numpy as np
 import pytest
 
 from pdeloop.cli import main
-from pdeloop.study import Failure, Study, StudyError, executors, rows, run
+from pdeloop.study import Failure, Study, StudyError, rows, run
 from pdeloop.study.executors import cluster
 from pdeloop.study.table import text
 from pdeloop.study.training import FILES, train_one
@@ -174,6 +176,10 @@ def test_a_worker_with_other_versions_is_refused_or_accepted_on_request(
     assert run(study, tmp_path, here, any_environment=True) == []
     result = json.loads((tmp_path / "small/two-point/0/result.json").read_text())
     assert result["environment"]["numpy"] == "1.0"
+    monkeypatch.undo()
+    table = text(rows(study, tmp_path))
+    assert "two-point*" in table and "*: some trainings had numpy 1.0 instead of " in table
+    monkeypatch.setattr(training, "environment", lambda: {**true, "numpy": "2.0"})
     with pytest.raises(StudyError, match="trained with other versions"):
         run(study, tmp_path, here)
 
@@ -209,6 +215,16 @@ def test_the_command_runs_continues_and_refuses_another_study(
     assert "results in" in capsys.readouterr().out and (out / "costs.png").stat().st_size > 1000
     assert main(["study", "--out", str(out), "--json"]) == 0
     assert len(json.loads(capsys.readouterr().out)["rows"]) == 2
+    for name in ("table.json", "costs.png"):
+        (tmp_path / name).write_text("of somebody else")
+        (out / name).unlink()
+        (out / name).symlink_to(tmp_path / name)
+    assert main(["study", "--out", str(out)]) == 0
+    assert len(json.loads((out / "table.json").read_text())["rows"]) == 2
+    assert {(tmp_path / name).read_text() for name in ("table.json", "costs.png")} == {
+        "of somebody else"
+    }
+    capsys.readouterr()
     file.write_text(json.dumps(CONTENT))
     assert main(["study", str(file), "--out", str(out)]) == 1
     assert "holds another study" in capsys.readouterr().err
@@ -246,53 +262,68 @@ def test_an_interrupted_command_ends_its_processes_in_the_middle(tmp_path: Path)
     assert not list(out.rglob("result.json"))
 
 
-def dask(command: str, *options: str) -> subprocess.Popen[bytes]:
-    """A Dask process on loopback, in a session of its own."""
+def dask(command: str, *options: str, packages: str = "") -> subprocess.Popen[bytes]:
+    """A Dask process on loopback, in a session of its own, with packages of another folder first."""
     words = [sys.executable, "-m", "distributed.cli." + command, "--host", "127.0.0.1", *options]
-    quiet = subprocess.DEVNULL
-    return subprocess.Popen(words, stdout=quiet, stderr=quiet, start_new_session=True)
+    quiet, first = subprocess.DEVNULL, {**os.environ, "PYTHONPATH": packages}
+    return subprocess.Popen(words, stdout=quiet, stderr=quiet, start_new_session=True, env=first)
+
+
+def installed_before(name: str, folder: Path, *others: str) -> str:
+    """A folder with the newest versions of packages before those installed here."""
+    older = [f"{each}<{metadata.version(each)}" for each in (name, *others)]
+    options = ("--quiet", "--no-deps", "--no-compile", "--only-binary=:all:", "--retries=0")
+    words = [sys.executable, "-m", "pip", "install", *options, "--target", str(folder), *older]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=LIMIT)
+    if done.returncode:
+        pytest.skip(f"another {name} cannot be had: {done.stderr.strip().splitlines()[-1]}")
+    return str(folder)
 
 
 @contextmanager
-def dask_cluster(folder: Path, workers: int) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
-    """Address of a real scheduler, and its real workers, one thread each."""
+def dask_cluster(
+    folder: Path, workers: int, *, scheduler: str = "", worker: str = ""
+) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+    """Address of a real scheduler, and its real workers, one thread each.
+
+    scheduler, worker: folders of packages that these processes have instead of those here.
+    """
+    folder.mkdir(exist_ok=True)
     file = folder / "scheduler.json"
     with ExitStack() as stack:
 
-        def started(command: str, *options: str) -> subprocess.Popen[bytes]:
-            process = dask(command, "--scheduler-file", str(file), "--no-dashboard", *options)
+        def started(command: str, *options: str, packages: str) -> subprocess.Popen[bytes]:
+            shared = ("--scheduler-file", str(file), "--no-dashboard")
+            process = dask(command, *shared, *options, packages=packages)
             stack.callback(process.wait, LIMIT)
             stack.callback(lambda: process.poll() is None and os.kill(process.pid, signal.SIGKILL))
             return process
 
-        started("dask_scheduler", "--port", "0")
+        started("dask_scheduler", "--port", "0", packages=scheduler)
         deadline = time.monotonic() + LIMIT
         while not file.exists():
             assert time.monotonic() < deadline, "no scheduler"
             time.sleep(0.05)
         known = [
             started(
-                "dask_worker", "--no-nanny", "--nthreads", "1", "--local-directory", str(folder)
+                *("dask_worker", "--no-nanny", "--nthreads", "1", "--local-directory", str(folder)),
+                packages=worker,
             )
             for _ in range(workers)
         ]
         address = json.loads(file.read_text())["address"]
-        from distributed import Client
+        if workers:
+            from distributed import Client
 
-        with Client(address, set_as_default=False) as client:
-            client.wait_for_workers(workers, timeout=LIMIT)
+            with Client(address, set_as_default=False) as client:
+                client.wait_for_workers(workers, timeout=LIMIT)
         yield address, known
 
 
 @pytest.mark.filterwarnings("default")  # of the libraries below Dask, in threads of its own
-def test_a_dask_cluster_that_loses_a_worker_gives_the_same_bits(
-    reference: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_dask_cluster_that_loses_a_worker_gives_the_same_bits(reference: Path, tmp_path: Path):
     out = tmp_path / "out"
     with dask_cluster(tmp_path, 2) as (address, workers):
-        with monkeypatch.context() as other, pytest.raises(StudyError, match=r"machine has 1\.0"):
-            other.setattr(executors.metadata, "version", lambda name: "1.0")
-            run(Study.of(CONTENT), tmp_path / "refused", partial(cluster, address))
 
         def kill_one(done: int, total: int, status: str) -> None:
             if done and workers[0].poll() is None:
@@ -310,3 +341,39 @@ def test_a_dask_cluster_that_loses_a_worker_gives_the_same_bits(
         with pytest.raises(KeyboardInterrupt):
             run(Study.of(CONTENT), tmp_path / "no", partial(cluster, address), tell=kill_the_other)
     assert contents(out) == contents(reference)
+
+
+@pytest.mark.filterwarnings("default")  # of the libraries below Dask, in threads of its own
+def test_a_dask_worker_with_another_numpy_is_refused_or_accepted_and_marked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    older = installed_before("numpy", tmp_path / "packages")
+    file, out = tmp_path / "study.yaml", str(tmp_path / "out")
+    file.write_text(json.dumps({**CONTENT, "seeds": 1}))
+    with dask_cluster(tmp_path / "dask", 1, worker=older) as (address, _):
+        words = ["study", str(file), "--out", out, "--scheduler", address]
+        assert main(words) == 1
+        said = capsys.readouterr().err.strip().splitlines()[-1]
+        assert re.fullmatch(
+            rf"pdeloop: a worker has numpy \S+ instead of {np.__version__}: .* --any-environment",
+            said,
+        )
+        assert main([*words, "--any-environment"]) == 0
+    result = json.loads((tmp_path / "out/small/two-point/0/result.json").read_text())
+    numpy = result["environment"]["numpy"]
+    assert numpy != np.__version__
+    told = capsys.readouterr().out
+    assert "two-point*" in told and f"*: some trainings had numpy {numpy} instead of" in told
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_scheduler_and_a_worker_with_another_dask_are_refused(tmp_path: Path):
+    older = installed_before("distributed", tmp_path / "packages", "dask")
+    words = f"has Dask .*, and this machine has {metadata.version('distributed')}; install the same"
+    study = Study.of(CONTENT)
+    one = dask_cluster(tmp_path / "one", 0, scheduler=older)
+    with one as (address, _), pytest.raises(StudyError, match=f"the scheduler {words}"):
+        run(study, tmp_path / "out", partial(cluster, address))
+    other = dask_cluster(tmp_path / "other", 1, worker=older)
+    with other as (address, _), pytest.raises(StudyError, match=f"the worker at tcp://.* {words}"):
+        run(study, tmp_path / "out", partial(cluster, address))

@@ -73,6 +73,7 @@ def carry_out(
     """
     from rich.console import Console
 
+    from loop_interfaces.files import write_atomically
     from pdeloop.interruption import interruptible
     from pdeloop.progress import Progress
     from pdeloop.study.executors import cluster, processes
@@ -107,16 +108,15 @@ def carry_out(
     finally:
         progress.close()
     table = rows(study, folder)
-    (folder / "table.json").write_text(
-        json.dumps({"rows": table, "versions": versions()}, indent=1)
-    )
+    content = json.dumps({"rows": table, "versions": versions()}, indent=1)
+    write_atomically(folder / "table.json", content.encode())
     if options.json:
         told = [failure._asdict() for failure in failures]
         print_json({"folder": str(folder), "rows": table, "failures": told})
     elif table:
         console.print("\n".join([text(table), *remarks(table)]), markup=False)
         if importlib.util.find_spec("matplotlib"):
-            plot(table, folder / "costs.png")
+            write_atomically(folder / "costs.png", plot(table))
     for failure in failures:
         console.print(f"failed: {failure.training}: {failure.reason}", markup=False)
     console.print(f"results in {folder}", markup=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -23,25 +24,34 @@ from pdeloop.finished_run import (
 )
 from pdeloop.output import aligned
 from pdeloop.study.description import Study
+from pdeloop.study.training import differences, environment
 
 CAVEAT = (
     f"In brackets: {100 * CONFIDENCE:.0f} % percentile bootstrap over the seeds. The reduced model, "
     "and with it LQT's cost, varies much from seed to seed: with few seeds such an interval is wide, "
     "and still too narrow."
 )
+MARK = "*"
+"""Of what was computed in other environments."""
 AVERAGES = ("ratio of the means", "mean of the ratios")
 """Of the seeds' costs and LQT's: see `pdeloop.finished_run.Reduction`."""
 
 
 def rows(study: Study, folder: Path) -> list[dict[str, Any]]:
-    """`figures` of every problem and variant, from the trainings in `folder` that are finished."""
-    found = []
+    """`figures` of every problem and variant, from the trainings in `folder` that are finished.
+
+    `other_environments` says how those differ from this process's in which some were carried out.
+    """
+    found, here = [], environment()
     for problem in study.problems:
         for variant in study.variants:
             places = [folder / problem / variant / str(seed) for seed in study.seeds]
             runs = [load_run(place) for place in places if (place / "result.json").exists()]
             if runs:
-                found.append({"problem": problem, "variant": variant, **figures(merged(runs))})
+                own = figures(merged(runs))
+                others = {differences(run.result.get("environment", {}), here) for run in runs}
+                own["other_environments"] = sorted(others - {""})
+                found.append({"problem": problem, "variant": variant, **own})
     return found
 
 
@@ -81,7 +91,8 @@ def text(table: Sequence[Mapping[str, Any]]) -> str:
     below = [("below LQT, %", "", *AVERAGES)]
     for row in table:
         known = CONTROLLERS.get(row["variant"])
-        name = row["problem"], row["variant"] if known is None else known.name
+        mark = MARK * bool(row["other_environments"])
+        name = row["problem"], (row["variant"] if known is None else known.name) + mark
         numbers = [cost_text(row[each]) for each in ("none", "lqt")]
         own = cost_text(row["cost"], row["interval"]), cost_text(row["worst"])
         counts = str(row["seeds"]), f"{row['rollouts']:.0f}"
@@ -90,6 +101,7 @@ def text(table: Sequence[Mapping[str, Any]]) -> str:
     lost = "lost: seeds with a rollout that diverged, which are left out." * any(
         row["diverged"] for row in table
     )
+    others = sorted({each for row in table for each in row["other_environments"]})
     return "\n".join(
         [
             *aligned(costs, 2),
@@ -97,6 +109,7 @@ def text(table: Sequence[Mapping[str, Any]]) -> str:
             *aligned(below, 2),
             CAVEAT,
             *([lost] if lost else []),
+            *(f"{MARK}: some trainings had {each}; the last bits may differ." for each in others),
             *(f"WARNING: {sentence}" for sentence in beside_no_control(table)),
         ]
     )
@@ -150,7 +163,7 @@ def reduction_texts(found: Mapping[str, Any] | None) -> tuple[str, str]:
     )
 
 
-def plot(table: Sequence[Mapping[str, Any]], path: Path) -> None:
+def plot(table: Sequence[Mapping[str, Any]]) -> bytes:
     """Every seed's cost, and mean and interval of every variant, a panel a problem, as a PNG."""
     from matplotlib import rc_context
 
@@ -172,4 +185,6 @@ def plot(table: Sequence[Mapping[str, Any]], path: Path) -> None:
             ax.set_xlim(-0.5, len(own) - 0.5)
             ax.set_title(problem)
         axes[0].set_ylabel("mean stage cost after adaptation")
-        figure.savefig(path)
+        content = BytesIO()
+        figure.savefig(content, format="png")
+    return content.getvalue()

@@ -43,14 +43,18 @@ def environment() -> dict[str, str]:
 def require_environment(expected: Mapping[str, str] | None) -> dict[str, str]:
     """The `environment` of this process; EnvironmentMismatchError if another one is expected."""
     here = environment()
-    if expected is not None and here != dict(expected):
-        other = [
-            f"{name} {here.get(name, 'missing')} instead of {expected.get(name, 'none')}"
-            for name in sorted({*here, *expected})
-            if here.get(name) != expected.get(name)
-        ]
-        raise EnvironmentMismatchError(f"a worker has {', '.join(other)}")
+    if expected is not None and (other := differences(here, expected)):
+        raise EnvironmentMismatchError(f"a worker has {other}")
     return here
+
+
+def differences(there: Mapping[str, str], expected: Mapping[str, str]) -> str:
+    """What another environment has instead of the expected one, in words; empty if nothing."""
+    return ", ".join(
+        f"{name} {there.get(name, 'missing')} instead of {expected.get(name, 'none')}"
+        for name in sorted({*there, *expected})
+        if there.get(name) != expected.get(name)
+    )
 
 
 def train_one(
