@@ -10,23 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 def indicator_supports(n_z: int, n_a: int, width: float) -> NDArray[np.float64]:
     """Phi_j(x_i) of n_a equally spaced actuators, (n_z, n_a), entries 0 or 1.
 
-    With w = width n_z and s = n_z // n_a, support j is 1 on the grid indices
-    int(c - w/2) <= i < int(c + w/2) around its centre c = int((j + 0.5) s): controlgym's convention.
-
-    Parameters
-    ----------
-    n_z
-        Number of grid points.
-    n_a
-        Number of actuators.
-    width
-        Width of one support as a fraction of the domain.
-
-    Raises
-    ------
-    ValueError
-        The supports would together be wider than the domain, one holds no grid point, or one leaves
-        the grid.
+    With w = width n_z and s = n_z // n_a, support j is 1 on the grid indices int(c - w/2) <= i <
+    int(c + w/2) around its centre c = int((j + 0.5) s): controlgym's convention. ValueError where
+    they would together be wider than the domain, one holds no grid point, or one leaves the grid.
     """
     if not width > 0:
         raise ValueError(f"width must be positive, got {width!r}")
@@ -60,23 +46,8 @@ def placed_supports(
     With w = width n_x and c the grid index nearest to the centre, support j is 1 on the indices
     floor(c - w/2) <= i < floor(c + w/2), modulo n_x, as many for each actuator. A Gaussian is
     exp(-d^2 / (2 width^2)), with the distance d from the centre as a share of the domain. Supports
-    may overlap; their actions then add up.
-
-    Parameters
-    ----------
-    n_x
-        Number of grid points.
-    positions
-        Centres as shares of the domain, from 0 to 1.
-    width
-        Width of one support, or its standard deviation, as a fraction of the domain.
-    gaussian
-        The shape.
-
-    Raises
-    ------
-    ValueError
-        A centre lies outside of the domain, or a Gaussian falls between the grid points.
+    may overlap; their actions then add up. ValueError for centres that are not shares of the
+    domain, and a Gaussian that falls between the grid points.
     """
     centres = np.asarray(positions, dtype=np.float64)
     if not ((centres >= 0.0) & (centres <= 1.0)).all():

@@ -29,20 +29,10 @@ _VERSIONS = itertools.count(1)
 class LearningCurve:
     """Mean stage cost by the rollouts that a seed has made, or by episode where only topics tell.
 
-    Attributes
-    ----------
-    axis, phase
-        What x is; what the training does.
-    budget
-        The rollouts of a seed, 0 if unknown.
-    references
-        Mean stage costs to compare with, by controller.
-    evaluations
-        Those of each seed's closing evaluation.
-    diverged
-        Rollouts of the adaptation that diverged.
-    version
-        Differs after each change, and from curve to curve.
+    axis, phase: what x is, what the training does; budget: the rollouts of a seed, 0 if unknown;
+    references: mean stage costs to compare with, by controller; evaluations: those of each seed's
+    closing evaluation; diverged: rollouts of the adaptation that did; version: differs after each
+    change, and from curve to curve.
     """
 
     axis: str = "episode"

@@ -28,25 +28,10 @@ ENVIRONMENTS = ctypes.CFUNCTYPE(None, *[ctypes.c_ssize_t] * 8)
 class ParallelStep:
     """Machine code that advances environments, with its constants and a scratch for each thread.
 
-    Parameters
-    ----------
-    code
-        Its address, see `batch_step.environments_of`.
-    plan
-        Its plan; the addresses of constants and scratch are filled in here.
-    constants, scratch
-        The constants, and the size of a plane of the scratch.
-    points_per_step
-        How much work an environment is.
-
-    Attributes
-    ----------
-    code : int
-        As given, for compiled code that calls it.
-    constants : array
-        The memory that the plans have the address of.
-    plans : structured array
-        The plan of each thread.
+    code: its address, see `batch_step.environments_of`; plan: its plan, where the addresses of
+    constants and scratch are filled in; scratch: size of a plane of it; points_per_step: how much
+    work an environment is. The memory of `constants` is what `plans`, one for each thread, have the
+    address of.
     """
 
     def __init__(

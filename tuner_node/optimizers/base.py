@@ -50,15 +50,9 @@ class Rollout:
 
 @dataclass(frozen=True, eq=False)
 class RolloutResult:
-    """The outcome of a rollout.
+    """The outcome of a rollout: its mean stage cost, of no meaning if it diverged.
 
-    Attributes
-    ----------
-    cost : float
-        Mean stage cost; of no meaning if the rollout diverged.
-    diverged : bool
-    trajectory : Trajectory, optional
-        Required by optimisers that learn from trajectories.
+    trajectory: required by optimisers that learn from trajectories.
     """
 
     cost: float

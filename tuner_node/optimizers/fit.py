@@ -46,19 +46,9 @@ _BLOCK = 1024
 class LocalModel:
     """x_{k+1} = x_k + c + A e + B a_k + H(e, e) + C(e, e, e) with e = x_k - m.
 
-    Attributes
-    ----------
-    centre : (r,) array
-        m.
-    constant : (r,) array
-        c.
-    linear : (r, r) array
-        A.
-    B : (r, n_a) array
-    quadratic : (r, r, r) array
-        H, symmetric in its last two indices.
-    cubic : (r, l, l, l) array
-        C, symmetric in its last three indices, on the first l coordinates of e; l may be 0.
+    centre (r,): m; constant (r,): c; linear (r, r): A; B (r, n_a); quadratic (r, r, r): H,
+    symmetric in its last two indices; cubic (r, l, l, l): C, symmetric in its last three, on the
+    first l coordinates of e; l may be 0.
     """
 
     centre: Array
@@ -128,16 +118,9 @@ def fit(
 ) -> list[LocalModel]:
     """Fit one model per ridge, and with `leading` above 0 one with a cubic part per ridge after them.
 
-    Parameters
-    ----------
-    x, a, change : (N, r), (N, n_a), (N, r) arrays
-        x_k, a_k and x_{k+1} - x_k, of any number of trajectories.
-    weights : (N,) array
-        Not negative.
-    ridges : sequence of float
-        Ridge of the quadratic and cubic part per unit weight; `numpy.inf` for an affine model.
-    leading : int
-        l, coordinates that the cubic part acts on, at most r.
+    x (N, r), a (N, n_a), change (N, r): x_k, a_k and x_{k+1} - x_k of any number of trajectories,
+    with weights (N,), not negative; ridges: of the quadratic and cubic part per unit weight,
+    `numpy.inf` for an affine model; leading: l, coordinates that the cubic part acts on.
     """
     r, n_a = x.shape[1], a.shape[1]
     share = weights / weights.sum()

@@ -67,24 +67,11 @@ _STAMPS = ("fields", "incumbents", "trials", "others")
 class SearchState:
     """Where an optimisation stands, apart from the rollouts that it remembers.
 
-    Attributes
-    ----------
-    policy, candidate : (n_a, 2 n_s) arrays
-        The incumbent, and the policy that is tried.
-    fields : (M,) array
-        Numbers of the initial fields that judge.
-    incumbents, trials, others : (M,) arrays
-        Stamps of the rollouts on these fields of the incumbent, of the candidate, and of what the
-        incumbent is compared to: the candidate rejected last, or the incumbent before. -1: none.
-    fall : float
-        What the candidate is predicted to gain.
-    damping : float
-        lambda.
-    accepted : bool
-        Whether the last candidate was accepted.
-    proposed : bool
-        Whether there is a candidate.
-    tells : int
+    policy, candidate (n_a, 2 n_s): the incumbent, and what is tried if `proposed`; fields (M,):
+    numbers of the initial fields that judge; incumbents, trials, others (M,): stamps of the
+    rollouts on these fields of the incumbent, of the candidate, and of what the incumbent is
+    compared to, the candidate rejected last or the incumbent before, -1: none; fall: what the
+    candidate is predicted to gain; damping: lambda; accepted: whether the last candidate was.
     """
 
     policy: Array

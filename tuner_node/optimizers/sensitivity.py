@@ -42,17 +42,10 @@ ISOTROPY = 0.3
 class Path:
     """A measured trajectory in reduced coordinates.
 
-    Attributes
-    ----------
-    x : (T, r) array
-        Whose first n_s columns are s.
-    a : (T, n_a) array
-    features : (T, n_s + 1) array
-        phi(s_k) = [s_k; 1], or [s_k; 0] where the law has no constant part.
-    K : (n_a, n_s) array
-        Feedback da/ds of the law that it was measured under.
-    free : (T, n_a) array, optional
-        1 where the action moves with the gains, 0 where it was saturated; None: it never was.
+    x (T, r): its first n_s columns are s; a (T, n_a); features (T, n_s + 1): phi(s_k) = [s_k; 1],
+    or [s_k; 0] where the law has no constant part; K (n_a, n_s): feedback da/ds of the law that it
+    was measured under; free (T, n_a): 1 where the action moves with the gains, 0 where it was
+    saturated, None: it never was.
     """
 
     x: Array

@@ -46,19 +46,10 @@ class ShowLoop:
 class Page:
     """The content of all web pages of a monitor, and what they ask for.
 
-    Attributes
-    ----------
-    view
-        The loop that is shown.
-    place
-        Its ROS domain, folder and namespace, the namespaces that there are, and a number that
-        differs from loop to loop.
-    parameters, controls
-        Of its nodes: parameters, and the services that they offer.
-    requests
-        What the pages ask for, for the thread that feeds the view.
-    open
-        Whether a browser shows the page.
+    view: the loop that is shown; place: its ROS domain, folder and namespace, the namespaces that
+    there are, and a number that differs from loop to loop; parameters, controls: of its nodes, the
+    latter the services that they offer; requests: what the pages ask for, for the thread that feeds
+    the view; open: whether a browser shows the page.
     """
 
     def __init__(self, environment: int = 0) -> None:
