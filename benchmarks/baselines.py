@@ -25,10 +25,10 @@ from typing import Any
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from benchmarks.limits import find
 from benchmarks.methods import LIBRARIES, METHODS, measure
+from loop_interfaces.arrays import Array
 from loop_interfaces.controllers import CONTROLLERS
 from loop_interfaces.files import read_json
 from loop_interfaces.parameters import table as parameters
@@ -42,7 +42,6 @@ from pdeloop.study.executors import processes as pool
 
 __all__ = ["run", "text"]
 
-Array = NDArray[np.float64]
 STUDIES = Path(__file__).parent / "studies"
 TEST, VALIDATION = 0, 2024
 """Evaluation seeds, which draw the initial fields of the tables, and those that choose constants."""

@@ -11,12 +11,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
+
+from loop_interfaces.arrays import Array
 
 __all__ = ["Descent", "descend"]
 
-Array = NDArray[np.float64]
 MEMORY = 40
 """Pairs that L-BFGS remembers."""
 WINDOW = 20

@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg, sparse
 from threadpoolctl import threadpool_limits
 
@@ -23,6 +22,7 @@ from controller_node.identification import identify
 from controller_node.lqt import Gains
 from controller_node.policy import excitation
 from controller_node.reduced_model import ReducedModel
+from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import unpack
 from pde_sim_node.build import build_plant
 from pde_sim_node.measurement import InstrumentedPlant
@@ -33,7 +33,6 @@ from pdeloop.study.training import require_environment
 from tuner_node.build import build_training
 from tuner_node.seeds import Purpose, derive
 
-Array = NDArray[np.float64]
 Values = Mapping[str, Any]
 Method = Callable[..., tuple[LocalPair, Law, int]]
 """(resolved parameters, constants) -> (pair, law, rollouts paid)."""

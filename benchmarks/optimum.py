@@ -27,13 +27,13 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from benchmarks.baselines import pairs
 from benchmarks.descent import WINDOW, Descent, descend
 from benchmarks.limits import content
 from benchmarks.warm_start import warm_start
+from loop_interfaces.arrays import Array
 from loop_interfaces.files import make_folder
 from loop_interfaces.model_rows import unpack
 from loop_interfaces.problem import load_parameters
@@ -45,7 +45,6 @@ from tuner_node.seeds import Purpose, derive
 
 __all__ = ["run", "text"]
 
-Array = NDArray[np.float64]
 Function = Callable[[Array], tuple[float, Array]]
 """A cost and its gradient."""
 Law = tuple[Array, Array]

@@ -25,11 +25,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.baselines import BUDGETS, TEST, VALIDATION, pairs
 from benchmarks.methods import evaluation_fields, training_field
 from benchmarks.warm_start import warm_start
+from loop_interfaces.arrays import Array
 from loop_interfaces.files import make_folder, write_atomically
 from loop_interfaces.model_rows import unpack
 from pdeloop.environments import VectorEnvironment
@@ -37,7 +37,6 @@ from pdeloop.episode import Law, projected_law, rollout
 from pdeloop.in_process import LocalPair
 from pdeloop.training_run import resolve
 
-Array = NDArray[np.float64]
 PENALTY = 100.0
 MARKS = (20, 40, 80, 160, 320, 640, 1280, 2560, 5120, 10240, 20480, 40960)
 """Rollouts after which the policy is measured."""

@@ -4,16 +4,14 @@
 from dataclasses import asdict, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from controller_node.identification import DesignSettings, design_each
 from controller_node.policy import excitations
+from loop_interfaces.arrays import Array
 from loop_interfaces.frames import KEPT_ARRAY, Frame
 from loop_interfaces.protocol import ModelFailure, Publication
 from loop_interfaces.signature import design_digest, digest_of, signature
 from loop_interfaces.topics import COMPLETED, MODEL_IDENTIFIED, VOID, CostColumn
-
-Array = NDArray[np.float64]
 
 
 class Exploration:

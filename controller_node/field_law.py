@@ -22,16 +22,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 
 from controller_node.reduced_model import Trajectory, leading_modes, pieces, steps_of
+from loop_interfaces.arrays import Array
 from loop_interfaces.field_models import FieldModel
 from loop_interfaces.field_models.convolution import fit_convolutions
 from loop_interfaces.field_models.differential import fit_differential
 from loop_interfaces.model_rows import ModelRows
-
-Array = NDArray[np.float64]
 
 LARGEST = 512
 """Points of a field, at most: the work grows with their third power."""

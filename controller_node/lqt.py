@@ -29,8 +29,7 @@ from scipy import linalg
 from threadpoolctl import threadpool_limits
 
 from controller_node.reduced_model import ReducedModel
-
-Array = NDArray[np.float64]
+from loop_interfaces.arrays import Array
 
 # A direction that the inputs move by less than this, relative to the model's size, counts as out of
 # reach.

@@ -27,8 +27,8 @@ from threadpoolctl import threadpool_limits
 
 from controller_node.reduced_model import ReducedModel, Trajectory, numerical_rank, pieces, steps_of
 from controller_node.regression import fit
+from loop_interfaces.arrays import Array
 
-Array = NDArray[np.float64]
 ORDERS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 28, 32, 40, 48, 64)
 FOLDS, PIECES = 4, 8
 SHARE = 0.8

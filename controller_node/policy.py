@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from controller_node.law import LAW, control, padded
+from loop_interfaces.arrays import Array
 from loop_interfaces.jit.simd import whole_lanes
 from loop_interfaces.topics import StartColumn
 
-Array = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 
 

@@ -12,10 +12,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import linalg
 
-Array = NDArray[np.float64]
+from loop_interfaces.arrays import Array
+
 Trajectory = tuple[Array, Array]
 """States (N + 1, n_z) and actions (N, n_a)."""
 

@@ -22,13 +22,12 @@ reduction", CMAME 306, 2016 (least squares on projected states).
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import linalg
 from threadpoolctl import threadpool_limits
 
 from controller_node.reduced_model import ReducedModel, Steps, leading_modes, steps_of
-
-Array = NDArray[np.float64]
+from loop_interfaces.arrays import Array
 
 
 def identify(trajectories: Sequence[tuple[ArrayLike, ArrayLike]], *, n_s: int) -> ReducedModel:

@@ -17,9 +17,8 @@ n_s is the number of columns, n_a that of the axis `actuator`; n_z follows from 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from loop_interfaces.arrays import Array
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,11 @@ from tempfile import TemporaryDirectory
 from typing import Any, TextIO
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from controller_node import identification
 from controller_node.reduced_model import ReducedModel
+from loop_interfaces.arrays import Array
 from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_equation, build_plant
 from pde_sim_node.equations import allow
@@ -28,8 +29,6 @@ from pdeloop.training_run import begin, carry_out
 from tuner_node.build import build_training
 
 __all__ = ["Problem", "identify", "problem", "train"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,14 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from loop_interfaces.array_files import read_arrays
+from loop_interfaces.arrays import Array
 from loop_interfaces.files import FileError, read_bounded
 
 __all__ = ["Measurements", "read_measurements"]
 
-Array = NDArray[np.float64]
 MAX_TEXT_BYTES = 2**28
 """Of a .csv file."""
 LARGEST = 1e100

@@ -32,12 +32,11 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 import pdeloop
+from loop_interfaces.arrays import Array
 from loop_interfaces.problem import shipped_problems
 from pde_sim_node.plant import DIVERGED_COST, Plant
 
 __all__ = ["Environment", "VectorEnvironment", "environment_id"]
-
-Array = NDArray[np.float64]
 
 
 class Environment(gymnasium.Env[Array, Array]):

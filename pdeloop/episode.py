@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from controller_node.policy import ProjectedLaw
+from loop_interfaces.arrays import Array
 from pde_sim_node.plant import MEAN_FIELD, EpisodeCosts, Plant
 
 __all__ = ["EpisodeRecord", "Law", "finite_array", "mean_field_cost", "projected_law", "rollout"]
 
-Array = NDArray[np.float64]
 Law: TypeAlias = Callable[[int, Array], Array]
 """(k, z_k of shape (M, state_size)) -> a_k of shape (M, n_a)."""
 

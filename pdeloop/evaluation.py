@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import pack
 from loop_interfaces.parameters import noisy
 from loop_interfaces.topics import CostColumn
@@ -22,7 +23,6 @@ from tuner_node.rollouts import CONTROLLERS
 from tuner_node.run_folder import RunFolderError
 from tuner_node.seeds import Purpose, derive, evaluation_noise
 
-Array = NDArray[np.float64]
 AGREE = 0.1
 """Relative difference of a mean cost that other rounding may explain where the field is chaotic."""
 

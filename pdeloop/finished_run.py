@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 import scipy  # whose statistics, half a second of a core, load when they are used
-from numpy.typing import NDArray
 
 from loop_interfaces import model_rows
+from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import ModelRows
 from loop_interfaces.topics import COMPLETED
 from pde_sim_node.plant import DIVERGED_COST, EpisodeCosts
@@ -20,7 +20,6 @@ from pdeloop.episode import EpisodeRecord
 from tuner_node.rollouts import CONTROLLERS
 from tuner_node.run_folder import RunFolder
 
-Array = NDArray[np.float64]
 RESAMPLES = 9999
 CONFIDENCE = 0.95
 

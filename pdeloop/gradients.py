@@ -16,15 +16,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from loop_interfaces.arrays import Array
 from pde_sim_node.plant import EpisodeCosts, Plant
 from pde_sim_node.solver.adjoint import adjoint_of
 from pdeloop.episode import EpisodeRecord, Law, finite_array, rollout
 
 __all__ = ["CostGradient", "Gradients", "features"]
-
-Array = NDArray[np.float64]
 
 
 class CostGradient(NamedTuple):

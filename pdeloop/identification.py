@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from controller_node.identification import DesignSettings, design
 from controller_node.order import OrderStudy, study_orders
+from loop_interfaces.arrays import Array
 from loop_interfaces.episodes import episode_name
 from loop_interfaces.model_rows import ModelRows, pack
 from loop_interfaces.parameters import as_recorded, model_order, table
@@ -26,7 +26,6 @@ from pdeloop.bags.reader import Bag
 from pdeloop.data_file import read_measurements
 from recorder_node.bag import BagError
 
-Array = NDArray[np.float64]
 Trajectories = Sequence[tuple[Array, Array]]
 
 

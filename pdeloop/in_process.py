@@ -11,11 +11,11 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from controller_node.identification import DesignSettings, design_each
 from controller_node.policy import ProjectedLaw, excitations
 from loop_interfaces import model_rows
+from loop_interfaces.arrays import Array
 from loop_interfaces.topics import CostColumn, StartColumn, noise_seeds
 from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.plant import Plant
@@ -24,7 +24,6 @@ from tuner_node.batch import Batch, BatchResult
 from tuner_node.training import Training
 from tuner_node.trajectory_collector import cut
 
-Array = NDArray[np.float64]
 Report = Callable[[Mapping[str, Any]], None]
 
 

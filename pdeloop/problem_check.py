@@ -18,6 +18,7 @@ from scipy import linalg
 
 from controller_node.identification import DesignSettings, design
 from controller_node.order import study_orders
+from loop_interfaces.arrays import Array
 from loop_interfaces.parameters import INSTRUMENTS
 from pde_sim_node.build import build_plant
 from pde_sim_node.equations import LinearEquation
@@ -27,7 +28,6 @@ from tuner_node.build import build_training
 
 __all__ = ["Finding", "Reach", "check", "draw", "linearisation", "reach"]
 
-Array = NDArray[np.float64]
 STEP_ERROR = 1e-2
 """Largest change of a sample by a halved integration step, relative to the sample's own change."""
 GROWS = 1e-8

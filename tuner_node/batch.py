@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from itertools import repeat
 
 import numpy as np
-from numpy.typing import NDArray
 
+from loop_interfaces.arrays import Array
 from loop_interfaces.topics import COMPLETED, MAX_GAIN, START_COLUMNS, CostColumn
 from tuner_node.optimizers import Rollout, RolloutResult, Trajectory
 
-Array = NDArray[np.float64]
 UNKNOWN_PLANT = -1
 """The plant's fingerprint before the first cost."""
 

@@ -25,9 +25,10 @@ from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from loop_interfaces import topics
+from loop_interfaces.arrays import Array
 from loop_interfaces.episodes import EPISODES_PER_START, episode_name
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import ModelFailure, Publication
@@ -36,7 +37,6 @@ from loop_interfaces.topics import START_COLUMNS, VOID, CostColumn, Topic
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult
 from tuner_node.pair import Chunk, DispatchError, Pair, PairPublication
 
-Array = NDArray[np.float64]
 SAMPLE_GRACE = 0.5
 """Seconds after its cost within which the last samples of an episode must have come in."""
 MAX_TARGETS = 64

@@ -4,9 +4,7 @@
 import math
 from dataclasses import dataclass, field
 
-import numpy as np
-from numpy.typing import NDArray
-
+from loop_interfaces.arrays import Array
 from loop_interfaces.episodes import episode_name
 from loop_interfaces.frames import Frame, FrameError, digest
 from loop_interfaces.protocol import Publication
@@ -16,7 +14,6 @@ from tuner_node.batch import Batch
 from tuner_node.optimizers import Trajectory
 from tuner_node.trajectory_collector import TrajectoryCollector
 
-Array = NDArray[np.float64]
 PairPublication = tuple[int, Publication]
 """(pair, message): publish the message in that pair's namespace."""
 REMEMBERED = 16

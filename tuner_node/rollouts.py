@@ -8,14 +8,13 @@ from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from loop_interfaces.arrays import Array
 from loop_interfaces.topics import StartColumn
 from tuner_node.batch import TrainingSettings
 from tuner_node.optimizers import Rollout
 from tuner_node.seeds import Purpose, derive, evaluation_noise
 
-Array = NDArray[np.float64]
 EXPLORATION = 1
 """Rollouts of an exploration."""
 CHECK = 2

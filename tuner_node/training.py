@@ -23,9 +23,9 @@ from itertools import islice
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from loop_interfaces import model_rows
+from loop_interfaces.arrays import Array
 from loop_interfaces.topics import COMPLETED, CostColumn
 from tuner_node import rollouts
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, TrainingSettings, batch_of
@@ -33,9 +33,6 @@ from tuner_node.budget import Budget
 from tuner_node.optimizers import Context, Optimizer, Record, Rollout, Trajectory
 from tuner_node.published_law import check_law
 from tuner_node.rollouts import CHECK, CONTROLLERS, EXPLORATION
-
-Array = NDArray[np.float64]
-
 
 OptimizerFactory = Callable[[Array, int, Context | None, int], Optimizer]
 """(warm-start policy, seed, context where trajectories are asked for, rollouts) -> optimiser."""

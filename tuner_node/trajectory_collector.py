@@ -8,14 +8,13 @@ it is when a sample comes twice with different content: which of them was the pl
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from loop_interfaces.arrays import Array
 from loop_interfaces.episodes import episode_name
 from loop_interfaces.frames import KEPT_ARRAY, Frame, FrameError
 from loop_interfaces.topics import COMPLETED
 from tuner_node.optimizers import Trajectory
 
-Array = NDArray[np.float64]
 MAX_BYTES = 2**30
 """Bytes that are kept of the samples of one episode, whoever sends them."""
 

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.arrays import Array
 from loop_interfaces.frames import Frame
 from loop_interfaces.topics import VOID, CostColumn
 from viewer_node.episode_samples import EpisodeSamples, Key, key_of, rows_of
@@ -20,7 +21,6 @@ from viewer_node.loop_nodes import LoopNodes
 from viewer_node.operation import Operation
 from viewer_node.rollout_costs import RolloutCosts, remember
 
-Array = NDArray[np.float64]
 SLOW = 1.0
 """Seconds after which an episode is shown while it runs; shorter ones when they are over."""
 SILENT = 5.0

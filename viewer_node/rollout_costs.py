@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces import model_rows
+from loop_interfaces.arrays import Array
 from loop_interfaces.frames import Frame
 from loop_interfaces.topics import COMPLETED, START_COLUMNS, CostColumn, StartColumn
 
-Array = NDArray[np.float64]
 Key = TypeVar("Key")
 Value = TypeVar("Value")
 MAX_KEPT = 100

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-Array = NDArray[np.float64]
+from loop_interfaces.arrays import Array
 
 # Of the inputs and the constant, on the scaled variables.
 _INPUT_RIDGE = 1e-8

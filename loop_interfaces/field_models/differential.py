@@ -26,7 +26,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from loop_interfaces.arrays import Array
+
 Spectrum = NDArray[np.complex128]
 
 # Largest p and j.

@@ -33,7 +33,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import resample
 
-Array = NDArray[np.float64]
+from loop_interfaces.arrays import Array
+
 Spectrum = NDArray[np.complex128]
 
 # p and j of the terms; 1 is added for the constant.

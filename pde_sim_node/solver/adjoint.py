@@ -33,6 +33,7 @@ from numba.core.errors import NumbaError
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
+from loop_interfaces.arrays import Array
 from loop_interfaces.jit import cache, native, simd
 from loop_interfaces.jit.cache import cached_njit, jit
 from loop_interfaces.jit.native import call_c
@@ -55,7 +56,6 @@ from pde_sim_node.solver.spectra import (
     synthesise,
 )
 
-Array = NDArray[np.float64]
 COMPLEX_STEP = 1e-30
 """g'(u) = Im g(u + i h)/h, without cancellation: h can be far below the rounding of u."""
 

@@ -8,13 +8,11 @@ nonlinear part on the dealiased grid and the forcing of the held action, N(v) = 
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import irfft, rfft
 
+from loop_interfaces.arrays import Array
 from pde_sim_node.equations import Equation
 from pde_sim_node.solver.etdrk4 import etdrk4_coefficients
-
-Array = NDArray[np.float64]
 
 
 class ReferenceStep:

@@ -10,8 +10,8 @@ from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from loop_interfaces.arrays import Array
 from loop_interfaces.episodes import episode_name
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import ModelFailure
@@ -30,7 +30,6 @@ from loop_interfaces.topics import (
 )
 from recorder_node.sources import Source
 
-Array = NDArray[np.float64]
 SETTLING, MODEL_SETTLING = 0.3, 10.0
 """Seconds after an episode's last message in which further ones may still come; the longer ones for an
 episode without its cost or its model."""

@@ -13,17 +13,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from loop_interfaces.arrays import Array
 from loop_interfaces.topics import TARGET
 from pdeloop.bags.episodes import EpisodeIndex, RecordedEpisode
 from pdeloop.bags.mcap_messages import Message, files, finished, read, text_of
 from recorder_node.bag import METADATA, BagError
 from recorder_node.recording import PARAMETERS
 from recorder_node.sources import source_of
-
-Array = NDArray[np.float64]
 
 
 class Bag:

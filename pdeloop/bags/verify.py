@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from controller_node.identification import DesignSettings, design
 from loop_interfaces import model_rows
+from loop_interfaces.arrays import Array
 from loop_interfaces.frames import Frame
 from loop_interfaces.parameters import PLANT, as_recorded, table, with_budget
 from loop_interfaces.spec import check, read_yaml
@@ -31,7 +31,6 @@ from pdeloop.in_process import LocalPair
 from tuner_node.batch import Batch
 from tuner_node.build import build_training
 
-Array = NDArray[np.float64]
 _TUNERS = ("seed", "seeds", "rollouts", "iterations", "start", "optimizer")
 SHOWN = 5
 """Differences that are described; the others are only counted."""

@@ -15,9 +15,9 @@ from itertools import count
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from loop_interfaces import model_rows
+from loop_interfaces.arrays import Array
 from loop_interfaces.frames import Frame
 from loop_interfaces.topics import (
     ACTION,
@@ -34,7 +34,6 @@ from loop_interfaces.topics import (
 )
 from pdeloop.problem_check import Finding
 
-Array = NDArray[np.float64]
 ASK_AGAIN = 0.5
 """Seconds after which an unanswered message is sent again."""
 PLANT = 31

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from controller_node.order import OrderStudy, study_orders
 from controller_node.policy import ProjectedLaw
 from loop_interfaces.array_files import read_arrays, taken
+from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import ModelRows, unpack
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD, Plant
@@ -26,8 +26,6 @@ from pdeloop.study.description import Study
 from pdeloop.study.training import CURVE
 from tuner_node.build import build_training
 from tuner_node.run_folder import RunFolderError
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -10,13 +10,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
+from loop_interfaces.arrays import Array
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.report.data import Curve, ProblemData
 from pdeloop.report.style import COLOURS, LINES, NAMES, panels, plain_log
 
-Array = NDArray[np.float64]
 Rows = Sequence[Mapping[str, Any]]
 EDGE = 1.5
 """Candidates that cost more, relative to the incumbent, or diverged stand at this height."""

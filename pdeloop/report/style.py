@@ -8,15 +8,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
-from numpy.typing import NDArray
 
+from loop_interfaces.arrays import Array
 from loop_interfaces.controllers import CONTROLLERS
 
-Array = NDArray[np.float64]
 COLOURS = {key: controller.colour for key, controller in CONTROLLERS.items()}
 NAMES = {key: controller.name for key, controller in CONTROLLERS.items()}
 LINES: dict[str, Any] = {"lqt": "--", "pure_po": "-.", "gauss_newton": (0, (5, 1))}

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from loop_interfaces.arrays import Array
 from loop_interfaces.controllers import CONTROLLERS
 from pdeloop.finished_run import (
     CONFIDENCE,
-    Array,
     FinishedRun,
     field_means,
     interval,

@@ -17,7 +17,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+from loop_interfaces.arrays import Array
+
 Row = dict[str, float | int | bool | str]
 State = dict[str, NDArray[np.generic]]
 

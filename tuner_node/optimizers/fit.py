@@ -29,9 +29,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from loop_interfaces.arrays import Array
+
 __all__ = ["LocalModel", "extended_basis", "fit"]
 
-Array = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 
 # Ridges on the scaled variables, per unit weight: enough to bound directions that the data does not

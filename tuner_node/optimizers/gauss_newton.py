@@ -31,8 +31,8 @@ from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
 from loop_interfaces.array_files import Arrays, taken
+from loop_interfaces.arrays import Array
 from tuner_node.optimizers.base import (
-    Array,
     Context,
     Record,
     Rollout,

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tuner_node.optimizers.base import Array
+from loop_interfaces.arrays import Array
 from tuner_node.optimizers.fit import LocalModel
 from tuner_node.optimizers.sensitivity import Path, predict_difference
 

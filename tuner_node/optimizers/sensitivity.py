@@ -27,12 +27,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 
+from loop_interfaces.arrays import Array
 from tuner_node.optimizers.fit import LocalModel
-
-Array = NDArray[np.float64]
 
 # Share of the trust region that bounds all gains alike, relative to the one in input energy.
 ISOTROPY = 0.3

@@ -27,9 +27,10 @@ from functools import cached_property
 import numpy as np
 from scipy import linalg
 
+from loop_interfaces.arrays import Array
 from loop_interfaces.field_models import FieldModel
 from loop_interfaces.field_models.differential import DifferentialModel
-from tuner_node.optimizers.base import Array, Record
+from tuner_node.optimizers.base import Record
 from tuner_node.optimizers.sensitivity import ISOTROPY, Path, expand
 
 # Inner steps, and the share of the objective below which a further one is not worth its time: in few

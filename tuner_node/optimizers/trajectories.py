@@ -5,7 +5,8 @@ import numpy as np
 import scipy.linalg
 
 from loop_interfaces.array_files import Arrays, taken
-from tuner_node.optimizers.base import Array, Record, RolloutResult, State, Trajectory
+from loop_interfaces.arrays import Array
+from tuner_node.optimizers.base import Record, RolloutResult, State, Trajectory
 
 
 def trajectory_arrays(name: str, trajectory: Trajectory | Record) -> State:

@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from loop_interfaces.array_files import taken
+from loop_interfaces.arrays import Array
 from tuner_node.optimizers.base import (
-    Array,
     Rollout,
     RolloutResult,
     Row,

@@ -10,7 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tuner_node.optimizers.base import Array, Record
+from loop_interfaces.arrays import Array
+from tuner_node.optimizers.base import Record
 from tuner_node.optimizers.fit import LocalModel, extended_basis, fit
 from tuner_node.optimizers.proposals.proposal import LEAST_FALL, MODES, Proposal
 from tuner_node.optimizers.proposals.reproducing import steps_of

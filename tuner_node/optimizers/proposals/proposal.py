@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tuner_node.optimizers.base import Array, Row
+from loop_interfaces.arrays import Array
+from tuner_node.optimizers.base import Row
 
 # Coordinates of the local models and of the sensitivities, at least.
 MODES = 32

@@ -9,7 +9,8 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from tuner_node.optimizers.base import Array, Context, Record
+from loop_interfaces.arrays import Array
+from tuner_node.optimizers.base import Context, Record
 from tuner_node.optimizers.proposals import chaotic, local, whole_field
 from tuner_node.optimizers.proposals.proposal import COMPARED, Proposal
 from tuner_node.optimizers.proposals.reproducing import (

@@ -11,8 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from loop_interfaces.arrays import Array
 from loop_interfaces.field_models.sensed import SHARED, SensedModel, fit_sensed, interpolated
-from tuner_node.optimizers.base import Array, Record
+from tuner_node.optimizers.base import Record
 from tuner_node.optimizers.fit import extended_basis
 from tuner_node.optimizers.proposals.proposal import COMPARED, TRUST, Proposal, spread
 from tuner_node.optimizers.proposals.reproducing import REPRODUCED

@@ -10,8 +10,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from loop_interfaces.arrays import Array
 from loop_interfaces.field_models import FieldModel
-from tuner_node.optimizers.base import Array, Record
+from tuner_node.optimizers.base import Record
 from tuner_node.optimizers.fit import extended_basis
 from tuner_node.optimizers.proposals.proposal import MODES, TRUST, Proposal, spread
 from tuner_node.optimizers.simulation import Loop, improve
