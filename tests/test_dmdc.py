@@ -8,37 +8,18 @@ import pytest
 
 from controller_node.dmdc import identify
 from controller_node.reduced_model import ReducedModel
+from tests.linear_system import assert_recovered, lift, linear_system, trajectory
 
 N_S, N_A, STEPS = 3, 2, 40
 
 
-def linear_system(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    A = rng.standard_normal((N_S, N_S))
-    A *= 0.95 / np.abs(np.linalg.eigvals(A)).max()
-    return A, rng.standard_normal((N_S, N_A))
-
-
-def trajectory(A: np.ndarray, B: np.ndarray, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    actions = rng.standard_normal((STEPS, N_A))
-    states = [rng.standard_normal(N_S)]
-    for a in actions:
-        states.append(A @ states[-1] + B @ a)
-    return np.array(states), actions
-
-
 @pytest.mark.parametrize("n_z", [N_S, 20, 60])
 def test_recovers_a_linear_system_to_machine_precision(n_z: int) -> None:
-    A, B = linear_system()
-    lift = np.linalg.qr(np.random.default_rng(2).standard_normal((n_z, N_S)))[0]
-    states, actions = trajectory(A, B)
-    model = identify([(states @ lift.T, actions)], p=N_S + N_A, n_s=N_S)
-    # U spans the columns of the lift, in another basis: T = U^T lift is orthogonal.
-    T = model.U.T @ lift
-    np.testing.assert_allclose(T @ T.T, np.eye(N_S), atol=1e-13)
-    np.testing.assert_allclose(T.T @ model.A @ T, A, atol=1e-12)
-    np.testing.assert_allclose(T.T @ model.B, B, atol=1e-12)
+    A, B = linear_system(N_S)
+    onto = lift(n_z, N_S)
+    states, actions = trajectory(A, B, steps=STEPS)
+    model = identify([(states @ onto.T, actions)], p=N_S + N_A, n_s=N_S)
+    assert_recovered(model, A, B, onto, atol=1e-12)
     np.testing.assert_allclose(model.U.T @ model.U, np.eye(N_S), atol=1e-13)
     assert (model.n_z, model.n_s, model.n_a) == (n_z, N_S, N_A)
 
@@ -56,7 +37,7 @@ def test_is_the_formula_of_the_paper() -> None:
 
 
 def test_basis_is_unique_and_repeatable() -> None:
-    states, actions = trajectory(*linear_system())
+    states, actions = trajectory(*linear_system(N_S), steps=STEPS)
     first = identify([(states, actions)], p=5, n_s=N_S)
     again = identify([(states.copy(), actions.copy())], p=5, n_s=N_S)
     for name in ("A", "B", "U"):
@@ -80,20 +61,19 @@ def test_basis_is_unique_and_repeatable() -> None:
     ],
 )
 def test_refuses_more_than_the_trajectory_holds(p: int, n_s: int, message: str) -> None:
-    lift = np.linalg.qr(np.random.default_rng(2).standard_normal((20, N_S)))[0]
-    states, actions = trajectory(*linear_system())
+    states, actions = trajectory(*linear_system(N_S), steps=STEPS)
     with pytest.raises(ValueError, match=message):
-        identify([(states @ lift.T, actions)], p=p, n_s=n_s)
+        identify([(states @ lift(20, N_S).T, actions)], p=p, n_s=n_s)
 
 
 def test_refuses_a_trajectory_shorter_than_p() -> None:
-    states, actions = trajectory(*linear_system())
+    states, actions = trajectory(*linear_system(N_S), steps=STEPS)
     with pytest.raises(ValueError, match="= 4, but p is 5"):
         identify([(states[:5], actions[:4])], p=5, n_s=3)
 
 
 def test_refuses_malformed_trajectories() -> None:
-    states, actions = trajectory(*linear_system())
+    states, actions = trajectory(*linear_system(N_S), steps=STEPS)
     with pytest.raises(ValueError, match="40 actions belong to 41 states, but 40"):
         identify([(states[:-1], actions)], p=5, n_s=3)
     with pytest.raises(ValueError, match="non-empty matrix"):

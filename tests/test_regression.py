@@ -9,43 +9,20 @@ from threadpoolctl import threadpool_limits
 
 from controller_node import dmdc
 from controller_node.regression import identify
+from tests.linear_system import assert_recovered, lift, linear_system, trajectory
 from tuner_node.exploration import least_variance
 
-Array = np.ndarray
 N_S, N_A, STEPS = 4, 2, 60
-
-
-def linear_system(seed: int = 0) -> tuple[Array, Array]:
-    rng = np.random.default_rng(seed)
-    A = rng.standard_normal((N_S, N_S))
-    A *= 0.95 / np.abs(np.linalg.eigvals(A)).max()
-    return A, rng.standard_normal((N_S, N_A))
-
-
-def trajectory(A: Array, B: Array, seed: int = 1, steps: int = STEPS) -> tuple[Array, Array]:
-    rng = np.random.default_rng(seed)
-    actions = rng.standard_normal((steps, B.shape[1]))
-    states = [rng.standard_normal(len(A))]
-    for a in actions:
-        states.append(A @ states[-1] + B @ a)
-    return np.array(states), actions
-
-
-def lift(n_z: int) -> Array:
-    return np.linalg.qr(np.random.default_rng(2).standard_normal((n_z, N_S)))[0]
 
 
 @pytest.mark.parametrize("n_z", [N_S, 30])
 def test_recovers_a_linear_system_from_pooled_trajectories(n_z: int) -> None:
-    A, B = linear_system()
+    A, B = linear_system(N_S)
     # None of them alone has enough steps for n_s + n_a unknowns.
     parts = [trajectory(A, B, seed, steps=N_S + N_A - 1) for seed in (1, 2, 3)]
-    onto = lift(n_z)
+    onto = lift(n_z, N_S)
     model = identify([(z @ onto.T, a) for z, a in parts], n_s=N_S)
-    T = model.U.T @ onto
-    np.testing.assert_allclose(T @ T.T, np.eye(N_S), atol=1e-13)
-    np.testing.assert_allclose(T.T @ model.A @ T, A, atol=1e-11)
-    np.testing.assert_allclose(T.T @ model.B, B, atol=1e-11)
+    assert_recovered(model, A, B, onto, atol=1e-11)
 
 
 def test_is_the_projected_least_squares_solution() -> None:
@@ -73,7 +50,7 @@ def test_does_not_depend_on_the_unit_of_the_inputs(scale: float) -> None:
 
 
 def test_does_not_depend_on_the_unit_where_inputs_are_not_independent() -> None:
-    states, actions = trajectory(*linear_system())
+    states, actions = trajectory(*linear_system(N_S), steps=STEPS)
     actions[:, 1] = 2.0 * actions[:, 0]
     model, other = (identify([(states, c * actions)], n_s=N_S) for c in (1.0, 1e-6))
     np.testing.assert_allclose(1e-6 * other.B, model.B, rtol=1e-6)
@@ -105,11 +82,11 @@ def test_same_bits_whatever_the_threads() -> None:
 
 
 def test_refuses_what_it_cannot_identify() -> None:
-    states, actions = trajectory(*linear_system())
+    states, actions = trajectory(*linear_system(N_S), steps=STEPS)
     with pytest.raises(ValueError, match="needs at least 6 steps, but there are 5"):
         identify([(states[:6], actions[:5])], n_s=N_S)
     with pytest.raises(ValueError, match="numerical rank of the states, 4, but n_s is 5"):
-        identify([(states @ lift(20).T, actions)], n_s=5)
+        identify([(states @ lift(20, N_S).T, actions)], n_s=5)
     with pytest.raises(ValueError, match="at least 1"):
         identify([(states, actions)], n_s=0)
     with pytest.raises(ValueError, match="40 actions belong to 41 states"):

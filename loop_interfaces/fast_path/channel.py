@@ -43,11 +43,11 @@ from loop_interfaces.jit import cache, native, simd
 from loop_interfaces.jit.cache import cached_njit, jit
 from loop_interfaces.jit.native import (
     CLOCK,
+    MachineCode,
     MonotonicClock,
     address_of,
     call_c,
     load_acquire,
-    machine_code,
     monotonic_ns,
     pointer_to,
     store_release,
@@ -176,12 +176,14 @@ def on_message(channel: Any) -> bool:
     return bool(found)
 
 
-@machine_code(types.void(pointer_to(CHANNEL), types.intp), *SOURCES)
-def on_new_message(channels: Any, count: int) -> None:
+def on_messages(channels: Any, count: int) -> None:
     """The middleware's callback: `on_message` for each message that arrived."""
     channel = carray(channels, 1)[0]
     while on_message(channel):
         pass
+
+
+on_new_message = MachineCode(on_messages, types.void(pointer_to(CHANNEL), types.intp), *SOURCES)
 
 
 # What the node's own thread calls.

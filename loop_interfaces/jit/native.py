@@ -92,11 +92,6 @@ class MachineCode:
         return address
 
 
-def machine_code(signature: Any, *sources: ModuleType) -> Callable[..., MachineCode]:
-    """A decorator that makes MachineCode of a function."""
-    return lambda function: MachineCode(function, signature, *sources)
-
-
 def pointer_to(record: np.dtype[Any]) -> Any:
     """The type of the address of such a record in a signature."""
     return types.CPointer(numba.from_dtype(record))  # type: ignore[no-untyped-call]
