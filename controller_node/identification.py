@@ -22,12 +22,22 @@ from loop_interfaces.parameters import model_order
 
 @dataclass(frozen=True)
 class DesignSettings:
-    """How to identify and what to design for: see the parameters of these names.
+    """How to identify and what to design for.
 
-    identification: "field", the regression or a law from a model of the whole field (`field_law`)
-    that is better; "regression"; or "dmdc". reduced_order: n_s of the first two, 0: as
-    `study_orders` suggests. dmdc_rank, dmdc_order: p and n_s of "dmdc"; 0: n_s + n_a, and
-    reduced_order. The gains are designed without the action_limit.
+    Attributes
+    ----------
+    n_a : int
+        Actuators.
+    reduced_order : int
+        n_s of "field" and "regression"; 0: as `order.study_orders` suggests.
+    state_weight, action_weight : float
+        Of the stage cost.
+    action_limit : float
+        Magnitude at which actions saturate; 0: none. The gains are designed without it.
+    identification : {"field", "regression", "dmdc"}
+        "field": the regression, or a law from a model of the whole field (`field_law`) that is better.
+    dmdc_rank, dmdc_order : int
+        p and n_s of "dmdc"; 0: n_s + n_a, and reduced_order.
     """
 
     n_a: int
@@ -48,11 +58,23 @@ class DesignSettings:
 def identify(
     trajectories: Sequence[tuple[ArrayLike, ArrayLike]], *, method: str, n_s: int, p: int = 0
 ) -> ReducedModel:
-    """The reduced model of one plant from trajectories (states (N + 1, n_z), actions (N, n_a)).
+    """The reduced model of one plant.
 
-    method: "regression", least squares in reduced coordinates, or truncated "dmdc"; n_s: its order,
-    0: the suggested one (`study_orders`); p: rank of "dmdc", 0: n_s + n_a. ValueError where the
-    data allow no such model, or there is no such method.
+    Parameters
+    ----------
+    trajectories : sequence of (states (N + 1, n_z), actions (N, n_a))
+        a_k is held from z_k to z_{k+1}.
+    method : {"regression", "dmdc"}
+        Least squares in reduced coordinates, or truncated DMDc.
+    n_s : int
+        Its order; 0: the suggested one (`order.study_orders`).
+    p : int
+        Rank of "dmdc"; 0: n_s + n_a.
+
+    Raises
+    ------
+    ValueError
+        The data allow no such model, or there is no such method.
     """
     if not any(np.any(actions) for _, actions in trajectories):
         raise ValueError("all actions are zero, which says nothing of B; excite the plant")
@@ -70,11 +92,21 @@ def design(
     target: NDArray[np.float64],
     settings: DesignSettings,
 ) -> ModelRows:
-    """A reduced model from trajectories, and its LQ-tracking gains for z_r.
+    """Reduce and design: a model from the trajectories, then the LQ-tracking gains.
 
-    trajectories: (states (N + 1, n_z), actions (N, n_a)) each. The order of the settings is lowered
-    to the size of the state where that is smaller. ValueError where the data allow no model of this
-    order, or the model no stabilising gains.
+    Parameters
+    ----------
+    trajectories : sequence of (states (N + 1, n_z), actions (N, n_a))
+        a_k is held from z_k to z_{k+1}.
+    target : (n_z,) array
+        z_r.
+    settings : DesignSettings
+        Method, order, which is lowered to the size of the state where that is smaller, and weights.
+
+    Raises
+    ------
+    ValueError
+        The data allow no model of this order, or the model no stabilising gains.
     """
     model = identify(
         trajectories,

@@ -40,6 +40,8 @@ def rows_of(n_z: int, components: int = 1) -> NDArray[np.intp]:
 
     They are evenly spaced, at most ROWS in each of the first MAX_COMPONENTS components.
 
+    Examples
+    --------
     >>> rows_of(6, components=2).tolist()
     [0, 1, 2, 3, 4, 5]
     >>> len(rows_of(1000))
@@ -53,12 +55,31 @@ def rows_of(n_z: int, components: int = 1) -> NDArray[np.intp]:
 class EpisodeSamples:
     """What was seen of one environment in one episode.
 
-    frame: the first state that was seen; environment: the one to keep, of a smaller batch the last;
-    components: of the state; horizon: steps that are expected, for which the columns are enough.
+    Parameters
+    ----------
+    frame
+        The first state that was seen.
+    environment
+        The one to keep; of a smaller batch the last.
+    components
+        Of the state.
+    horizon
+        Steps that are expected; the columns are enough for them.
 
-    first, last: the step of column 0, and the newest one of which the state `z` (n_z,) was seen;
-    stride: steps of a column; fields, actions: what was seen, (COLUMNS, rows) and (COLUMNS, n_a),
-    NaN where nothing was; version: differs after each change, and from episode to episode.
+    Attributes
+    ----------
+    first, last
+        The step of column 0, and the newest step of which the state was seen.
+    stride
+        Steps of a column.
+    fields, actions
+        What was seen, (COLUMNS, rows) and (COLUMNS, n_a); NaN where nothing was.
+    z
+        The newest state (n_z,).
+    ended
+        Whether the episode is over.
+    version
+        Differs after each change, and from episode to episode.
     """
 
     def __init__(

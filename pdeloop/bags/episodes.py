@@ -46,10 +46,22 @@ _ONCE = {START: "start", POLICY: "policy", COST: "cost", MODEL_IDENTIFIED: "mode
 class RecordedEpisode:
     """What was recorded of one episode.
 
-    first, last: arrival of its first and last message, ns since the epoch; start, policy, cost:
-    what the topics of these names said, and model what `model/identified` did; states, actions: by
-    step; failure: why there is no model; bases: the models that its policies are about;
-    contradictions: messages that were recorded twice with different content, in words.
+    Attributes
+    ----------
+    key : (str, int, int)
+        Namespace, run, and number of the episode.
+    first, last : int
+        Arrival of its first and last message, ns since the epoch.
+    start, policy, cost, model : Frame or None
+        What the topics of these names said; model is that of `model/identified`.
+    states, actions : dict of int to Frame
+        By step.
+    failure : ModelFailure or None
+        Why there is no model.
+    bases : Frame or None
+        The models that its policies are about.
+    contradictions : list of str
+        Messages that were recorded twice with different content, in words.
     """
 
     key: Key

@@ -79,8 +79,13 @@ def mismatches(models: Sequence[LocalModel], pairs: Sequence[Comparison], horizo
 def choices(errors: Array, accepted: bool) -> list[tuple[float, list[int]]]:
     """Forgetting, and the models to average over with it; the choice to use first comes first.
 
-    errors: from `mismatches`; accepted: whether the last candidate was. If so little forgetting is
-    preferred, as it sees the whole effect of a step, and otherwise the smallest error.
+    Parameters
+    ----------
+    errors : (models, kappas) array
+        From `mismatches`.
+    accepted : bool
+        Whether the last candidate was accepted: if so little forgetting is preferred, as it sees
+        the whole effect of a step, and otherwise the smallest error.
     """
     best = errors.min(axis=0)
     order = [int(j) for j in np.argsort(best, kind="stable")]

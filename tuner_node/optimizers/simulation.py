@@ -46,8 +46,20 @@ _WORST = 2.0
 class Loop:
     """The closed loop of a law a = K U^T z + b, and its cost.
 
-    U (n_z, n_s), target (n_z,): basis of s = U^T z, and z_r; horizon: T, the steps of an episode;
-    action_limit: 0: none; noise: standard deviation of what a simulation adds to U^T z.
+    Attributes
+    ----------
+    U : (n_z, n_s) array
+        Basis of the projected state s = U^T z.
+    target : (n_z,) array
+        z_r.
+    state_weight, action_weight : float
+        q and r.
+    horizon : int
+        T, the steps of an episode.
+    action_limit : float
+        0: none.
+    noise : float
+        Standard deviation of what a simulation adds to U^T z; 0: nothing.
     """
 
     U: Array
@@ -215,9 +227,20 @@ def improve(
 ) -> Improvement:
     """Gauss-Newton steps on the model until they gain nothing more.
 
-    theta (n_a, n_s + 1): where to start, and what the trust region is about; fields (F, n_z):
-    initial ones; V (n_z, r): orthonormal coordinates of the sensitivities, U first; damping:
-    lambda.
+    Parameters
+    ----------
+    loop : Loop
+        The law's basis, the target and the weights.
+    model : FieldModel
+        One that reproduces the measured rollouts.
+    theta : (n_a, n_s + 1) array
+        Where to start, and what the trust region is about.
+    fields : (F, n_z) array
+        Initial fields.
+    V : (n_z, r) array
+        Orthonormal coordinates of the sensitivities, U first.
+    damping : float
+        lambda.
     """
     start, shape, path = theta, theta.shape, [theta]
     now = first = loop.simulate(model, theta, fields)

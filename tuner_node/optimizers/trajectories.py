@@ -40,9 +40,14 @@ def taken_record(
 
 
 class Records:
-    """The last `memory` rollouts, and older ones that are still referred to.
+    """The last rollouts, and older ones that are still referred to.
 
-    limit: a diverged rollout counts until a state exceeds this magnitude.
+    Parameters
+    ----------
+    memory : int
+        How many rollouts to remember.
+    limit : float
+        A diverged rollout counts until a state exceeds this magnitude.
     """
 
     def __init__(self, memory: int, limit: float) -> None:

@@ -38,8 +38,16 @@ def propose(
 ) -> Proposal | None:
     """The first step that gains enough, else the one that gains most, or None if none is finite.
 
-    data, shares: the rollouts that the models are fitted to, and how much each counts; the others
-    as of `Proposer.propose`.
+    Parameters
+    ----------
+    loop : Loop
+        The closed loop and its cost.
+    data : sequence of Record
+        The rollouts that the models are fitted to.
+    shares : sequence of float
+        How much each of them counts.
+    incumbents, others, damping, accepted
+        As of `Proposer.propose`.
     """
     V = extended_basis(loop.U, [record.states for record in data], max(MODES, loop.U.shape[1]))
     models = _fit(data, shares, V, len(incumbents))

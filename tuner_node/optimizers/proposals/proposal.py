@@ -24,12 +24,22 @@ _BEYOND = 1.5
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """A policy to try, and why.
+    """A policy to try.
 
-    fall: that of the mean stage cost, as predicted; models: how many were averaged; kappa:
-    forgetting; mismatch: the models' smallest relative error in predicting measured differences of
-    trajectories, or in reproducing the rollouts; kind: "local", "convolution", "differential" or
-    "sensed".
+    Attributes
+    ----------
+    policy : (n_a, 2 n_s) array
+    fall : float
+        The fall of the mean stage cost that the quadratic model predicts.
+    models : int
+        How many models were averaged.
+    kappa : float
+        Forgetting.
+    mismatch : float
+        Their smallest relative error in predicting measured differences of trajectories, or that of the
+        model of the whole field in reproducing the rollouts.
+    kind : str
+        "local", "convolution", "differential" or "sensed".
     """
 
     policy: Array

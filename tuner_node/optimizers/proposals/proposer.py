@@ -30,10 +30,20 @@ _LEAST_WEIGHT = 0.05
 
 
 class Proposer:
-    """Proposes policies for one problem; policy: any of the training, for its shape.
+    """Proposes policies for one problem.
 
-    `loop` is the closed loop and its cost; `sensed` is None where the states are not one reading of
-    each of a few sensors.
+    Parameters
+    ----------
+    context : Context
+    policy : (n_a, 2 n_s) array
+        Any policy of the training, for its shape.
+
+    Attributes
+    ----------
+    loop : Loop
+        The closed loop and its cost.
+    sensed : SensedProposals or None
+        None where the states are not one reading of each of a few sensors.
     """
 
     def __init__(self, context: Context, policy: Array) -> None:
@@ -80,9 +90,18 @@ class Proposer:
     ) -> Proposal | None:
         """The next policy to try, or None if no model gives a finite step.
 
-        records: all remembered rollouts; incumbents: those of the incumbent on the fields of the
-        moment; others: on the same fields, the candidate that was rejected last, or the previous
-        incumbent; damping: lambda; accepted: whether the last candidate was.
+        Parameters
+        ----------
+        records : sequence of Record
+            All remembered rollouts.
+        incumbents : sequence of Record
+            The rollouts of the incumbent on the fields of the moment.
+        others : sequence of Record or None
+            On the same fields: the candidate that was rejected last, or the previous incumbent.
+        damping : float
+            lambda.
+        accepted : bool
+            Whether the last candidate was accepted.
         """
         loop, reproduced = self.loop, self._reproduced
         records = [self._clean(record) for record in records]

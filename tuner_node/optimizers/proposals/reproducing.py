@@ -33,8 +33,18 @@ def reproducing_model(
 ) -> tuple[FieldModel | None, float, bool]:
     """A model that reproduces the measured rollouts, how well, and whether it does as a whole.
 
-    Else in pieces, if there is one. steps: from `steps_of`, what the models are fitted to;
-    measured: theta and the states of the rollouts (`Loop.measured`); reproduced: the largest error.
+    Else in pieces, if there is one.
+
+    Parameters
+    ----------
+    loop : Loop
+        The closed loop.
+    steps : tuple of arrays
+        From `steps_of`; what the models are fitted to.
+    measured : sequence of tuple
+        theta and the states of the rollouts to be reproduced (`Loop.measured`).
+    reproduced : float
+        The largest error.
     """
     fitted: list[FieldModel] = []
     for models in _fitted(steps) if measured else ():

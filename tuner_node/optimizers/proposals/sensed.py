@@ -26,9 +26,21 @@ MOST_SENSORS = 32
 class SensedProposals:
     """Proposals from a model of the field between the sensors.
 
-    loop: its states are one reading of each sensor; centres (n_a,): of the actuators, as shares of
-    the domain; largest_cost: mean stage cost of a rollout above which it is not fitted. `equation`
-    (12,) has the unknowns that the rollouts share, as they were fitted last; zero before.
+    Parameters
+    ----------
+    loop : Loop
+        Its states are one reading of each sensor.
+    centres : (n_a,) array
+        Of the actuators, as shares of the domain.
+    noise : float
+        Standard deviation of the noise on every reading.
+    largest_cost : float
+        Mean stage cost of a rollout above which it is not fitted.
+
+    Attributes
+    ----------
+    equation : (12,) array
+        The unknowns that the rollouts share, as they were fitted last; zero before.
     """
 
     def __init__(self, loop: Loop, centres: Array, noise: float, largest_cost: float) -> None:
