@@ -196,7 +196,7 @@ def test_a_pair_is_chosen_on_the_page_and_an_environment_by_its_flag(loop, page,
     monitor = loop.pdeloop("monitor", "--port", "0", "--namespace", "pair1", "--environment", "1")
     page.go(address(loop, monitor))
     page.until(f"{STATE} === 'running'", LIMIT)
-    page.until("document.querySelector('#pair').options.length === 2", LIMIT)
+    page.until("document.querySelector('#pair')?.options.length === 2", LIMIT)
     assert page.ask("document.querySelector('#pair').value") == "/pair1"
     said = "document.querySelector('#field').getAttribute('aria-label')"
     page.until(f"{said}.includes('environment 1')", LIMIT)
