@@ -57,7 +57,7 @@ class _Program(argparse.ArgumentParser):
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
         program = self.prog.rpartition(" ")[2]
         function = importlib.import_module(f"benchmarks.{program}").run
-        self.description = inspect.getdoc(function)
+        self.description = documentation(function)[0]
         options = add_options(self, function)
         self.add_argument("--json", action="store_true", help="print JSON instead of a table")
         self.set_defaults(command=_measure, program=program, options=options)
@@ -66,7 +66,7 @@ class _Program(argparse.ArgumentParser):
 
 def add_options(parser: argparse.ArgumentParser, function: Callable[..., Any]) -> list[str]:
     """Declare the parameters of a function as options; their names."""
-    hints = get_type_hints(function)
+    hints, (_, said) = get_type_hints(function), documentation(function)
     parameters = inspect.signature(function).parameters
     for name, parameter in parameters.items():
         default = parameter.default
@@ -75,9 +75,10 @@ def add_options(parser: argparse.ArgumentParser, function: Callable[..., Any]) -
         flag = parameter.kind is parameter.KEYWORD_ONLY
         word = f"--{name.replace('_', '-')}" if flag else name
         if kind is bool:
-            parser.add_argument(word, action="store_true")
+            parser.add_argument(word, action="store_true", help=said.get(name))
             continue
         choices = get_args(kind) or None
+        shown = "" if required or default in (None, ()) else f"[{_words(default)}]"
         nargs = "+" if several and (flag or required) else "*" if several else None
         parser.add_argument(
             word,
@@ -85,9 +86,29 @@ def add_options(parser: argparse.ArgumentParser, function: Callable[..., Any]) -
             choices=choices,
             nargs="?" if nargs is None and not (flag or required) else nargs,
             metavar=None if choices else name.upper(),
-            help="" if required or default in (None, ()) else f"[{default}]",
+            help=" ".join(filter(None, (said.get(name), shown))),
         )
     return list(parameters)
+
+
+def documentation(function: Callable[..., Any]) -> tuple[str, dict[str, str]]:
+    """What a docstring says of a function and, by name, of its parameters, `%` doubled for argparse."""
+    text, _, parameters = (inspect.getdoc(function) or "").partition("\n\nParameters\n----------\n")
+    said: dict[str, list[str]] = {}
+    names: list[str] = []
+    for line in parameters.partition("\n\n")[0].splitlines():
+        if line.startswith(" "):
+            for name in names:
+                said[name].append(line.strip().replace("%", "%%"))
+        else:
+            names = line.partition(" :")[0].split(", ")
+            said |= {name: [] for name in names}
+    return text, {name: " ".join(lines) for name, lines in said.items()}
+
+
+def _words(value: Any) -> str:
+    """A value as one writes it after a flag."""
+    return " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
 
 def _kind(hint: Any) -> tuple[Any, bool]:

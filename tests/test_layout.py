@@ -143,6 +143,15 @@ def test_bench_lists_its_programs(capsys) -> None:
         assert program in said
 
 
+def test_bench_explains_the_options_of_a_program(capsys) -> None:
+    with pytest.raises(SystemExit) as left:
+        benchmarks_parser().parse_args(["optimum", "--help"])
+    assert left.value.code == 0
+    said = capsys.readouterr().out
+    assert "--seeds SEEDS" in said and "Trainings whose basis U is used. [6]" in said
+    assert "-----" not in said
+
+
 def test_a_refusal_is_the_sentence_of_the_node_whatever_its_end_says(tmp_path) -> None:
     child = Child("tuner_node", list, tmp_path / "tuner_node.log")
     assert child.refusal() == ""
