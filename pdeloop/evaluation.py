@@ -19,7 +19,7 @@ from pdeloop.finished_run import FinishedRun
 from pdeloop.in_process import LocalPair
 from pdeloop.output import aligned
 from tuner_node.batch import Batch
-from tuner_node.rollouts import CONTROLLERS
+from tuner_node.rollouts import EVALUATED
 from tuner_node.run_folder import RunFolderError
 from tuner_node.seeds import Purpose, derive, evaluation_noise
 
@@ -103,7 +103,7 @@ def mean_costs(
 def _costs(run: FinishedRun, pair: LocalPair, seeds: int, **fields: Any) -> dict[str, Array]:
     """Costs (seeds, fields) of the first training seeds; fields: as of `mean_costs`."""
     warm, adapted = run.warm[:seeds], run.policies[:seeds]
-    laws = dict(zip(CONTROLLERS, (np.zeros_like(warm), warm, adapted), strict=True))
+    laws = dict(zip(EVALUATED, (np.zeros_like(warm), warm, adapted), strict=True))
     policies, models = np.concatenate([*laws.values()]), np.tile(np.arange(seeds), len(laws))
     costs = mean_costs(pair, run.values, policies, models, **fields)
     return dict(zip(laws, np.split(costs, len(laws)), strict=True))

@@ -17,7 +17,7 @@ from loop_interfaces.model_rows import ModelRows
 from loop_interfaces.topics import COMPLETED
 from pde_sim_node.plant import DIVERGED_COST, EpisodeCosts
 from pdeloop.episode import EpisodeRecord
-from tuner_node.rollouts import CONTROLLERS
+from tuner_node.rollouts import EVALUATED
 from tuner_node.run_folder import RunFolder
 
 RESAMPLES = 9999
@@ -131,7 +131,7 @@ def load_run(folder: str | Path) -> FinishedRun:
         policies=arrays["policy"],
         warm=arrays["lqt"],
         models=[model_rows.unpack(rows, values["n_a"]) for rows in arrays["model"]],
-        costs={name: np.array(result["costs_by_field"][name]) for name in CONTROLLERS},
+        costs={name: np.array(result["costs_by_field"][name]) for name in EVALUATED},
         rollouts=result.get("rollouts", []),
     )
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from loop_interfaces.controllers import CONTROLLERS
-from tuner_node.rollouts import CONTROLLERS as EVALUATED
+from tuner_node.rollouts import EVALUATED
 
 VISION = {
     "normal": np.eye(3),

@@ -11,7 +11,12 @@ import pytest
 
 from tuner_node.optimizers.fit import LocalModel, extended_basis, fit
 from tuner_node.optimizers.selection import KAPPAS, Comparison, choices, mismatches
-from tuner_node.optimizers.sensitivity import Path, damped_step, expand, predict_difference
+from tuner_node.optimizers.sensitivity import (
+    ReducedTrajectory,
+    damped_step,
+    expand,
+    predict_difference,
+)
 
 R, N_A, N_S, STEPS = 4, 2, 3, 12
 
@@ -29,7 +34,9 @@ def planted(seed: int = 0, bend: float = 0.1) -> LocalModel:
     )
 
 
-def roll(model: LocalModel, theta: np.ndarray, x: np.ndarray, limit: float = np.inf) -> Path:
+def roll(
+    model: LocalModel, theta: np.ndarray, x: np.ndarray, limit: float = np.inf
+) -> ReducedTrajectory:
     """Closed loop a = K s + b of the model, with theta = [K b], saturated at +- limit."""
     states, actions = [], []
     for _ in range(STEPS):
@@ -40,7 +47,7 @@ def roll(model: LocalModel, theta: np.ndarray, x: np.ndarray, limit: float = np.
     s, applied = np.array(states), np.array(actions)
     free = None if limit == np.inf else (np.abs(applied) < limit).astype(float)
     features = np.column_stack([s[:, :N_S], np.ones(STEPS)])
-    return Path(s, applied, features, theta[:, :N_S], free)
+    return ReducedTrajectory(s, applied, features, theta[:, :N_S], free)
 
 
 THETA = 0.1 * np.random.default_rng(9).standard_normal((N_A, N_S + 1))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.topics import COMPLETED
-from tuner_node.rollouts import CONTROLLERS
+from tuner_node.rollouts import EVALUATED
 from tuner_node.training import Training
 
 
@@ -20,7 +20,7 @@ def check_result(content: Mapping[str, Any], seed: int, seeds: int) -> None:
         raise ValueError("its seeds are not the run's")
     costs = content.get("costs_by_field")
     costs = costs if isinstance(costs, dict) else {}
-    tables = [np.array(costs.get(name), dtype=np.float64) for name in CONTROLLERS]
+    tables = [np.array(costs.get(name), dtype=np.float64) for name in EVALUATED]
     if len({table.shape for table in tables}) > 1 or tables[0].ndim != 2 or len(tables[0]) != seeds:
         raise ValueError(
             f"its 'costs_by_field' are not a table of {seeds} seeds for each controller"
@@ -70,10 +70,10 @@ def summarise(training: Training) -> dict[str, Any]:
     diverged = (training.ended != COMPLETED).sum(axis=(0, 2))
     costs = training.evaluation
     mean = costs.mean(axis=2)
-    none, lqt, adapted = (mean[:, CONTROLLERS.index(name)] for name in CONTROLLERS)
+    none, lqt, adapted = (mean[:, EVALUATED.index(name)] for name in EVALUATED)
     return {
-        "costs": {name: mean[:, i].tolist() for i, name in enumerate(CONTROLLERS)},
-        "costs_by_field": {name: costs[:, i].tolist() for i, name in enumerate(CONTROLLERS)},
+        "costs": {name: mean[:, i].tolist() for i, name in enumerate(EVALUATED)},
+        "costs_by_field": {name: costs[:, i].tolist() for i, name in enumerate(EVALUATED)},
         "mean_cost": {"none": none.mean(), "lqt": lqt.mean(), "adapted": adapted.mean()},
         "reduction": {
             "mean_of_ratios": float((1 - adapted / lqt).mean()),
@@ -81,7 +81,7 @@ def summarise(training: Training) -> dict[str, Any]:
         },
         "improved": bool((adapted <= lqt).all()),
         "evaluation_rollouts": int(costs[:, 0].size),
-        "diverged": dict(zip(CONTROLLERS, diverged.tolist(), strict=True)),
+        "diverged": dict(zip(EVALUATED, diverged.tolist(), strict=True)),
         "seed": training.settings.seed,
         "seeds": training.settings.seeds,
         "rollouts": training.budget.by_purpose(),

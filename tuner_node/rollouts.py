@@ -19,7 +19,7 @@ EXPLORATION = 1
 """Rollouts of an exploration."""
 CHECK = 2
 """Rollouts of a check: no control and the warm start, on one sampled field."""
-CONTROLLERS = ("none", "lqt", "adapted")
+EVALUATED = ("none", "lqt", "adapted")
 """The controllers of the closing evaluation, in the order of its rows."""
 NOISE = {
     "identify": Purpose.EXPLORATORY_NOISE,
@@ -65,7 +65,7 @@ def checks(
 def evaluations(
     settings: TrainingSettings, warm: Array, adapted: Array
 ) -> list[tuple[int, Rollout]]:
-    """The CONTROLLERS of every seed on the fields of the evaluation.
+    """The controllers of EVALUATED for every seed on the fields of the evaluation.
 
     warm, adapted (S, n_a, 2 n_s): the policies. Each rollout comes with the index of its seed.
     """
@@ -91,7 +91,7 @@ def noise_seeds(
     """
     if phase == "evaluate":
         fields = evaluation_noise(settings.evaluation_seed, settings.evaluation_fields)
-        return fields * (settings.seeds * len(CONTROLLERS))
+        return fields * (settings.seeds * len(EVALUATED))
     rows_of: Counter[int] = Counter()
     noise = []
     for m in rows[:, StartColumn.MODEL].astype(int).tolist():

@@ -32,7 +32,7 @@ from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, TrainingSettings
 from tuner_node.budget import Budget
 from tuner_node.optimizers import Context, Optimizer, Record, Rollout, Trajectory
 from tuner_node.published_law import check_law
-from tuner_node.rollouts import CHECK, CONTROLLERS, EXPLORATION
+from tuner_node.rollouts import CHECK, EVALUATED, EXPLORATION
 
 OptimizerFactory = Callable[[Array, int, Context | None, int], Optimizer]
 """(warm-start policy, seed, context where trajectories are asked for, rollouts) -> optimiser."""
@@ -160,7 +160,7 @@ class Training:
     @property
     def evaluation_shape(self) -> tuple[int, int, int]:
         """(S, controllers, fields)."""
-        return self.settings.seeds, len(CONTROLLERS), self.settings.evaluation_fields
+        return self.settings.seeds, len(EVALUATED), self.settings.evaluation_fields
 
     @property
     def generation(self) -> int:
@@ -350,8 +350,8 @@ class Training:
             {
                 "event": "evaluated",
                 "seed": seed,
-                **dict(zip(CONTROLLERS, costs.mean(axis=-1).tolist(), strict=True)),
-                "diverged": dict(zip(CONTROLLERS, lost.sum(axis=-1).tolist(), strict=True)),
+                **dict(zip(EVALUATED, costs.mean(axis=-1).tolist(), strict=True)),
+                "diverged": dict(zip(EVALUATED, lost.sum(axis=-1).tolist(), strict=True)),
             }
             for seed, costs, lost in zip(
                 self.settings.all_seeds, self.evaluation, self.ended != COMPLETED, strict=True

@@ -19,7 +19,7 @@ import numpy as np
 
 from loop_interfaces.arrays import Array
 from tuner_node.optimizers.fit import LocalModel
-from tuner_node.optimizers.sensitivity import Path, predict_difference
+from tuner_node.optimizers.sensitivity import ReducedTrajectory, predict_difference
 
 # Ridges of the quadratic part.
 RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
@@ -40,8 +40,8 @@ _WORST = 2.0
 class Comparison:
     """Two measured trajectories, and by how much theta differs, (n_a, n_s + 1)."""
 
-    first: Path
-    second: Path
+    first: ReducedTrajectory
+    second: ReducedTrajectory
     change: Array
 
 

@@ -37,7 +37,7 @@ ISOTROPY = 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class Path:
+class ReducedTrajectory:
     """A measured trajectory in reduced coordinates.
 
     x (T, r): its first n_s columns are s; a (T, n_a); features (T, n_s + 1): phi(s_k) = [s_k; 1],
@@ -62,7 +62,7 @@ class Expansion:
 
 
 def expand(
-    path: Path,
+    path: ReducedTrajectory,
     jacobians: Array,
     B: Array,
     *,
@@ -75,7 +75,7 @@ def expand(
 
     Parameters
     ----------
-    path : Path
+    path : ReducedTrajectory
         A measured trajectory.
     jacobians : (T, r, r) array
         A_k at the states of the path.
@@ -144,7 +144,7 @@ def predict_difference(
     gammas : (C,) array
         Values of gamma.
     free : (P, T, n_a) array, optional
-        Of the measured trajectories, see `Path`.
+        Of the measured trajectories, see `ReducedTrajectory`.
 
     Returns
     -------
@@ -173,7 +173,7 @@ def predict_difference(
 
 def damped_step(
     models: Sequence[LocalModel],
-    paths: Sequence[Path],
+    paths: Sequence[ReducedTrajectory],
     *,
     target: Array,
     state_weight: float,

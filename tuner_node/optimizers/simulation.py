@@ -31,7 +31,7 @@ from loop_interfaces.arrays import Array
 from loop_interfaces.field_models import FieldModel
 from loop_interfaces.field_models.differential import DifferentialModel
 from tuner_node.optimizers.base import Record
-from tuner_node.optimizers.sensitivity import ISOTROPY, Path, expand
+from tuner_node.optimizers.sensitivity import ISOTROPY, ReducedTrajectory, expand
 
 # Inner steps, and the share of the objective below which a further one is not worth its time: in few
 # coordinates the gradient is no better, while the adjoint one leads on where steps are small.
@@ -138,19 +138,19 @@ class Loop:
         """theta, and the states from which it acted."""
         return self.theta(record.policy), record.acted_from
 
-    def path_of(self, record: Record, V: Array) -> Path:
+    def path_of(self, record: Record, V: Array) -> ReducedTrajectory:
         """A measured rollout in the coordinates x = V^T z."""
         K = np.ascontiguousarray(record.policy[:, : self.U.shape[1]])
         return self.path(record.acted_from, record.actions, K, V)
 
-    def path(self, states: Array, actions: Array, K: Array, V: Array) -> Path:
+    def path(self, states: Array, actions: Array, K: Array, V: Array) -> ReducedTrajectory:
         """A trajectory under the feedback K in the coordinates x = V^T z, of which s are the first."""
         x = states @ V
         features = np.hstack([x[:, : K.shape[1]], np.full((len(x), 1), self.one)])
         free = None
         if self.action_limit:
             free = (np.abs(actions) < self.action_limit).astype(np.float64)
-        return Path(x, actions, features, K, free)
+        return ReducedTrajectory(x, actions, features, K, free)
 
 
 @dataclass(frozen=True, eq=False)
