@@ -37,6 +37,32 @@ def _fitted(problem: pdeloop.Problem, seed: int) -> tuple[SensedModel, Array, fl
         )
 
 
+def test_the_cost_of_a_rollout_tells_of_the_field_between_the_sensors() -> None:
+    problem = pdeloop.problem("allen-cahn", sensors=SENSORS, horizon=40)
+    plant = problem.plant()
+    explored, excited = problem.explore(1000)
+    uncontrolled = rollout(plant, lambda k, y: np.zeros((1, plant.n_a)), [FIELD])
+    readings = np.stack([explored[:-1], uncontrolled.states[:-1, 0]])
+    actions = [excited, uncontrolled.actions[:, 0]]
+    distance = float(uncontrolled.costs.mean[0]) / (plant.state_weight * SENSORS)
+
+    def off(*known: Array) -> float:
+        """The relative error of the simulated distance from the target."""
+        with threadpool_limits(1):
+            model, fields, error = fit_sensed(
+                readings, actions, _equally_spaced(plant.n_a), 0.0, None, *known
+            )
+        assert error < 1e-5
+        z, target, squares = fields[1], interpolated(plant.target), []
+        for action in actions[1]:
+            squares.append(np.mean((z - target) ** 2))
+            z = model.step(z, action)
+        return abs(float(np.mean(squares)) / distance - 1.0)
+
+    assert off() > 0.02
+    assert off(plant.target, np.array([np.nan, distance])) < 1e-3
+
+
 def _scale(problem: pdeloop.Problem) -> float:
     """What the published readings are multiplied by."""
     return float(np.sqrt(problem.values["n_z"] / SENSORS))

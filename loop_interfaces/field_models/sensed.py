@@ -8,8 +8,10 @@ on a periodic domain of length 1, with time in sampling times and the declared c
 actuators. Nothing else depends on where on the domain something happens, so that there are a dozen
 unknowns, however fine the grid. The fields in which the rollouts begin are unknown, too: a few Fourier
 coefficients each. All of them are fitted at once to the readings y_k = z_k(sensors) of whole rollouts,
+and to d, the mean of (z - z_r)^2 over all points and steps of each, which its cost tells,
 
-    min  mean over rollouts and steps |y_k^model - y_k|^2 + a small ridge,
+    min  mean over rollouts and steps |y_k^model - y_k|^2 / mean |y_k|^2
+         + mean over rollouts (0.1 (d^model / d - 1))^2 + a small ridge,
 
 by the method of Levenberg and Marquardt, first over the beginning of the rollouts and then
 further. What lies between the sensors is seen, later, where it passes one.
@@ -71,6 +73,8 @@ _FIELD_RIDGE, _FIELD_RIDGE_WAVE = 1e-3, 4.0
 _SHARED_DEVIATION, _FIELD_DEVIATION = 10.0, 0.5
 _DAMPING = (1e-2, 1e-9, 1e4)
 _LEAST_GAIN = 1e-3
+# Weight of the relative error of a distance from the target against that of the readings.
+_DISTANCE = 0.1
 _DIFFERENCE = 1e-5
 
 
@@ -195,6 +199,8 @@ def fit_sensed(
     centres: Array,
     noise: float = 0.0,
     start: Array | None = None,
+    target: Array | None = None,
+    distances: Array | None = None,
 ) -> tuple[SensedModel, Array, float]:
     """Fit the equation and the initial fields of rollouts.
 
@@ -208,22 +214,28 @@ def fit_sensed(
         Standard deviation of the noise on every reading.
     start : (12,) array, optional
         The shared unknowns to begin with; from several equations, with no actuators, if there are none.
+    target : (n_y,) array, optional
+        z_r at the sensors.
+    distances : (rollouts,) array, optional
+        d of each rollout; NaN where it is not known.
 
     Returns
     -------
     SensedModel, (rollouts, n) array and float
-        The one with the least error, its initial fields, and the error: the mean of
-        |y_k^model - y_k|^2 without what noise has in it, relative to that of |y_k|^2.
+        The one with the least error, its initial fields, and the error: what is minimised, but for
+        the ridge and for what noise has in it.
     """
     y, a = np.stack(readings), np.stack(actions)
-    problem = _Problem(y, a, centres, noise)
+    if target is None or distances is None:
+        target, distances = np.zeros(y.shape[2]), np.full(len(y), np.nan)
+    problem = _Problem(y, a, centres, noise, target, distances)
     fields = problem.interpolated()
     if start is None:
         calmest = np.argsort(np.sum(y * y, axis=(1, 2)), kind="stable").tolist()
         acted = [m for m in calmest if a[m].any()]
         pair = list(dict.fromkeys([*acted[:1], *calmest]))[:2]
         shared, fields[pair] = _first_guess(
-            _Problem(y[pair], a[pair], centres, noise, _PLACE_RIDGE)
+            _Problem(y[pair], a[pair], centres, noise, target, distances[pair], _PLACE_RIDGE)
         )
     else:
         shared = start
@@ -248,13 +260,21 @@ def _first_guess(problem: _Problem) -> tuple[Array, Array]:
 
 
 class _Problem:
-    """Readings y (R, T, n_y) and actions a (R, T, n_a), and the least squares problem.
+    """The least squares problem: readings y (R, T, n_y), actions a (R, T, n_a), distances (R,).
 
-    noise becomes what the noise has in the mean square of the readings, as a share of it.
+    target, distances: as in `fit_sensed`. noise becomes what the noise has in the mean square of the
+    readings, as a share of it.
     """
 
     def __init__(
-        self, y: Array, a: Array, centres: Array, noise: float, place_ridge: float = 0.0
+        self,
+        y: Array,
+        a: Array,
+        centres: Array,
+        noise: float,
+        target: Array,
+        distances: Array,
+        place_ridge: float = 0.0,
     ) -> None:
         self.y, self.a, self._centres = y, a, centres
         self._size = float(np.sqrt(np.mean(y * y))) or 1.0
@@ -268,6 +288,10 @@ class _Problem:
         twice = np.where((waves == 0) | (waves == self._n // 2), 1.0, 2.0)
         self._read = np.exp(2j * np.pi * waves[:, None] * places) * (twice / self._n)[:, None]
         self._waves = np.r_[0, 1 : _WAVES + 1, 1 : _WAVES + 1]
+        # Times |transform|^2: the mean square of the field.
+        self._mean_square = twice / self._n**2
+        self._target = np.fft.rfft(interpolated(target))
+        self._distances = distances
 
     def interpolated(self) -> Array:
         """Initial fields from the first readings alone, (R, 33)."""
@@ -346,18 +370,28 @@ class _Problem:
         return -(-steps // _COMPARED)
 
     def _residuals(self, shared: Array, fields: Array, steps: int) -> Array:
-        """Errors of the readings for unknowns (P, 12) and (P, R, 33), each as a share of the whole."""
+        """Errors for unknowns (P, 12) and (P, R, 33), as shares of the whole: (P, R, errors).
+
+        Those of the readings and, over whole rollouts, that of the distance.
+        """
         stride = self._stride(steps)
         equation = _Equation(shared[:, None], self._n, self._centres)
         z = _spectrum(fields, self._n)
         residuals = []
+        distance = np.zeros(z.shape[:2])
         for k in range(steps):
             if k % stride == 0:
                 residuals.append((z @ self._read).real - self.y[:, k])
+            distance += np.abs(z - self._target) ** 2 @ self._mean_square
             z = equation.step(z, equation.force(self.a[:, k]))
-        whole: Array = np.stack(residuals, axis=2)
+        whole: Array = np.concatenate(residuals, axis=2)
         whole /= self._size * np.sqrt(whole[0].size)
-        return whole
+        if steps < self.y.shape[1]:
+            return whole
+        off = distance / (steps * self._distances) - 1.0
+        off = np.where(np.isnan(self._distances), 0.0, off)
+        off *= _DISTANCE / np.sqrt(len(self.y))
+        return np.concatenate([whole, off[..., None]], axis=2)
 
     def _linearised(self, shared: Array, fields: Array, steps: int) -> tuple[Array, Array]:
         """Residuals (r,) and their derivatives (unknowns, r). A field moves its own rollout alone."""

@@ -98,4 +98,15 @@ class SensedProposals:
         """The model, the initial fields, and the relative error of the readings."""
         readings = [record.acted_from for record in rollouts]
         actions = [record.actions for record in rollouts]
-        return fit_sensed(readings, actions, self._centres, self._noise, start)
+        return fit_sensed(
+            *(readings, actions, self._centres, self._noise, start),
+            self._loop.target,
+            np.array([self._distance(record) for record in rollouts]),
+        )
+
+    def _distance(self, record: Record) -> float:
+        """Mean of (z - z_r)^2, from the cost; NaN where it tells none, as after the exploration."""
+        loop = self._loop
+        acting = loop.action_weight * float(np.sum(record.actions**2)) / len(record.actions)
+        distance = (record.cost - acting) / (loop.state_weight * len(loop.target))
+        return distance if record.usable and distance > 0.0 else np.nan
