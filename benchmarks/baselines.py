@@ -81,9 +81,11 @@ def run(
     Parameters
     ----------
     studies
-        Of benchmarks/studies, or YAML files like those.
-    rollouts, seeds
-        Budgets, in all, and how many seeds, those of the study if not given.
+        Names in benchmarks/studies, or YAML files like those.
+    rollouts
+        Budgets, of all rollouts before the evaluation.
+    seeds
+        How many; those of the study if not given.
     methods
         Only these; all of the file if not given.
     settings

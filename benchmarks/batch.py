@@ -26,7 +26,17 @@ SHORT_FROM = 64
 
 
 def run(*, problem: str = "allen-cahn", turns: int = 3, batches: tuple[int, ...] = BATCHES) -> Any:
-    """One row for each batch, and the fitted model."""
+    """One row for each batch, and the fitted model.
+
+    Parameters
+    ----------
+    problem
+        What is controlled.
+    turns
+        Measurements of each batch.
+    batches
+        Numbers of environments.
+    """
     samples: dict[tuple[int, str], list[float]] = {}
     for horizon in (LONG, SHORT):
         own = [m for m in batches if (m < SHORT_FROM) == (horizon == LONG)]

@@ -208,8 +208,10 @@ def run(
         Trainings whose basis U is used.
     fields
         Initial fields that a law is optimised on.
-    evaluation_seed, evaluation_fields
-        Draws of held-out fields to measure on, and how many in each.
+    evaluation_seed
+        Draws of held-out fields to measure on.
+    evaluation_fields
+        How many fields are in each.
     tolerance
         Converged when 20 iterations gain less than this share.
     jobs

@@ -78,8 +78,10 @@ def run(
         Comes and goes.
     problem
         The loop's.
-    windows, seconds
-        How many windows of so many seconds without it, and with it.
+    windows
+        How many without it, and as many with it.
+    seconds
+        Of a window.
     """
     times: tuple[list[float], list[float]] = ([], [])
     processor: tuple[list[float], list[float]] = ([], [])

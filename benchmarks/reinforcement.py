@@ -63,10 +63,16 @@ def run(
 
     Parameters
     ----------
-    problem, algorithm, seed
-        What is controlled; "ppo" or "sac"; of the training, as in the other methods.
-    minutes, rollouts
-        Of processor time, and of the plant, at most.
+    problem
+        What is controlled.
+    algorithm
+        "ppo" or "sac".
+    seed
+        Of the training, as in the other methods.
+    minutes
+        Of processor time, at most.
+    rollouts
+        Of the plant, at most.
     settings
         Words NAME=JSON: `reach`, `environments` (how many are advanced in a batch), `scale`, or what
         the library's agent is called with.

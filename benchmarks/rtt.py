@@ -103,8 +103,10 @@ def run(
 
     Parameters
     ----------
-    turns, seconds
-        Turns of each, and how long one takes.
+    turns
+        Measurements of each row.
+    seconds
+        Of a measurement.
     cores
         Where plant and controller are: wherever the scheduler puts them (nodes started by hand), on
         one core for both (as `pdeloop train` does it). The ping-pong is on any two, and with

@@ -38,8 +38,10 @@ def run(*, problem: str = "burgers", turns: int = 3, iterations: int = 40) -> di
 
     Parameters
     ----------
-    problem, iterations
-        Of a training.
+    problem
+        What is controlled.
+    iterations
+        Of a training, of two rollouts each.
     turns
         Trainings of each way.
     """

@@ -24,7 +24,17 @@ from pdeloop.study.executors import processes
 def run(
     *, problem: str = "burgers", seeds: int = 8, workers: Sequence[int] = (1, 2)
 ) -> dict[str, Any]:
-    """A row for each number of workers, 1 among them; `seeds` is that of the trainings."""
+    """A row for each number of workers, 1 among them.
+
+    Parameters
+    ----------
+    problem
+        Of the trainings.
+    seeds
+        How many trainings there are.
+    workers
+        Numbers of processes.
+    """
     content = {"problems": [problem], "seeds": seeds, "settings": {"rollouts": 20}}
     study, rows = Study.of(content), []
     for count in sorted({1, *workers}):
