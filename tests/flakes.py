@@ -3,8 +3,9 @@
 
     python -m tests.flakes --runs 10 --load 4 [-n WORKERS] [-k EXPRESSION]
 
-Runs them `runs` times beside `load` processes that do nothing but compute, and prints each failure, the
-machine's load average over the last minute of each run, and how many failures there were.
+Runs them `runs` times beside `load` processes that do nothing but compute, and prints each failure with
+what its processes printed, the machine's load average over the last minute of each run, and how many
+failures there were.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ def busy(load: int) -> Iterator[None]:
             process.wait()
 
 
-def run(expression: str, workers: int) -> tuple[int, list[str]]:
-    """How many tests ran once each, and the names of those that failed."""
+def run(expression: str, workers: int) -> tuple[int, list[str], str]:
+    """How many tests ran once each, the names of those that failed, and what pytest says of these."""
     command = [sys.executable, "-m", "pytest", "-q", "-rfE", "-m", "topics", "-k", expression]
     command += ["-n", str(workers), "--dist", "worksteal"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
@@ -45,7 +46,8 @@ def run(expression: str, workers: int) -> tuple[int, list[str]]:
         raise SystemExit(done.stdout[-2000:] + done.stderr[-2000:])
     counts = {kind: int(number) for number, kind in re.findall(r"(\d+) (passed|failed)", last)}
     failed = [line.split()[1] for line in lines if line.startswith(("FAILED ", "ERROR "))]
-    return sum(counts.values()), failed
+    sections = re.search(r"^=+ (ERRORS|FAILURES) =+$.*(?=^=+ short test)", done.stdout, re.M | re.S)
+    return sum(counts.values()), failed, sections[0] if sections else ""
 
 
 def main() -> int:
@@ -58,7 +60,7 @@ def main() -> int:
     ran, failed = 0, Counter[str]()
     with busy(options.load):
         for number in range(1, options.runs + 1):
-            tests, names = run(options.k, options.n)
+            tests, names, sections = run(options.k, options.n)
             ran += tests
             failed.update(names)
             load = f"load average {os.getloadavg()[0]:.0f}"
@@ -66,6 +68,8 @@ def main() -> int:
                 f"run {number}: {len(names)} of {tests} failed, {load} {' '.join(names)}",
                 flush=True,
             )
+            if sections:
+                print(sections, flush=True)
     print(f"{failed.total()} failures in {ran} tests of {options.runs} runs")
     for name, count in failed.most_common():
         print(f"{count:4} {name}")

@@ -124,13 +124,18 @@ def test_a_second_plant_with_other_parameters_never_mixes_in(loop, tmp_path):
 
 def test_of_two_plants_there_from_the_start_the_one_that_was_asked_for_is_trained(loop, tmp_path):
     values = parameters(iterations=100)
-    loop.node("pde_sim_node", *PARAMETERS, "-p", "physical.viscosity:=0.02")
-    start_pair(loop)
+    other = ("-r", "__node:=other_plant", "-p", "physical.viscosity:=0.02")
+    loop.node("pde_sim_node", *PARAMETERS, *other)  # it ends every episode first
+    start_pair(loop, real_time_factor=SLOW)
     out = tmp_path / "run"
-    tuner = start_tuner(loop, out, iterations=100, plant=fingerprint(values))
-    text = loop.wait(tuner, LIMIT)
+    with operator(loop) as desk:
+        plants = {"/pde_sim_node", "/other_plant"}
+        until(lambda: plants <= set(desk.ask(nodes=None)), LIMIT, "two plants")
+        tuner = start_tuner(loop, out, iterations=100, plant=fingerprint(values))
+        until(lambda: "plant with other parameters" in loop.output(tuner), LIMIT, "refusal")
+        full_speed(desk)
+    loop.wait(tuner, LIMIT)
     assert_same_training(out, in_process(iterations=100))
-    assert "plant with other parameters" in text
 
 
 def test_a_second_plant_with_the_same_parameters_is_harmless(loop, tmp_path):
