@@ -23,6 +23,7 @@ from pdeloop.bags.verify import verify
 from pdeloop.identification import identify_bag
 from recorder_node.bag import BagWriter, Channel
 from tests.loop_harness import Processes, until
+from tests.operator_harness import operator
 from tests.small import RECORDED, SMALL, paced, same_bits
 from tests.small_disk import read_only_folder, small_disk
 from tests.small_loop import (
@@ -301,12 +302,15 @@ def test_one_recorder_records_several_pairs(loop, tmp_path):
         loop.node("pde_sim_node", *where, "-p", "publish_clock:=false")
         loop.node("controller_node", *where)
     pairs = ("-p", "pairs:=['a','b']")
+    with operator(loop) as desk:
+        tuner = loop.node(
+            "tuner_node",
+            *("--params-file", str(SMALL), "-p", "recorder:=start", *pairs),
+            *tuner_arguments(tmp_path / "run", seeds=2, max_batch=3),
+        )
+        lacking = "recorder of pair 0 and recorder of pair 1"  # both pairs are there
+        until(lambda: desk.values("tuner_node").get("waiting for") == lacking, LIMIT, "pairs known")
     recorder = loop.node("recorder_node", "-p", f"bag:={tmp_path / 'bag'}", *pairs)
-    tuner = loop.node(
-        "tuner_node",
-        *("--params-file", str(SMALL), "-p", "recorder:=start", *pairs),
-        *tuner_arguments(tmp_path / "run", seeds=2, max_batch=3),
-    )
     loop.wait(tuner, LIMIT)
     recorder.send_signal(signal.SIGINT)
     loop.wait(recorder, LIMIT)
