@@ -53,7 +53,7 @@ def declare(node: Node, specs: Iterable[Spec], given: dict[str, Any]) -> dict[st
 
 def take_over(node: Node, former: Node) -> None:
     """Declare the parameters of a node that is no more, with the values that they had last."""
-    for name, parameter in former._parameters.items():
+    for name, parameter in former.get_parameters_by_prefix("").items():
         if not node.has_parameter(name):
             node.declare_parameter(
                 name, parameter.value, former.describe_parameter(name), ignore_override=True

@@ -31,6 +31,34 @@ def complaints(text: str) -> list[str]:
     return [line for line in lines if not any(words in line for words in late)]
 
 
+JOINED_AGAIN = """
+import rclpy
+from rclpy.parameter import Parameter
+from loop_interfaces.parameters import PLANT
+from loop_interfaces.ros.parameters import declare, on_change, take_over
+
+rclpy.init()
+former = rclpy.create_node("plant")
+declare(former, PLANT, {})
+on_change(former, PLANT, lambda values: None)
+former.set_parameters([Parameter("action_timeout", value=0.5)])
+former.destroy_node()
+node = rclpy.create_node("plant")
+take_over(node, former)
+on_change(node, PLANT, lambda values: None)
+print(node.get_parameter("action_timeout").value)
+for name, value in ("action_timeout", -1.0), ("max_repeats", 7), ("publish_clock", False):
+    print(node.set_parameters([Parameter(name, value=value)])[0].successful)
+print([spec.name for spec in PLANT if not node.has_parameter(spec.name)])
+"""
+
+
+def test_a_node_that_joins_the_network_again_has_the_parameters_that_were_set(loop: Processes):
+    lines = loop.wait(loop.start("-c", JOINED_AGAIN, name="again"), LIMIT).splitlines()
+    printed = [line for line in lines if "[INFO]" not in line]
+    assert printed == ["0.5", "False", "True", "False", "[]"]
+
+
 def test_a_paused_and_stepped_plant_gives_the_same_policy_and_nobody_complains(
     loop: Processes, tmp_path
 ):
