@@ -13,14 +13,14 @@ from controller_node.regression import identify
 from pdeloop import data_file
 from pdeloop.cli import FAILED, main
 from pdeloop.data_file import read_measurements
-from tests.test_regression import linear_system, trajectory
+from tests.linear_system import linear_system, trajectory
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "measurements.csv"
 Array = np.ndarray
 
 
 def arrays(**changes: Any) -> dict[str, Any]:
-    states, actions = trajectory(*linear_system())
+    states, actions = trajectory(*linear_system(4), steps=60)
     good = {"states": states, "actions": actions, "target": states[0], "sample_time": 0.1}
     return {name: value for name, value in {**good, **changes}.items() if value is not None}
 

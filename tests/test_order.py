@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from controller_node.order import study_orders
-from tests.test_regression import linear_system, trajectory
+from tests.linear_system import linear_system, trajectory
 
 Array = np.ndarray
 
 
 def planted(noise: float = 0.0, steps: int = 400) -> tuple[Array, Array]:
     """A linear system of order 4 whose states are seen as 12 numbers, the later modes ever weaker."""
-    states, actions = trajectory(*linear_system(), steps=steps)
+    states, actions = trajectory(*linear_system(4), steps=steps)
     rng = np.random.default_rng(7)
     onto = np.linalg.qr(rng.standard_normal((12, 4)))[0] * [1.0, 0.5, 0.25, 0.1]
     seen = states @ onto.T
