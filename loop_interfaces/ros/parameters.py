@@ -53,11 +53,10 @@ def declare(node: Node, specs: Iterable[Spec], given: dict[str, Any]) -> dict[st
 
 def take_over(node: Node, former: Node) -> None:
     """Declare the parameters of a node that is no more, with the values that they had last."""
-    for name, parameter in former.get_parameters_by_prefix("").items():
+    for name in former.get_parameters_by_prefix(""):
         if not node.has_parameter(name):
-            node.declare_parameter(
-                name, parameter.value, former.describe_parameter(name), ignore_override=True
-            )
+            value, description = former.get_parameter(name).value, former.describe_parameter(name)
+            node.declare_parameter(name, value, description, ignore_override=True)
 
 
 def on_change(node: Node, specs: Iterable[Spec], apply: Callable[[dict[str, Any]], None]) -> None:
