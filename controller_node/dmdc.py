@@ -26,7 +26,7 @@ from threadpoolctl import threadpool_limits
 from controller_node.reduced_model import ReducedModel, leading_modes, numerical_rank, steps_of
 
 
-def identify(
+def truncated_dmdc(
     trajectories: Sequence[tuple[ArrayLike, ArrayLike]], *, p: int, n_s: int
 ) -> ReducedModel:
     """Identify a reduced model from trajectories of one plant, whose steps are pooled.

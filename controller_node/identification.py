@@ -80,10 +80,10 @@ def identify(
         raise ValueError("all actions are zero, which says nothing of B; excite the plant")
     n_s = n_s or study_orders(trajectories).suggested
     if method in ("field", "regression"):
-        return regression.identify(trajectories, n_s=n_s)
+        return regression.exact_regression(trajectories, n_s=n_s)
     if method == "dmdc":
         n_a = np.shape(trajectories[0][1])[-1]
-        return dmdc.identify(trajectories, p=p or n_s + n_a, n_s=n_s)
+        return dmdc.truncated_dmdc(trajectories, p=p or n_s + n_a, n_s=n_s)
     raise ValueError(f"method is {method!r}; expected 'regression' or 'dmdc'")
 
 

@@ -30,7 +30,9 @@ from controller_node.reduced_model import ReducedModel, Steps, leading_modes, st
 from loop_interfaces.arrays import Array
 
 
-def identify(trajectories: Sequence[tuple[ArrayLike, ArrayLike]], *, n_s: int) -> ReducedModel:
+def exact_regression(
+    trajectories: Sequence[tuple[ArrayLike, ArrayLike]], *, n_s: int
+) -> ReducedModel:
     """Identify a reduced model from trajectories of one plant, whose steps are pooled.
 
     Parameters
@@ -60,7 +62,7 @@ def identify(trajectories: Sequence[tuple[ArrayLike, ArrayLike]], *, n_s: int) -
     >>> z = [np.array([1.0])]
     >>> for a_k in a:
     ...     z.append(0.9 * z[-1] + 2.0 * a_k)
-    >>> model = identify([(z, a)], n_s=1)
+    >>> model = exact_regression([(z, a)], n_s=1)
     >>> model.A.round(12), model.B.round(12)
     (array([[0.9]]), array([[2.]]))
     """
@@ -81,7 +83,7 @@ def identify(trajectories: Sequence[tuple[ArrayLike, ArrayLike]], *, n_s: int) -
 
 
 def fit(data: Steps, U: Array) -> ReducedModel:
-    """The regression on given modes U (n_z, n_s); see `identify`. Call with one LAPACK thread."""
+    """`exact_regression` on given modes U (n_z, n_s). Call with one LAPACK thread."""
     s, y = data.before @ U, data.inputs
     n_s = s.shape[1]
     # In units in which both have the norm 1, so that what counts as zero does not depend on theirs.

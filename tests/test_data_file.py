@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from controller_node.regression import identify
+from controller_node.regression import exact_regression
 from pdeloop import data_file
 from pdeloop.cli import FAILED, main
 from pdeloop.data_file import read_measurements
@@ -36,7 +36,7 @@ def test_the_example_is_read_and_gives_the_order_of_the_plant_that_made_it(
     text = capsys.readouterr().out
     assert "order 5 from 120 steps of 2 trajectories" in text and "suggested" in text
     with np.load(out) as saved:
-        assert np.array_equal(saved["A"], identify(found.trajectories, n_s=5).A)
+        assert np.array_equal(saved["A"], exact_regression(found.trajectories, n_s=5).A)
     assert main(["identify", "--data", str(EXAMPLE), "--order", "2"]) == 0
     assert "order 2 from" in capsys.readouterr().out
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from controller_node.dmdc import identify
+from controller_node.dmdc import truncated_dmdc
 from controller_node.reduced_model import ReducedModel
 from tests.linear_system import assert_recovered, lift, linear_system, trajectory
 
@@ -18,7 +18,7 @@ def test_recovers_a_linear_system_to_machine_precision(n_z: int) -> None:
     A, B = linear_system(N_S)
     onto = lift(n_z, N_S)
     states, actions = trajectory(A, B, steps=STEPS)
-    model = identify([(states @ onto.T, actions)], p=N_S + N_A, n_s=N_S)
+    model = truncated_dmdc([(states @ onto.T, actions)], p=N_S + N_A, n_s=N_S)
     assert_recovered(model, A, B, onto, atol=1e-12)
     np.testing.assert_allclose(model.U.T @ model.U, np.eye(N_S), atol=1e-13)
     assert (model.n_z, model.n_s, model.n_a) == (n_z, N_S, N_A)
@@ -28,7 +28,7 @@ def test_is_the_formula_of_the_paper() -> None:
     rng = np.random.default_rng(3)
     states, actions = rng.standard_normal((STEPS + 1, 12)), rng.standard_normal((STEPS, N_A))
     p, n_s = 7, 4
-    model = identify([(states, actions)], p=p, n_s=n_s)
+    model = truncated_dmdc([(states, actions)], p=p, n_s=n_s)
     psi, xi, lam_t = np.linalg.svd(np.vstack([states[:-1].T, actions.T]), full_matrices=False)
     truncated = lam_t[:p].T @ np.diag(1.0 / xi[:p])
     left = model.U.T @ states[1:].T @ truncated
@@ -38,12 +38,12 @@ def test_is_the_formula_of_the_paper() -> None:
 
 def test_basis_is_unique_and_repeatable() -> None:
     states, actions = trajectory(*linear_system(N_S), steps=STEPS)
-    first = identify([(states, actions)], p=5, n_s=N_S)
-    again = identify([(states.copy(), actions.copy())], p=5, n_s=N_S)
+    first = truncated_dmdc([(states, actions)], p=5, n_s=N_S)
+    again = truncated_dmdc([(states.copy(), actions.copy())], p=5, n_s=N_S)
     for name in ("A", "B", "U"):
         assert np.array_equal(getattr(first, name), getattr(again, name))
     # The opposite trajectory has opposite singular vectors; the sign rule gives the same basis.
-    opposite = identify([(-states, -actions)], p=5, n_s=N_S)
+    opposite = truncated_dmdc([(-states, -actions)], p=5, n_s=N_S)
     np.testing.assert_allclose(opposite.U, first.U, atol=1e-13)
     largest = np.abs(first.U).argmax(axis=0)
     assert (first.U[largest, np.arange(N_S)] > 0).all()
@@ -63,31 +63,31 @@ def test_basis_is_unique_and_repeatable() -> None:
 def test_refuses_more_than_the_trajectory_holds(p: int, n_s: int, message: str) -> None:
     states, actions = trajectory(*linear_system(N_S), steps=STEPS)
     with pytest.raises(ValueError, match=message):
-        identify([(states @ lift(20, N_S).T, actions)], p=p, n_s=n_s)
+        truncated_dmdc([(states @ lift(20, N_S).T, actions)], p=p, n_s=n_s)
 
 
 def test_refuses_a_trajectory_shorter_than_p() -> None:
     states, actions = trajectory(*linear_system(N_S), steps=STEPS)
     with pytest.raises(ValueError, match="= 4, but p is 5"):
-        identify([(states[:5], actions[:4])], p=5, n_s=3)
+        truncated_dmdc([(states[:5], actions[:4])], p=5, n_s=3)
 
 
 def test_refuses_malformed_trajectories() -> None:
     states, actions = trajectory(*linear_system(N_S), steps=STEPS)
     with pytest.raises(ValueError, match="40 actions belong to 41 states, but 40"):
-        identify([(states[:-1], actions)], p=5, n_s=3)
+        truncated_dmdc([(states[:-1], actions)], p=5, n_s=3)
     with pytest.raises(ValueError, match="non-empty matrix"):
-        identify([(states[0], actions)], p=5, n_s=3)
+        truncated_dmdc([(states[0], actions)], p=5, n_s=3)
     with pytest.raises(ValueError, match="non-empty matrix"):
-        identify([(states[:1], actions[:0])], p=5, n_s=3)
+        truncated_dmdc([(states[:1], actions[:0])], p=5, n_s=3)
     broken = states.copy()
     broken[7, 1] = np.nan
     with pytest.raises(ValueError, match="row 7"):
-        identify([(broken, actions)], p=5, n_s=3)
+        truncated_dmdc([(broken, actions)], p=5, n_s=3)
     broken = actions.copy()
     broken[3, 0] = np.inf
     with pytest.raises(ValueError, match="actions must be finite, but row 3"):
-        identify([(states, broken)], p=5, n_s=3)
+        truncated_dmdc([(states, broken)], p=5, n_s=3)
 
 
 def test_reduced_model_checks_itself_and_is_read_only() -> None:

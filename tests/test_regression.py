@@ -8,7 +8,7 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 from controller_node import dmdc
-from controller_node.regression import identify
+from controller_node.regression import exact_regression
 from tests.linear_system import assert_recovered, lift, linear_system, trajectory
 from tuner_node.exploration import least_variance
 
@@ -21,14 +21,14 @@ def test_recovers_a_linear_system_from_pooled_trajectories(n_z: int) -> None:
     # None of them alone has enough steps for n_s + n_a unknowns.
     parts = [trajectory(A, B, seed, steps=N_S + N_A - 1) for seed in (1, 2, 3)]
     onto = lift(n_z, N_S)
-    model = identify([(z @ onto.T, a) for z, a in parts], n_s=N_S)
+    model = exact_regression([(z @ onto.T, a) for z, a in parts], n_s=N_S)
     assert_recovered(model, A, B, onto, atol=1e-11)
 
 
 def test_is_the_projected_least_squares_solution() -> None:
     rng = np.random.default_rng(3)
     states, actions = rng.standard_normal((STEPS + 1, 12)), rng.standard_normal((STEPS, N_A))
-    model = identify([(states, actions)], n_s=N_S)
+    model = exact_regression([(states, actions)], n_s=N_S)
     s = states @ model.U
     residual = s[1:] - s[:-1] @ model.A.T - actions @ model.B.T
     # The residual of least squares is orthogonal to all regressors.
@@ -42,8 +42,8 @@ def test_does_not_depend_on_the_unit_of_the_inputs(scale: float) -> None:
     rng = np.random.default_rng(4)
     states, actions = rng.standard_normal((STEPS + 1, 20)), rng.standard_normal((STEPS, N_A))
     model, other = (
-        identify([(states, actions)], n_s=6),
-        identify([(states, scale * actions)], n_s=6),
+        exact_regression([(states, actions)], n_s=6),
+        exact_regression([(states, scale * actions)], n_s=6),
     )
     np.testing.assert_allclose(other.A, model.A, atol=1e-12)
     np.testing.assert_allclose(scale * other.B, model.B, atol=1e-12)
@@ -52,7 +52,7 @@ def test_does_not_depend_on_the_unit_of_the_inputs(scale: float) -> None:
 def test_does_not_depend_on_the_unit_where_inputs_are_not_independent() -> None:
     states, actions = trajectory(*linear_system(N_S), steps=STEPS)
     actions[:, 1] = 2.0 * actions[:, 0]
-    model, other = (identify([(states, c * actions)], n_s=N_S) for c in (1.0, 1e-6))
+    model, other = (exact_regression([(states, c * actions)], n_s=N_S) for c in (1.0, 1e-6))
     np.testing.assert_allclose(1e-6 * other.B, model.B, rtol=1e-6)
     # The least norm: nothing along the direction that the inputs never take.
     np.testing.assert_allclose(model.B @ [2.0, -1.0], 0.0, atol=1e-12)
@@ -61,12 +61,12 @@ def test_does_not_depend_on_the_unit_where_inputs_are_not_independent() -> None:
 def test_truncated_dmdc_is_the_same_at_full_rank() -> None:
     rng = np.random.default_rng(5)
     states, actions = rng.standard_normal((STEPS + 1, 8)), rng.standard_normal((STEPS, N_A))
-    model = identify([(states, actions)], n_s=8)
-    truncated = dmdc.identify([(states, actions)], p=8 + N_A, n_s=8)
+    model = exact_regression([(states, actions)], n_s=8)
+    truncated = dmdc.truncated_dmdc([(states, actions)], p=8 + N_A, n_s=8)
     for name in ("A", "B", "U"):
         np.testing.assert_allclose(getattr(truncated, name), getattr(model, name), atol=1e-12)
     # With fewer directions than n_s + n_a it loses the inputs first when they are small.
-    cut = dmdc.identify([(states, 1e-3 * actions)], p=8, n_s=8)
+    cut = dmdc.truncated_dmdc([(states, 1e-3 * actions)], p=8, n_s=8)
     assert np.linalg.norm(1e-3 * cut.B) < 1e-3 * np.linalg.norm(model.B)
 
 
@@ -74,9 +74,9 @@ def test_same_bits_whatever_the_threads() -> None:
     rng = np.random.default_rng(6)
     states, actions = rng.standard_normal((301, 256)), rng.standard_normal((300, 12))
     with threadpool_limits(limits=1):
-        one = identify([(states, actions)], n_s=24)
+        one = exact_regression([(states, actions)], n_s=24)
     with threadpool_limits(limits=4):
-        four = identify([(states, actions)], n_s=24)
+        four = exact_regression([(states, actions)], n_s=24)
     for name in ("A", "B", "U"):
         assert np.array_equal(getattr(one, name), getattr(four, name))
 
@@ -84,13 +84,13 @@ def test_same_bits_whatever_the_threads() -> None:
 def test_refuses_what_it_cannot_identify() -> None:
     states, actions = trajectory(*linear_system(N_S), steps=STEPS)
     with pytest.raises(ValueError, match="needs at least 6 steps, but there are 5"):
-        identify([(states[:6], actions[:5])], n_s=N_S)
+        exact_regression([(states[:6], actions[:5])], n_s=N_S)
     with pytest.raises(ValueError, match="numerical rank of the states, 4, but n_s is 5"):
-        identify([(states @ lift(20, N_S).T, actions)], n_s=5)
+        exact_regression([(states @ lift(20, N_S).T, actions)], n_s=5)
     with pytest.raises(ValueError, match="at least 1"):
-        identify([(states, actions)], n_s=0)
+        exact_regression([(states, actions)], n_s=0)
     with pytest.raises(ValueError, match="40 actions belong to 41 states"):
-        identify([(states, actions), (states[:40], actions[:40])], n_s=N_S)
+        exact_regression([(states, actions), (states[:40], actions[:40])], n_s=N_S)
 
 
 def test_the_variance_for_noise_gives_the_error_of_the_inputs_that_it_promises() -> None:
@@ -117,7 +117,7 @@ def test_the_variance_for_noise_gives_the_error_of_the_inputs_that_it_promises()
         for a in actions:
             states.append(A @ states[-1] + B @ a)
         measured = np.array(states) + noise * rng.standard_normal((steps + 1, n_z))
-        model = identify([(measured, actions)], n_s=2)
+        model = exact_regression([(measured, actions)], n_s=2)
         errors.append(model.B[:, 0] - model.U.T @ B[:, 0])
     found = np.sqrt(np.mean(np.square(errors))) / np.linalg.norm(B)
     assert found == pytest.approx(accuracy, rel=0.15)
