@@ -177,6 +177,9 @@ def test_a_late_sample_that_contradicts_one_that_was_used_ends_the_run(kind, epi
         served.assign(observed(1), 0.0)
     feed(served, 0, start)  # again the same: no harm
     served.tick(0.0)
+    assert not served.state(0, Frame(RUN, start.episode + 9, 0, 0.0, np.ones((1, 2))))
     getattr(served, kind)(0, Frame(RUN, start.episode, 3, 0.0, np.ones((1, 2))))
+    # At once: were the tuner killed before its next regular tick, nobody would know any more.
+    assert served.state(0, Frame(RUN, start.episode + 9, 0, 0.0, np.ones((1, 2))))
     with pytest.raises(DispatchError, match=f"two different {kind}s .* one of which was used"):
         served.tick(0.0)

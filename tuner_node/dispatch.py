@@ -202,12 +202,13 @@ class Dispatcher:
     def state(self, pair: int, frame: Frame) -> bool:
         """Take a sample z_k of a pair's episode.
 
-        True if it is the last one and the cost is there: `tick` then handles them in their order.
-        Raises FrameError for a sample of another shape.
+        True if `tick` has to follow at once: it is the last one and the cost is there, or samples that
+        were used are contradicted. Raises FrameError for a sample of another shape.
         """
         known, target = self.pairs[pair], self._targets.get(frame.plant)
         known.sample("states", frame, frame.values.shape[1] if target is None else len(target))
-        return known.pending_cost is not None and frame.step == known.pending_cost.step
+        last = known.pending_cost is not None and frame.step == known.pending_cost.step
+        return last or any(samples.contradiction for samples in known.used_samples())
 
     def action(self, pair: int, frame: Frame) -> None:
         """Take a sample a_k of a pair's episode. Raises FrameError for one of another shape."""
