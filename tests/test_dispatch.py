@@ -176,6 +176,19 @@ def test_two_different_models_of_one_episode_end_the_run():
         served.model(0, replace(model, values=2 * model.values), 0.0)
 
 
+def test_a_model_that_comes_again_and_again_is_no_answer_of_a_silent_plant():
+    served = dispatcher(episode_timeout=10.0)
+    rows = np.array([[3.0, 4.0, 0.1, 0.0]])
+    ((_, first),) = starts(served.assign(Batch(rows, None), 0.0))
+    for now in range(1, 10):
+        served.model(0, Frame(RUN, first.episode, 0, 1.0, np.ones((1, 7))), float(now))
+        assert served.notes == []
+        served.tick(float(now))
+    ((_, second),) = starts(served.tick(11.5))
+    assert second.episode == first.episode + 1
+    assert "silent" in served.notes[-1]
+
+
 def test_a_void_episode_is_repeated_under_a_new_number_and_given_up_at_last():
     served = dispatcher()
     ((_, first),) = starts(served.assign(batch(1), 0.0))

@@ -230,7 +230,10 @@ class Dispatcher:
             raise FrameError(f"expected {count} models, got {len(frame.values)}")
         if self.plant not in (UNKNOWN_PLANT, frame.plant):
             raise FrameError(f"expected a model of plant {self.plant}, got one of {frame.plant}")
-        known.last_heard = now
+        if (
+            known.chunk.models is None
+        ):  # the same again says nothing of a plant that does not answer
+            known.last_heard = now
         known.take_answer(topics.MODEL_IDENTIFIED.name, frame)
         known.chunk.models = frame.values.copy()
         known.release_if_done(self._batch)

@@ -104,7 +104,7 @@ class History:
 
     def run(self) -> Training | DispatchError:
         """TimeoutError if the training does not end in `LIMIT` virtual seconds."""
-        while self.time < LIMIT:
+        while self._events and self.time < LIMIT:
             self.time, _, event = heapq.heappop(self._events)
             try:
                 event()
