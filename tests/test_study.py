@@ -194,7 +194,10 @@ def test_a_worker_with_other_versions_is_refused_or_accepted_on_request(
         ({"variants": ["a"]}, "'variants' is"),
         ({"variants": {"../a": {}}}, "expected a name of letters"),
         ({"variants": {"a": 1}}, "variant 'a' is 1"),
+        ({"variants": {}}, "'variants' is empty"),
+        ({"variants": {"a": {"seed": 4}}}, "leave them out, and give 'seeds' beside"),
         ({"settings": 3}, "'settings' is 3"),
+        ({"settings": {"seeds": 4}}, "leave them out, and give 'seeds' beside"),
         ({"seed": 3}, "unknown entries: seed"),
         ({"/**": {}}, "this is a problem's file; expected a study's"),
     ],
@@ -202,7 +205,7 @@ def test_a_worker_with_other_versions_is_refused_or_accepted_on_request(
 def test_a_study_that_cannot_be_is_refused_in_one_sentence(change: dict[str, Any], sentence: str):
     with pytest.raises(StudyError, match=sentence):
         Study.of({**CONTENT, **change})
-    with pytest.raises(ValueError, match="rollout"):
+    with pytest.raises(StudyError, match=r"small, variant 'gauss-newton': parameter 'rollouts' is -1"):
         Study.of({**CONTENT, "settings": {"rollouts": -1}}).trainings()
 
 
@@ -239,6 +242,21 @@ def test_the_command_runs_continues_and_refuses_another_study(
     assert "needs certificates" in capsys.readouterr().err
     assert main(["study", *words, "tcp://127.0.0.1:1"]) == 1
     assert "no Dask scheduler answers" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_the_command_takes_an_own_equation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("PDELOOP_EQUATIONS", "")  # to be as it was after the test
+    monkeypatch.chdir(tmp_path)
+    assert main(["new", "own"]) == 0
+    settings = {"rollouts": 9, "horizon": 40, "evaluation_fields": 2}
+    (tmp_path / "study.yaml").write_text(
+        json.dumps({"problems": ["own/own.yaml"], "settings": settings})
+    )
+    words = ["study", "study.yaml", "--out", "out", "--processes", "1"]
+    assert main(words) == 1 and not Path("out").exists()
+    assert main([*words, "--equation", "own/own.py:Own"]) == 0
+    assert Path("out/own/default/0/result.json").exists()
 
 
 def test_an_interrupted_command_ends_its_processes_in_the_middle(tmp_path: Path):

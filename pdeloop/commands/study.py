@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from loop_interfaces.spec import ParameterError
-from pdeloop.commands.common import Commands, add_json, command
+from pdeloop.commands.common import Commands, add_equation, add_json, allow_equation, command
 from pdeloop.output import print_json
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ def add(commands: Commands) -> None:
         metavar="STUDY.yaml",
         help="problems, seeds, variants, settings",
     )
+    add_equation(study)
     add_execution(study)
 
 
@@ -128,6 +129,7 @@ def _study(options: argparse.Namespace) -> int:
     from pdeloop.study.description import Study
     from pdeloop.study.run import kept
 
+    allow_equation(options)
     if options.file is None and options.out is None:
         raise ParameterError(
             "no study given; expected a YAML file, or --out DIR of one to continue"

@@ -69,11 +69,18 @@ class Study:
         for name, table in (("variants", variants), ("settings", settings)):
             if not isinstance(table, dict):
                 raise StudyError(f"'{name}' is {table!r}; expected a table")
+        if not variants:
+            raise StudyError("'variants' is empty; expected one or more, such as: default: {}")
         for name, table in variants.items():
             if not isinstance(name, str) or not _NAME.fullmatch(name):
                 raise StudyError(f"variant {name!r}; expected a name of letters, digits, . + - _")
             if not isinstance(table, dict):
                 raise StudyError(f"variant '{name}' is {table!r}; expected a table of parameters")
+        if any(own in table for table in (settings, *variants.values()) for own in ("seed", "seeds")):
+            raise StudyError(
+                "the settings or a variant have 'seed' or 'seeds'; leave them out, and give 'seeds' "
+                "beside 'problems'"
+            )
         files = {}
         for word in problems:
             beside = folder / str(word)
@@ -99,10 +106,12 @@ class Study:
         found: dict[str, dict[str, Any]] = {}
         for problem, file in self.problems.items():
             for variant, table in self.variants.items():
-                values = resolve(
-                    file, {**self.settings, **table, "seed": self.seeds[0], "seeds": 1}
-                )
-                build_training(values)
+                own = {**self.settings, **table, "seed": self.seeds[0], "seeds": 1}
+                try:
+                    values = resolve(file, own)
+                    build_training(values)
+                except ValueError as error:
+                    raise StudyError(f"{problem}, variant '{variant}': {error}") from error
                 for seed in self.seeds:
                     found[f"{problem}/{variant}/{seed}"] = {**values, "seed": seed}
         return found

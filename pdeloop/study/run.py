@@ -113,7 +113,6 @@ def run(
         be written.
     """
     trainings = study.trainings()  # refuses before there is a folder
-    keep(folder, study)
     expected = None if any_environment else environment()
     finished = {name for name in trainings if (folder / name / "result.json").exists()}
     if expected is not None:
@@ -123,6 +122,7 @@ def run(
     for _ in range(ATTEMPTS):
         try:
             with executor() as pool:
+                keep(folder, study)  # not before there is somebody to train
                 todo = {n: v for n, v in trainings.items() if n not in finished}
                 waiting = {
                     pool.submit(tasks.get(n.split("/")[1], train), v, expected): n
