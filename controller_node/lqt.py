@@ -21,6 +21,7 @@ arXiv:2403.01005.
 Anderson, Moore, "Optimal Control: Linear Quadratic Methods", chapter 4.
 """
 
+from numbers import Real
 from typing import NamedTuple
 
 import numpy as np
@@ -113,8 +114,8 @@ def track(model: ReducedModel, *, state_weight: float, action_weight: float) -> 
     array([[-1.5]])
     """
     for name, weight in (("state_weight", state_weight), ("action_weight", action_weight)):
-        if not (np.isfinite(weight) and weight > 0.0):
-            raise ValueError(f"{name} must be positive and finite, but it is {weight}.")
+        if not (isinstance(weight, Real) and 0.0 < weight < np.inf):
+            raise ValueError(f"{name} must be positive and finite, but it is {weight!r}.")
     A, B = model.A, model.B
     Q = state_weight * np.eye(model.n_s)
     R = action_weight * np.eye(model.n_a)

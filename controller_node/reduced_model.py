@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import linalg
 
-from loop_interfaces.arrays import Array
+from loop_interfaces.arrays import Array, float_array
 
 Trajectory = tuple[Array, Array]
 """States (N + 1, n_z) and actions (N, n_a)."""
@@ -105,9 +105,9 @@ def steps_of(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> Steps:
     ValueError for shapes that do not fit, NaN and infinity.
     """
     befores, afters, inputs = [], [], []
+    if not trajectories or any(len(trajectory) != 2 for trajectory in trajectories):
+        raise ValueError("expected a list of trajectories, each a tuple (states, actions)")
     for trajectory in trajectories:
-        if len(trajectory) != 2:
-            raise ValueError("expected a list of trajectories, each a tuple (states, actions)")
         z, own = _matrix("states", trajectory[0]), _matrix("actions", trajectory[1])
         if z.shape[0] != len(own) + 1:
             raise ValueError(
@@ -148,7 +148,7 @@ def leading_modes(after: Array, n_s: int) -> tuple[Array, Array]:
 
 
 def _matrix(name: str, values: ArrayLike) -> Array:
-    array = np.asarray(values, dtype=np.float64)
+    array = float_array(name, values)
     if array.ndim != 2 or 0 in array.shape:
         raise ValueError(
             f"{name} must be a non-empty matrix with one row per step, but the shape is "

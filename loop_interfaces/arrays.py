@@ -2,6 +2,18 @@
 """What numbers are computed with: float64, everywhere."""
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+
+
+def float_array(name: str, values: ArrayLike) -> Array:
+    """The values as float64; a ValueError unless they are an array of real numbers."""
+    try:
+        array = np.asarray(values)
+        what = str(array.dtype)
+    except ValueError:  # NumPy's word for rows of different lengths
+        array, what = np.asarray(None), "rows of different lengths"
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"{name} must be an array of real numbers, got {what}")
+    return array.astype(np.float64, copy=False)

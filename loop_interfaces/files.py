@@ -128,15 +128,18 @@ def open_ordinary(path: Path) -> BufferedReader:
     return os.fdopen(descriptor, "rb")
 
 
-def read_bounded(path: Path, most: int) -> bytes:
-    """The content of a file. FileError if it cannot be read, or has more than `most` bytes."""
+def read_bounded(path: Path, most: int, instead: str = "") -> bytes:
+    """The content of a file. FileError if it cannot be read, or has more than `most` bytes.
+
+    instead: what to do then, for the error.
+    """
     try:
         with open_ordinary(path) as file:
             content = file.read(most + 1)
     except OSError as error:
         raise FileError(f"{path} cannot be read: {error.strerror or error}") from error
     if len(content) > most:
-        raise FileError(f"{path} is larger than {most} bytes")
+        raise FileError(f"{path} is larger than {most} bytes" + (instead and f"; {instead}"))
     return content
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from loop_interfaces.parameters import table, with_budget, with_identification
-from loop_interfaces.spec import ParameterError, check, check_names, read_yaml
+from loop_interfaces.spec import ParameterError, check, check_names, exponent_hint, read_yaml
 
 
 def config_folder() -> Path:
@@ -60,9 +60,12 @@ def _physical(given: Mapping[str, Any]) -> dict[str, float]:
     physical: dict[str, float] = {}
     for name, value in given.items():
         if name.startswith("physical."):
+            value = value.tolist() if hasattr(value, "tolist") else value  # NumPy's
             if isinstance(value, bool) or not isinstance(value, (int, float)):
-                raise ParameterError(f"parameter '{name}' is {value!r}; expected a number")
-            physical[name] = float(value) if abs(value) < 2**1000 else math.inf
+                raise ParameterError(
+                    f"parameter '{name}' is {value!r}; expected a number{exponent_hint(value)}"
+                )
+            physical[name] = math.inf if abs(value) >= 2**1000 else float(value)
     return physical
 
 

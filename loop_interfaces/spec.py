@@ -21,6 +21,7 @@ Value = bool | int | float | str | list[str] | list[float]
 MAX_YAML_BYTES = 1_000_000
 MAX_PARAMETERS = 10_000
 _FILE_NAME = re.compile(r"[^\W_][\w.-]{,99}")
+_EXPONENT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)[eE][+-]?\d+")
 
 
 class ParameterError(ValueError):
@@ -101,12 +102,14 @@ class Spec:
 
         called: what the user calls it, if not by the parameter's name.
         """
+        value = value.tolist() if hasattr(value, "tolist") else value  # NumPy's
         good: Value | None = self._coerce(value)
         if good is None:
             called = called or f"parameter '{self.name}'"
             raise ParameterError(
                 f"{called} is {value!r}; expected {self.range}"
                 + (f" ({self.unit})" if self.unit else "")
+                + (exponent_hint(value) if self.type is float else "")
             )
         return good
 
@@ -152,8 +155,7 @@ class Spec:
         return value
 
     def _coerce_numbers(self, value: Any) -> list[float] | None:
-        """A list, a tuple or an array of numbers in the range, as a list."""
-        value = value.tolist() if hasattr(value, "tolist") else value
+        """A list or a tuple of numbers in the range, as a list."""
         if not isinstance(value, list | tuple):
             return None
         number = replace(self, default=0.0)
@@ -165,6 +167,13 @@ def _plain(number: float) -> str:
     """A bound as people write it: 1000000, not 1e+06."""
     whole = float(number).is_integer() and abs(number) < 1e17
     return str(int(number)) if whole else f"{number:g}"
+
+
+def exponent_hint(value: object) -> str:
+    """What to do with a text like '1e12', which YAML 1.1 does not read as a number; else empty."""
+    if isinstance(value, str) and _EXPONENT.fullmatch(value):
+        return "; YAML reads a number with an exponent only with point and sign, like 1.0e+12"
+    return ""
 
 
 def check_names(names: Iterable[str], known: Iterable[str]) -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from io import StringIO
+from numbers import Integral
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TextIO
@@ -74,6 +75,7 @@ class Problem:
         ValueError
             The parameters do not fit together, or `batch` is less than 1.
         """
+        _check_count("batch", batch, 1)
         plant = build_plant(self.values)
         plant.reset(np.arange(batch))
         return plant
@@ -190,6 +192,8 @@ def identify(
     """
     if not trajectories or any(not isinstance(t, tuple) or len(t) != 2 for t in trajectories):
         raise ValueError("identify needs one trajectory or more, each a tuple (states, actions)")
+    _check_count("n_s", n_s, 0)
+    _check_count("p", p, 0)
     return identification.identify(trajectories, method=method, n_s=n_s, p=p)
 
 
@@ -257,3 +261,9 @@ def train(
         finally:
             display.close()
         return load_run(folder)
+
+
+def _check_count(name: str, value: object, least: int) -> None:
+    """ValueError unless the value is a whole number, of NumPy's too, and not below the least."""
+    if not isinstance(value, Integral) or int(value) < least:
+        raise ValueError(f"{name} is {value!r}; expected a whole number of at least {least}")

@@ -135,7 +135,7 @@ def _npz(path: Path) -> Measurements:
 
 
 def _csv(path: Path) -> Measurements:
-    raw = read_bounded(path, MAX_TEXT_BYTES)
+    raw = read_bounded(path, MAX_TEXT_BYTES, "give the same as .npz (docs/identification.md)")
     lines = csv.reader(io.StringIO(raw.decode("utf-8-sig", errors="replace"), newline=""))
     try:
         return _table(line for line in lines if line)

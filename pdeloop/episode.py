@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from controller_node.policy import ProjectedLaw
-from loop_interfaces.arrays import Array
+from loop_interfaces.arrays import Array, float_array
 from pde_sim_node.plant import MEAN_FIELD, EpisodeCosts, Plant
 
 __all__ = ["EpisodeRecord", "Law", "finite_array", "mean_field_cost", "projected_law", "rollout"]
@@ -158,12 +158,9 @@ def projected_law(plant: Plant, U: ArrayLike, policy: ArrayLike) -> Law:
     >>> pdeloop.rollout(plant, law, [0, 1, 2]).costs.mean.round(1)
     array([0.6, 0.7, 0.6])
     """
-    basis = np.asarray(U, dtype=np.float64)
-    if basis.ndim != 2 or len(basis) != plant.state_size:
-        raise ValueError(f"U must have shape ({plant.state_size}, n_s), got {basis.shape}")
-    basis = finite_array("U", U, basis.shape)
-    gains = np.asarray(policy, dtype=np.float64)
-    gains = finite_array("policy", policy, (*gains.shape[:-2], plant.n_a, 2 * basis.shape[1]))
+    basis = finite_basis(plant, U)
+    gains = float_array("policy", policy)
+    gains = finite_array("policy", gains, (*gains.shape[:-2], plant.n_a, 2 * basis.shape[1]))
     projected, batch = ProjectedLaw([basis], plant.target, plant.instruments.action_limit), 0
 
     def actions(k: int, states: Array) -> Array:
@@ -176,9 +173,17 @@ def projected_law(plant: Plant, U: ArrayLike, policy: ArrayLike) -> Law:
     return actions
 
 
+def finite_basis(plant: Plant, U: ArrayLike) -> Array:
+    """A basis (state_size, n_s) of the plant's states; a ValueError unless it is one, and finite."""
+    basis = float_array("U", U)
+    if basis.ndim != 2 or len(basis) != plant.state_size:
+        raise ValueError(f"U must have shape ({plant.state_size}, n_s), got {basis.shape}")
+    return finite_array("U", basis, basis.shape)
+
+
 def finite_array(name: str, values: ArrayLike, shape: Sequence[int]) -> Array:
     """The values as float64; a ValueError unless they are finite and of this shape."""
-    array = np.asarray(values, dtype=np.float64)
+    array = float_array(name, values)
     if array.shape != tuple(shape):
         raise ValueError(f"{name} must have shape {tuple(shape)}, got {array.shape}")
     if not np.isfinite(array).all():

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from loop_interfaces.arrays import Array
 from pde_sim_node.plant import EpisodeCosts, Plant
 from pde_sim_node.solver.adjoint import adjoint_of
-from pdeloop.episode import EpisodeRecord, Law, finite_array, rollout
+from pdeloop.episode import EpisodeRecord, Law, finite_array, finite_basis, rollout
 
 __all__ = ["CostGradient", "Gradients", "features"]
 
@@ -109,7 +109,7 @@ class Gradients:
         ValueError
             Shapes that do not fit the plant, NaN or infinity.
         """
-        shape = self.plant.horizon, len(np.asarray(fields)), self.plant.n_a
+        shape = self.plant.horizon, len(np.atleast_1d(fields)), self.plant.n_a
         given = finite_array("actions", actions, shape)
         return self._gradient(self._roll(fields, lambda k, _: given[k]), given)
 
@@ -135,8 +135,7 @@ class Gradients:
         ValueError
             Shapes that do not fit the plant, NaN or infinity.
         """
-        basis = np.asarray(U, dtype=np.float64)
-        basis = finite_array("U", U, (self.plant.n_z, *basis.shape[1:2]))
+        basis = finite_basis(self.plant, U)
         n_s = basis.shape[1]
         gains = finite_array("policy", policy, (self.plant.n_a, 2 * n_s))
         s_r = basis.T @ self.plant.target

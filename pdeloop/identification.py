@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from controller_node.identification import DesignSettings, design
 from controller_node.order import OrderStudy, study_orders
 from loop_interfaces.arrays import Array
 from loop_interfaces.episodes import episode_name
+from loop_interfaces.files import write_atomically
 from loop_interfaces.model_rows import ModelRows, pack
 from loop_interfaces.parameters import as_recorded, model_order, table
 from loop_interfaces.spec import ParameterError
@@ -175,9 +177,10 @@ def save(found: Identified, path: Path) -> None:
     """Write the model as an .npz archive: A, B, U, K_a, K_b, s_r and `model`, the rows of the topic."""
     model = found.model
     arrays: dict[str, Any] = {name: getattr(model, name) for name in model.__dataclass_fields__}
+    content = BytesIO()
+    np.savez(content, model=pack(model)[np.newaxis], **arrays)
     try:
-        with path.open("wb") as file:
-            np.savez(file, model=pack(model)[np.newaxis], **arrays)
+        write_atomically(path, content.getvalue())
     except OSError as error:
         raise BagError(f"cannot write {path}: {error.strerror}") from error
 

@@ -107,7 +107,23 @@ def test_what_does_not_fit_is_refused_in_one_sentence(small) -> None:
         (lambda: pdeloop.problem("burgerz"), "unknown problem 'burgerz'; expected one of"),
         (lambda: pdeloop.problem(n_zz=4), "n_zz"),
         (lambda: pdeloop.problem(physical={"viscousity": 1.0}), "unknown parameter 'physical"),
-        (lambda: small.plant(batch=0), "one for each environment"),
+        (lambda: pdeloop.problem(physical={"viscosity": np.nan}), "must lie between .* got nan"),
+        (lambda: small.plant(batch=0), "batch is 0; expected a whole number of at least 1"),
+        (lambda: small.plant(batch="2"), "batch is '2'; expected a whole number"),
+        (
+            lambda: pdeloop.identify((states, actions), n_s=2.5),
+            "n_s is 2.5; expected a whole number",
+        ),
+        (lambda: pdeloop.identify((states + 1j, actions), n_s=2), "real numbers, got complex128"),
+        (
+            lambda: pdeloop.identify(("a", actions), n_s=2),
+            "states must be an array of real numbers",
+        ),
+        (
+            lambda: pdeloop.identify(([[1, 2], [3]], actions), n_s=2),
+            "got rows of different lengths",
+        ),
+        (lambda: pdeloop.study_orders([]), "a list of trajectories"),
         (lambda: pdeloop.identify(n_s=2), "one trajectory or more"),
         (lambda: pdeloop.identify((states[1:], actions), n_s=2), "actions belong to"),
         (lambda: pdeloop.identify((np.nan * states, actions), n_s=2), "must be finite"),
@@ -123,6 +139,8 @@ def test_what_does_not_fit_is_refused_in_one_sentence(small) -> None:
         ),
         (lambda: gradients.of_actions(np.zeros((3, 1, n_a)), [0]), "actions must have shape"),
         (lambda: gradients.of_actions(holes, [0]), "actions must be finite"),
+        (lambda: gradients.of_actions(np.zeros_like(holes), 0), "must be M seeds, .* or an array"),
+        (lambda: gradients.of_policy(basis.T, np.zeros((n_a, 4)), [0]), "U must have shape .*n_s"),
         (lambda: gradients.of_policy(basis, np.zeros((n_a, 5)), [0]), "policy must have shape"),
         (lambda: pdeloop.Gradients(pdeloop.problem(sensors=4).plant()), "without noise, limits"),
         (lambda: pdeloop.train(small, optimizer="adam"), "'optimizer' is 'adam'"),
@@ -135,6 +153,13 @@ def test_what_does_not_fit_is_refused_in_one_sentence(small) -> None:
         with pytest.raises(ValueError, match=words) as caught:
             refused()
         assert "\n" not in str(caught.value)
+
+
+def test_numbers_of_numpy_serve_as_parameters() -> None:
+    given = {"horizon": np.int64(5), "process_noise": np.float32(0.5)}
+    made = pdeloop.problem("burgers", physical={"viscosity": np.int64(1)}, **given)
+    assert [type(made.values[name]) for name in given] == [int, float]
+    assert made.values["physical.viscosity"] == 1.0
 
 
 def test_a_training_that_is_stopped_by_a_service_says_how_to_go_on(

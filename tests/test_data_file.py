@@ -114,7 +114,7 @@ def test_other_files_and_larger_ones_are_refused(
     refused(tmp_path / "own.xlsx", r"must be a .npz or a .csv file")
     refused(tmp_path / "none.csv", "cannot be read: No such file")
     monkeypatch.setattr(data_file, "MAX_TEXT_BYTES", 100)
-    refused(EXAMPLE, "larger than 100 bytes")
+    refused(EXAMPLE, "larger than 100 bytes; give the same as .npz")
 
 
 def refused(path: Path, words: str) -> None:

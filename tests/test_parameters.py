@@ -29,6 +29,11 @@ SPECS = {spec.name: spec for spec in table()}
         ("length", 0.0, "'length' is 0.0; expected a number above 0"),
         ("length", float("nan"), "'length' is nan; expected a number above 0"),
         ("sample_time", "fast", "'sample_time' is 'fast'; expected a number above 0"),
+        (
+            "length",
+            "1.0e12",
+            "(m); YAML reads a number with an exponent only",
+        ),
         ("actuator_width", 1.5, "'actuator_width' is 1.5; expected a number above 0, at most 1"),
         ("start", "lqg", "'start' is 'lqg'; expected one of lqt, zero"),
         ("seed", -1, "'seed' is -1; expected a whole number from 0"),
@@ -93,6 +98,7 @@ def test_shipped_problems_load_and_build(name):
         ("/**: {ros__parameters: {n_zz: 3}}", "unknown parameter 'n_zz'; did you mean 'n_z'"),
         ("/**: {ros__parameters: {n_z: odd}}", "'n_z' is 'odd'"),
         ("/**: {ros__parameters: {physical: {viscosity: thick}}}", "'physical.viscosity'"),
+        ("/**: {ros__parameters: {physical: {viscosity: 1e-3}}}", "point and sign, like 1.0e+12"),
         ("x: !!python/object/apply:os.system ['true']", "not valid YAML"),
     ],
 )

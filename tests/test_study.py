@@ -205,7 +205,9 @@ def test_a_worker_with_other_versions_is_refused_or_accepted_on_request(
 def test_a_study_that_cannot_be_is_refused_in_one_sentence(change: dict[str, Any], sentence: str):
     with pytest.raises(StudyError, match=sentence):
         Study.of({**CONTENT, **change})
-    with pytest.raises(StudyError, match=r"small, variant 'gauss-newton': parameter 'rollouts' is -1"):
+    with pytest.raises(
+        StudyError, match=r"small, variant 'gauss-newton': parameter 'rollouts' is -1"
+    ):
         Study.of({**CONTENT, "settings": {"rollouts": -1}}).trainings()
 
 

@@ -74,7 +74,7 @@ class RunFolder:
         """Begin a new training here. RunFolderError if the folder holds one or cannot be written."""
         if (self.path / "parameters.yaml").exists():
             raise RunFolderError(
-                f"{self.path} already holds a run; choose another folder, "
+                f"{self.path} already holds a run; choose another folder, delete this one, "
                 f"or continue it with: pdeloop train --resume {self.path} "
                 "(a tuner_node with -p resume:=true)"
             )

@@ -40,7 +40,8 @@ def configured_equation(name: str, environment: Mapping[str, str] = os.environ) 
     if ":" in name and identity(name) not in allowed:
         raise ValueError(
             f"the equation {name!r} is code, which is not run because a file names it; if you trust "
-            f"it, name it yourself: --equation {name}, or for nodes and workers {ALLOWED}={name} in the environment"
+            f"it, name it yourself: --equation {name}, or for nodes and workers {ALLOWED}={name} in "
+            "the environment"
         )
     return load_equation(name)
 

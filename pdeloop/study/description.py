@@ -76,7 +76,9 @@ class Study:
                 raise StudyError(f"variant {name!r}; expected a name of letters, digits, . + - _")
             if not isinstance(table, dict):
                 raise StudyError(f"variant '{name}' is {table!r}; expected a table of parameters")
-        if any(own in table for table in (settings, *variants.values()) for own in ("seed", "seeds")):
+        if any(
+            own in table for table in (settings, *variants.values()) for own in ("seed", "seeds")
+        ):
             raise StudyError(
                 "the settings or a variant have 'seed' or 'seeds'; leave them out, and give 'seeds' "
                 "beside 'problems'"
