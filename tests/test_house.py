@@ -38,6 +38,8 @@ ROS = (
     "launch",
     "launch_ros",
 )
+LARGE = ("matplotlib", "scipy.signal", "scipy.stats")
+"""Half a second of a core to import: for who uses them, not for each node that starts."""
 
 
 def sources(*packages: str) -> list[Path]:
@@ -81,10 +83,10 @@ def test_nothing_installed_imports_benchmarks_or_tests():
         assert not tops(path) & {"benchmarks", "tests"}, path
 
 
-def test_the_loop_runs_in_one_process_without_ros():
+def test_the_loop_runs_in_one_process_without_ros_and_large_imports():
     program = (
         "import sys\n"
-        f"for name in {ROS!r}: sys.modules[name] = None\n"
+        f"for name in {ROS + LARGE!r}: sys.modules[name] = None\n"
         "from tests.small import parameters, train_here\n"
         "print(train_here(parameters(iterations=1)).policies().shape)\n"
     )

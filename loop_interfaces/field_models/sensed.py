@@ -32,8 +32,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import scipy  # whose signal processing, half a second of a core, loads when it is used
 from numpy.typing import NDArray
-from scipy.signal import resample
 
 from loop_interfaces.arrays import Array
 
@@ -87,7 +87,7 @@ def interpolated(readings: Array) -> Array:
     """The field (n,) of lowest wavenumbers with these readings (n_y,)."""
     sensors = len(readings)
     n = grid_points(sensors)
-    field: Array = resample(readings, n)
+    field: Array = scipy.signal.resample(readings, n)
     return np.roll(field, n // (2 * sensors))
 
 
