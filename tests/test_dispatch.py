@@ -162,6 +162,17 @@ def test_a_cost_that_is_taken_back_after_it_was_used_ends_the_run():
         served.cost(0, replace(costs_of(first), values=costs_of(first).values + 1.0), 2.0)
 
 
+def test_in_a_pause_an_episode_that_fails_when_it_is_run_again_is_told_from_a_cost_that_is_taken_back():
+    served = dispatcher()
+    ((_, start),) = starts(served.assign(batch(1), 0.0))
+    served.pause()
+    cost = costs_of(start)
+    served.cost(0, cost, 1.0)
+    assert served.cost(0, void_of(start), 2.0) == []
+    with pytest.raises(DispatchError, match="took back the cost of episode"):
+        served.cost(0, replace(void_of(start), step=cost.step), 3.0)
+
+
 def test_two_different_models_of_one_episode_end_the_run():
     served = dispatcher()
     rows = np.array([[3.0, 4.0, 0.1, 0.0]])

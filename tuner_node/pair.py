@@ -78,8 +78,8 @@ class Pair:
     """Since when only another plant's costs come."""
     paused_until: float = -math.inf
     """How long the plant's report that it is paused holds."""
-    answers: dict[tuple[str, int], int] = field(default_factory=dict)
-    """By topic and episode: a digest of the answer that was taken."""
+    answers: dict[tuple[str, int], tuple[int, int]] = field(default_factory=dict)
+    """By topic and episode: a digest of the answer that was taken, and its step."""
     signed: dict[int, int] = field(default_factory=dict)
     """D of the last episodes, see loop_interfaces.signature."""
     last_start: Publication | None = None
@@ -114,7 +114,7 @@ class Pair:
 
     def take_answer(self, topic: str, answer: Frame) -> None:
         """An answer is used: another one for its episode contradicts it."""
-        self.answers[topic, answer.episode] = digest(answer.values)
+        self.answers[topic, answer.episode] = digest(answer.values), answer.step
 
     def runs(self, episode: int) -> bool:
         """Whether this episode is under way."""
@@ -125,15 +125,20 @@ class Pair:
 
         It is then chance which of the two answers was taken.
         """
-        taken = self.answers.get((topic, answer.episode))
+        if (topic, answer.episode) not in self.answers:
+            return
+        taken, step = self.answers[topic, answer.episode]
         void = topic == COST.name and bool((answer.values[:, -1:] == VOID).any())
-        if taken is not None and not void and digest(answer.values) != taken:
+        if not void and digest(answer.values) != taken:
             raise DispatchError(
                 f"two different messages on {topic} answer episode {episode_name(answer.episode)}; "
                 "expected one plant and one controller in this namespace: stop the other and start a "
                 "new run"
             )
-        if taken is not None and void and not self.runs(answer.episode) and not paused:
+        # While the tuner is paused, a plant that was started anew runs its last episode again, and may
+        # not come to its end. What it takes back has the step of the cost.
+        failed_again = paused and answer.step != step
+        if void and not self.runs(answer.episode) and not failed_again:
             raise DispatchError(
                 f"the plant took back the cost of episode {episode_name(answer.episode)}, which this "
                 "run has used, because different starts or actions came: stop the second tuner or "
