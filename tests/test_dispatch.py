@@ -156,16 +156,18 @@ def test_a_cost_that_is_taken_back_after_it_was_used_ends_the_run():
     with pytest.raises(
         DispatchError, match=f"took back the cost of episode {episode_name(first.episode)}"
     ):
-        served.cost(0, void_of(first), 1.0)
+        served.cost(0, replace(void_of(first), step=costs_of(first).step), 1.0)
     served.cost(0, costs_of(second), 1.0)
     with pytest.raises(DispatchError, match=r"two different messages on episode/cost"):
         served.cost(0, replace(costs_of(first), values=costs_of(first).values + 1.0), 2.0)
 
 
-def test_in_a_pause_an_episode_that_fails_when_it_is_run_again_is_told_from_a_cost_that_is_taken_back():
+@pytest.mark.parametrize("paused", [False, True])
+def test_an_episode_that_fails_when_it_is_run_again_is_told_from_a_cost_that_is_taken_back(paused):
     served = dispatcher()
     ((_, start),) = starts(served.assign(batch(1), 0.0))
-    served.pause()
+    if paused:
+        served.pause()
     cost = costs_of(start)
     served.cost(0, cost, 1.0)
     assert served.cost(0, void_of(start), 2.0) == []

@@ -330,7 +330,7 @@ class Dispatcher:
             self.counters["answers of another run"] += 1
             return None
         if self.plant in (UNKNOWN_PLANT, frame.plant):
-            known.check_answer(frame, topic.name, paused=self.paused)
+            known.check_answer(frame, topic.name)
         if not known.runs(frame.episode):
             self.counters["answers of another episode"] += 1
             return None

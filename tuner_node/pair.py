@@ -120,7 +120,7 @@ class Pair:
         """Whether this episode is under way."""
         return self.chunk is not None and self.episode == episode
 
-    def check_answer(self, answer: Frame, topic: str, *, paused: bool) -> None:
+    def check_answer(self, answer: Frame, topic: str) -> None:
         """Raise DispatchError if its episode was answered already, and otherwise.
 
         It is then chance which of the two answers was taken.
@@ -135,10 +135,9 @@ class Pair:
                 "expected one plant and one controller in this namespace: stop the other and start a "
                 "new run"
             )
-        # While the tuner is paused, a plant that was started anew runs its last episode again, and may
-        # not come to its end. What it takes back has the step of the cost.
-        failed_again = paused and answer.step != step
-        if void and not self.runs(answer.episode) and not failed_again:
+        # A plant that was started anew runs its last episode again, and may not come to its end: that
+        # is void at an earlier step.
+        if void and answer.step == step and not self.runs(answer.episode):
             raise DispatchError(
                 f"the plant took back the cost of episode {episode_name(answer.episode)}, which this "
                 "run has used, because different starts or actions came: stop the second tuner or "
