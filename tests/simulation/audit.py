@@ -35,7 +35,7 @@ def audit(plan: Plan) -> str:
 
     The last one is the limit that docs/security.md names: other bits, as a forged message, or the
     answer to a forged state, came to a process that the true one with its header never reached, or
-    reached when the run's last cost was on its way.
+    reached when the run's last cost, or the last before its tuner ended, was on its way.
 
     Raises
     ------

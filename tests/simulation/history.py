@@ -12,6 +12,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+from loop_interfaces.episodes import EPISODES_PER_START
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.protocol import ModelFailure, Publication
 from loop_interfaces.topics import (
@@ -90,7 +91,7 @@ class History:
         self._answered: set[Process] = set()
         """Plants that the loop's own controller has answered."""
         self._taken_back: set[tuple[int, int]] = set()
-        """Pairs and episodes whose cost is void, which the tuner has not heard yet."""
+        """Pairs and episodes whose cost is void, which the tuner that began them has not heard."""
         self._answers_forged = False
         """Whether what a controller sends now answers a forged state."""
         self._cut: set[tuple[str, str]] = set()
@@ -227,9 +228,12 @@ class History:
             unsigned = writer == "unsigned rival" and process not in self._answered
             forged = writer == "stranger" or answers_forged or unsigned
             header = topic, pair, frame.run, frame.episode, frame.step, frame.time, frame.plant
-            (self._forgeries if forged else self._heard).add((process, *header))
-            if topic is COST and process.name == "tuner" and _is_void(frame):
-                self._taken_back.discard((pair, frame.episode))
+            # What comes when the tuner that began the episode has ended is too late for its run.
+            start = frame.episode // EPISODES_PER_START
+            if not frame.episode or ("tuner" in self._processes and start == self._starts - 1):
+                (self._forgeries if forged else self._heard).add((process, *header))
+                if topic is COST and process.name == "tuner" and _is_void(frame):
+                    self._taken_back.discard((pair, frame.episode))
             self._answers_forged = forged and topic is STATE
             try:
                 process.take(topic, frame, pair)
