@@ -86,12 +86,7 @@ class Introspection:
         # A steady period, though the housekeeping comes a little late each time.
         self._due = max(self._due + PERIOD, now + PERIOD / 2)
         self.look_at_publishers()
-        namesakes, refused = self._namesakes(now), self._refused - self._reported
-        self._reported = self._refused
-        if refused:
-            self._node.get_logger().warning(
-                f"refused {refused} message(s), the last one because: {self._reason}"
-            )
+        namesakes, refused = self._namesakes(now), self.log_refused()
         if self._publisher is None:
             return
         status = self._diagnostics(now)
@@ -103,6 +98,16 @@ class Introspection:
         values = {**status.values, "refused messages": self._refused, "uptime": uptime}
         self._last = Status(status.level, status.message, values)
         self._publish(self._publisher, self._last)
+
+    def log_refused(self) -> int:
+        """Log how many messages were refused since the last call, and return that number."""
+        refused = self._refused - self._reported
+        self._reported = self._refused
+        if refused:
+            self._node.get_logger().warning(
+                f"refused {refused} message(s), the last one because: {self._reason}"
+            )
+        return refused
 
     def offer(self, name: str, act: Callable[[], str]) -> None:
         """A std_srvs/Trigger service, after which the node reports at once.

@@ -254,3 +254,24 @@ def test_services_that_do_not_fit_the_moment_say_why(loop: Processes):
         assert not success
         assert message == "no episode is under way; expected one to step in"
         assert desk.call("/pde_sim_node/resume") == "resumed"
+
+
+REFUSED_AT_THE_END = """
+import rclpy
+from loop_interfaces.ros import node_loop
+rclpy.init()
+loop = node_loop.NodeLoop(rclpy.create_node("served"))
+rounds = 0
+def end(now):
+    global rounds
+    rounds += 1
+    if rounds == 2:  # the first round has reported; the next report is a second later
+        loop.introspection.refuse("state", ValueError("expected another shape"))
+        loop.stop("the end")
+loop.run(housekeeping=end)
+"""
+
+
+def test_what_a_node_refused_just_before_its_end_is_logged(loop: Processes):
+    node = loop.start("-c", REFUSED_AT_THE_END, name="refusing")
+    assert "refused 1 message(s), the last one because: state: expected" in loop.wait(node, LIMIT)
