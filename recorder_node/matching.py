@@ -6,8 +6,8 @@ from __future__ import annotations
 from loop_interfaces.parameters import table
 from loop_interfaces.ros.peers import Peers
 
-PATIENCE = 3.0
-"""Seconds in which a node is expected to answer a request for its parameters."""
+PATIENCE = 10.0
+"""Seconds in which the graph is expected to show a node's name and its parameter services."""
 
 
 class Matching:
@@ -31,10 +31,12 @@ class Matching:
     def complete(self, now: float) -> bool:
         """Whether every required topic has a publisher, and all of them have discovered us.
 
-        One that does not answer for a while has no parameter services to say so.
+        A node with parameter services must have answered, however long it takes; one that shows
+        none within PATIENCE cannot.
         """
         return not self._lacking and all(
-            peer.values is not None or now - peer.since > PATIENCE for peer in self._peers.known
+            peer.values is not None or (now - peer.since > PATIENCE and not peer.offers_parameters)
+            for peer in self._peers.known
         )
 
     def changed(self, run: int) -> bool:

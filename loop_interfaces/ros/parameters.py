@@ -127,6 +127,10 @@ class RemoteParameters:
         """Go on with what can be gone on with; never waits."""
         next(self._asking, None)
 
+    def offered(self) -> bool:
+        """Whether the graph shows the services, or has shown them."""
+        return self.values is not None or self._list.service_is_ready()
+
     def _ask(self) -> Iterator[None]:
         """Ask for the names, then for the values; yields wherever it has to wait."""
         listed = yield from self._call(self._list, ListParameters.Request())

@@ -31,6 +31,11 @@ class Peer:
         """Its parameters; None until it has answered."""
         return None if self.parameters is None else self.parameters.values
 
+    @property
+    def offers_parameters(self) -> bool:
+        """Whether the graph shows the node's parameter services."""
+        return self.parameters is not None and self.parameters.offered()
+
 
 class Peers:
     """The processes that publish some topics, each of which is asked for its parameters once."""

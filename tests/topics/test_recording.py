@@ -334,3 +334,53 @@ def test_a_killed_recorder_is_started_again_and_goes_on_in_another_bag(loop, tmp
     report = verify(out)
     assert report.count == 0, report.text()
     assert describe(out / "bag-2")["finished"]
+
+
+MATCHING = """
+import sys, time
+import rclpy, rclpy.executors
+from std_msgs.msg import String
+from loop_interfaces.ros.peers import Peers
+from recorder_node.matching import PATIENCE, Matching
+
+rclpy.init()
+served = sys.argv[1] == "served"
+plant = rclpy.create_node("plant", start_parameter_services=served)
+publisher = plant.create_publisher(String, "state", 1)
+recorder = rclpy.create_node("recorder")
+peers = Peers(recorder)
+matching = Matching(peers, required=["/state"], others=[])
+
+
+def look_until(condition):
+    while not condition():
+        matching.look(time.monotonic())
+        time.sleep(0.01)
+    return peers.known[0]
+
+
+peer = look_until(lambda: peers.known and peers.known[0].name)
+if served:  # its services are there, but busy
+    look_until(lambda: peer.offers_parameters)
+for waited in (PATIENCE - 1, PATIENCE + 1):
+    print("after", waited, matching.complete(peer.since + waited))
+if served:
+    executor = rclpy.executors.SingleThreadedExecutor()
+    executor.add_node(plant)
+    executor.add_node(recorder)
+
+    def answered():
+        executor.spin_once(0)
+        return peer.values is not None
+
+    look_until(answered)
+    print("answered", matching.complete(peer.since))
+"""
+
+
+def test_a_slow_answer_is_waited_for_and_a_node_without_services_is_not(loop):
+    slow = loop.start("-c", MATCHING, "served", name="slow")
+    lines = loop.wait(slow, LIMIT).splitlines()
+    assert lines == ["after 9.0 False", "after 11.0 False", "answered True"]
+    mute = loop.start("-c", MATCHING, "not", name="mute")
+    assert loop.wait(mute, LIMIT).splitlines() == ["after 9.0 False", "after 11.0 True"]
