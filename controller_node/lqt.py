@@ -92,7 +92,7 @@ def track(model: ReducedModel, *, state_weight: float, action_weight: float) -> 
     Raises
     ------
     ValueError
-        A weight that is not positive and finite.
+        A weight that is not positive and finite, or no model.
     DesignError
         A mode on or outside the unit circle that no actuator reaches, or a Riccati equation or a
         steady-state map without a usable solution.
@@ -113,6 +113,8 @@ def track(model: ReducedModel, *, state_weight: float, action_weight: float) -> 
     >>> gains.K_a.round(6)
     array([[-1.5]])
     """
+    if not isinstance(model, ReducedModel):
+        raise ValueError(f"model is {model!r}; expected a ReducedModel")
     for name, weight in (("state_weight", state_weight), ("action_weight", action_weight)):
         if not (isinstance(weight, Real) and 0.0 < weight < np.inf):
             raise ValueError(f"{name} must be positive and finite, but it is {weight!r}.")

@@ -19,6 +19,7 @@ Ljung, "System Identification: Theory for the User", 2nd ed., chapter 16 (cross-
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from numbers import Integral
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -136,7 +137,10 @@ def study_orders(
     """
     everything = steps_of(trajectories)
     known = [(np.asarray(z, np.float64), np.asarray(a, np.float64)) for z, a in trajectories]
-    tried = sorted({n for n in orders if n >= 1})
+    asked = list(orders)
+    if wrong := [order for order in asked if not isinstance(order, Integral)]:
+        raise ValueError(f"orders holds {wrong[0]!r}; expected whole numbers")
+    tried = sorted({n for n in asked if n >= 1})
     errors, scales = [], np.zeros(2)
     with threadpool_limits(limits=1):  # as in the identification itself
         singular_values: Array = linalg.svdvals(everything.after)

@@ -105,7 +105,11 @@ def steps_of(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> Steps:
     ValueError for shapes that do not fit, NaN and infinity.
     """
     befores, afters, inputs = [], [], []
-    if not trajectories or any(len(trajectory) != 2 for trajectory in trajectories):
+    if (
+        not isinstance(trajectories, Sequence)
+        or not trajectories
+        or any(not isinstance(t, Sequence) or len(t) != 2 for t in trajectories)
+    ):
         raise ValueError("expected a list of trajectories, each a tuple (states, actions)")
     for trajectory in trajectories:
         z, own = _matrix("states", trajectory[0]), _matrix("actions", trajectory[1])

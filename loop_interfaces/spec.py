@@ -222,6 +222,8 @@ def read_document(path: Path) -> Any:
         return yaml.safe_load(raw)
     except (yaml.YAMLError, UnicodeDecodeError, ValueError, RecursionError) as error:
         first = str(error).splitlines()[0]
+        if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
+            first = f"{error.problem or first}, in line {error.problem_mark.line + 1}"
         raise ParameterError(f"{path} is not valid YAML: {first}") from error
 
 

@@ -147,6 +147,8 @@ def problem(
     >>> states.shape, actions.shape
     ((101, 64), (100, 6))
     """
+    if physical is not None and not isinstance(physical, Mapping):
+        raise ValueError(f"physical is {physical!r}; expected a dict of names and numbers")
     given = parameters | {f"physical.{name}": value for name, value in (physical or {}).items()}
     if "equation" in given:
         given["equation"] = allow(given["equation"])
@@ -243,6 +245,8 @@ def train(
     >>> run.policies.shape, run.costs["adapted"].shape
     ((1, 6, 8), (1, 2))
     """
+    if not isinstance(problem, Problem | str):
+        raise ValueError(f"problem is {problem!r}; expected a Problem or its name")
     if over_topics and out is None:
         raise ValueError("a training over topics needs a folder for its results and logs: give out")
     with TemporaryDirectory() as temporary:

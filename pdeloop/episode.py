@@ -84,7 +84,8 @@ def rollout(
     Raises
     ------
     ValueError
-        The seeds are refused, or the law gives actions of another shape or that are not finite.
+        No plant, no law or no seeds are given, or the law gives actions of another shape or that are
+        not finite.
 
     Examples
     --------
@@ -97,6 +98,10 @@ def rollout(
     >>> (episode.costs.diverged_step < 0).all()
     np.True_
     """
+    if not isinstance(plant, Plant):
+        raise ValueError(f"plant is {plant!r}; expected a Plant")
+    if not callable(law):
+        raise ValueError(f"law is {law!r}; expected a function of k and the states")
     z = plant.reset(seeds, noise)
     batch, kept = len(z), plant.horizon if keep else -1
     states = np.empty((kept + 1, *z.shape))

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -122,6 +123,8 @@ def load_run(folder: str | Path) -> FinishedRun:
     ValueError
         There is no run, or it is not finished; the message says how to go on.
     """
+    if not isinstance(folder, str | PathLike):
+        raise ValueError(f"folder is {folder!r}; expected the path of a run")
     run = RunFolder(Path(folder))
     values, arrays, result = run.values(), run.policies(), run.result()
     return FinishedRun(

@@ -131,6 +131,21 @@ def test_what_does_not_fit_is_refused_in_one_sentence(small) -> None:
         (lambda: pdeloop.projected_law(plant, basis[1:], np.zeros((n_a, 4))), "U must have shape"),
         (lambda: pdeloop.projected_law(plant, basis, np.zeros((n_a, 3))), "policy must have shape"),
         (lambda: pdeloop.study_orders((states, actions)), "a list of trajectories"),
+        (lambda: pdeloop.problem(physical=3), "physical is 3; expected a dict"),
+        (lambda: pdeloop.train(3), "problem is 3; expected a Problem or its name"),
+        (lambda: pdeloop.load_run(3), "folder is 3; expected the path"),
+        (lambda: pdeloop.identify(3, n_s=2), "each a tuple .states, actions."),
+        (lambda: pdeloop.study_orders(3), "a list of trajectories"),
+        (
+            lambda: pdeloop.study_orders([(states, actions)], orders="ab"),
+            "orders holds 'a'; expected whole numbers",
+        ),
+        (
+            lambda: pdeloop.track(3, state_weight=1.0, action_weight=1.0),
+            "model is 3; expected a ReducedModel",
+        ),
+        (lambda: pdeloop.rollout(3, lambda k, z: z, [0]), "plant is 3; expected a Plant"),
+        (lambda: pdeloop.rollout(plant, 3, [0]), "law is 3; expected a function"),
         (lambda: pdeloop.rollout(plant, lambda k, z: z, [0]), "actions must have shape"),
         (lambda: pdeloop.rollout(plant, lambda k, z: z, 0), "must be M seeds, .* or an array"),
         (

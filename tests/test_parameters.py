@@ -94,6 +94,7 @@ def test_shipped_problems_load_and_build(name):
         ("n_z: 3", "not a ROS parameter file"),
         ("/**: {ros__parameters: [1]}", "not a ROS parameter file"),
         ("a: [", "not valid YAML"),
+        ("a: 1\nb: 2: 3\n", "not valid YAML: mapping values are not allowed here, in line 2"),
         ("", "not a ROS parameter file"),
         ("/**: {ros__parameters: {n_zz: 3}}", "unknown parameter 'n_zz'; did you mean 'n_z'"),
         ("/**: {ros__parameters: {n_z: odd}}", "'n_z' is 'odd'"),

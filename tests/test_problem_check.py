@@ -121,6 +121,8 @@ def test_what_new_writes_runs_and_passes_its_own_test(
         ("9x", "is no name"),
         ("burgers", "shipped"),
         ("a" * 61, "is no name"),
+        ("class", "Python has 'class' already"),
+        ("numpy", "Python has 'numpy' already"),
     ],
 )
 def test_new_refuses_a_name(name: str, words: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -159,3 +161,11 @@ def test_an_option_of_the_other_check_is_refused(
         .err.splitlines()[-1]
         .startswith(f"pdeloop check: error: leave out {wrong}")
     )
+
+
+def test_a_picture_that_cannot_be_written_is_refused_before_the_check(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["check", "burgers", "--picture", str(tmp_path / "none" / "x.png")]) == FAILED
+    told = capsys.readouterr()
+    assert not told.out and "No such file" in told.err

@@ -67,14 +67,14 @@ def _check(options: argparse.Namespace) -> int:
         from pdeloop.training_run import resolve
 
         values = resolve(options.problem, allow_equation(options))
+        if options.picture is not None:
+            draw(values, options.picture)  # before the check, which takes longer
         found = check(values)
     findings = []
     for finding in found:
         findings.append(finding)
         if not options.json:
             print(f"{'ok ' if finding.good else 'BAD'}  {finding.name}: {finding.text}", flush=True)
-    if options.picture is not None:
-        draw(values, options.picture)
     if options.json:
         print_json([asdict(finding) for finding in findings])
     elif options.picture is not None:

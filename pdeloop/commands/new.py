@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import argparse
 import re
+from importlib.util import find_spec
+from keyword import iskeyword
 from pathlib import Path
 from string import Template
 
@@ -21,7 +23,8 @@ def write(name: str, into: Path) -> tuple[list[Path], str]:
     """Write class, YAML and test of a PDE into a new folder; the files, and what --equation names.
 
     name: of the problem and its folder, small letters, digits, '-' and '_'; into: where the folder
-    goes. ParameterError for another name, a shipped problem's, and a folder that is there.
+    goes. ParameterError for another name, a shipped problem's or a Python module's, and a folder that
+    is there.
     """
     if len(name) > 60 or not _NAME.fullmatch(name):
         raise ParameterError(
@@ -31,6 +34,8 @@ def write(name: str, into: Path) -> tuple[list[Path], str]:
     if name in shipped_problems():
         raise ParameterError(f"'{name}' is a shipped problem; take another name")
     module = name.replace("-", "_")
+    if iskeyword(module) or _is_module(module):
+        raise ParameterError(f"Python has '{module}' already; take another name")
     words = module.split("_")
     kind = "".join(word.capitalize() for word in words)
     filled = {
@@ -53,6 +58,12 @@ def write(name: str, into: Path) -> tuple[list[Path], str]:
         text = (_TEMPLATES / template).read_text()
         (folder / file).write_text(Template(text).substitute(filled))
     return [folder / file for file in files], f"{folder / module}.py:{kind}"
+
+
+def _is_module(name: str) -> bool:
+    """Whether Python would find another module of this name; a folder without code is none."""
+    found = find_spec(name)
+    return found is not None and found.origin is not None
 
 
 def add(commands: Commands) -> None:

@@ -79,8 +79,10 @@ class Disk:
         checkpoint.restore(folder / "checkpoint", found.append)
         number = int(found[0].pop("number")) if found else 0
         written = self._number - during
-        if rot:  # the one before is there, unless the crash came when only one had its name
-            written = 0 if during else written - 1
+        if (
+            rot
+        ):  # the one before is there, unless only one had its name, or was left by damage before
+            written = 0 if during or len(self._saved) < 2 else written - 1
         assert number >= written, f"checkpoint {written} was written, {number} was found"
         self._saved = [state for state in self._saved if state["number"] <= number]
         self._number = self._found = number
