@@ -41,10 +41,11 @@ def run(expression: str, workers: int) -> tuple[int, list[str], str]:
     command = [sys.executable, "-m", "pytest", "-q", "-rfE", "-m", "topics", "-k", expression]
     command += ["-n", str(workers), "--dist", "worksteal"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    *lines, last = done.stdout.strip().splitlines()
-    if done.returncode not in (0, 1):
+    lines = done.stdout.splitlines()
+    ends = [line for line in lines if re.match(r"=* ?\d+ (passed|failed).* in ", line)]
+    if done.returncode not in (0, 1) or not ends:
         raise SystemExit(done.stdout[-2000:] + done.stderr[-2000:])
-    counts = {kind: int(number) for number, kind in re.findall(r"(\d+) (passed|failed)", last)}
+    counts = {kind: int(number) for number, kind in re.findall(r"(\d+) (passed|failed)", ends[-1])}
     failed = [line.split()[1] for line in lines if line.startswith(("FAILED ", "ERROR "))]
     sections = re.search(r"^=+ (ERRORS|FAILURES) =+$.*(?=^=+ short test)", done.stdout, re.M | re.S)
     return sum(counts.values()), failed, sections[0] if sections else ""
