@@ -19,6 +19,7 @@ from controller_node.responder import Responder
 from loop_interfaces.diagnostics import Level, Rate, Status
 from loop_interfaces.frames import Frame
 from loop_interfaces.parameters import taken_by
+from loop_interfaces.ros import introspection
 from loop_interfaces.ros.endpoints import reader_qos, writer_qos
 from loop_interfaces.ros.introspection import Introspection
 from loop_interfaces.topics import COST, STATE, TARGET, VOID
@@ -58,6 +59,44 @@ def test_a_publisher_whose_messages_do_not_arrive_is_named_with_its_topic():
     assert said.startswith("/lab/mine publishes /target so that it does not arrive (QoS: Volatile")
     assert node.get_logger().error.call_count == 1
     assert found.several_publishers == {"/target": ["/good", "/lab/mine"]}
+
+
+def test_every_topic_with_a_wrong_publisher_is_named_and_again_while_it_lasts(monkeypatch):
+    monkeypatch.setattr(introspection, "is_confined", lambda: True)
+    node, lone = MagicMock(), SimpleNamespace(node_namespace="/", node_name="mine")
+    lone.qos_profile = QoSProfile(depth=1)
+    node.count_publishers.return_value = 1
+    node.get_publishers_info_by_topic.return_value = [lone]
+    node.count_services.return_value = 1
+    found = Introspection(node)
+    for topic in ("/target", "/policy", "/model"):
+        found.supervise(topic, reader_qos(TARGET))
+    found.round(1.0)
+    said = [call.args[0].split()[2] for call in node.get_logger().error.call_args_list]
+    assert said == ["/target", "/policy", "/model"]
+    node.count_publishers.return_value = 2
+    node.get_publishers_info_by_topic.return_value = [lone, lone]
+    for now in range(2, 32):
+        found.round(float(now))
+    assert node.get_logger().error.call_count == 3 * 4
+    warned = [call.args[0] for call in node.get_logger().warning.call_args_list]
+    assert len(warned) == 3 * 3
+    assert warned[0].startswith("several nodes publish /target: /mine (2 nodes of this name); only")
+
+
+def test_a_node_that_was_started_again_is_not_two_of_its_name(monkeypatch):
+    monkeypatch.setattr(introspection, "is_confined", lambda: True)
+    node, there = MagicMock(), SimpleNamespace(node_namespace="/", node_name="mine")
+    there.qos_profile = writer_qos(TARGET)
+    node.count_services.return_value = 1
+    found = Introspection(node)
+    found.supervise("/target", reader_qos(TARGET))
+    for now in range(40):
+        count = 2 if now % 10 < 5 else 1  # one that was killed is seen for a while
+        node.count_publishers.return_value = count
+        node.get_publishers_info_by_topic.return_value = [there] * count
+        found.round(float(now))
+    assert not node.get_logger().warning.called and found.several_publishers == {}
 
 
 @pytest.mark.parametrize(

@@ -5,9 +5,11 @@ All of it runs in the node's housekeeping, off the hot path: nothing here is cal
 the loop.
 """
 
+import math
 import socket
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -19,6 +21,7 @@ from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from std_srvs.srv import Trigger
 
 from loop_interfaces.diagnostics import ConditionTimer, Level, Status
+from loop_interfaces.isolation import is_confined
 
 NAMELESS = "_NODE_NAME_UNKNOWN_"
 """The graph's name for the node of an endpoint, before it has discovered the node."""
@@ -30,7 +33,11 @@ PERIOD = 1.0
 WORKING = 1.0
 """Seconds of one computation after which it is reported while it lasts."""
 NAMESAKE_GRACE = 6.0
-"""Seconds a second node of our name may be seen before it counts: a killed one is seen for 4 s."""
+"""Seconds a second node of a name may be seen before it counts: a killed one is seen for 4 s."""
+NAMESAKE_GRACE_OUTSIDE = 25.0
+"""The same where the profile is not ours, and the middleware's lease is perhaps its default of 20 s."""
+AGAIN = 10.0
+"""Seconds after which a warning that still holds is repeated."""
 
 
 def full_name(endpoint: Any) -> str:
@@ -59,6 +66,11 @@ class Introspection:
         """The nodes that published a topic which one node should publish."""
         self._known: dict[str, int] = {}
         """Publishers of a topic that were looked at."""
+        self._doubled: dict[str, ConditionTimer] = {}
+        """How long a topic has had two publishers of one name."""
+        self._grace = NAMESAKE_GRACE if is_confined() else NAMESAKE_GRACE_OUTSIDE
+        self._told: dict[str, float] = {}
+        """When a warning was given."""
 
     def supervise(self, name: str, qos: QoSProfile) -> None:
         """Check the publishers of a topic, by its full name: one other node should publish it.
@@ -85,7 +97,7 @@ class Introspection:
             return
         # A steady period, though the housekeeping comes a little late each time.
         self._due = max(self._due + PERIOD, now + PERIOD / 2)
-        self.look_at_publishers()
+        self.look_at_publishers(now)
         namesakes, refused = self._namesakes(now), self.log_refused()
         if self._publisher is None:
             return
@@ -161,7 +173,7 @@ class Introspection:
             message.header.stamp = self._node.get_clock().now().to_msg()
             publisher.publish(message)
 
-    def look_at_publishers(self) -> bool:
+    def look_at_publishers(self, now: float) -> bool:
         """Warn of several publishers of one topic, and of one whose QoS is not compatible.
 
         Returns whether every publisher's name is known; it is discovered a little after the
@@ -182,22 +194,41 @@ class Introspection:
             for name, offered in there:
                 verdict, reason = qos_check_compatible(offered, asked)
                 if verdict == QoSCompatibility.ERROR:
-                    self._node.get_logger().error(
-                        f"{name} publishes {topic} so that it does not arrive (QoS: "
-                        f"{reason.removeprefix('ERROR: ').rstrip(';')}); expected a publisher as in "
-                        "docs/interfaces.md",
-                        throttle_duration_sec=10.0,
-                    )
-            found = {name for name, _ in there}
-            if len(found) > 1:
+                    reason = reason.removeprefix("ERROR: ").rstrip(";")
+                    text = f"{name} publishes {topic} so that it does not arrive (QoS: {reason})"
+                    if self._is_due(text, now):
+                        self._node.get_logger().error(
+                            f"{text}; expected a publisher as in docs/interfaces.md"
+                        )
+            found = self._several(topic, Counter(name for name, _ in there), now)
+            if found:
                 known = self.several_publishers.get(topic, ())
-                self.several_publishers[topic] = sorted(found.union(known))
-                self._node.get_logger().warning(
-                    f"{len(found)} nodes publish {topic}: {', '.join(sorted(found))}; "
-                    "only messages of this run, episode, step and plant count",
-                    throttle_duration_sec=10.0,
-                )
+                self.several_publishers[topic] = sorted({*found, *known})
+                text = f"several nodes publish {topic}: {', '.join(found)}"
+                if self._is_due(text, now):
+                    self._node.get_logger().warning(
+                        f"{text}; only messages of this run, episode, step and plant count"
+                    )
         return all_named
+
+    def _several(self, topic: str, names: Counter[str], now: float) -> list[str]:
+        """The publishers of a topic by the names of their nodes, if they are several nodes."""
+        doubled = self._doubled.setdefault(topic, ConditionTimer())
+        lasts = doubled.seconds(names.total() > len(names), now) > self._grace
+        if len(names) < 2 and not lasts:
+            return []
+        return [
+            f"{name} ({count} nodes of this name)" if count > 1 and lasts else name
+            for name, count in sorted(names.items())
+        ]
+
+    def _is_due(self, text: str, now: float) -> bool:
+        """Whether to give a warning, which may have been given before."""
+        due = now >= self._told.get(text, -math.inf) + AGAIN
+        if due:
+            self._told = {known: at for known, at in self._told.items() if now < at + AGAIN}
+            self._told[text] = now
+        return due
 
     def _namesakes(self, now: float) -> int:
         """How many other nodes have had this one's full name for a while; says so.
@@ -207,7 +238,7 @@ class Introspection:
         """
         own = f"{self._node.get_fully_qualified_name()}/get_parameters"
         others = self._node.count_services(own) - 1
-        if self._namesake.seconds(others > 0, now) <= NAMESAKE_GRACE:
+        if self._namesake.seconds(others > 0, now) <= self._grace:
             return 0
         self._node.get_logger().warning(
             f"{others} other node(s) called {self._node.get_fully_qualified_name()} in this ROS "
