@@ -158,6 +158,16 @@ def clock_message(time: float) -> bytes | None:
     return _CLOCK.pack(0, 1, 0, *divmod(round(time * 1e9), 10**9))
 
 
+def arrival_time(stamp: int, offset: int) -> int:
+    """When a sample came, in ns since the epoch. FrameError beyond what ROS's time can hold.
+
+    offset: see ClockOffset.
+    """
+    if not 0 <= stamp + offset < 2**63:
+        raise FrameError(f"expected a sample with a time, got the stamp {stamp} ns")
+    return stamp + offset
+
+
 class ClockOffset:
     """Puts the plant's stamps on the reader's clock: the smallest delay of late counts as none.
 

@@ -18,6 +18,7 @@ from loop_interfaces.samples import (
     Sample,
     SampleBatch,
     TokenBucket,
+    arrival_time,
     clock_message,
     unpack,
 )
@@ -138,6 +139,13 @@ def test_stamps_are_put_on_the_readers_clock():
     later = 3_600 * second
     assert clock.update(5_000, later, received=later + 2_000) == later - 3_000  # it was set
     assert clock.update(6_000, later + 1_000, received=later + 2_000) == later - 4_000
+
+
+@pytest.mark.parametrize("stamp, offset", [(2**64 - 1, 0), (2**63, 0), (5, -6), (2**62, 2**62)])
+def test_a_stamp_beyond_any_time_is_refused(stamp, offset):
+    assert arrival_time(5, -5) == 0
+    with pytest.raises(FrameError, match="expected a sample with a time"):
+        arrival_time(stamp, offset)
 
 
 def test_stamps_follow_a_clock_that_drifts():

@@ -19,6 +19,7 @@ from loop_interfaces.samples import (
     CLOCK_KIND,
     STATE_KIND,
     ClockOffset,
+    arrival_time,
     clock_message,
     unpack,
 )
@@ -128,9 +129,10 @@ class SampleSubscription:
             sent, samples = unpack(batch)
             offset = self._offset.update(sent, info["source_timestamp"], info["received_timestamp"])
             for sample in samples:
-                yield sample.kind, sample.stamp + offset, sample.raw
+                arrival = arrival_time(sample.stamp, offset)
+                yield sample.kind, arrival, sample.raw
                 if self._clock and (clock := clock_message(sample.time)) is not None:
-                    yield CLOCK_KIND, sample.stamp + offset, clock
+                    yield CLOCK_KIND, arrival, clock
         for kind, intake in self._singles.items():
             for raw, info in intake.take(until):
                 yield kind, info["received_timestamp"], raw
