@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -14,6 +16,7 @@ from viewer_node.diagnostics import ViewerDiagnostics
 from viewer_node.episode_samples import COLUMNS
 from viewer_node.loop_view import LoopView
 from viewer_node.picture import UNSEEN, diverging
+from viewer_node.rollout_costs import MAX_BYTES
 
 RUN, PLANT, N_Z, N_A, N_S = 5, 9, 8, 2, 3
 RNG = np.random.default_rng(4)
@@ -30,6 +33,20 @@ TARGET = np.linspace(0.0, 1.0, N_Z)
 
 def frame(values, episode: int = 1, step: int = 0, plant: int = PLANT) -> Frame:
     return Frame(RUN, episode, step, 0.0, np.asarray(values, dtype=float), plant)
+
+
+def test_what_comes_under_ever_new_ids_fills_no_memory():
+    made = LoopView()
+    tracemalloc.start()
+    for i in range(40):
+        large = np.zeros((1, 1, 2**20))
+        made.policy(frame(large, episode=i), 0.0)
+        made.model(frame(large, step=i), 0.0)
+        made.start(frame(np.zeros((2**18, 4)), episode=i), 0.0)
+        made.target(frame(large.ravel(), plant=i), 0.0)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 5 * MAX_BYTES
 
 
 def view() -> LoopView:

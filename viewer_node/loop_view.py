@@ -60,7 +60,7 @@ class LoopView:
         self.rounds = self.episodes = self.samples = 0
         self.current: EpisodeSamples | None = None
         self.finished: EpisodeSamples | None = None
-        self.targets: dict[int, Array] = {}
+        self._targets: dict[int, Frame] = {}
         self.run = 0
         self._costs = RolloutCosts()
         self._numbers: dict[str, float] = {}
@@ -157,7 +157,7 @@ class LoopView:
     def target(self, frame: Frame, now: float) -> None:
         """Take z_r of a plant."""
         self.nodes.heard(now, "plant")
-        remember(self.targets, frame.plant, frame.values)
+        remember(self._targets, frame.plant, frame)
 
     def paused(self, frame: Frame, now: float) -> None:
         """Take whether an operator holds the plant."""
@@ -191,7 +191,7 @@ class LoopView:
         current = self.current
         if current is None:
             return None
-        target = self.targets.get(current.key[2])
+        target = self.target_of(current.key)
         fits = target is not None and len(target) == len(current.z)
         return current.z, target if fits else None
 
@@ -240,7 +240,7 @@ class LoopView:
             return before
         some = seen[:: max(1, seen.size // 20_000)]
         low, high = (float(v) for v in np.percentile(some, EXTREMES))
-        target = self.targets.get(shown.key[2])
+        target = self.target_of(shown.key)
         if target is not None:
             target = target[rows_of(len(target), shown.components)][part]
             low, high = min(low, float(target.min())), max(high, float(target.max()))
@@ -249,6 +249,11 @@ class LoopView:
         size = STEADY * max(high - low, before[1] - before[0])
         same = abs(low - before[0]) <= size and abs(high - before[1]) <= size
         return before if same else (low, high)
+
+    def target_of(self, key: Key) -> Array | None:
+        """z_r of the plant of an episode."""
+        frame = self._targets.get(key[2])
+        return None if frame is None else frame.values
 
     def _error(self) -> Array | None:
         """z - z_r of the newest sample."""

@@ -15,9 +15,10 @@ from loop_interfaces.frames import Frame
 from loop_interfaces.topics import COMPLETED, START_COLUMNS, CostColumn, StartColumn
 
 Key = TypeVar("Key")
-Value = TypeVar("Value")
 MAX_KEPT = 100
 """Episodes whose gains are remembered until their costs come."""
+MAX_BYTES = 2**26
+"""Of all that is remembered of one kind."""
 MAX_MODELS = 4
 """Generations of models."""
 
@@ -46,12 +47,13 @@ class Rollouts:
         return float(self.mean[rows].mean()) if rows.any() else None
 
 
-def remember(known: dict[Key, Value], key: Key, value: Value, most: int = MAX_KEPT) -> None:
-    """Keep a value as the newest; of more than `most` the oldest goes."""
+def remember(known: dict[Key, Frame], key: Key, frame: Frame, most: int = MAX_KEPT) -> None:
+    """Keep a frame as the newest; of more than `most`, or than MAX_BYTES, the oldest ones go."""
     known.pop(key, None)
-    known[key] = value
-    if len(known) > most:
+    room = MAX_BYTES - frame.values.nbytes
+    while known and (len(known) >= most or sum(f.values.nbytes for f in known.values()) > room):
         del known[next(iter(known))]
+    known[key] = frame
 
 
 class RolloutCosts:

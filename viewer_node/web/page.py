@@ -169,7 +169,7 @@ class Page:
         yield "curve", curve.version, lambda: json.dumps({"part": "curve", **curve.message()})
         if shown is None:
             return
-        target = view.targets.get(shown.key[2])
+        target = view.target_of(shown.key)
         chosen = (self.place["begun"], shown.components, self.component)
         yield "target", (*chosen, id(target)), partial(self._target, target, shown)
         samples = (*chosen, shown.version, shown.ended, self._colours)
