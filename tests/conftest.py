@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 from collections.abc import Generator, Iterator
@@ -67,10 +68,14 @@ def pytest_runtest_makereport(
 
 
 def shared_memory() -> set[str]:
-    """Fast DDS's files in shared memory."""
-    folder = Path("/dev/shm")
-    names = {path.name for path in folder.iterdir()}
-    return {name for name in names if "fastrtps" in name or "fastdds" in name}
+    """Fast DDS's files in shared memory that no living process uses."""
+    names = {path.name for path in Path("/dev/shm").iterdir()}
+    found = {name for name in names if "fastrtps" in name or "fastdds" in name}
+    for maps in Path("/proc").glob("[0-9]*/maps") if found else ():
+        with contextlib.suppress(OSError):
+            used = maps.read_text()
+            found = {name for name in found if f"/dev/shm/{name}" not in used}
+    return found
 
 
 @pytest.fixture
