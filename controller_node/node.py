@@ -84,9 +84,8 @@ class ControllerNode:
                 self._senders[send.topic].send(send.frame)
             else:
                 self._failed.publish(String(data=send.to_json()))
-                self._node.get_logger().error(
-                    f"no reduced model: {send.reason}", throttle_duration_sec=1.0
-                )
+                what = "to be run again" if send.retry else "no reduced model"
+                self._node.get_logger().error(f"{what}: {send.reason}", throttle_duration_sec=1.0)
 
     def _report(self, now: float) -> Status:
         self._diagnostics.plants = self._node.count_publishers(

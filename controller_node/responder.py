@@ -7,7 +7,7 @@ keeps nothing that the latched topics do not give it back after a restart, excep
 exploratory episode: if it missed some, it says so and the episode is run again.
 """
 
-from collections import Counter, OrderedDict
+from collections import Counter, OrderedDict, deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -22,11 +22,21 @@ from loop_interfaces.episodes import episode_name
 from loop_interfaces.frames import KEPT_ARRAY, Frame, FrameError
 from loop_interfaces.protocol import ModelFailure, Publication
 from loop_interfaces.signature import NOT_SIGNED, digest_of, signature
-from loop_interfaces.topics import ACTION, COMPLETED, MAX_GAIN, CostColumn, StartColumn, start_rows
+from loop_interfaces.topics import (
+    ACTION,
+    COMPLETED,
+    MAX_GAIN,
+    VOID,
+    CostColumn,
+    StartColumn,
+    start_rows,
+)
 
 MAX_RUNS = 8
 """Runs, and plants, that are remembered. The least recently used is dropped first, but never the one
 that was answered last, whatever else comes in."""
+MAX_KEPT = 4
+"""Policies, and sets of reduced models, that are kept of a run: a stranger's beside the tuner's."""
 MAX_BYTES = 2**29
 """Bytes that are kept of all runs together. Less recently used runs are dropped for a newer one;
 a run that has no room alone is refused, and an exploratory episode without room gives no model."""
@@ -46,30 +56,45 @@ class Answering:
     signature: float
 
 
+@dataclass(frozen=True)
+class _Models:
+    """Reduced models as a tuner has sent them: their number, which episodes name, and a digest."""
+
+    number: int
+    digest: int
+    rows: list[model_rows.ModelRows]
+
+
 @dataclass
 class _Run:
-    """What one run's tuner has sent, and what was made of it."""
+    """What came in the name of one run, and what was made of it. policies, models: the newest ones."""
 
     start: Frame | None = None
     exploration: Exploration | None = None
     """Of the episode, if it explores."""
-    policy: Frame | None = None
-    disputed: int = -1
-    """The episode for which two different policies came."""
-    models: list[model_rows.ModelRows] = field(default_factory=list)
-    models_digest: int = 0
-    generation: int = -1
-    """Number of these models; an episode names the one that its policies belong to."""
+    policies: deque[Frame] = field(default_factory=lambda: deque(maxlen=MAX_KEPT))
+    models: deque[_Models] = field(default_factory=lambda: deque(maxlen=MAX_KEPT))
     answering: Answering | None = None
     """Dropped with whatever arrives that changes it."""
 
     @property
     def nbytes(self) -> int:
-        frames = [frame.values.nbytes for frame in (self.start, self.policy) if frame is not None]
-        models = [a.nbytes for model in self.models for a in (model.U, model.A, model.B)]
+        frames = [
+            frame.values.nbytes for frame in (self.start, *self.policies) if frame is not None
+        ]
+        rows = [model for models in self.models for model in models.rows]
+        matrices = [a.nbytes for model in rows for a in (model.U, model.A, model.B)]
         samples = self.exploration.nbytes if self.exploration else 0
         # The law has a copy of every U.
-        return sum(frames) + 2 * sum(models) + samples
+        return sum(frames) + 2 * sum(matrices) + samples
+
+    def policies_of(self, episode: int) -> list[Frame]:
+        """All that came for an episode."""
+        return [policy for policy in self.policies if policy.episode == episode]
+
+    def models_of(self, number: int) -> list[_Models]:
+        """All that came under a number."""
+        return [models for models in self.models if models.number == number]
 
     def episode_start(self, frame: Frame) -> Frame | None:
         """The start of the frame's episode, if it is the one this run is in."""
@@ -102,6 +127,13 @@ class Responder:
         """Why the last episode's identification gave no model; empty if it did."""
         self._ended = (-1, -1)
         """Run and episode of the last cost."""
+        self._attended = (-1, -1, -1)
+        """Run, plant and episode whose states were answered from the first one on."""
+        self._furthest = -1
+        """The last step of it that was answered."""
+        self._claimed = (-1, -1, -1), -1
+        """The same of an episode, and the step to which it went by its cost: further than was
+        answered."""
 
     @property
     def run(self) -> int | None:
@@ -131,19 +163,28 @@ class Responder:
     def start(self, frame: Frame) -> Sequence[Publication | ModelFailure]:
         """Take the start of an episode: whether it explores, and which model each environment uses.
 
-        Repeated, it is answered with what came out of an exploration. FrameError for rows that are
-        none of a start, and where there is no room for another run.
+        Repeated, it is answered with what came out of an exploration; one of an earlier episode is
+        ignored. Another one for the same episode asks for a new one, as the plant may have taken
+        either. FrameError for rows that are none of a start, and where there is no room for another
+        run.
         """
         rows = start_rows(frame)
         if not len(rows):
             self._runs.pop(frame.run, None)
             return []
         run = self._run(frame.run, rows.nbytes)
-        if run.episode_start(frame) is None:
+        known = run.start
+        if known is not None and frame.episode < known.episode:
+            self.counters["starts of an earlier episode"] += 1
+            return []
+        if known is None or frame.episode > known.episode:
             run.start, run.answering = replace(frame, values=rows.copy()), None
             explores = rows[0, StartColumn.EXCITATION] >= 0
             run.exploration = Exploration(run.start, self._settings) if explores else None
             self.failure = ""
+        elif _differ(known, frame):
+            reason = f"two different starts came for episode {episode_name(frame.episode)}"
+            return [ModelFailure(frame.run, frame.episode, True, f"{reason}; expected one tuner")]
         elif run.exploration and run.exploration.outcomes:
             return list(run.exploration.outcomes.values())  # the answer may have been lost
         return self._answer_pending()
@@ -151,8 +192,8 @@ class Responder:
     def policy(self, frame: Frame) -> list[Publication | ModelFailure]:
         """Take the policies [K_a K_b] of an episode's environments, (M, n_a, 2 n_s).
 
-        FrameError for another number of actuators, gains beyond MAX_GAIN, or other ones than came
-        before.
+        Where others came for the episode before, those are taken that its start signs. FrameError
+        then, and for another number of actuators or gains beyond MAX_GAIN.
         """
         n_a = self._settings.n_a
         if frame.values.shape[1] != n_a:
@@ -160,26 +201,37 @@ class Responder:
         if frame.values.size and np.abs(frame.values).max() > MAX_GAIN:
             raise FrameError(f"expected gains of at most {MAX_GAIN:g} in magnitude")
         run = self._run(frame.run, frame.values.nbytes)
-        known = run.policy
-        shape = frame.values.shape
         # One of another shape could never have been used: it puts nothing in doubt.
-        if known and known.episode == frame.episode and known.values.shape == shape:
-            if np.array_equal(known.values, frame.values):
-                return self._answer_pending()
-            run.disputed, run.answering = frame.episode, None
-            raise FrameError(
-                f"two different policies came for episode {episode_name(frame.episode)}, which is "
-                "therefore not answered; expected one tuner"
-            )
-        run.policy, run.answering = replace(frame, values=frame.values.copy()), None
+        shape = frame.values.shape
+        before = [p for p in run.policies_of(frame.episode) if p.values.shape == shape]
+        if not any(np.array_equal(known.values, frame.values) for known in before):
+            run.policies.append(replace(frame, values=frame.values.copy()))
+            run.answering = None
+            if before:
+                raise FrameError(
+                    f"two different policies came for episode {episode_name(frame.episode)}; "
+                    "expected one tuner"
+                )
         return self._answer_pending()
 
     def model(self, frame: Frame) -> list[Publication | ModelFailure]:
-        """Take a run's reduced models, as in model_rows. ValueError if they leave no room for U."""
+        """Take a run's reduced models, as in model_rows.
+
+        Where others came under their number before, those are taken that the start of an episode
+        signs. FrameError then; ValueError if they leave no room for U.
+        """
         run = self._run(frame.run, 2 * frame.values.nbytes)
-        run.models = [model_rows.unpack(rows.copy(), self._settings.n_a) for rows in frame.values]
-        run.models_digest = digest_of(frame.values)
-        run.generation, run.answering = frame.step, None
+        digest, before = digest_of(frame.values), run.models_of(frame.step)
+        if digest not in [known.digest for known in before]:
+            n_a = self._settings.n_a
+            rows = [model_rows.unpack(rows.copy(), n_a) for rows in frame.values]
+            run.models.append(_Models(frame.step, digest, rows))
+            run.answering = None
+            if before:
+                raise FrameError(
+                    f"two different sets of reduced models came under number {frame.step}; "
+                    "expected one tuner"
+                )
         return self._answer_pending()
 
     def state(self, frame: Frame) -> list[Publication | ModelFailure]:
@@ -209,6 +261,9 @@ class Responder:
             taken_back = exploration.take_back(frame.plant)
             actions = exploration.actions(frame.step)
         self._pending, self._served, self.episode = None, (frame.run, frame.plant), frame.episode
+        ids = *self._served, self.episode
+        if frame.step == 0 and ids != self._attended:
+            self._attended, self._furthest = ids, 0
         self.advance_counters(1, frame.step)
         time = answering.signature or frame.time
         return [Publication(ACTION, replace(frame, time=time, values=actions)), *taken_back]
@@ -217,6 +272,11 @@ class Responder:
         """Account for states of the present episode, up to `step`, that were answered."""
         self.answered += answers
         self.step = step
+        ids = *self._served, self.episode
+        if self._attended == ids:
+            self._furthest = max(self._furthest, step)
+        if self._claimed[0] == ids and step >= self._claimed[1]:
+            self._claimed = (-1, -1, -1), -1
 
     def answering(self, state: Frame) -> Answering | None:
         """What answers the states of an episode, like one that was answered before.
@@ -236,7 +296,8 @@ class Responder:
     def cost(self, frame: Frame) -> list[Publication | ModelFailure]:
         """Take the end of an episode; of an exploratory one give the models, or why there are none.
 
-        FrameError for costs that are not of the episode's shape.
+        An episode that is void where it was, when by another cost it had gone further, cannot be relied
+        on: that is said. FrameError for costs that are not of the episode's shape.
         """
         self._ended = (frame.run, frame.episode)
         if frame.values.shape[1] == len(CostColumn) and len(frame.values):
@@ -244,8 +305,9 @@ class Responder:
             self.last_cost = float(completed[:, CostColumn.MEAN].mean()) if len(completed) else None
         run = self._runs.get(frame.run)
         start = run.episode_start(frame) if run else None
+        taken_back = self._compare_claims(frame)
         if run is None or start is None or run.exploration is None:
-            return []
+            return taken_back
         if frame.values.shape != (len(start.values), len(CostColumn)):
             raise FrameError(
                 f"expected costs of shape {(len(start.values), len(CostColumn))}, "
@@ -259,6 +321,26 @@ class Responder:
             self.counters["identifications failed" if self.failure else "models identified"] += 1
         return [outcomes[frame.plant]] if frame.plant in outcomes else []
 
+    def _compare_claims(self, cost: Frame) -> list[Publication | ModelFailure]:
+        """That the plant gives an episode up that by a cost went further than its states were answered.
+
+        One of the two alone is no contradiction: a second controller may have answered the others, or
+        a second plant be slower.
+        """
+        ids = cost.run, cost.plant, cost.episode
+        if not (cost.values[:, -1:] == VOID).any():
+            if ids == self._attended and cost.step > self._furthest:
+                self._claimed = ids, cost.step
+            return []
+        if ids != self._claimed[0] or cost.step >= self._claimed[1]:
+            return []
+        reason = (
+            f"a cost says that it went to step {self._claimed[1]}, and the plant gave it up at step "
+            f"{cost.step}"
+        )
+        self._claimed = (-1, -1, -1), -1
+        return [ModelFailure(cost.run, cost.episode, False, reason)]
+
     def waits_for(self) -> list[str]:
         """Topics that the state waiting for its answer still lacks; empty when none waits."""
         pending = self._pending
@@ -269,11 +351,11 @@ class Responder:
         lacking = [] if start else ["episode/start"]
         lacking += [] if pending.plant in self._targets else ["target"]
         if start and run.exploration is None:
-            lacking += [] if run.models and run.generation == start.step else ["model"]
-            if run.policy is None or run.policy.episode != pending.episode:
-                lacking.append("policy")
-            elif run.disputed == pending.episode:
-                lacking.append("policy (two different ones came)")
+            models, policies = run.models_of(start.step), run.policies_of(pending.episode)
+            lacking += [] if models else ["model"]
+            lacking += [] if policies else ["policy"]
+            if models and policies and self._named(run, start) is None:
+                lacking.append("one tuner (different policies or models came)")
         return lacking
 
     def _run(self, number: int, more: int) -> _Run:
@@ -319,33 +401,52 @@ class Responder:
         known, target = run.answering, self._targets.get(frame.plant)
         if known is not None and (known.plant, known.episode) == (frame.plant, frame.episode):
             return known
-        law = None
-        if target is None or (
-            run.exploration is None and (law := self._law(run, start, target)) is None
-        ):
+        if target is None:
             return None
-        signed = NOT_SIGNED
-        if start.plant:
-            published: list[Any] = [start.values, self._settings.action_limit]
-            if law is not None and run.policy is not None:
-                published += [run.policy.values, run.models_digest]
-            signed = signature(digest_of(*published), target)
+        law, named = None, None
+        if run.exploration is None:
+            if (named := self._named(run, start)) is None:
+                return None
+            law = self._law(start, *named, target)
+        signed = signature(self._digest(start, named), target) if start.plant else NOT_SIGNED
         run.answering = Answering(frame.plant, frame.episode, law, signed)
         return run.answering
 
-    def _law(self, run: _Run, start: Frame, target: np.ndarray) -> ProjectedLaw | None:
-        """The law set for the run's episode; None while something has not arrived yet."""
-        policy = run.policy
-        if policy is None or policy.episode != start.episode or run.disputed == start.episode:
-            return None
-        if not run.models or run.generation != start.step:
-            return None
+    def _named(self, run: _Run, start: Frame) -> tuple[Frame, _Models] | None:
+        """Policies and models of the run's episode, None while they have not arrived.
+
+        Of several those that the start signs, or the newest if it signs none of them; None if it
+        signs nothing.
+        """
+        found = [
+            (policy, models)
+            for models in run.models_of(start.step)
+            for policy in run.policies_of(start.episode)
+        ]
+        fitting = [named for named in found if len(named[0].values) == len(start.values)]
+        if len(fitting) > 1:
+            signed = [named for named in fitting if self._digest(start, named) == start.plant]
+            return (signed or fitting)[-1] if start.plant else None
+        return next(iter(fitting or found), None)
+
+    def _digest(self, start: Frame, named: tuple[Frame, _Models] | None) -> int:
+        """D, see loop_interfaces.signature. named: policies and models, None where it explores."""
+        published: list[Any] = [start.values, self._settings.action_limit]
+        if named is not None:
+            policy, models = named
+            published += [policy.values, models.digest]
+        return digest_of(*published)
+
+    def _law(
+        self, start: Frame, policy: Frame, models: _Models, target: np.ndarray
+    ) -> ProjectedLaw:
+        """The law set for an episode."""
         index = start.values[:, StartColumn.MODEL].astype(np.int64)
         if len(policy.values) != len(index):
             raise FrameError(
                 f"expected policies for {len(index)} environments, got {len(policy.values)}"
             )
-        law = ProjectedLaw([model.U for model in run.models], target, self._settings.action_limit)
+        law = ProjectedLaw([model.U for model in models.rows], target, self._settings.action_limit)
         law.set(policy.values, index)
         return law
 
@@ -358,6 +459,11 @@ def _forget(known: OrderedDict[int, Any], newest: int, protected: int) -> None:
     known.move_to_end(newest)
     if len(known) > MAX_RUNS:
         del known[next(key for key in known if key not in (newest, protected))]
+
+
+def _differ(a: Frame, b: Frame) -> bool:
+    """Whether two starts of an episode say different things."""
+    return (a.plant, a.step) != (b.plant, b.step) or not np.array_equal(a.values, b.values)
 
 
 def _contradict(a: Frame, b: Frame) -> bool:

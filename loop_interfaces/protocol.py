@@ -19,6 +19,10 @@ NO_CONTROLLER = 65
 """Exit code of a tuner whose laws diverged (as sysexits' EX_DATAERR); its results are written."""
 
 
+MAX_REASON = 1000
+"""Characters of a reason that are shown."""
+
+
 @dataclass(slots=True)
 class Publication:
     """Publish `frame` on `topic`. Never changed once it is made (see `Frame`)."""
@@ -29,10 +33,10 @@ class Publication:
 
 @dataclass(frozen=True)
 class ModelFailure:
-    """Why an identification episode gave no model.
+    """Why an exploratory episode gave no model, or why an episode cannot be relied on.
 
-    retry: the samples were incomplete and the same episode can be run again; otherwise the data
-    allow no model and `reason` says why.
+    retry: something was incomplete or contradictory, and the same rows can be run again; otherwise
+    the data allow no model, or the episode is not to be used, and `reason` says why.
     """
 
     run: int
@@ -54,7 +58,13 @@ class ModelFailure:
                 run=int(fields["run"]),
                 episode=int(fields["episode"]),
                 retry=bool(fields["retry"]),
-                reason=str(fields["reason"]),
+                reason=_one_line(str(fields["reason"])),
             )
         except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
             raise ValueError(f"expected the JSON of a model failure, got {text[:80]!r}") from error
+
+
+def _one_line(text: str) -> str:
+    """A text from the network as it may be printed: nothing that a terminal or an encoding acts on."""
+    words = " ".join(text[:MAX_REASON].split())
+    return "".join(c if c.isprintable() else "?" for c in words)

@@ -15,6 +15,7 @@ state T advances nothing: it acknowledges the last state.
     AWAITING  no answer for `action_timeout`        AWAITING     state(e, k) again
     AWAITING  no answer after `max_repeats`         IDLE         cost(e), void: not a cost
     active    contradicts what was taken of e       IDLE         cost(e), void; active: not IDLE
+    active    start(f), f > e                       AWAITING     cost(e), void; state(f, 0)
     any       end of the run, start of another run  IDLE         none; or as a start in IDLE
 
 Which starts and actions contradict, and which are signed: pde_sim_node.taken_actions.
@@ -33,10 +34,8 @@ from enum import Enum, auto
 import numpy as np
 
 from loop_interfaces import topics
-from loop_interfaces.episodes import episode_name
 from loop_interfaces.frames import MAX_VALUES, Frame, FrameError, digest
 from loop_interfaces.protocol import Publication
-from loop_interfaces.samples import MAX_TIME
 from loop_interfaces.signature import signature
 from loop_interfaces.topics import VOID, CostColumn, StartColumn, Topic, noise_seeds, start_rows
 from pde_sim_node.plant import Plant
@@ -158,8 +157,9 @@ class Lockstep:
 
     def overdue(self) -> bool:
         """Whether the awaited action has been missing for many repeats."""
-        waits = self._phase is Phase.AWAITING and self.deadline is not None
-        return waits and self._repeats * self._timing.action_timeout > 2.0
+        if self._phase is not Phase.AWAITING or (self.paused and not self._stepping):
+            return False
+        return self._repeats * self._timing.action_timeout > 2.0
 
     def announcement(self) -> Publication:
         """The target z_r, sent once at the start and latched."""
@@ -213,14 +213,11 @@ class Lockstep:
     def start(self, frame: Frame, now: float) -> list[Publication]:
         """Begin an episode, or answer again for one that is known.
 
-        Raises FrameError for a malformed seed list or another run's episode while one is under way,
-        or other seeds for an episode that asks for another signature.
+        Raises FrameError for a malformed seed list or another run's episode while one is under way.
         """
         rows = start_rows(frame)
         if len(rows) * max(self.plant.state_size, self.plant.n_a) > MAX_VALUES:
             raise FrameError(f"{len(rows)} environments are more than one message can hold")
-        if not 0.0 <= frame.time < MAX_TIME:
-            raise FrameError(f"expected a time from 0 to {MAX_TIME:g} s, got {frame.time:g}")
         if frame.run != self.run:
             hold = self._timing.run_hold
             if self.run and now - self._tuner_heard < hold:
@@ -240,6 +237,8 @@ class Lockstep:
         signed = signature(frame.plant, self.plant.target)
         if frame.episode <= self.episode:
             return self._start_again(frame, rows, signed, now)
+        if self.active:
+            report.append(self._finish(now, void=True))
         seeds = rows[:, StartColumn.SEED].astype(np.int64)
         self._state = self.plant.reset(seeds, noise_seeds(rows))
         self._actions.episode = Episode(rows.copy(), signed)
@@ -360,11 +359,6 @@ class Lockstep:
         if not present:
             self.counters["starts of an earlier episode"] += 1
             return []
-        if signed != episode.signature and not np.array_equal(rows, episode.rows):
-            raise FrameError(
-                f"episode {episode_name(frame.episode)} was started with other seeds; "
-                "a new episode needs a new number"
-            )
         self.counters["starts repeated"] += 1
         if self._phase is Phase.AWAITING:
             return [self._stamped(topics.STATE, self._state)]

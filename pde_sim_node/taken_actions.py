@@ -3,9 +3,8 @@
 
 Whoever is asked twice answers the same to the bit. So another answer to a state that was answered
 already comes from somebody else, or from a controller that cannot be relied on: which of the two was
-taken is chance, and the episode is void. The same holds for two starts of an episode that ask for the
-same signature. When the other one comes after the end of one of the last episodes, the cost of that
-episode is sent again, void.
+taken is chance, and the episode is void. The same holds for two starts of an episode. When the other
+one comes after the end of one of the last episodes, the cost of that episode is sent again, void.
 
 Where the tuner asks for it (loop_interfaces.signature), the first action of a run says whether its
 controller signs. If so, only actions with the signature of their episode are taken; if not, a signed
@@ -39,8 +38,8 @@ class Episode:
     cost: Frame | None = None
 
     def started_otherwise(self, rows: np.ndarray, signature: float) -> bool:
-        """Whether a start with these rows could have been taken in place of its own."""
-        return signature == self.signature and not np.array_equal(rows, self.rows)
+        """Whether this is another start than its own."""
+        return signature != self.signature or not np.array_equal(rows, self.rows)
 
     def contradicted_by(self, action: Frame) -> bool:
         """Whether another action was taken at this step."""

@@ -68,6 +68,7 @@ class LocalPair:
             self._fingerprint,
             [t for part in parts for t in part.trajectories or ()] if batch.trajectories else None,
             self.plant.target,
+            frozenset([self.plant.horizon]),
         )
 
     def roll_out(self, batch: Batch) -> EpisodeRecord:

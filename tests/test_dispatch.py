@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -14,8 +15,9 @@ from loop_interfaces.protocol import ModelFailure
 from loop_interfaces.topics import COMPLETED, POLICY, START, VOID
 from tests.small import dispatcher_of
 from tuner_node.batch import Batch
-from tuner_node.dispatch import Dispatcher
-from tuner_node.pair import DispatchError
+from tuner_node.dispatch import MAX_TARGET_BYTES, Dispatcher
+from tuner_node.errors import DispatchError
+from tuner_node.pair import FOREIGN_PLANT_GRACE
 
 RUN = 42
 
@@ -145,6 +147,40 @@ def test_two_different_targets_of_the_run_s_plant_end_the_run():
     assert served.target(0, replace(target, plant=6), 0.0) == []  # not this run's plant
     with pytest.raises(DispatchError, match="two different targets came for the plant 5"):
         served.target(0, other, 2.0)
+
+
+def test_targets_of_ever_new_plants_fill_no_memory():
+    served, values = dispatcher(), np.zeros(2**22)
+    refused = 0
+    tracemalloc.start()
+    for plant in range(30):
+        try:
+            served.target(0, Frame(0, 0, 0, 0.0, values, plant), 0.0)
+        except FrameError as error:
+            assert "expected the targets of at most" in str(error)
+            refused += 1
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert refused and peak < 1.1 * MAX_TARGET_BYTES
+    ((_, start),) = starts(served.assign(batch(1), 0.0))
+    served.cost(0, replace(costs_of(start), plant=3), 1.0)  # the run's plant is known from now on
+    for plant in range(30):
+        assert served.target(0, Frame(0, 0, 0, 0.0, values, plant), 2.0) == []
+
+
+def test_another_plant_ends_the_run_only_where_that_of_the_run_never_was():
+    for there in (True, False):
+        served = dispatcher(plant=5)
+        ((_, start),) = starts(served.assign(batch(1), 0.0))
+        if there:
+            served.target(0, Frame(0, 0, 0, 0.0, np.arange(3.0), 5), 0.0)
+        foreign = replace(costs_of(start), plant=6)
+        for now in np.arange(1.0, 40.0, 0.5):
+            late = now > 1.0 + FOREIGN_PLANT_GRACE and not there
+            with pytest.raises(DispatchError if late else FrameError, match="other parameters"):
+                served.cost(0, foreign, now)
+        served.cost(0, replace(foreign, plant=5), 40.0)
+        assert served.result() is not None
 
 
 def test_a_cost_that_is_taken_back_after_it_was_used_ends_the_run():
@@ -280,7 +316,7 @@ def test_an_exploratory_episode_is_done_with_its_model_and_fails_with_its_reason
     with pytest.raises(DispatchError, match="no reduced model: p is too large"):
         served.failure(0, ModelFailure(RUN, last.episode, False, "p is too large"), 0.0)
     with pytest.raises(
-        DispatchError, match=f"took back the model of episode {episode_name(again.episode)}.*two st"
+        DispatchError, match=f"took back episode {episode_name(again.episode)}.*two st"
     ):
         served.failure(0, ModelFailure(RUN, again.episode, False, "two states came"), 0.0)
     for known in (start, again):  # a controller that was started anew has lost the states

@@ -236,7 +236,7 @@ class Plant:
         rows = np.zeros((len(seeds), 4))
         rows[:, 0], rows[:, 1] = seeds, -1
         for lockstep in (self.lockstep, self.judge):
-            (send,) = lockstep.start(Frame(RUN, episode, 0, 0.0, rows, told), self.now)
+            *_, send = lockstep.start(Frame(RUN, episode, 0, 0.0, rows, told), self.now)
         return send.frame
 
     def action(self, state: Frame) -> bytes:

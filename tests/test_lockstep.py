@@ -87,8 +87,6 @@ def test_foreign_late_repeated_and_malformed_messages_change_no_number():
             protocol.action(replace(wrong, values=wrong.values[:1]), now)
         with pytest.raises(FrameError, match="has this plant"):
             protocol.start(start(1, run=99), now)
-        with pytest.raises(FrameError, match="other seeds"):  # for another signature
-            protocol.start(replace(start(1, seeds=(5, 6)), plant=9), now)
         (again,) = protocol.start(start(1), now)
         assert again.frame.step == state.step
 
@@ -240,7 +238,7 @@ def test_a_plant_that_was_paused_in_a_run_is_paused_in_it_when_it_is_started_aga
     assert {send.topic for now in range(1, 60) for send in protocol.tick(float(now))} == {PAUSED}
     _, state = protocol.resume(60.0)
     assert state.frame.values.tobytes() == quiet[0].values.tobytes()
-    assert protocol.start(start(2), 61.0)[0].topic is STATE
+    assert [send.topic for send in protocol.start(start(2), 61.0)] == [COST, STATE]
 
     # Another run has nothing to do with it, nor has a damaged record.
     assert plant_protocol(paused_run=RUN).start(start(1, run=RUN + 1), 0.0)[0].topic is STATE
@@ -310,6 +308,8 @@ def test_a_stepped_plant_whose_controller_is_gone_never_gives_up():
         assert all(send.topic in (STATE, PAUSED) for send in protocol.tick(now))
     assert protocol.overdue()
     assert protocol.active
+    protocol.pause(100.0)  # nobody waits for an action now
+    assert not protocol.overdue()
 
 
 def paced(protocol: Lockstep, episode: int, change=None) -> list[Frame]:
@@ -405,10 +405,18 @@ def test_an_action_that_contradicts_one_of_an_episode_that_ended_takes_its_cost_
     assert protocol.contradiction == ""
 
 
-def test_two_different_starts_void_the_episode():
+OTHER_STARTS = {
+    "other seeds": start(1, seeds=(5, 6)),
+    "another signature": replace(start(1), plant=9),
+    "both": replace(start(1, seeds=(5, 6)), plant=9),
+}
+
+
+@pytest.mark.parametrize("other", OTHER_STARTS.values(), ids=OTHER_STARTS)
+def test_two_different_starts_void_the_episode(other):
     quiet = run_episode(plant_protocol(), 1)
     protocol = plant_protocol()
-    (state,) = protocol.start(start(1, seeds=(5, 6)), 0.0)  # the first to come is the forged one
+    (state,) = protocol.start(other, 0.0)  # the first to come is the forged one
     protocol.action(answer(state.frame), 0.0)
     for _ in range(2):
         (void,) = protocol.start(start(1), 0.0)
@@ -419,12 +427,12 @@ def test_two_different_starts_void_the_episode():
 
 
 @pytest.mark.parametrize("later", [0, 3])
-def test_a_start_that_contradicts_that_of_an_episode_that_ended_takes_its_cost_back(later):
+@pytest.mark.parametrize("other", OTHER_STARTS.values(), ids=OTHER_STARTS)
+def test_a_start_that_contradicts_that_of_an_episode_that_ended_takes_its_cost_back(later, other):
     protocol = plant_protocol()
     cost = run_episode(protocol, 1)[-1]
     for episode in range(2, 2 + later):
         run_episode(protocol, episode)
-    other = start(1, seeds=(5, 6))
     (send,) = protocol.start(other, 1.0)
     assert send.topic is COST
     assert (send.frame.run, send.frame.episode, send.frame.step) == (RUN, 1, cost.step)

@@ -301,12 +301,12 @@ def test_a_start_may_carry_seeds_of_the_noise() -> None:
         return Frame(1, episode, 0, 0.0, np.array([[3.0, -1.0, 0.0, 0.0, *noise]]))
 
     first, second, third = (
-        protocol.start(start(i + 1, *noise), 0.0)[0].frame.values.copy()
+        protocol.start(start(i + 1, *noise), 0.0)[-1].frame.values.copy()
         for i, noise in enumerate([(5.0,), (6.0,), (5.0,)])
     )
     assert same_bits(first, third)
     assert not (first == second).any()
-    bare = protocol.start(start(4), 0.0)[0].frame.values
+    bare = protocol.start(start(4), 0.0)[-1].frame.values
     assert not (bare == first).any()
     for wrong in (-1.0, 0.5):
         with pytest.raises(FrameError, match="noise seeds"):

@@ -13,7 +13,7 @@ import pytest
 from loop_interfaces.frames import Frame
 from tests.small import dispatcher_of
 from tuner_node.dispatch import PAUSE_LEASE
-from tuner_node.pair import DispatchError
+from tuner_node.errors import DispatchError
 from tuner_node.participants import SECOND_TUNER_GRACE, Participants, Publishers
 
 

@@ -93,6 +93,14 @@ def test_any_text_is_no_news_of_a_failed_model(text):
         assert "\n" not in str(error)
 
 
+@tried
+@given(st.text(max_size=3000))
+def test_a_reason_from_the_network_is_one_line_that_can_be_printed(text):
+    shown = ModelFailure.from_json(ModelFailure(1, 2, True, text).to_json()).reason
+    assert shown.isprintable() and len(shown.encode()) <= 4000
+    assert shown == text or not text.isprintable() or len(text) > 1000 or "  " in f" {text} "
+
+
 ANYTHING = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner),

@@ -336,7 +336,7 @@ def test_a_state_that_contradicts_an_exploration_takes_back_its_model_once(respo
 
 
 @pytest.mark.parametrize("when", ["before", "after"])
-def test_an_episode_with_two_different_policies_is_not_answered(responder, when):
+def test_without_signatures_an_episode_with_two_different_policies_is_not_answered(responder, when):
     responder.model(Frame(RUN, 0, 0, 0.0, models()))
     good, forged = (Frame(RUN, 4, 0, 0.0, np.full((1, 4, 8), gain)) for gain in (0.1, 0.2))
     state = Frame(RUN, 4, 0, 0.0, plant().reset(np.array([1])))
@@ -348,7 +348,7 @@ def test_an_episode_with_two_different_policies_is_not_answered(responder, when)
     with pytest.raises(FrameError, match="two different policies came for episode 4"):
         responder.policy(second)
     assert responder.state(state) == [] and responder.answering(state) is None
-    assert responder.waits_for() == ["policy (two different ones came)"]
+    assert responder.waits_for() == ["one tuner (different policies or models came)"]
     responder.policy(Frame(RUN, 5, 0, 0.0, good.values))
     responder.start(start(5, (1, -1, 0.0, 0)))
     assert len(responder.state(Frame(RUN, 5, 0, 0.0, state.values))) == 1

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -13,11 +14,21 @@ from controller_node.responder import Responder
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.model_rows import ModelRows, pack
 from loop_interfaces.signature import design_digest
-from loop_interfaces.topics import COST, MODEL, POLICY, START, TARGET, VOID, CostColumn, Topic
+from loop_interfaces.topics import (
+    COST,
+    MODEL,
+    POLICY,
+    START,
+    STATE,
+    TARGET,
+    VOID,
+    CostColumn,
+    Topic,
+)
 from tests.small import dispatcher_of
 from tests.test_lockstep import plant_protocol
 from tuner_node.batch import Batch
-from tuner_node.pair import DispatchError
+from tuner_node.errors import DispatchError
 
 N_Z, N_A, N_S = 32, 4, 3
 RNG = np.random.default_rng(0)
@@ -63,7 +74,7 @@ class Loop:
         for _, send in publications:
             self.told[send.topic] = send.frame
             if send.topic is START:
-                (state,) = self.plant.start(send.frame, 0.0)
+                *_, state = self.plant.start(send.frame, 0.0)
                 self.state = state.frame
 
     def controller_told(self, limit: float = 0.0, order: int = N_S, **others: object) -> Responder:
@@ -120,6 +131,105 @@ def test_a_controller_that_was_told_something_else_never_moves_the_plant(others)
             loop.act(foreign)
 
     assert loop.finish(disturb).tobytes() == expected.tobytes()
+
+
+@pytest.mark.parametrize("topic", [POLICY, MODEL], ids=["policy", "model"])
+@pytest.mark.parametrize("first", [True, False], ids=["first", "later"])
+def test_a_controller_answers_by_the_policy_and_model_that_the_start_signs(topic, first):
+    expected = Loop().finish()
+    loop = Loop()
+    true, count = loop.told[topic], 0
+
+    def disturb() -> None:
+        nonlocal count
+        count += 1
+        for step in (1, 2):  # more of them than are kept are told again, as the tuner's are
+            with pytest.raises(FrameError, match=r"two different .* came .*; expected one tuner"):
+                handle(replace(true, values=true.values + 1e-3 * (count % 3) + step))
+        with contextlib.suppress(FrameError):
+            handle(true)
+
+    if first:
+        loop.controller = loop.controller_told(**{topic.name: true.values + 1e-3})
+    handle = {POLICY: loop.controller.policy, MODEL: loop.controller.model}[topic]
+    if first:
+        with pytest.raises(FrameError, match=r"two different .* came .*; expected one tuner"):
+            handle(true)
+    assert loop.finish(disturb).tobytes() == expected.tobytes()
+
+
+@pytest.mark.parametrize("first", [True, False], ids=["first", "later"])
+def test_a_controller_that_cannot_know_the_start_says_so_and_the_episode_is_run_again(first):
+    loop = Loop()
+    start = loop.told[START]
+    forged = replace(start, values=np.repeat(ROWS, 2, axis=0))
+    controller = loop.controller_told(start=(forged if first else start).values)
+    assert controller.start(forged if first else start) == []
+    (failure,) = controller.start(start if first else forged)
+    assert "two different starts came for episode" in failure.reason
+    loop.take(loop.tuner.failure(0, failure, 0.0))
+    assert loop.told[START].episode == start.episode + 1
+    assert loop.told[START].values.tobytes() == start.values.tobytes()
+
+
+def test_a_start_of_an_earlier_episode_keeps_no_controller_from_answering():
+    expected = Loop().finish()
+    loop = Loop()
+    former = replace(loop.told[START], episode=loop.told[START].episode - 1)
+
+    def disturb() -> None:
+        assert loop.controller.start(former) == []
+
+    assert loop.finish(disturb).tobytes() == expected.tobytes()
+
+
+def test_a_cost_in_the_middle_of_an_episode_is_contradicted_by_the_controller():
+    loop = Loop()
+    true = loop.finish()
+    (cost,) = loop.plant.start(loop.told[START], 0.0)
+    assert loop.controller.cost(cost.frame) == []
+    assert loop.tuner.cost(0, cost.frame, 0.0) == []
+    loop.begin()
+    for topic, handle in ((POLICY, loop.controller.policy), (START, loop.controller.start)):
+        handle(loop.told[topic])
+    for _ in range(3):
+        (send,) = loop.act(loop.controller)
+        loop.state = send.frame
+    forged = replace(cost.frame, episode=loop.state.episode)
+    assert loop.controller.cost(forged) == []
+    loop.tuner.cost(0, forged, 0.0)
+    ((_, _), (_, start)) = loop.tuner.assign(Batch(ROWS, POLICIES), 0.0)
+    void, state = loop.plant.start(start.frame, 0.0)
+    assert (void.topic, void.frame.step, state.topic) == (COST, 3, STATE)
+    assert loop.tuner.cost(0, void.frame, 0.0) == []  # a plant started again may say so
+    (failure,) = loop.controller.cost(void.frame)
+    assert loop.controller.cost(void.frame) == []
+    with pytest.raises(DispatchError, match=r"took back episode .* gave it up at step 3"):
+        loop.tuner.failure(0, failure, 0.0)
+    assert true.tobytes() == cost.frame.values.tobytes()
+
+
+@pytest.mark.parametrize("twin", ["plant", "controller"])
+def test_a_second_plant_or_controller_of_the_same_kind_takes_nothing_back(twin):
+    """One of two plants is slower, or one of two controllers."""
+    loop, slow = Loop(), plant_protocol()
+    slower = loop.controller_told()
+    (state,) = slow.start(loop.told[START], 0.0)
+    slower.state(loop.state)
+    for controller in (loop.controller, slower)[: 1 + (twin == "plant")]:
+        (action,) = controller.state(state.frame)
+    slow.action(action.frame, 0.0)
+    loop.finish()
+    (cost,) = loop.plant.start(loop.told[START], 0.0)
+    loop.tuner.cost(0, cost.frame, 0.0)
+    ((_, _), (_, start)) = loop.tuner.assign(Batch(ROWS, POLICIES), 0.0)
+    gives_up = slow if twin == "plant" else loop.plant
+    controller = loop.controller if twin == "plant" else slower
+    assert controller.cost(cost.frame) == []
+    for send in gives_up.start(start.frame, 0.0):
+        if send.topic is COST:
+            assert controller.cost(send.frame) == []
+            assert loop.tuner.cost(0, send.frame, 0.0) == []
 
 
 @pytest.mark.parametrize("rows", [ROWS, EXPLORING], ids=["policy", "exploration"])

@@ -16,6 +16,7 @@ from tests.small import parameters, same_bits, train_here
 from tuner_node import checkpoint, training_state
 from tuner_node.batch import BatchResult
 from tuner_node.build import build_training
+from tuner_node.errors import ContradictionError
 
 
 def test_a_seed_has_one_policy_alone_and_beside_others_and_however_episodes_are_cut():
@@ -258,15 +259,17 @@ def test_an_order_from_the_data_is_of_one_seed():
         build_training(parameters(reduced_order=0, seeds=2))
 
 
-def test_a_trajectory_that_was_cut_short_is_no_rollout_to_the_end():
-    values = parameters(optimizer="gauss_newton", rollouts=20)
-    training, pair = build_training(values), LocalPair(values)
-    training.finish(pair.run(training.next_batch()))
-    pair.use_models(training.models)
+@pytest.mark.parametrize("optimizer", ["gauss_newton", "two_point"])
+def test_all_episodes_of_a_run_have_as_many_steps_also_after_a_restart(optimizer):
+    values = parameters(optimizer=optimizer)
+    former, training = build_training(values), build_training(values)
+    pair, horizon = LocalPair(values), values["horizon"]
+    former.finish(pair.run(former.next_batch()))
+    training_state.restore(training, training_state.arrays_of(former))
+    pair.follow(training)
     result = pair.run(training.next_batch())
-    (first, second), horizon = result.trajectories, values["horizon"]
-    short = replace(first, states=first.states[:4], actions=first.actions[:3])
-    with pytest.raises(ValueError, match=f"after 3 and {horizon} steps, expected one horizon"):
-        training.finish(replace(result, trajectories=[short, second]))
+    for steps in ({3}, {3, horizon}):
+        with pytest.raises(ContradictionError, match=f"after 3 and {horizon} steps, expected one"):
+            training.finish(replace(result, steps=frozenset(steps)))
     training.finish(result)
-    assert training.phase == "adapt"
+    assert training.phase != "identify"

@@ -13,7 +13,7 @@ from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.topics import COMPLETED
 from tests.test_dispatch import RUN, batch, costs_of, dispatcher, starts
 from tuner_node.batch import Batch
-from tuner_node.pair import DispatchError
+from tuner_node.errors import DispatchError
 from tuner_node.trajectory_collector import TrajectoryCollector
 
 STEPS = 30

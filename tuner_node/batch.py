@@ -38,7 +38,8 @@ class BatchResult:
     """Results of a batch of R rollouts.
 
     costs (R, 3): as CostColumn says; models (R, rows, n_s): after an exploration; plant: its
-    fingerprint; trajectories and target (n_z,): where the batch asked for trajectories.
+    fingerprint; trajectories and target (n_z,): where the batch asked for trajectories; steps:
+    after how many its episodes ended.
     """
 
     costs: Array
@@ -46,6 +47,7 @@ class BatchResult:
     plant: int = UNKNOWN_PLANT
     trajectories: list[Trajectory] | None = None
     target: Array | None = None
+    steps: frozenset[int] = frozenset()
 
     def rollouts(self) -> list[RolloutResult]:
         """As an optimiser is told them; of an exploration they mean nothing."""

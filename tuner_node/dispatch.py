@@ -35,12 +35,13 @@ from loop_interfaces.protocol import ModelFailure, Publication
 from loop_interfaces.signature import digest_of
 from loop_interfaces.topics import START_COLUMNS, VOID, CostColumn, Topic
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult
-from tuner_node.pair import Chunk, DispatchError, Pair, PairPublication
+from tuner_node.errors import ContradictionError, DispatchError
+from tuner_node.pair import Chunk, Pair, PairPublication
 
 SAMPLE_GRACE = 0.5
 """Seconds after its cost within which the last samples of an episode must have come in."""
-MAX_TARGETS = 64
-"""Plants whose target is remembered."""
+MAX_TARGETS, MAX_TARGET_BYTES = 64, 2**28
+"""Plants whose targets are remembered until the run's own is known, and the bytes of all."""
 REQUEST_PERIOD = 2.0
 """Seconds without an answer after which an episode's policy and start are sent once more."""
 PAUSE_LEASE = 10.0
@@ -135,6 +136,7 @@ class Dispatcher:
             raise FrameError(f"expected costs of shape {shape}, got {frame.values.shape}")
         if self.plant == UNKNOWN_PLANT:
             self.plant = frame.plant
+            self._targets = {p: target for p, target in self._targets.items() if p == self.plant}
         known.check_plant(frame, self.plant, now)
         self.sim_time = max(self.sim_time, frame.time)
         known.last_heard = now
@@ -143,7 +145,7 @@ class Dispatcher:
             self._retry(known, f"{void}: no action came, or different starts or actions")
         else:
             known.take_answer(topics.COST.name, frame)
-            known.chunk.costs = frame.values.copy()
+            known.chunk.costs, known.chunk.steps = frame.values.copy(), frame.step
             self.last_costs = known.chunk.costs[:, CostColumn.MEAN]
             if self._batch.trajectories:
                 known.pending_cost, known.pending_since = frame, now
@@ -187,16 +189,26 @@ class Dispatcher:
         return newest if newest >= 0 else None
 
     def target(self, pair: int, frame: Frame, now: float) -> list[PairPublication]:
-        """Take the target z_r of a plant. DispatchError if that of the run's plant was another one."""
+        """Take the target z_r of a plant. ContradictionError if that of the run's plant was another.
+
+        FrameError if there is no room for it.
+        """
+        if self.plant not in (UNKNOWN_PLANT, frame.plant):
+            return []
         known = self._targets.get(frame.plant)
         if known is None:
-            if len(self._targets) < MAX_TARGETS:
-                self._targets[frame.plant] = frame.values.copy()
-        elif self.plant in (UNKNOWN_PLANT, frame.plant) and not np.array_equal(known, frame.values):
-            raise DispatchError(
+            size = sum(target.nbytes for target in self._targets.values()) + frame.values.nbytes
+            if len(self._targets) == MAX_TARGETS or size > MAX_TARGET_BYTES:
+                raise FrameError(
+                    f"expected the targets of at most {MAX_TARGETS} plants, {MAX_TARGET_BYTES} bytes"
+                )
+            self._targets[frame.plant] = frame.values.copy()
+        elif not np.array_equal(known, frame.values):
+            raise ContradictionError(
                 f"two different targets came for the plant {frame.plant} of this run; expected one "
                 "plant with this fingerprint: stop the other and start a new run"
             )
+        self.pairs[pair].announced.add(frame.plant)
         return []
 
     def state(self, pair: int, frame: Frame) -> bool:
@@ -240,23 +252,23 @@ class Dispatcher:
         return self._begin_episodes(now)
 
     def failure(self, pair: int, failure: ModelFailure, now: float) -> list[PairPublication]:
-        """Take the report that an exploratory episode gave no model, or none that means anything."""
-        known = self.pairs[pair]
+        """Take the report that an episode gave no model, or that it cannot be relied on."""
+        known, batch = self.pairs[pair], self._batch
         if failure.run != self.run:
             return []
-        if not known.runs(failure.episode):
-            used = (topics.MODEL_IDENTIFIED.name, failure.episode) in known.answers
-            if used and not failure.retry:  # with `retry` it has only lost the states since
-                raise DispatchError(
-                    f"the controller took back the model of episode {episode_name(failure.episode)}, "
-                    f"which this run has used, because {failure.reason}; stop who else publishes state "
-                    "and start a new run"
-                )
-            return []
-        if not failure.retry:
-            raise DispatchError(f"no reduced model: {failure.reason}")
-        self._retry(known, failure.reason)
-        return self._begin_episodes(now)
+        if known.runs(failure.episode) and batch is not None:
+            if batch.exploratory and not failure.retry:
+                raise DispatchError(f"no reduced model: {failure.reason}")
+            self._retry(known, failure.reason)
+            return self._begin_episodes(now)
+        # With `retry` the controller has only lost what it knew.
+        if not failure.retry and known.used(failure.episode):
+            raise ContradictionError(
+                f"the controller took back episode {episode_name(failure.episode)}, which this run "
+                f"has used, because {failure.reason}; stop who else publishes in this namespace and "
+                "start a new run"
+            )
+        return []
 
     def tick(self, now: float) -> list[PairPublication]:
         """Ask again for what is not answered; start again what has been silent for too long.
@@ -310,6 +322,7 @@ class Dispatcher:
             self.plant,
             seen if batch.trajectories else None,
             self._targets.get(self.plant),
+            frozenset(chunk.steps for chunk in self._chunks),
         )
 
     def missing(self) -> list[str]:
@@ -324,7 +337,7 @@ class Dispatcher:
         return [pair for pair in self.pairs if not pair.missing]
 
     def _answering(self, pair: int, frame: Frame, topic: Topic) -> Pair | None:
-        """The pair, if this answers its episode; a DispatchError if it contradicts another answer."""
+        """The pair, if this answers its episode; a ContradictionError if another answer was used."""
         known = self.pairs[pair]
         if frame.run != self.run:
             self.counters["answers of another run"] += 1
@@ -358,7 +371,7 @@ class Dispatcher:
     def _begin_episodes(self, now: float) -> list[PairPublication]:
         for samples in (used for pair in self.pairs for used in pair.used_samples()):
             if samples.contradiction:
-                raise DispatchError(
+                raise ContradictionError(
                     f"{samples.contradiction}, one of which was used: stop who else publishes them "
                     "and start a new run"
                 )

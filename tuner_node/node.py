@@ -3,7 +3,7 @@
 
 For each pair of plant and controller, in its namespace:
 Publishes   policy, episode/start, model
-Subscribes  episode/cost, episode/paused, model/identified, model/failed
+Subscribes  episode/cost, episode/paused, target, model/identified, model/failed, samples
 Serves      ~/pause, ~/resume, ~/stop (std_srvs/Trigger)
 Messages, order and parameters: docs/interfaces.md. What it does is in tuner_node.session.
 """
@@ -33,16 +33,19 @@ from loop_interfaces.ros.suspend_watchdog import sleep_for
 from tuner_node import narration
 from tuner_node.build import build_dispatcher, build_training
 from tuner_node.diagnostics import TunerDiagnostics
+from tuner_node.errors import ContradictionError, DispatchError
 from tuner_node.narration import Narration
-from tuner_node.pair import DispatchError, PairPublication
+from tuner_node.pair import PairPublication
 from tuner_node.participants import Participants, Publishers
 from tuner_node.results import summarise
 from tuner_node.run_store import open_run
 from tuner_node.session import Session
 
+SETTLE = 0.3
+"""Seconds after the last episode in which what contradicts it still counts."""
 LINGER = 0.5
-"""Seconds in which the last messages, and the answer to a request to stop, are taken: when a writer
-is gone, its readers lose what they have not taken yet."""
+"""Seconds after an early end in which the last messages, and the answer to a request to stop, are
+taken: when a writer is gone, its readers lose what they have not taken yet."""
 NAMES_KNOWN = 1.0
 """Seconds to wait at the end for the names of publishers, which are discovered after them."""
 PROGRESS_PERIOD = 2.0
@@ -76,7 +79,9 @@ class TunerNode:
         self._diagnostics = TunerDiagnostics(self._session)
         self._participants = Participants(self._session, values["recorder"])
         self._pairs: list[str] = values["pairs"]
-        self._failure: str | None = None
+        self._failure: DispatchError | None = None
+        self._settled: float | None = None
+        """When the results are final, once all rollouts are done."""
         self._several_publishers: dict[str, list[str]] = {}
         self._wire(node, loop)
         log.info(f"run {identity.run} of {values['problem']}, seed {values['seed']}")
@@ -84,23 +89,29 @@ class TunerNode:
     def run(self) -> int:
         """Train to the end; 0 when done, 130 when interrupted, STOPPED on request."""
         self._guarded(self._session.begin)
-        reason = self._loop.run(self._housekeeping)
+        reason = self._loop.run(
+            self._housekeeping,
+            tick=lambda now: self._loop.stop("done"),
+            deadline=lambda: self._settled,
+        )
         if self._loop.suspended:
             return 0
+        self._send(self._session.dispatcher.release())
+        finished = self._session.done and self._failure is None
         try:
-            return self._end(reason)
+            return self._finish() if finished else self._end(reason)
         finally:
-            sleep_for(LINGER)
+            sleep_for(LINGER - SETTLE * finished)
 
     def _end(self, reason: str) -> int:
-        if self._session.done:
-            return self._finish()
-        self._send(self._session.dispatcher.release())
-        if self._writer:
+        contradicted = isinstance(self._failure, ContradictionError)
+        if self._writer and contradicted:
+            self._writer.give_up(str(self._failure))
+        elif self._writer:
             self._writer.keep(now=self._loop.now(), force=True)
         if self._failure:
             told = narration.several_publishers(self._all_several_publishers())
-            raise ConfigurationError("; ".join([self._failure, *told]))
+            raise ConfigurationError("; ".join([str(self._failure), *told]))
         if self._session.stopped:
             self._log.info("stopped on request")
             return STOPPED
@@ -118,14 +129,14 @@ class TunerNode:
         published = topics.POLICY, topics.START, topics.MODEL
         for number, namespace in enumerate(self._pairs):
             self._senders.append({t.name: loop.sender(t, namespace) for t in published})
+            # The target before the costs: what has come in with one is then taken before it.
             handlers = {
+                topics.TARGET: dispatcher.target,
                 topics.COST: dispatcher.cost,
                 topics.MODEL_IDENTIFIED: dispatcher.model,
                 topics.PAUSED: dispatcher.plant_paused,
             }
             if session.training.settings.trajectories:
-                # Before the costs: what has come in with one is then taken before it.
-                handlers = {topics.TARGET: dispatcher.target, **handlers}
                 on_state = partial(self._on_state, number)
                 loop.observe(namespace, on_state, partial(dispatcher.action, number))
             for topic, handle in handlers.items():
@@ -195,15 +206,17 @@ class TunerNode:
                 publications = session.advance(event(now), now)
             self._send(publications)
         except DispatchError as error:
-            self._failure = self._failure or str(error)
+            self._failure = self._failure or error
             self._loop.stop("failure")
         while self._rows:  # after the messages, which others wait for, and before the checkpoint
             self._report(self._rows.popleft())
-        if self._writer:
+        if self._writer and self._failure is None:
             with self._loop.introspection.working("writing the checkpoint"):
                 self._writer.keep(now=self._loop.now())
-        if session.done or session.stopped:
+        if session.stopped:
             self._loop.stop("done")
+        elif session.done and self._settled is None:
+            self._settled = self._loop.now() + SETTLE
 
     def _send(self, publications: list[PairPublication]) -> None:
         for pair, publication in publications:
@@ -262,7 +275,9 @@ class TunerNode:
     def _all_several_publishers(self) -> dict[str, list[str]]:
         """The nodes of every topic that has had more than one publisher."""
         introspection, deadline = self._loop.introspection, time.monotonic() + NAMES_KNOWN
-        while not introspection.look_at_publishers() and time.monotonic() < deadline:
+        while (
+            not introspection.look_at_publishers(self._loop.now()) and time.monotonic() < deadline
+        ):
             sleep_for(0.05)
         return self._several_publishers | self._loop.introspection.several_publishers
 

@@ -11,6 +11,7 @@ from loop_interfaces.protocol import Publication
 from loop_interfaces.signature import NOT_SIGNED, signature, signature_in
 from loop_interfaces.topics import COST, VOID, CostColumn
 from tuner_node.batch import Batch
+from tuner_node.errors import ContradictionError, DispatchError
 from tuner_node.optimizers import Trajectory
 from tuner_node.trajectory_collector import TrajectoryCollector
 
@@ -24,10 +25,6 @@ FOREIGN_PLANT_GRACE = 20.0
 """Seconds with costs of another plant only, after which the run stops."""
 
 
-class DispatchError(RuntimeError):
-    """An episode that cannot be run: attempts used up, or a model that cannot be designed."""
-
-
 @dataclass
 class Chunk:
     """A part of the batch: `rows` of it, how often they were started, and their results."""
@@ -35,6 +32,7 @@ class Chunk:
     rows: slice
     attempts: int = 0
     costs: Array | None = None
+    steps: int = 0
     models: Array | None = None
     trajectories: list[Trajectory] | None = None
 
@@ -74,6 +72,8 @@ class Pair:
     pending_cost: Frame | None = None
     """The cost of the episode, while the last samples of its trajectories are missing."""
     pending_since: float = 0.0
+    announced: set[int] = field(default_factory=set)
+    """The plants whose targets came."""
     foreign_since: float = math.inf
     """Since when only another plant's costs come."""
     paused_until: float = -math.inf
@@ -120,8 +120,12 @@ class Pair:
         """Whether this episode is under way."""
         return self.chunk is not None and self.episode == episode
 
+    def used(self, episode: int) -> bool:
+        """Whether an answer to this one of the last episodes was taken."""
+        return any(known == episode for _, known in self.answers)
+
     def check_answer(self, answer: Frame, topic: str) -> None:
-        """Raise DispatchError if its episode was answered already, and otherwise.
+        """Raise ContradictionError if its episode was answered already, and otherwise.
 
         It is then chance which of the two answers was taken.
         """
@@ -130,7 +134,7 @@ class Pair:
         taken, step = self.answers[topic, answer.episode]
         void = topic == COST.name and bool((answer.values[:, -1:] == VOID).any())
         if not void and digest(answer.values) != taken:
-            raise DispatchError(
+            raise ContradictionError(
                 f"two different messages on {topic} answer episode {episode_name(answer.episode)}; "
                 "expected one plant and one controller in this namespace: stop the other and start a "
                 "new run"
@@ -138,7 +142,7 @@ class Pair:
         # A plant that was started anew runs its last episode again, and may not come to its end: that
         # is void at an earlier step.
         if void and answer.step == step and not self.runs(answer.episode):
-            raise DispatchError(
+            raise ContradictionError(
                 f"the plant took back the cost of episode {episode_name(answer.episode)}, which this "
                 "run has used, because different starts or actions came: stop the second tuner or "
                 "controller and start a new run"
@@ -154,8 +158,12 @@ class Pair:
             )
 
     def check_plant(self, cost: Frame, plant: int, now: float) -> None:
-        """A FrameError unless a cost is of this plant; a DispatchError after FOREIGN_PLANT_GRACE."""
-        self.foreign_since = min(self.foreign_since, now) if cost.plant != plant else math.inf
+        """A FrameError unless a cost is of this plant.
+
+        A DispatchError after FOREIGN_PLANT_GRACE, if this plant has not been there.
+        """
+        foreign = cost.plant != plant and plant not in self.announced
+        self.foreign_since = min(self.foreign_since, now) if foreign else math.inf
         if now - self.foreign_since > FOREIGN_PLANT_GRACE:
             raise DispatchError(
                 f"the plant has other parameters (fingerprint {cost.plant}) than the one this "

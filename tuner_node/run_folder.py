@@ -2,8 +2,8 @@
 """A training's folder and what is in it.
 
 parameters.yaml    the resolved parameters, in ROS form: what defines the training
-run.json           the run's id on the network, how often its tuner was started, and the plant's
-                   fingerprint if it was given (0: not)
+run.json           the run's id on the network, how often its tuner was started, the plant's
+                   fingerprint if it was given (0: not), and why nobody may continue it, if so
 progress.jsonl     what happened, one JSON object a line, as it happened
 checkpoint         the training's state (tuner_node.checkpoint), and the one before
 policy.npz         policy (S, n_a, 2 n_s), lqt (the same), model rows (S, rows, n_s), seeds (S,)
@@ -93,6 +93,11 @@ class RunFolder:
         self.unfinished()
         try:
             known = read_json(self.path / "run.json")
+            if "contradiction" in known:
+                raise RunFolderError(
+                    f"the run in {self.path} cannot be continued, as it has used what was contradicted "
+                    f"({known['contradiction']})"
+                )
             self._check_same(known["parameters"], parameters)
             identity = RunIdentity(int(known["run"]), int(known["incarnation"]) + 1)
             if not (0 < identity.run < MAX_ID and 0 < identity.incarnation < 2**21):
@@ -109,6 +114,12 @@ class RunFolder:
             AttributeError,
         ) as error:
             raise RunFolderError(f"{self.path}/run.json cannot be used: {error}") from error
+
+    def give_up(self, reason: str) -> None:
+        """Let `reopen` refuse from now on. Raises OSError where that cannot be written."""
+        path = self.path / "run.json"
+        content = read_json(path) | {"contradiction": reason}
+        write_atomically(path, json.dumps(content).encode())
 
     def parameters(self) -> dict[str, Any]:
         """The resolved parameters of the training here."""

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.files import FileError
 from loop_interfaces.frames import MAX_ID
 from tuner_node import checkpoint, training_state
 from tuner_node.run_folder import RunFolder, RunIdentity
@@ -70,6 +71,15 @@ class RunWriter:
             )
         took = time.monotonic() - began
         self._save_at = now + max(CHECKPOINT_PERIOD, took / CHECKPOINT_SHARE)
+
+    def give_up(self, reason: str) -> None:
+        """Let nobody continue the training, which has used what was contradicted."""
+        try:
+            self._folder.give_up(reason)
+        except (OSError, FileError) as error:
+            self._warn(
+                f"do not continue the run in {self._folder.path}, although it can be: {error}"
+            )
 
     def finish(self, extra: Mapping[str, Any]) -> dict[str, Any]:
         """Write the results of the finished training. Raises OSError if they cannot be written."""

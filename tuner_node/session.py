@@ -9,7 +9,8 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from tuner_node.dispatch import Dispatcher
-from tuner_node.pair import DispatchError, PairPublication
+from tuner_node.errors import DispatchError
+from tuner_node.pair import PairPublication
 from tuner_node.training import Training
 
 Report = Callable[[Mapping[str, Any]], None]
@@ -102,5 +103,5 @@ class Session:
             self._report({"event": "phase", "phase": self._phase, **self.training.progress})
         if batch is None:
             self.done = True
-            return self.dispatcher.release()
+            return []
         return self.dispatcher.assign(batch, now)

@@ -30,6 +30,7 @@ from loop_interfaces.topics import COMPLETED, CostColumn
 from tuner_node import rollouts
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, TrainingSettings, batch_of
 from tuner_node.budget import Budget
+from tuner_node.errors import ContradictionError
 from tuner_node.optimizers import Context, Optimizer, Record, Rollout, Trajectory
 from tuner_node.published_law import check_law
 from tuner_node.rollouts import CHECK, EVALUATED, EXPLORATION
@@ -62,6 +63,8 @@ class Training:
     ended: Array | None = None
     """How those rollouts ended (see CostColumn.ENDED), of the same shape."""
     plant: int = UNKNOWN_PLANT
+    steps: int = 0
+    """Of an episode; 0: not known yet."""
     explorations: list[Trajectory | None] = field(default_factory=list)
     """The exploratory trajectory of every seed, where the optimiser wants trajectories."""
     target: Array | None = None
@@ -111,8 +114,7 @@ class Training:
                 f"the plant has other parameters (fingerprint {result.plant}) than the one this run "
                 f"began with ({self.plant}); continue it with that one, or start a new run"
             )
-        self._check_steps(result)
-        self.plant = result.plant
+        self.plant, self.steps = result.plant, self._same_steps(result)
         if self.phase == "identify":
             assert result.models is not None
             if result.trajectories is not None:
@@ -128,19 +130,15 @@ class Training:
             return self._tell(result)
         return self._evaluated(result)
 
-    def _check_steps(self, result: BatchResult) -> None:
-        """Raise ValueError if a trajectory to the end has not as many steps as those before."""
-        known = [kept.actions for own in self.measured for kept in own]
-        known += [explored.actions for explored in self.explorations if explored is not None]
-        known += [
-            r.trajectory.actions for r in result.rollouts() if r.trajectory and not r.diverged
-        ]
-        steps = sorted({len(actions) for actions in known})
+    def _same_steps(self, result: BatchResult) -> int:
+        """The steps of an episode. ContradictionError if not all of this run have as many."""
+        steps = sorted({*result.steps, *([self.steps] if self.steps else [])})
         if len(steps) > 1:
-            raise ValueError(
-                f"rollouts of this run ended after {' and '.join(map(str, steps))} steps, expected one "
+            raise ContradictionError(
+                f"episodes of this run ended after {' and '.join(map(str, steps))} steps, expected one "
                 "horizon: stop who else publishes episode/cost and start a new run"
             )
+        return next(iter(steps), 0)
 
     def policies(self) -> Array:
         """The adapted policies, of the shape of the warm starts."""

@@ -29,6 +29,7 @@ def arrays_of(training: Training) -> Arrays:
     arrays: Arrays = {
         "phase": np.array(training.phase),
         "plant": np.array(training.plant),
+        "steps": np.array(training.steps),
         "attempts": np.array(training.attempts),
         "pending": np.array(training.pending, dtype=np.int64),
         "history": np.array(json.dumps(training.history)),
@@ -67,6 +68,7 @@ def _fill(training: Training, arrays: Arrays) -> None:
     training.budget.restore(taken(arrays, "budget", "i", training.budget.state().shape))
     training.law_seen = bool(taken(arrays, "law_seen", "b", ()))
     training.plant = int(taken(arrays, "plant", "i", ()))
+    training.steps = int(taken(arrays, "steps", "i", ()))
     training.attempts = taken(arrays, "attempts", "i", (seeds,)).tolist()
     training.pending = taken(arrays, "pending", "i", (None,)).tolist()
     training.history = json.loads(str(taken(arrays, "history", "U", ())))

@@ -13,12 +13,12 @@ from tests.simulation.history import History
 from tests.simulation.plan import Plan, draw
 from tests.simulation.processes import remembering, values
 from tests.small import same_bits, train_here
-from tuner_node.pair import DispatchError
+from tuner_node.errors import DispatchError
 from tuner_node.training import Training
 
 GAVE_UP = "gave up after"
 CAUSES = re.compile(
-    rf"{GAVE_UP} \d+ attempts|expected one|stop the|two different|took back the"
+    rf"{GAVE_UP} \d+ attempts|expected one|stop the|two different|took back"
     "|plant has other parameters|actions are not those of the law"
 )
 """What an error says that names a cause."""

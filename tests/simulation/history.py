@@ -41,7 +41,7 @@ from tests.simulation.processes import (
     TunerProcess,
     values,
 )
-from tuner_node.pair import DispatchError
+from tuner_node.errors import DispatchError
 from tuner_node.training import Training
 
 LEASE = 4.0

@@ -275,8 +275,7 @@ class TunerProcess(Process):
             TARGET: self.dispatcher.target,
             PAUSED: self.dispatcher.plant_paused,
         }[topic]
-        if topic is not TARGET or self.session.training.settings.trajectories:
-            self._guarded(lambda now: handler(pair, frame, now))
+        self._guarded(lambda now: handler(pair, frame, now))
 
     def see(self, samples: list[tuple[Topic, Frame]], pair: int) -> None:
         """Take samples of an episode."""

@@ -267,7 +267,9 @@ def test_a_strange_publisher_is_reported_by_name_and_changes_nothing(loop, tmp_p
                 )
     loop.wait(tuner, LIMIT)
     assert_same_training(out, in_process(iterations=40))
-    assert "2 nodes publish /action: /controller_node, /stranger" in loop.output(running["plant"])
+    assert "several nodes publish /action: /controller_node, /stranger" in loop.output(
+        running["plant"]
+    )
     told = json.loads((out / "result.json").read_text())["several_publishers"]
     assert told == {
         "/action": ["/controller_node", "/stranger"],
@@ -342,10 +344,17 @@ def test_an_error_for_which_a_stranger_may_be_the_reason_names_the_stranger(loop
     with operator(loop) as desk:
         loop.start("-c", SECOND_PLANT, name="second")
         until(lambda: "/second_plant" in desk.ask(nodes=None), LIMIT, "second plant")
-        tuner = start_tuner(loop, tmp_path / "run", iterations=100_000)
-        (line,) = loop.wait(tuner, LIMIT, code=1).strip().splitlines()[-1:]
+        out, options = tmp_path / "run", {"iterations": 100_000}
+        (line,) = loop.wait(start_tuner(loop, out, **options), LIMIT, code=1).splitlines()[-1:]
+        # What it has used is in its checkpoint.
+        again = loop.wait(start_tuner(loop, out, **options, resume=True), LIMIT, code=1)
+    assert "cannot be continued, as it has used what was contradicted (two different" in again
+    assert not (out / "result.json").exists()
     assert "expected one plant and one controller in this namespace" in line
-    assert "; 2 nodes published /episode/cost: /pde_sim_node, /second_plant; expected one" in line
+    assert (
+        "; several nodes published /episode/cost: /pde_sim_node, /second_plant; expected one"
+        in line
+    )
 
 
 SECOND_PLANT = """
