@@ -26,6 +26,7 @@ PLAN = plan_type(
     ("batch", np.int64),
     ("actions", np.int64),  # address of room for them
     ("step", np.int64),  # that was answered last
+    ("furthest", np.int64),  # that was answered since it was armed: two plants may be served
     ("signature", np.float64),  # 0 where the tuner asks for none
 )
 
@@ -38,6 +39,7 @@ def respond(plan: Any, head: int, message: int, length: int) -> bool:
         return False
     act(plan.law, head + 8 * FIRST, plan.actions, plan.batch)
     plan.step = int(step)
+    plan.furthest = max(plan.furthest, plan.step)
     numbers = plan.batch * plan.law.n_a
     time = plan.signature if plan.signature < 0.0 else load_unaligned(head, TIME)
     write_answer(plan.answer, plan.step, time, plan.actions, numbers)
@@ -84,9 +86,10 @@ class ControllerFastPath(FastPath):
         self._law = law  # the record has addresses of what it owns
         plan["law"], plan["batch"] = law.plan, batch
         plan["actions"] = self._actions.ctypes.data
-        plan["signature"] = answering.signature
+        plan["signature"], plan["furthest"] = answering.signature, -1
         return True
 
     def synchronise(self, answers: int, last: float) -> None:
         if answers:
-            self._responder.advance_counters(answers, int(self.plan["step"]))
+            plan = self.plan
+            self._responder.advance_counters(answers, int(plan["step"]), int(plan["furthest"]))

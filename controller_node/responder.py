@@ -264,18 +264,18 @@ class Responder:
         ids = *self._served, self.episode
         if frame.step == 0 and ids != self._attended:
             self._attended, self._furthest = ids, 0
-        self.advance_counters(1, frame.step)
+        self.advance_counters(1, frame.step, frame.step)
         time = answering.signature or frame.time
         return [Publication(ACTION, replace(frame, time=time, values=actions)), *taken_back]
 
-    def advance_counters(self, answers: int, step: int) -> None:
-        """Account for states of the present episode, up to `step`, that were answered."""
+    def advance_counters(self, answers: int, step: int, furthest: int) -> None:
+        """Account for states of the present episode that were answered: the last and the furthest."""
         self.answered += answers
         self.step = step
         ids = *self._served, self.episode
         if self._attended == ids:
-            self._furthest = max(self._furthest, step)
-        if self._claimed[0] == ids and step >= self._claimed[1]:
+            self._furthest = max(self._furthest, furthest)
+        if self._claimed[0] == ids and furthest >= self._claimed[1]:
             self._claimed = (-1, -1, -1), -1
 
     def answering(self, state: Frame) -> Answering | None:

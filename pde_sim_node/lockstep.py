@@ -15,7 +15,7 @@ state T advances nothing: it acknowledges the last state.
     AWAITING  no answer for `action_timeout`        AWAITING     state(e, k) again
     AWAITING  no answer after `max_repeats`         IDLE         cost(e), void: not a cost
     active    contradicts what was taken of e       IDLE         cost(e), void; active: not IDLE
-    active    start(f), f > e                       AWAITING     cost(e), void; state(f, 0)
+    active    start(f), f > e                       AWAITING     cost(e), void before T; state(f, 0)
     any       end of the run, start of another run  IDLE         none; or as a start in IDLE
 
 Which starts and actions contradict, and which are signed: pde_sim_node.taken_actions.
@@ -237,8 +237,8 @@ class Lockstep:
         signed = signature(frame.plant, self.plant.target)
         if frame.episode <= self.episode:
             return self._start_again(frame, rows, signed, now)
-        if self.active:
-            report.append(self._finish(now, void=True))
+        if self.active:  # what it comes to is known once the last state is sent
+            report.append(self._finish(now, void=self.step < self.plant.horizon))
         seeds = rows[:, StartColumn.SEED].astype(np.int64)
         self._state = self.plant.reset(seeds, noise_seeds(rows))
         self._actions.episode = Episode(rows.copy(), signed)

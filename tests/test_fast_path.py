@@ -19,7 +19,7 @@ from controller_node.responder import Responder
 from loop_interfaces import model_rows
 from loop_interfaces.frames import HEADER, ArrayCodec, Frame, FrameError
 from loop_interfaces.signature import signature
-from loop_interfaces.topics import ACTION, COST, STATE, VOID, CostColumn
+from loop_interfaces.topics import ACTION, COMPLETED, COST, STATE, VOID, CostColumn
 from pde_sim_node.fast_path import PlantFastPath
 from tests.test_lockstep import PLANT, RUN, plant_protocol
 
@@ -170,6 +170,24 @@ def test_a_controller_leaves_everything_else_to_the_responder() -> None:
     # Padding of ordinary message objects is undefined; the labels themselves are not.
     assert fast(controller.path, good.replace(b"env", b"enw", 1)) is None
     assert fast(controller.path, good)
+
+
+@pytest.mark.parametrize("furthest, says", [(6, 1), (7, 0)])
+def test_the_furthest_of_two_plants_is_remembered_though_the_other_was_answered_last(
+    furthest: int, says: int
+) -> None:
+    controller = Controller(1)
+    controller.begin(4)
+    controller.ordinary(controller.state(4, 0))
+    with armed(controller.path) as answer:
+        assert all(answer(controller.state(4, step)) for step in (1, 2, furthest, 3))
+    assert controller.responder.step == 3
+    cost, void = (
+        Frame(RUN, 4, step, 0.1, np.array([[1.0, 7.0, ended]]), PLANT)
+        for step, ended in ((7, COMPLETED), (3, VOID))
+    )
+    assert controller.responder.cost(cost) == []
+    assert len(controller.responder.cost(void)) == says
 
 
 def test_a_responder_knows_what_was_answered_and_what_it_was_told_since_counts() -> None:

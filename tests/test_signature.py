@@ -210,15 +210,15 @@ def test_a_cost_in_the_middle_of_an_episode_is_contradicted_by_the_controller():
 
 
 @pytest.mark.parametrize("twin", ["plant", "controller"])
-def test_a_second_plant_or_controller_of_the_same_kind_takes_nothing_back(twin):
+@pytest.mark.parametrize("steps", [1, 30])
+def test_a_second_plant_or_controller_of_the_same_kind_takes_nothing_back(twin, steps):
     """One of two plants is slower, or one of two controllers."""
     loop, slow = Loop(), plant_protocol()
     slower = loop.controller_told()
     (state,) = slow.start(loop.told[START], 0.0)
-    slower.state(loop.state)
-    for controller in (loop.controller, slower)[: 1 + (twin == "plant")]:
-        (action,) = controller.state(state.frame)
-    slow.action(action.frame, 0.0)
+    for _ in range(steps):
+        (action,) = slower.state(state.frame)
+        (state,) = slow.action(action.frame, 0.0)
     loop.finish()
     (cost,) = loop.plant.start(loop.told[START], 0.0)
     loop.tuner.cost(0, cost.frame, 0.0)
