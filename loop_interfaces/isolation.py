@@ -5,11 +5,14 @@ import ipaddress
 import os
 import re
 from pathlib import Path
+from xml.etree import ElementTree
 
+from loop_interfaces.files import FileError, read_bounded
 from loop_interfaces.problem import config_folder
 
 PROFILE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 NETWORK = "PDELOOP_NETWORK"
+MAX_PROFILE_BYTES = 2**20
 
 
 def loopback_environment() -> dict[str, str]:
@@ -25,6 +28,25 @@ def loopback_environment() -> dict[str, str]:
 def keep_on_this_machine() -> None:
     """Apply `loopback_environment` to this process; call before ROS is initialised."""
     os.environ.update(loopback_environment())
+
+
+def check_profile() -> None:
+    """ValueError where the user's Fast DDS profile is none: Fast DDS would go on with its defaults."""
+    path = os.environ.get(PROFILE)
+    if not path:
+        return
+    try:
+        root = ElementTree.fromstring(read_bounded(Path(path), MAX_PROFILE_BYTES))
+    except (FileError, ElementTree.ParseError) as error:
+        reason = str(error)
+    else:
+        if any(element.tag.rpartition("}")[2] == "profiles" for element in root.iter()):
+            return
+        reason = "it has no element <profiles>"
+    raise ValueError(
+        f"{PROFILE}={path} is no Fast DDS profile ({reason}); Fast DDS would send to every interface: "
+        "correct it, or unset the variable to stay on this machine"
+    )
 
 
 def is_confined() -> bool:

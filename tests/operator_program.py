@@ -4,6 +4,7 @@
 {"know": [SERVICE, ...]}            look for these already, so that a call is quick
 {"call": SERVICE}                   a std_srvs/Trigger; [success, message]
 {"set": [NODE, PARAMETER, VALUE]}   [successful, reason]
+{"malform": NODE}                   sends a request to set a parameter of no type there is
 {"get": [NODE, PARAMETER]}          the value
 {"describe": NODE}                  {parameter: read_only}
 {"diagnostics": None}               {status name: [reports so far, level, message, {key: value}]}
@@ -22,6 +23,7 @@ from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
 from rclpy.parameter import Parameter, parameter_value_to_python
@@ -76,6 +78,12 @@ class Operator:
             request = SetParameters.Request(parameters=[parameter])
             (result,) = self.request(SetParameters, f"{node}/set_parameters", request).results
             return [result.successful, result.reason]
+        if what == "malform":
+            client = self.node.create_client(SetParameters, f"{argument}/set_parameters")
+            assert client.wait_for_service(LIMIT)
+            odd = ParameterMessage(name="odd", value=ParameterValue(type=42))
+            client.call_async(SetParameters.Request(parameters=[odd]))
+            return None
         if what == "get":
             node, name = argument
             request = GetParameters.Request(names=[name])

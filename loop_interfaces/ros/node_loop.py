@@ -12,11 +12,10 @@ node.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from rclpy.executors import ShutdownException, TimeoutException
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray
@@ -240,12 +239,8 @@ class NodeLoop(EventLoop):
         served, any_served = True, False
         while served and not self.stopped and self.now() < now + SERVING:
             served = False
-            with suppress(TimeoutException, ShutdownException):
-                while True:  # what is ready now; then a TimeoutException
-                    callback, _, _ = self._executor.wait_for_ready_callbacks(timeout_sec=0)
-                    callback()
-                    callback.result()
-                    served = any_served = True
+            while self.serve_next(0.0):  # what is ready now
+                served = any_served = True
         return any_served
 
     def _end_long_wait(self) -> None:

@@ -15,7 +15,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args, try_shutdown
 
-from loop_interfaces.isolation import PROFILE, is_confined, outside_sockets
+from loop_interfaces.isolation import PROFILE, check_profile, is_confined, outside_sockets
 from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.parameters import take_over
 
@@ -36,6 +36,7 @@ def ros_node(
     make_loop: NodeLoop for a node of the loop, Observer for one that observes it.
     """
     try:
+        check_profile()
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rcl raises bare RuntimeErrors and its own types
         raise ConfigurationError(_first_line(error)) from error

@@ -9,11 +9,13 @@ its peers have forgotten it.
 
 import time
 from collections.abc import Callable
+from typing import Any
 
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import ShutdownException, SingleThreadedExecutor, TimeoutException
 from rclpy.node import Node
+from rclpy.service import Service
 
 from loop_interfaces.ros.introspection import PERIOD, Introspection
 from loop_interfaces.ros.suspend_watchdog import SuspendWatchdog
@@ -28,6 +30,13 @@ SUSPENDED = 2.0
 The DDS lease is 4 s, and announcements come every second: peers that stop hearing a participant
 forget it, while it does not know and does not introduce itself again. Joining as a new participant is
 the way back."""
+
+
+PARAMETER_SERVICES = {
+    *("describe_parameters", "get_parameter_types", "get_parameters", "list_parameters"),
+    *("set_parameters", "set_parameters_atomically"),
+}
+"""What rclpy offers itself; a request that it cannot make sense of ends in an exception there."""
 
 
 class EventLoop:
@@ -53,6 +62,26 @@ class EventLoop:
         """Leave `run` after the present event."""
         self._stop_reason = reason
 
+    def serve_next(self, seconds: float) -> bool:
+        """Call the executor's next callback, after a wait of so long at most; whether there was one.
+
+        A malformed request for parameters is refused.
+        """
+        entity: Any
+        try:
+            callback, entity, _ = self._executor.wait_for_ready_callbacks(timeout_sec=seconds)
+        except (TimeoutException, ShutdownException):
+            return False
+        callback()
+        try:
+            callback.result()
+        except Exception as error:
+            name = entity.service_name if isinstance(entity, Service) else ""
+            if name.rpartition("/")[2] not in PARAMETER_SERVICES:
+                raise
+            self.introspection.refuse(name, error)
+        return True
+
     @property
     def stopped(self) -> bool:
         """Whether `stop` was called or ROS was shut down."""
@@ -76,7 +105,7 @@ class Observer(EventLoop):
         self._turned = self.now()
         with SuspendWatchdog(self._wake_if_stuck) as watchdog:
             while not self.stopped:
-                self._executor.spin_once(timeout_sec=WAIT)
+                self.serve_next(WAIT)
                 self._turned = self.now()
                 if watchdog.longest() > SUSPENDED:
                     self.suspended = True

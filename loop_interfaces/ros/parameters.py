@@ -54,7 +54,7 @@ def declare(node: Node, specs: Iterable[Spec], given: dict[str, Any]) -> dict[st
 def take_over(node: Node, former: Node) -> None:
     """Declare the parameters of a node that is no more, with the values that they had last."""
     for name in former.get_parameters_by_prefix(""):
-        if not node.has_parameter(name):
+        if name and not node.has_parameter(name):  # rclpy lets a request make one without a name
             value, description = former.get_parameter(name).value, former.describe_parameter(name)
             node.declare_parameter(name, value, description, ignore_override=True)
 

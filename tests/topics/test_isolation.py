@@ -11,7 +11,13 @@ import sys
 
 import pytest
 
-from loop_interfaces.isolation import NETWORK, PROFILE, loopback_environment, outside_sockets
+from loop_interfaces.isolation import (
+    NETWORK,
+    PROFILE,
+    check_profile,
+    loopback_environment,
+    outside_sockets,
+)
 from loop_interfaces.problem import config_folder
 from pdeloop.domain import DomainError, own_domain
 from tests.loop_harness import ROOT, Processes, udp_sockets, until
@@ -34,15 +40,17 @@ def test_the_hundred_and_third_node_of_a_domain_has_its_ports_and_all_on_loopbac
 
 
 def test_a_profile_without_effect_is_noticed_and_refused(loop: Processes, tmp_path):
-    # The node's own copy of the configuration is damaged; Fast DDS would only log that. It runs in
-    # a network namespace without any interface, so that its defaults reach nobody.
+    # In the node's own copy of the configuration nothing has an effect; Fast DDS would only log that.
+    # It runs in a network namespace without any interface, so that its defaults reach nobody.
     alone = ("unshare", "-n", "-m")
     if not shutil.which(alone[0]) or subprocess.run([*alone, "true"]).returncode != 0:
         pytest.skip("needs root, and the right to make namespaces")
     sources = tmp_path / "copy"
     for folder in ("loop_interfaces", "controller_node", "config"):
         shutil.copytree(ROOT / folder, sources / folder)
-    (sources / "config" / "fastdds_loopback.xml").write_text("<dds>broken")
+    (sources / "config" / "fastdds_loopback.xml").write_text(
+        "<dds><profiles><nothing/></profiles></dds>"
+    )
     environment = {**loop.environment, "PYTHONPATH": str(sources)}
     del environment[PROFILE]
     done = subprocess.run(
@@ -60,6 +68,23 @@ def test_a_profile_without_effect_is_noticed_and_refused(loop: Processes, tmp_pa
     )
     assert done.returncode == 1, done.stdout + done.stderr
     assert "did not take effect" in done.stderr.strip().splitlines()[-1]
+
+
+@pytest.mark.parametrize("content", [None, "", "<dds>broken", "<dds></dds>", "x" * 2**21])
+def test_a_profile_that_is_none_is_refused_before_there_is_a_socket(tmp_path, monkeypatch, content):
+    path = tmp_path / "mine.xml"
+    if content is not None:
+        path.write_text(content)
+    monkeypatch.setenv(PROFILE, str(path))
+    with pytest.raises(ValueError, match="is no Fast DDS profile") as refusal:
+        check_profile()
+    assert str(path) in str(refusal.value) and "\n" not in str(refusal.value)
+    command = [sys.executable, "-m", "controller_node.node"]
+    if content is None:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+        assert (done.returncode, done.stderr) == (1, f"controller_node: {refusal.value}\n")
+    monkeypatch.setenv(PROFILE, str(config_folder() / "fastdds_loopback.xml"))
+    check_profile()
 
 
 def test_a_socket_on_every_interface_counts_as_outside():

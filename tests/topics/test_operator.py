@@ -13,6 +13,7 @@ from tests.operator_harness import SLOW, full_speed, operator
 from tests.small import SMALL
 from tests.small_loop import (
     LIMIT,
+    PARAMETERS,
     adapted,
     assert_same_training,
     in_process,
@@ -41,7 +42,7 @@ rclpy.init()
 former = rclpy.create_node("plant")
 declare(former, PLANT, {})
 on_change(former, PLANT, lambda values: None)
-former.set_parameters([Parameter("action_timeout", value=0.5)])
+former.set_parameters([Parameter("action_timeout", value=0.5), Parameter("", value=1)])
 former.destroy_node()
 node = rclpy.create_node("plant")
 take_over(node, former)
@@ -254,6 +255,17 @@ def test_services_that_do_not_fit_the_moment_say_why(loop: Processes):
         assert not success
         assert message == "no episode is under way; expected one to step in"
         assert desk.call("/pde_sim_node/resume") == "resumed"
+
+
+def test_a_malformed_request_for_parameters_is_refused_and_harms_no_node(loop: Processes):
+    plant = start_pair(loop)["plant"]
+    viewer = loop.node("viewer_node", *PARAMETERS)  # the other kind of event loop
+    with operator(loop) as desk:
+        for name, process in ("/pde_sim_node", plant), ("/viewer_node", viewer):
+            desk.ask(malform=name)
+            refusal = f"refused 1 message(s), the last one because: {name}/set_parameters: 42 is"
+            until(lambda p=process, r=refusal: r in loop.output(p), LIMIT, f"refusal by {name}")
+            assert desk.ask(get=[name, "use_sim_time"]) is False
 
 
 REFUSED_AT_THE_END = """
