@@ -78,9 +78,8 @@ class Timing:
 class Lockstep:
     """One plant serving the episodes of one run at a time. `now` is any monotonic time in s.
 
-    fingerprint: of the plant's parameters, see build.fingerprint; paused_run, signed_run: the runs
-    in which this plant was paused, and had a controller that signs, when its process ended; 0:
-    none.
+    fingerprint: of the plant's parameters, see build.fingerprint; paused, signed_run: whether this
+    plant was paused when its process ended, and the run whose controller signed; 0: none.
     """
 
     def __init__(
@@ -89,7 +88,7 @@ class Lockstep:
         timing: Timing,
         *,
         fingerprint: int = 0,
-        paused_run: int = 0,
+        paused: bool = False,
         signed_run: int = 0,
     ) -> None:
         self.plant = plant
@@ -104,11 +103,10 @@ class Lockstep:
         """The rows of the last `episode/cost`."""
         self.contradiction = ""
         """Why the last cost that was sent is void, if two different messages came in one place."""
-        self.deadline: float | None = None
+        self.deadline: float | None = 0.0 if paused else None
         """When `tick` is to be called next; None while nothing is due."""
-        self.paused = False
+        self.paused = paused
         self._fingerprint = fingerprint
-        self._paused_run = paused_run
         self._stepping = False
         """Whether a paused plant waits for the one action that it may still take."""
         self._phase = Phase.IDLE
@@ -177,7 +175,6 @@ class Lockstep:
 
     def resume(self, now: float) -> list[Publication]:
         """Send the state that is ready, or again the one that is not answered."""
-        self._paused_run = 0
         if not self.paused:
             return []
         self.paused, self._stepping, self.deadline = False, False, None
@@ -226,10 +223,6 @@ class Lockstep:
                     f"(until it ends, or is silent for {hold:g} s)"
                 )
             self._serve(frame.run, now)
-        report: list[Publication] = []
-        if frame.run == self._paused_run:
-            self._paused_run = 0
-            report = self.pause(now)
         self._tuner_heard = now
         if not len(rows):
             self._serve(0, now)
@@ -237,8 +230,9 @@ class Lockstep:
         signed = signature(frame.plant, self.plant.target)
         if frame.episode <= self.episode:
             return self._start_again(frame, rows, signed, now)
+        replaced: list[Publication] = []
         if self.active:  # what it comes to is known once the last state is sent
-            report.append(self._finish(now, void=self.step < self.plant.horizon))
+            replaced = [self._finish(now, void=self.step < self.plant.horizon)]
         seeds = rows[:, StartColumn.SEED].astype(np.int64)
         self._state = self.plant.reset(seeds, noise_seeds(rows))
         self._actions.episode = Episode(rows.copy(), signed)
@@ -246,7 +240,7 @@ class Lockstep:
         self.time = max(self.time, frame.time) + self.plant.sample_time
         if self.pacer:
             self.pacer.begin(now)
-        return report + self._send_unless_paused(now)
+        return replaced + self._send_unless_paused(now)
 
     def action(self, frame: Frame, now: float) -> list[Publication]:
         """Advance on the awaited action; ignore any other.

@@ -69,7 +69,7 @@ class PlantNode:
             plant,
             Timing(**{spec.name: values[spec.name] for spec in PLANT if spec.live}),
             fingerprint=fingerprint(values),
-            paused_run=self._run_record.paused,
+            paused=self._run_record.paused,
             signed_run=self._run_record.signed,
         )
         self._diagnostics = PlantDiagnostics(self._lockstep)
@@ -80,6 +80,8 @@ class PlantNode:
             f"{values['problem']}: {plant.n_z} points, {plant.n_a} actuators, "
             f"{plant.horizon} steps of {values['sample_time']:g} s"
         )
+        if self._lockstep.paused:
+            node.get_logger().warning("paused, as when its process ended: ~/resume lets it go on")
 
     def join(self, node: Node, loop: NodeLoop) -> None:
         self._node, self._loop = node, loop
@@ -131,10 +133,10 @@ class PlantNode:
         return was
 
     def _record_run(self) -> None:
-        """So that a plant that is started again in this run stays paused, and asks for signatures."""
+        """So that a plant that is started again stays paused, and asks for the run's signatures."""
         lockstep = self._lockstep
         try:
-            self._run_record.keep(lockstep.run if lockstep.paused else 0, lockstep.signed_run)
+            self._run_record.keep(lockstep.paused, lockstep.signed_run)
         except (OSError, FileError) as error:
             self._node.get_logger().warning(
                 f"a pause and a signing controller are forgotten with this process: {error}",

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from loop_interfaces.files import FileError, open_own, private_folder
+from pde_sim_node.run_record import forget
 
 DOMAINS = range(1, 101)
 """Domains whose ports lie outside the ephemeral range on Linux; 0 is everybody's default."""
@@ -58,6 +59,7 @@ def own_domain() -> Iterator[int]:
             except OSError:
                 continue
             if _unused(domain):
+                forget(domain)
                 yield domain
                 return
     raise DomainError(f"all ROS domains from {DOMAINS[0]} to {DOMAINS[-1]} are in use")

@@ -17,7 +17,7 @@ from typing import Any
 
 import controller_node.fast_path
 import pde_sim_node.fast_path
-from loop_interfaces.files import make_own_folder
+from loop_interfaces.files import FileError, make_own_folder
 from loop_interfaces.isolation import NETWORK, loopback_environment
 from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_equation, build_plant
@@ -70,12 +70,20 @@ def begin(
 
 
 def reopen(folder: Path) -> dict[str, Any]:
-    """The parameters of the unfinished training in `folder`; RunFolderError if there is none."""
+    """The parameters of the unfinished training in `folder`, which goes on if it was paused.
+
+    RunFolderError if there is none.
+    """
     run = RunFolder(folder)
     run.unfinished()
     values = run.values()
     if (folder / "result.json").exists():
         raise RunFolderError(f"the run in {folder} is complete; there is nothing to continue")
+    try:
+        with run.locked():
+            run.hold(False)
+    except FileError as error:
+        raise RunFolderError(f"{folder}/run.json cannot be used: {error}") from error
     return values
 
 

@@ -12,7 +12,7 @@ from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.topics import COMPLETED, COST, PAUSED, STATE, VOID, CostColumn
 from pde_sim_node.build import build_plant
 from pde_sim_node.lockstep import Lockstep, Timing
-from pde_sim_node.run_record import RunRecord
+from pde_sim_node.run_record import RunRecord, forget
 from tests.small import parameters
 
 RUN = 11
@@ -20,13 +20,13 @@ PLANT = 77
 SEEDS = (3, 4)
 
 
-def plant_protocol(paused_run: int = 0, signed_run: int = 0, **overrides) -> Lockstep:
+def plant_protocol(paused: bool = False, signed_run: int = 0, **overrides) -> Lockstep:
     values = parameters(**overrides)
     return Lockstep(
         build_plant(values),
         Timing(action_timeout=0.1, max_repeats=3, run_hold=10.0),
         fingerprint=PLANT,
-        paused_run=paused_run,
+        paused=paused,
         signed_run=signed_run,
     )
 
@@ -223,27 +223,39 @@ def test_a_paused_plant_holds_the_next_state_back_and_times_nothing_out():
     assert outcome(paused) == outcome(quiet)
 
 
-def test_a_plant_that_was_paused_in_a_run_is_paused_in_it_when_it_is_started_again(tmp_path):
+@pytest.mark.parametrize("paused_in", ["no run", "this run", "a run that has ended"])
+def test_a_plant_that_was_paused_is_paused_when_it_is_started_again(tmp_path, paused_in):
     quiet = run_episode(plant_protocol(), 1)
-    record = RunRecord("/pair/plant", 7, tmp_path / "records")
-    assert (record.paused, record.signed) == (0, 0)
-    record.keep(RUN, 5)
-    for other in (("/pair/other", 7), ("/pair/plant", 8)):
-        assert RunRecord(*other, tmp_path / "records").paused == 0
-    again = RunRecord("/pair/plant", 7, tmp_path / "records")
+    former, records = plant_protocol(), tmp_path / "records"
+    record = RunRecord("/pair/plant", 7, records)
+    assert (record.paused, record.signed) == (False, 0)
+    if paused_in == "this run":
+        former.start(start(1), 0.0)
+    former.pause(0.0)
+    if paused_in == "a run that has ended":
+        former.start(start(2, seeds=()), 1.0)
+    record.keep(former.paused, 5)
+    for other in (("/pair/other", 7), ("/pair/plant", 8), ("/pair/plant", 70)):
+        assert not RunRecord(*other, records).paused
+    again = RunRecord("/pair/plant", 7, records)
     assert again.signed == 5
-    protocol = plant_protocol(paused_run=again.paused)
-    (report,) = protocol.start(start(1), 0.0)  # latched: it is there at once
-    assert (report.topic, report.frame.values.tolist()) == (PAUSED, [1.0])
-    assert {send.topic for now in range(1, 60) for send in protocol.tick(float(now))} == {PAUSED}
+    protocol = plant_protocol(paused=again.paused)
+    assert protocol.paused_report().frame.values.tolist() == [1.0]
+    for now in range(1, 60):
+        if now == 3:
+            assert protocol.start(start(1), 3.0) == []
+        assert {send.topic for send in protocol.tick(float(now))} <= {PAUSED}
     _, state = protocol.resume(60.0)
     assert state.frame.values.tobytes() == quiet[0].values.tobytes()
     assert [send.topic for send in protocol.start(start(2), 61.0)] == [COST, STATE]
 
-    # Another run has nothing to do with it, nor has a damaged record.
-    assert plant_protocol(paused_run=RUN).start(start(1, run=RUN + 1), 0.0)[0].topic is STATE
-    (tmp_path / "records" / "7+pair+plant").write_text("x")
-    assert RunRecord("/pair/plant", 7, tmp_path / "records").paused == 0
+    (records / "7+pair+plant").write_text("x")  # damaged
+    assert not RunRecord("/pair/plant", 7, records).paused
+    RunRecord("/pair/plant", 8, records).keep(True, 0)
+    again.keep(True, 6)
+    forget(7, records)
+    assert not RunRecord("/pair/plant", 7, records).paused
+    assert RunRecord("/pair/plant", 8, records).paused
 
 
 def test_a_paused_plant_says_so_once_a_second():

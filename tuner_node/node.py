@@ -75,6 +75,9 @@ class TunerNode:
         self._problem, self._out = values["problem"], values["out"]
         self._narration = Narration(values["seed"], values["seeds"])
         dispatcher = build_dispatcher(values, training, identity)
+        if identity.paused:
+            dispatcher.pause()
+            log.warning("paused, as when its process ended: ~/resume lets it go on")
         self._session = Session(training, dispatcher, self._rows.append)
         self._diagnostics = TunerDiagnostics(self._session)
         self._participants = Participants(self._session, values["recorder"])
@@ -158,16 +161,22 @@ class TunerNode:
 
     def _pause(self) -> str:
         self._session.dispatcher.pause()
+        if self._writer:
+            self._writer.hold(True)
         under_way = len(self._session.dispatcher.episodes())
         return "paused" + (f"; {under_way} episode(s) under way will end" if under_way else "")
 
     def _resume(self) -> str:
         was = "resumed" if self._session.dispatcher.paused else "was not paused"
         self._guarded(self._session.dispatcher.resume)
+        if self._writer:
+            self._writer.hold(False)
         return was
 
     def _stop(self) -> str:
         self._guarded(lambda now: self._session.stop())
+        if self._writer:
+            self._writer.hold(False)  # whoever continues the run has chosen to
         if self._session.stopped:
             return "stopping now"
         return "stopping after the rollouts under way" + (

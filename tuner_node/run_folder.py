@@ -2,8 +2,9 @@
 """A training's folder and what is in it.
 
 parameters.yaml    the resolved parameters, in ROS form: what defines the training
-run.json           the run's id on the network, how often its tuner was started, the plant's
-                   fingerprint if it was given (0: not), and why nobody may continue it, if so
+run.json           the run's id on the network, how often its tuner was started, whether an
+                   operator has paused it, the plant's fingerprint if it was given (0: not), and
+                   why nobody may continue it, if so
 progress.jsonl     what happened, one JSON object a line, as it happened
 checkpoint         the training's state (tuner_node.checkpoint), and the one before
 policy.npz         policy (S, n_a, 2 n_s), lqt (the same), model rows (S, rows, n_s), seeds (S,)
@@ -57,10 +58,14 @@ class RunFolderError(ValueError):
 
 @dataclass(frozen=True)
 class RunIdentity:
-    """run: the id in every frame of this training; incarnation: starts of its tuner so far."""
+    """run: the id in every frame of this training; incarnation: starts of its tuner so far.
+
+    paused: whether an operator had paused it when its tuner ended.
+    """
 
     run: int
     incarnation: int
+    paused: bool = False
 
 
 class RunFolder:
@@ -99,7 +104,8 @@ class RunFolder:
                     f"({known['contradiction']})"
                 )
             self._check_same(known["parameters"], parameters)
-            identity = RunIdentity(int(known["run"]), int(known["incarnation"]) + 1)
+            paused = bool(known.get("paused", False))
+            identity = RunIdentity(int(known["run"]), int(known["incarnation"]) + 1, paused)
             if not (0 < identity.run < MAX_ID and 0 < identity.incarnation < 2**21):
                 raise ValueError("ids out of range")
             return self._identify(identity, known["parameters"])
@@ -116,10 +122,16 @@ class RunFolder:
             raise RunFolderError(f"{self.path}/run.json cannot be used: {error}") from error
 
     def give_up(self, reason: str) -> None:
-        """Let `reopen` refuse from now on. Raises OSError where that cannot be written."""
+        """Let `reopen` refuse from now on. OSError or FileError where that cannot be written."""
+        self._change(contradiction=reason)
+
+    def hold(self, paused: bool) -> None:
+        """Remember whether an operator has paused it. OSError or FileError where that fails."""
+        self._change(paused=paused)
+
+    def _change(self, **entries: Any) -> None:
         path = self.path / "run.json"
-        content = read_json(path) | {"contradiction": reason}
-        write_atomically(path, json.dumps(content).encode())
+        write_atomically(path, json.dumps(read_json(path) | entries).encode())
 
     def parameters(self) -> dict[str, Any]:
         """The resolved parameters of the training here."""
@@ -249,6 +261,7 @@ class RunFolder:
         content = {
             "run": identity.run,
             "incarnation": identity.incarnation,
+            "paused": identity.paused,
             "plant": parameters.get("plant", 0),
             "parameters": {k: v for k, v in parameters.items() if k not in TRANSIENT},
         }

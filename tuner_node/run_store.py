@@ -81,6 +81,13 @@ class RunWriter:
                 f"do not continue the run in {self._folder.path}, although it can be: {error}"
             )
 
+    def hold(self, paused: bool) -> None:
+        """Remember whether an operator has paused the training, for its tuner's next process."""
+        try:
+            self._folder.hold(paused)
+        except (OSError, FileError) as error:
+            self._warn(f"a pause is forgotten with this process: {error}")
+
     def finish(self, extra: Mapping[str, Any]) -> dict[str, Any]:
         """Write the results of the finished training. Raises OSError if they cannot be written."""
         self.keep(now=time.monotonic(), force=True)

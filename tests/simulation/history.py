@@ -72,8 +72,8 @@ class History:
         self.time = 0.0
         self.rows: list[Any] = []
         self.refused: list[str] = []
-        self.records: dict[str, tuple[int, int]] = {}
-        """Each plant's record of the runs with a pause and a signing controller, which outlives it."""
+        self.records: dict[str, tuple[bool, int]] = {}
+        """Each plant's record of a pause and of the run whose controller signs, which outlives it."""
         self._disk = Disk(random.Random(plan.seed + 2))
         self._starts = 0
         self._events: list[tuple[float, int, Callable[[], None]]] = []

@@ -153,12 +153,12 @@ class PlantProcess(Process):
     def __init__(self, history: History, name: str, rate: float, pair: int) -> None:
         super().__init__(history, name, "plant", rate, pair)
         plant, fingerprint = _plant(history.plan.iterations, name)
-        paused_run, signed_run = history.records.get(name, (0, 0))
+        paused, signed_run = history.records.get(name, (False, 0))
         self.lockstep = Lockstep(
             copy.copy(plant),
             Timing(action_timeout=0.05, max_repeats=100, run_hold=5.0),
             fingerprint=fingerprint,
-            paused_run=paused_run,
+            paused=paused,
             signed_run=signed_run,
         )
         self._samples: list[tuple[Topic, Frame]] = []
@@ -194,8 +194,7 @@ class PlantProcess(Process):
         self._record()
 
     def _record(self) -> None:
-        run = self.lockstep.run if self.lockstep.paused else 0
-        self.history.records[self.name] = run, self.lockstep.signed_run
+        self.history.records[self.name] = self.lockstep.paused, self.lockstep.signed_run
 
     def _send(self, publications: Iterable[Publication]) -> None:
         """Samples go in one message, before the cost."""

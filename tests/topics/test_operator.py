@@ -154,6 +154,12 @@ def test_a_paused_tuner_begins_no_episode_and_keeps_the_plant_from_another_tuner
         assert adapted(out) == done
         assert adapted(tmp_path / "second") == 0
         assert desk.values("pde_sim_node")["episodes"] == episodes
+        tuner.send_signal(signal.SIGKILL)
+        tuner.wait()
+        tuner = start_tuner(loop, out, iterations=ITERATIONS, resume=True)
+        until(lambda: "paused, as when its process ended" in loop.output(tuner), LIMIT, "restart")
+        desk.wait_for_reports("tuner_node", 3)
+        assert adapted(out) == done
         # The last report of that name may be the refused one's.
         until(
             lambda: desk.status("tuner_node")[2].startswith("paused in rollout "),
