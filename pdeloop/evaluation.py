@@ -23,8 +23,10 @@ from tuner_node.rollouts import EVALUATED
 from tuner_node.run_folder import RunFolderError
 from tuner_node.seeds import Purpose, derive, evaluation_noise
 
-AGREE = 0.1
+ROUNDED = 0.1
 """Relative difference of a mean cost that other rounding may explain where the field is chaotic."""
+SAME = 1e-6
+"""The same for each single cost where the plant's fingerprint is another one than the run's."""
 
 
 def evaluate(
@@ -46,7 +48,8 @@ def evaluate(
 def another_loop(run: FinishedRun) -> str:
     """Why a run's costs are not those of the built-in plant and law, in words; empty if they are.
 
-    The closing evaluation is computed again for that, for its first seed.
+    The closing evaluation is computed again for that, for its first seed. A plant of the run's
+    fingerprint may round otherwise on another machine; any other plant must give the same costs.
     """
     try:
         pair = _pair(run)
@@ -54,6 +57,7 @@ def another_loop(run: FinishedRun) -> str:
         return f"the run had another plant than the built-in one ({error})"
     count, seed = run.costs["none"].shape[1], int(run.values["evaluation_seed"])
     here = _costs(run, pair, 1, fields=count, seed=seed)
+    same_plant = run.result.get("plant") == pair.fingerprint
     nodes = ", ".join(run.result.get("controller", {}).get("nodes", ()))
     for name, what, law in (
         ("none", "plant", "no control"),
@@ -61,8 +65,10 @@ def another_loop(run: FinishedRun) -> str:
         ("adapted", "control law", "the adapted policy"),
     ):
         there, own = run.costs[name][0], here[name][0]
-        if not _agree(there, own):
+        if not _agree(there, own, same_plant=same_plant):
             whose = f" (its controller: {nodes})" if nodes and name != "none" else ""
+            if name == "none" and not same_plant:
+                whose = " (with another fingerprint)"
             return (
                 f"the run had another {what} than the built-in one{whose}: {law} cost "
                 f"{_text(there)} in its closing evaluation, and {_text(own)} here"
@@ -116,13 +122,15 @@ def _pair(run: FinishedRun) -> LocalPair:
     return pair
 
 
-def _agree(there: Array, here: Array) -> bool:
+def _agree(there: Array, here: Array, *, same_plant: bool) -> bool:
     lost = [np.isnan(costs) | (costs >= DIVERGED_COST) for costs in (there, here)]
     if (lost[0] != lost[1]).any():
         return False
-    good = ~lost[0]
-    a, b = there[good].sum(), here[good].sum()
-    return bool(abs(a - b) <= AGREE * max(abs(a), abs(b)))
+    there, here = there[~lost[0]], here[~lost[0]]
+    if not same_plant:
+        return np.allclose(there, here, rtol=SAME, atol=0.0)
+    a, b = there.sum(), here.sum()
+    return bool(abs(a - b) <= ROUNDED * max(abs(a), abs(b)))
 
 
 def _text(costs: Array) -> str:

@@ -28,11 +28,11 @@ Report = Callable[[Mapping[str, Any]], None]
 
 
 class LocalPair:
-    """A plant and a controller in this process."""
+    """A plant, of this fingerprint, and a controller in this process."""
 
     def __init__(self, values: Mapping[str, Any], plant: Plant | None = None) -> None:
         self.plant = plant or build_plant(values)
-        self._fingerprint = fingerprint(values)
+        self.fingerprint = fingerprint(values)
         self._settings = DesignSettings.of(values)
         self._law: ProjectedLaw | None = None
         self._generation = 0
@@ -65,7 +65,7 @@ class LocalPair:
         return BatchResult(
             np.concatenate([part.costs for part in parts]),
             np.concatenate(models) if models else None,
-            self._fingerprint,
+            self.fingerprint,
             [t for part in parts for t in part.trajectories or ()] if batch.trajectories else None,
             self.plant.target,
             frozenset([self.plant.horizon]),

@@ -94,6 +94,18 @@ def test_rounding_of_another_machine_is_not_another_plant(run, capsys):
         result["costs_by_field"][name] = [[1.01 * cost for cost in row] for row in rows]
     (run / "result.json").write_text(json.dumps(result))
     assert main(["evaluate", str(run), "--fields", "1"]) == 0
+    assert "adapted" in capsys.readouterr().out
+    # A plant with another fingerprint is another one if a single cost differs by more than 1e-6.
+    (run / "result.json").write_text(json.dumps(result | {"plant": result["plant"] + 1}))
+    assert "had another plant than the built-in one (with another fingerprint)" in refused(
+        capsys, run
+    )
+
+
+def test_a_plant_of_another_source_that_computes_the_same_costs_is_the_same(run):
+    result = json.loads((run / "result.json").read_text())
+    (run / "result.json").write_text(json.dumps(result | {"plant": result["plant"] + 1}))
+    assert main(["evaluate", str(run), "--fields", "1"]) == 0
 
 
 def test_policies_that_diverge_are_no_success(run, capsys):
