@@ -8,7 +8,7 @@ exploratory episode: if it missed some, it says so and the episode is run again.
 """
 
 from collections import Counter, OrderedDict, deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -38,8 +38,9 @@ that was answered last, whatever else comes in."""
 MAX_KEPT = 4
 """Policies, and sets of reduced models, that are kept of a run: a stranger's beside the tuner's."""
 MAX_BYTES = 2**29
-"""Bytes that are kept of all runs together. Less recently used runs are dropped for a newer one;
-a run that has no room alone is refused, and an exploratory episode without room gives no model."""
+"""Bytes that are kept of all runs together, and half as many of targets. Less recently used ones are
+dropped for a newer one; a run that has no room alone is refused, and an exploratory episode without
+room gives no model."""
 
 
 @dataclass(frozen=True)
@@ -154,8 +155,14 @@ class Responder:
 
     def target(self, frame: Frame) -> list[Publication | ModelFailure]:
         """Take the target z_r of a plant, (n_z,)."""
-        self._targets[frame.plant] = frame.values.copy()
-        _forget(self._targets, frame.plant, self._served[1])
+        targets = self._targets
+        targets[frame.plant] = frame.values.copy()
+        _forget(
+            targets,
+            frame.plant,
+            self._served[1],
+            lambda: sum(target.nbytes for target in targets.values()) > MAX_BYTES // 2,
+        )
         for run in self._runs.values():
             run.answering = None
         return self._answer_pending()
@@ -454,11 +461,17 @@ class Responder:
         return self.state(self._pending) if self._pending is not None else []
 
 
-def _forget(known: OrderedDict[int, Any], newest: int, protected: int) -> None:
-    """Keep MAX_RUNS entries: `newest`, `protected`, and the most recently used others."""
+def _forget(
+    known: OrderedDict[int, Any],
+    newest: int,
+    protected: int,
+    full: Callable[[], bool] = lambda: False,
+) -> None:
+    """Keep `newest`, `protected`, and the most recently used others: MAX_RUNS, or less while full."""
     known.move_to_end(newest)
-    if len(known) > MAX_RUNS:
-        del known[next(key for key in known if key not in (newest, protected))]
+    others = [key for key in known if key not in (newest, protected)]
+    while others and (len(known) > MAX_RUNS or full()):
+        del known[others.pop(0)]
 
 
 def _differ(a: Frame, b: Frame) -> bool:

@@ -296,6 +296,16 @@ def test_a_run_of_a_stranger_fills_no_memory(responder, monkeypatch):
     assert model.topic is MODEL_IDENTIFIED
 
 
+def test_targets_of_ever_new_plants_fill_no_memory(responder, monkeypatch):
+    monkeypatch.setattr("controller_node.responder.MAX_BYTES", 100_000)
+    explore(responder, 1)  # so that the plant of the run is known
+    served = set(responder._targets)
+    for number in range(1000, 1020):
+        responder.target(Frame(0, 0, 0, 0.0, np.ones(3000), plant=number))
+        assert sum(target.nbytes for target in responder._targets.values()) <= 50_000
+    assert served < set(responder._targets)
+
+
 def test_states_of_one_number_count_with_what_keeps_them(responder, monkeypatch):
     monkeypatch.setattr("controller_node.responder.MAX_BYTES", 100_000)
     responder.start(start(1, (1, 2, 0.1, 0)))
