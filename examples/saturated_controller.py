@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A controller in 150 lines: local sensors, saturated actuators. Nothing of pdeloop is imported.
+"""A controller in 160 lines: local sensors, saturated actuators. Nothing of pdeloop is imported.
 
 Actuator j sees only y_j, the mean of the field over its own part of the grid, and the same mean r_j of
 the target, and answers
@@ -19,7 +19,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, String
 
 A_MAX, P, F = 2.0, 1.0, 0.0  # the limit of an actuator, and where p and f start
-COMPLETED = -1.0
+COMPLETED, VOID = -1.0, -2.0
 
 VOLATILE = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 NEWEST = QoSProfile(depth=8, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -64,6 +64,7 @@ class SaturatedController(Node):
         super().__init__("saturated_controller")
         self.n_a = self.declare_parameter("n_a", 6).value
         self.targets, self.start, self.policy, self.waiting = {}, None, None, None
+        self.result = None  # of an exploratory episode
         self.actions = self.create_publisher(Float64MultiArray, "action", VOLATILE)
         self.models = self.create_publisher(Float64MultiArray, "model/identified", LATCHED)
         self.failures = self.create_publisher(String, "model/failed", LATCHED)
@@ -83,7 +84,14 @@ class SaturatedController(Node):
 
     def on_start(self, message):
         header, rows = from_message(message)
-        self.start = (header[:2], rows) if rows.size else None  # no rows: the run is over
+        known = self.start[0] if self.start is not None else [0, 0]
+        if not rows.size:
+            self.start = None if known[0] == header[0] else self.start  # its run is over
+        elif known != header[:2]:
+            self.start, self.result = (header[:2], rows), None
+        elif self.result is not None:  # the start again: the result may have been lost
+            publisher, result = self.result
+            publisher.publish(result)
         self.answer()
 
     def on_policy(self, message):
@@ -121,7 +129,9 @@ class SaturatedController(Node):
             return
         target = self.targets.get(header[4])
         if target is None or not (costs[:, 2] == COMPLETED).all():
-            self.failures.publish(String(data=failure(header)))
+            retry = target is None or bool((costs[:, 2] == VOID).any())
+            self.result = self.failures, String(data=failure(header, retry))
+            self.failures.publish(self.result[1])
             return
         n_z = target.size
         U = np.full((n_z, 1), n_z**-0.5)  # not used by this law; it has to have orthonormal columns
@@ -129,13 +139,14 @@ class SaturatedController(Node):
         rows += [np.full((self.n_a, 1), F), target[None] @ U]
         model = np.repeat(np.concatenate(rows)[None], len(costs), axis=0)
         header[2] = 0
-        self.models.publish(to_message(["model", "row", "mode"], header, model))
+        self.result = self.models, to_message(["model", "row", "mode"], header, model)
+        self.models.publish(self.result[1])
 
 
-def failure(header):
+def failure(header, retry):
     reason = "the exploratory episode was not completed"
     ids = {"run": int(header[0]), "episode": int(header[1])}
-    return json.dumps({**ids, "retry": True, "reason": reason})
+    return json.dumps({**ids, "retry": retry, "reason": reason})
 
 
 if __name__ == "__main__":

@@ -142,6 +142,16 @@ def test_the_documents_table_is_that_of_the_specs():
     assert documented == {}
 
 
+def test_the_documents_code_prints_the_table(capsys):
+    text = (Path(__file__).parent.parent / "docs" / "interfaces.md").read_text()
+    (block,) = re.findall(
+        r"^```python\n(from loop_interfaces.*?)^```", text, re.MULTILINE | re.DOTALL
+    )
+    exec(block, {})
+    rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()]
+    assert [row[0] for row in rows] == [spec.name for spec in table()]
+
+
 def test_a_text_is_parsed_as_its_parameter_asks():
     assert SPECS["horizon"].parse("20") == 20
     assert SPECS["sample_time"].parse("1e-3") == 1e-3
