@@ -44,11 +44,15 @@ DRAWN = 5
 
 @dataclass(frozen=True)
 class Finding:
-    """What one check found: whether it is good, and one or more sentences."""
+    """What one check found: whether it is good, and one or more sentences.
+
+    note: it is for its reader to judge.
+    """
 
     name: str
     good: bool
     text: str
+    note: bool = False
 
 
 def check(values: Mapping[str, Any]) -> Iterator[Finding]:

@@ -146,6 +146,7 @@ def test_new_overwrites_nothing(
         (["burgers", "--n-a", "2"], "--n-a: only for the check of a node"),
         (["burgers", "--patience", "10"], "--patience: only for the check of a node"),
         (["burgers", "--network"], "--network: only for the check of a node"),
+        (["plant", "--n-z", "8"], "--n-z: only for the check of a node (controller)"),
         (["tuner", "--equation", "burgers"], "--equation: only for the check of a problem's FILE"),
         (["plant", "--picture", "x.png"], "--picture: only for the check of a problem's FILE"),
     ],
@@ -161,6 +162,27 @@ def test_an_option_of_the_other_check_is_refused(
         .err.splitlines()[-1]
         .startswith(f"pdeloop check: error: leave out {wrong}")
     )
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--n-a", "-3"],
+        ["--n-a", "1000000000000"],
+        ["--n-a", "2.5"],
+        ["--patience", "inf"],
+        ["--patience", "nan"],
+        ["--limit", "0"],
+    ],
+)
+def test_a_number_out_of_its_range_is_refused(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["check", "plant", *words])
+    assert ended.value.code == 2
+    told = capsys.readouterr().err
+    assert f"{words[0]}: expected a " in told and told.endswith(f", got {words[1]}\n")
 
 
 def test_a_picture_that_cannot_be_written_is_refused_before_the_check(

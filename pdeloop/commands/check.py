@@ -4,15 +4,24 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from dataclasses import asdict
+from math import nan
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pdeloop.commands.common import Commands, add_equation, add_json, allow_equation, command
 from pdeloop.output import print_json
 
+if TYPE_CHECKING:
+    from pdeloop.problem_check import Finding
+
 ROLES = ("plant", "controller", "tuner")
-OF_A_NODE = {"n_a": 1, "patience": 10.0, "network": False}
-"""The options that only the check of a node has, and their defaults."""
+OF_A_NODE = {
+    **dict.fromkeys(("n_a", "patience", "limit", "namespace", "network"), ROLES),
+    "n_z": ("controller",),
+}
+"""The options that only the check of a node has, and of which."""
 OF_A_FILE = ("equation", "picture")
 
 
@@ -35,11 +44,14 @@ def add(commands: Commands) -> None:
         metavar="FILE",
         help="a problem's YAML file, or a shipped name; or plant, controller, tuner",
     )
-    check.add_argument("--n-a", type=int, metavar="N", help="actuators of the node [1]")
-    check.add_argument("--patience", type=float, metavar="S", help="seconds that it may take [10]")
-    check.add_argument(
-        "--network", action="store_true", default=None, help="also a node on another machine"
-    )
+    whole, real = _number(int, 1, 65536), _number(float, 0.1, 86400.0)
+    add_option = check.add_argument_group("of a node").add_argument
+    add_option("--n-a", type=_number(int, 1, 1024), metavar="N", help="its actuators [1]")
+    add_option("--n-z", type=whole, metavar="N", help="a controller's state [64, and its order]")
+    add_option("--patience", type=real, metavar="S", help="seconds that an answer may take [10]")
+    add_option("--limit", type=real, metavar="S", help="seconds that the check may take [600]")
+    add_option("--namespace", metavar="NS", help="where its topics are")
+    add_option("--network", action="store_true", default=None, help="it may run on another machine")
     add_equation(check)
     check.add_argument(
         "--picture",
@@ -54,14 +66,16 @@ def _check(options: argparse.Namespace) -> int:
     of_a_node = options.problem in ROLES
     given = {name: getattr(options, name) for name in (*OF_A_NODE, *OF_A_FILE)}
     given = {name: value for name, value in given.items() if value is not None}
-    if wrong := [name for name in given if (name in OF_A_NODE) != of_a_node]:
-        flags = ", ".join(f"--{name.replace('_', '-')}" for name in wrong)
-        what = "a problem's FILE" if of_a_node else f"a node ({', '.join(ROLES)})"
-        options.refuse(f"leave out {flags}: only for the check of {what}")
+    for name in given:
+        takers = OF_A_NODE.get(name)
+        if options.problem in takers if takers else not of_a_node:
+            continue
+        what = "a problem's FILE" if takers is None else f"a node ({', '.join(takers)})"
+        options.refuse(f"leave out --{name.replace('_', '-')}: only for the check of {what}")
     if of_a_node:
         from pdeloop.conformance.node import check_node
 
-        found = check_node(options.problem, **{**OF_A_NODE, **given})
+        found = check_node(options.problem, **given)
     else:
         from pdeloop.problem_check import check, draw
         from pdeloop.training_run import resolve
@@ -74,9 +88,31 @@ def _check(options: argparse.Namespace) -> int:
     for finding in found:
         findings.append(finding)
         if not options.json:
-            print(f"{'ok ' if finding.good else 'BAD'}  {finding.name}: {finding.text}", flush=True)
+            print(f"{_mark(finding):4} {finding.name}: {finding.text}", flush=True)
     if options.json:
         print_json([asdict(finding) for finding in findings])
     elif options.picture is not None:
         print(f"picture in {options.picture}")
     return 0 if all(finding.good for finding in findings) else 1
+
+
+def _mark(finding: Finding) -> str:
+    if not finding.good:
+        return "BAD"
+    return "note" if finding.note else "ok"
+
+
+def _number(kind: type[int] | type[float], least: float, most: float) -> Callable[[str], float]:
+    """What reads a number in a range, for argparse."""
+
+    def read(text: str) -> float:
+        try:
+            number = kind(text)
+        except ValueError:
+            number = nan
+        if not least <= number <= most:
+            what = "a whole number" if kind is int else "a number"
+            raise argparse.ArgumentTypeError(f"expected {what} from {least} to {most}, got {text}")
+        return number
+
+    return read

@@ -1,80 +1,114 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The loop's topics for the checks of pdeloop.conformance.checks."""
+"""The loop's topics for the checks of pdeloop.conformance."""
 
 from __future__ import annotations
 
 import secrets
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
+from typing import Any
 
-import rclpy
+from rclpy.duration import Duration
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from std_msgs.msg import Float64MultiArray
+from rclpy.publisher import Publisher
+from std_msgs.msg import Float64MultiArray, String
 
-from loop_interfaces.frames import MAX_ID, ArrayCodec, Frame
+from loop_interfaces.frames import MAX_ID, ArrayCodec
 from loop_interfaces.isolation import keep_on_this_machine
-from loop_interfaces.ros.endpoints import Sender, reader_qos
+from loop_interfaces.protocol import ModelFailure
+from loop_interfaces.ros.endpoints import Sender, reader_qos, scoped, writer_qos
 from loop_interfaces.ros.node_main import ros_node
 from loop_interfaces.topics import ARRAYS, Topic
-from pdeloop.conformance.checks import CHECKS
+from pdeloop.conformance.controller import ControllerCheck
+from pdeloop.conformance.plant import PlantCheck
+from pdeloop.conformance.probing import FAILED, Check, Message
+from pdeloop.conformance.tuner import TunerCheck
+from pdeloop.interruption import Interruption
 from pdeloop.problem_check import Finding
 
-KEPT = 1000
-"""Messages that wait to be looked at."""
+CHECKS: dict[str, type[Check]] = {
+    "plant": PlantCheck,
+    "controller": ControllerCheck,
+    "tuner": TunerCheck,
+}
+KEPT = 200
+"""Frames that wait to be looked at."""
+WAIT = 0.1
+"""Seconds of one wait at most: a wait does not end by a signal."""
 
 
 class RosWire:
-    """The topics of the present ROS domain; `published` are those of the checked node."""
+    """The topics of a namespace in this ROS domain; `published` are those of the checked node."""
 
-    def __init__(self, published: tuple[Topic, ...], node: Node) -> None:
-        self._node, self._stopped = node, False
-        self._inbox: deque[tuple[Topic, Frame]] = deque(maxlen=KEPT)
-        self.heard, self.refused = False, ""
-        """Whether any message came; what was wrong with the last one that was refused."""
-        self._senders = {t.name: Sender(node, t) for t in ARRAYS if t not in published}
-        for topic in published:
-            take = partial(self._take, topic, ArrayCodec(topic.labels))
-            node.create_subscription(
-                Float64MultiArray, topic.name, take, reader_qos(topic), raw=True
-            )
+    def __init__(self, published: tuple[Topic, ...], namespace: str, node: Node) -> None:
+        self._stopped, self.heard, self.refused = "", False, ""
+        self._inbox: deque[tuple[Topic, Message]] = deque(maxlen=KEPT)
+        self._executor = SingleThreadedExecutor(context=node.context)
+        self._executor.add_node(node)
+        self._send: dict[Topic, Callable[[Any], None]] = {}
+        self._publishers: list[Publisher] = []
+        for topic in ARRAYS:
+            if topic in published:
+                take = partial(self._take, topic, ArrayCodec(topic.labels).decode)
+                name, qos = scoped(namespace, topic.name), reader_qos(topic)
+                node.create_subscription(Float64MultiArray, name, take, qos, raw=True)
+            else:
+                sender = Sender(node, topic, namespace)
+                self._send[topic] = sender.send
+                self._publishers.append(sender.publisher)
+        failed = scoped(namespace, FAILED.name)
+        if FAILED in published:
+            take = partial(self._take, FAILED, lambda message: ModelFailure.from_json(message.data))
+            node.create_subscription(String, failed, take, reader_qos(FAILED))
+        else:
+            failures = node.create_publisher(String, failed, writer_qos(FAILED))
+            self._send[FAILED] = lambda told: failures.publish(String(data=told.to_json()))
 
-    def send(self, topic: Topic, frame: Frame) -> None:
-        self._senders[topic.name].send(frame)
+    def now(self) -> float:
+        return time.monotonic()
 
-    def next(self, *topics: Topic, seconds: float) -> tuple[Topic, Frame] | None:
-        end = time.monotonic() + seconds
+    def send(self, topic: Topic, message: Message) -> None:
+        self._send[topic](message)
+
+    def next(self, *topics: Topic, seconds: float) -> tuple[Topic, Message] | None:
+        end = self.now() + seconds
         while True:
+            if self._stopped:
+                raise Interruption(self._stopped)
             for found in self._inbox:
                 if found[0] in topics:
                     self._inbox.remove(found)
                     return found
-            if self._stopped:
-                raise KeyboardInterrupt
-            if (left := end - time.monotonic()) <= 0.0:
+            left = end - self.now()
+            if left < 0.0:
                 return None
-            rclpy.spin_once(self._node, timeout_sec=left)
+            self._executor.spin_once(timeout_sec=min(left, WAIT))
+
+    def settle(self) -> None:
+        for publisher in self._publishers:
+            publisher.wait_for_all_acked(Duration(seconds=1))
 
     def stop(self, reason: str) -> None:
         """End the check; called by a signal."""
-        self._stopped = True
+        self._stopped = reason
 
-    def _take(self, topic: Topic, codec: ArrayCodec, raw: bytes) -> None:
+    def _take(self, topic: Topic, decode: Callable[[Any], Message], raw: Any) -> None:
         self.heard = True
         try:
-            self._inbox.append((topic, codec.decode(raw)))
+            self._inbox.append((topic, decode(raw)))
         except ValueError as error:
-            self.refused = f"{topic.name}: {error}"
+            self.refused = f"`{topic.name}`: {error}"
 
 
-def check_node(kind: str, *, n_a: int, patience: float, network: bool) -> Iterator[Finding]:
-    """What is found of the plant, controller or tuner in this ROS domain."""
+def check_node(
+    kind: str, *, namespace: str = "", network: bool = False, **options: Any
+) -> Iterator[Finding]:
+    """What is found of the plant, controller or tuner in this ROS domain. options: see Check."""
     if not network:
         keep_on_this_machine()
-    check = CHECKS[kind]
-    with ros_node("pdeloop_check", [], partial(RosWire, check.published)) as (_, wire):
-        run = 1 + secrets.randbelow(MAX_ID - 2)
-        yield from check(wire, n_a, patience=patience, run=run).all()
-        if wire.heard:
-            yield Finding("messages", not wire.refused, wire.refused or "all of them well formed")
+    make = CHECKS[kind]
+    with ros_node("pdeloop_check", [], partial(RosWire, make.published, namespace)) as (_, wire):
+        yield from make(wire, run=1 + secrets.randbelow(MAX_ID - 1000), **options).findings()
