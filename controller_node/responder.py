@@ -185,7 +185,7 @@ class Responder:
             self.counters["starts of an earlier episode"] += 1
             return []
         if known is None or frame.episode > known.episode:
-            run.start, run.answering = replace(frame, values=rows.copy()), None
+            run.start = replace(frame, values=rows.copy())
             explores = rows[0, StartColumn.EXCITATION] >= 0
             run.exploration = Exploration(run.start, self._settings) if explores else None
             self.failure = ""

@@ -138,10 +138,10 @@ class Lockstep:
     def awaiting(self) -> Frame | None:
         """The state that was sent, if its action will advance the plant at once.
 
-        None at the end of an episode, and while the plant is paused or kept to the wall clock.
+        None while the plant is paused or kept to the wall clock.
         """
         waits = self._phase is Phase.AWAITING and not self.paused and not self.pacer
-        return self.last_state if waits and self.step < self.plant.horizon else None
+        return self.last_state if waits else None
 
     @property
     def stale(self) -> int:
