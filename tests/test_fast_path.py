@@ -19,9 +19,9 @@ from controller_node.responder import Responder
 from loop_interfaces import model_rows
 from loop_interfaces.frames import HEADER, ArrayCodec, Frame, FrameError
 from loop_interfaces.signature import signature
-from loop_interfaces.topics import ACTION, COMPLETED, COST, STATE, VOID, CostColumn
+from loop_interfaces.topics import ACTION, COMPLETED, COST, STATE, VOID
 from pde_sim_node.fast_path import PlantFastPath
-from tests.test_lockstep import PLANT, RUN, plant_protocol
+from tests.test_lockstep import PLANT, RUN, is_void, plant_protocol
 
 N_Z, N_S, N_A = 37, 5, 3
 RNG = np.random.default_rng(0)
@@ -198,6 +198,11 @@ def test_a_responder_knows_what_was_answered_and_what_it_was_told_since_counts()
         assert all(answer(controller.state(4, step)) for step in range(1, 8))
         assert (controller.responder.answered, controller.responder.step) == (1, 0)
     assert (controller.responder.answered, controller.responder.step) == (8, 7)
+    # A state of another episode that waits is dropped with the next answer.
+    assert controller.responder.state(controller.own.decode(controller.state(5, 0))) == []
+    assert fast(controller.path, raw := controller.state(4, 8)) is None
+    assert controller.ordinary(raw) == controller.expected(raw)
+    assert controller.responder.waits_for() == []
     # A state that waits for its policy has to be answered first, and new policies taken.
     controller.begin(5)
     controller.ordinary(controller.state(5, 0))
@@ -222,7 +227,7 @@ def test_a_responder_knows_what_was_answered_and_what_it_was_told_since_counts()
     controller.responder.start(Frame(RUN, 9, 0, 0.0, rows))
     controller.ordinary(controller.state(9, 0))
     assert fast(controller.path, controller.state(9, 1)) is None
-    assert controller.responder.answered == 15
+    assert controller.responder.answered == 16
 
 
 class NoSamples:
@@ -393,7 +398,7 @@ def test_the_fast_path_of_a_plant_ends_where_its_log_does() -> None:
     assert plant.lockstep.step == 6
 
 
-def test_silence_and_contradictions_are_noticed_after_the_fast_path() -> None:
+def test_silence_is_noticed_after_the_fast_path() -> None:
     plant = Plant()
     state = plant.ordinary(plant.action(plant.begin(1, (3, 4))))
     for _ in range(3):
@@ -406,10 +411,33 @@ def test_silence_and_contradictions_are_noticed_after_the_fast_path() -> None:
     (again,) = plant.lockstep.tick(plant.now + 0.11)
     assert plant.sent.encode(again.frame) == found
 
-    # The same answer again is a duplicate, another one to the same state voids the episode.
-    assert plant.lockstep.action(plant.own.decode(raw), plant.now) == []
-    other = with_number(raw, 8, -1, 0.123)
-    (cost,) = plant.lockstep.action(plant.own.decode(other), plant.now)
-    assert cost.topic is COST
-    assert (cost.frame.values[:, CostColumn.ENDED] == VOID).all()
-    assert plant.lockstep.contradiction
+
+def test_repeats_before_an_answer_on_the_fast_path_are_not_counted_for_the_next_state() -> None:
+    plant = Plant()  # which gives up after 3 repeats of one state
+    state = plant.ordinary(plant.action(plant.begin(1, (3, 4))))
+    for _ in range(2):
+        for _ in range(3):
+            plant.now += 0.11
+            (again,) = plant.lockstep.tick(plant.now)
+            assert again.topic is STATE
+        found = fast(plant.path, plant.action(state), plant.now)
+        assert found is not None
+        state = ArrayCodec(STATE.labels).decode(found)
+
+
+@pytest.mark.parametrize("contradicted", [0, 1, 2])
+def test_every_action_of_the_fast_path_can_be_contradicted(contradicted: int) -> None:
+    plant = Plant()
+    state = plant.ordinary(plant.action(plant.begin(1, (3, 4))))
+    taken = []
+    with armed(plant.path) as answer:
+        for _ in range(3):
+            taken.append(plant.action(state))
+            found = answer(taken[-1])
+            assert found is not None
+            state = ArrayCodec(STATE.labels).decode(found)
+    for raw in taken:
+        assert plant.lockstep.action(plant.own.decode(raw), 0.0) == []  # the same again
+    other = with_number(taken[contradicted], 8, -1, 0.123)
+    assert is_void(*plant.lockstep.action(plant.own.decode(other), 0.0))
+    assert f"for step {contradicted + 1} of episode 1" in plant.lockstep.contradiction

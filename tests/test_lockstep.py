@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from loop_interfaces.frames import Frame, FrameError
+from loop_interfaces.protocol import Publication
 from loop_interfaces.topics import COMPLETED, COST, PAUSED, STATE, VOID, CostColumn
 from pde_sim_node.build import build_plant
 from pde_sim_node.lockstep import Lockstep, Timing
 from pde_sim_node.run_record import RunRecord, forget
+from pde_sim_node.taken_actions import REMEMBERED
 from tests.small import parameters
 
 RUN = 11
@@ -44,6 +46,10 @@ def answer(state: Frame, scale: float = 0.1) -> Frame:
 def kept(frame: Frame) -> Frame:
     """The frame for later: the plant writes its next state into the same memory."""
     return replace(frame, values=frame.values.copy())
+
+
+def is_void(send: Publication) -> bool:
+    return send.topic is COST and bool((send.frame.values[:, CostColumn.ENDED] == VOID).all())
 
 
 def run_episode(protocol: Lockstep, episode: int, now: float = 0.0, disturb=None) -> list[Frame]:
@@ -118,6 +124,15 @@ def test_two_different_actions_for_one_state_void_the_episode():
     again = run_episode(protocol, 2)
     assert again[-1].values.tobytes() == quiet[-1].values.tobytes()
     assert protocol.contradiction == ""
+
+
+def test_a_void_episode_is_not_declared_void_again_by_what_comes_later():
+    protocol = plant_protocol()
+    (send,) = protocol.start(start(1), 0.0)
+    first = kept(send.frame)
+    protocol.action(answer(first), 0.0)
+    assert is_void(*protocol.action(answer(first, scale=0.2), 0.0))
+    assert protocol.action(answer(first, scale=0.3), 0.0) == []
 
 
 def test_silence_repeats_the_state_and_then_voids_the_episode():
@@ -256,6 +271,14 @@ def test_a_plant_that_was_paused_is_paused_when_it_is_started_again(tmp_path, pa
     forget(7, records)
     assert not RunRecord("/pair/plant", 7, records).paused
     assert RunRecord("/pair/plant", 8, records).paused
+
+
+def test_what_is_recorded_of_a_plant_is_what_was_kept_last(tmp_path):
+    record = RunRecord("/plant", 7, tmp_path)
+    for paused, signed in ((False, 5), (True, 5), (False, 5), (False, 6), (True, 6), (True, 9)):
+        record.keep(paused, signed)
+        again = RunRecord("/plant", 7, tmp_path)
+        assert (again.paused, again.signed) == (paused, signed)
 
 
 def test_a_paused_plant_says_so_once_a_second():
@@ -417,6 +440,17 @@ def test_an_action_that_contradicts_one_of_an_episode_that_ended_takes_its_cost_
     assert protocol.contradiction == ""
 
 
+def test_actions_of_the_last_16_episodes_can_be_contradicted_and_of_none_before():
+    assert REMEMBERED == 16
+    protocol = plant_protocol(horizon=3)
+    states = {episode: run_episode(protocol, episode)[0] for episode in range(1, 21)}
+    for episode in range(1, 21):
+        sent = protocol.action(answer(states[episode], scale=0.2), 1.0)
+        assert [(is_void(send), send.frame.episode) for send in sent] == (
+            [(True, episode)] if episode > 4 else []
+        )
+
+
 OTHER_STARTS = {
     "other seeds": start(1, seeds=(5, 6)),
     "another signature": replace(start(1), plant=9),
@@ -450,6 +484,7 @@ def test_a_start_that_contradicts_that_of_an_episode_that_ended_takes_its_cost_b
     assert (send.frame.run, send.frame.episode, send.frame.step) == (RUN, 1, cost.step)
     assert (send.frame.values[:, CostColumn.ENDED] == VOID).all()
     assert "two different starts came for episode 1" in protocol.contradiction
+    assert (protocol.counters["costs taken back"], protocol.counters["episodes void"]) == (1, 0)
     # Whoever asks again is told the same.
     for asked in (start(1), other):
         again = protocol.start(asked, 1.0)

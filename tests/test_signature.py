@@ -15,6 +15,7 @@ from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.model_rows import ModelRows, pack
 from loop_interfaces.signature import design_digest
 from loop_interfaces.topics import (
+    COMPLETED,
     COST,
     MODEL,
     POLICY,
@@ -26,7 +27,7 @@ from loop_interfaces.topics import (
     Topic,
 )
 from tests.small import dispatcher_of
-from tests.test_lockstep import plant_protocol
+from tests.test_lockstep import is_void, plant_protocol
 from tuner_node.batch import Batch
 from tuner_node.errors import DispatchError
 
@@ -159,11 +160,14 @@ def test_a_controller_answers_by_the_policy_and_model_that_the_start_signs(topic
 
 
 @pytest.mark.parametrize("first", [True, False], ids=["first", "later"])
-def test_a_controller_that_cannot_know_the_start_says_so_and_the_episode_is_run_again(first):
+@pytest.mark.parametrize(
+    "other", [{"values": np.repeat(ROWS, 2, axis=0)}, {"plant": 9}, {"step": 2}], ids=str
+)
+def test_a_controller_that_cannot_know_the_start_says_so_and_the_episode_is_run_again(first, other):
     loop = Loop()
     start = loop.told[START]
-    forged = replace(start, values=np.repeat(ROWS, 2, axis=0))
-    controller = loop.controller_told(start=(forged if first else start).values)
+    forged = replace(start, **other)
+    controller = Responder(DesignSettings(N_A, N_S, 1.0, 1.0))
     assert controller.start(forged if first else start) == []
     (failure,) = controller.start(start if first else forged)
     assert "two different starts came for episode" in failure.reason
@@ -175,7 +179,8 @@ def test_a_controller_that_cannot_know_the_start_says_so_and_the_episode_is_run_
 def test_a_start_of_an_earlier_episode_keeps_no_controller_from_answering():
     expected = Loop().finish()
     loop = Loop()
-    former = replace(loop.told[START], episode=loop.told[START].episode - 1)
+    start = loop.told[START]
+    former = replace(start, episode=start.episode - 1, values=start.values[::-1])
 
     def disturb() -> None:
         assert loop.controller.start(former) == []
@@ -232,6 +237,37 @@ def test_a_second_plant_or_controller_of_the_same_kind_takes_nothing_back(twin, 
             assert loop.tuner.cost(0, send.frame, 0.0) == []
 
 
+CLAIMS = {  # states answered, step of the cost, states answered after it, step of the void one: said
+    "it went further": ([0, 1, 2], 30, [], 2, True),
+    "not further than answered": ([0, 1, 2], 2, [], 1, False),
+    "given up where it was": ([0, 1, 2], 5, [], 5, False),
+    "another one answered before": ([3, 4], 30, [], 4, False),
+    "answered after it": ([0, 1, 2], 5, [3, 4, 5], 4, False),
+    "two plants, the slower one last": ([0, 1, 2, 1], 2, [], 1, False),
+}
+
+
+@pytest.mark.parametrize("answered, step, later, void, said", CLAIMS.values(), ids=CLAIMS)
+def test_an_episode_that_is_given_up_short_of_its_cost_and_of_its_states_is_told(
+    answered, step, later, void, said
+):
+    loop = Loop()
+
+    def answer(steps) -> None:
+        for k in steps:
+            (action,) = loop.controller.state(replace(loop.state, step=k))
+            assert action.topic.name == "action"
+
+    def cost(at: int, ended: float) -> list:
+        rows = np.tile([1.0, 1.0, ended], (len(ROWS), 1))
+        return loop.controller.cost(replace(loop.state, step=at, values=rows))
+
+    answer(answered)
+    assert cost(step, COMPLETED) == []
+    answer(later)
+    assert len(cost(void, VOID)) == said
+
+
 @pytest.mark.parametrize("rows", [ROWS, EXPLORING], ids=["policy", "exploration"])
 def test_once_an_action_was_signed_no_unsigned_one_is_taken_for_the_whole_run(rows):
     expected = Loop(rows).finish()
@@ -272,10 +308,10 @@ def test_a_model_of_a_controller_with_other_parameters_is_refused_also_when_it_c
     other.state(loop.state)
     (foreign,), (own,) = other.cost(cost.frame), loop.controller.cost(cost.frame)
     loop.tuner.cost(0, cost.frame, 0.0)
-    for _ in range(2):  # before its own and after it
+    for time in (own.frame.time, cost.frame.time):  # before its own and after it; not signed
         with pytest.raises(FrameError, match="with the parameters of this run's tuner"):
             loop.tuner.model(0, foreign.frame, 0.0)
-        loop.tuner.model(0, own.frame, 0.0)
+        loop.tuner.model(0, replace(own.frame, time=time), 0.0)
     result = loop.tuner.result()
     assert result is not None and np.array_equal(result.models, own.frame.values)
 
@@ -293,6 +329,32 @@ def test_a_run_with_a_controller_that_does_not_sign_is_void_as_soon_as_another_s
             loop.take(loop.tuner.cost(0, cost.frame, 0.0))
     with pytest.raises(DispatchError, match="gave up after 3 attempts"):
         loop.tuner.cost(0, cost.frame, 0.0)
+
+
+@pytest.mark.parametrize("time", ["echoes", "0"])
+def test_a_controller_that_does_not_sign_is_served_also_by_a_plant_that_is_started_again(time):
+    loop = Loop()
+    plant, sent = loop.plant, [loop.state]
+    for step in range(40):
+        action = unsigned(sent[-1]) if time == "echoes" else replace(unsigned(sent[-1]), time=0.0)
+        (send,) = plant.action(action, 0.0)
+        if send.topic is COST:
+            break
+        if step == 5:
+            plant = plant_protocol(signed_run=plant.signed_run)
+            (send,) = plant.start(loop.told[START], 0.0)
+        sent.append(send.frame)
+    assert send.topic is COST and not is_void(send)
+
+
+def test_an_action_that_is_not_signed_is_not_awaited():
+    loop = Loop()
+    (send,) = loop.act(loop.controller)
+    loop.state = send.frame
+    (signed,) = loop.controller.state(loop.state)
+    assert loop.plant.awaits(signed.frame)
+    for time in (loop.state.time, 0.0, -1.0):
+        assert not loop.plant.awaits(replace(signed.frame, time=time))
 
 
 def test_a_tuner_that_asks_for_no_signature_gets_the_time_of_the_state():
