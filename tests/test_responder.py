@@ -23,6 +23,7 @@ from tests.small import parameters, same_bits
 from tuner_node.batch import Batch
 
 RUN = 5
+COSTS = np.array([[1.0, 30.0, COMPLETED]])
 SETTINGS = DesignSettings(n_a=4, reduced_order=4, state_weight=1.0, action_weight=1.0)
 
 
@@ -64,16 +65,47 @@ def explore(responder: Responder, episode: int, excitation_seed: int = 2, lose: 
             assert same_bits(send.frame.values[0], expected)
         if k < plant().horizon:
             states = plant().step(excitation(excitation_seed, k, 4, 0.1)[np.newaxis])
-    costs = np.array([[1.0, 30.0, COMPLETED]])
-    return responder.cost(Frame(RUN, episode, plant().horizon, 1.0, costs))
+    return responder.cost(Frame(RUN, episode, plant().horizon, 1.0, COSTS))
 
 
 def test_exploration_gives_the_model_of_the_same_trajectory_in_process(responder):
     (send,) = explore(responder, 1)
     assert send.topic is MODEL_IDENTIFIED
     assert same_bits(send.frame.values, models())
-    (again,) = responder.cost(Frame(RUN, 1, 30, 1.0, np.array([[1.0, 30.0, COMPLETED]])))
+    (again,) = responder.cost(Frame(RUN, 1, 30, 1.0, COSTS))
     assert same_bits(again.frame.values, send.frame.values)
+
+
+@pytest.mark.parametrize("environment", [0, 1])
+def test_an_exploration_of_which_one_environment_is_void_gives_no_model(responder, environment):
+    responder.start(start(1, (1, 2, 0.1, 0), (3, 4, 0.1, 0)))
+    states = plant().reset(np.array([1, 3]))
+    for k in range(31):
+        (send,) = responder.state(Frame(RUN, 1, k, 0.0, states))
+        states = plant().step(send.frame.values) if k < 30 else states
+    costs = np.repeat(COSTS, 2, axis=0)
+    costs[environment, CostColumn.ENDED] = VOID
+    (failure,) = responder.cost(Frame(RUN, 1, 30, 1.0, costs))
+    assert isinstance(failure, ModelFailure) and failure.retry
+    assert failure.reason == "the exploratory episode is void"
+
+
+def test_a_state_beyond_the_last_one_does_not_count_for_one_that_was_lost(responder):
+    responder.start(start(1, (1, 2, 0.1, 0)))
+    responder.state(Frame(RUN, 1, 31, 0.0, plant().reset(np.array([1]))))
+    (failure,) = explore(responder, 1, lose=7)
+    assert isinstance(failure, ModelFailure) and failure.retry
+
+
+def test_the_actions_of_an_exploration_are_limited_as_those_of_the_law():
+    free, limited = (Responder(replace(SETTINGS, action_limit=limit)) for limit in (0.0, 0.05))
+    for made in (free, limited):
+        made.target(target())
+        made.start(start(1, (1, 2, 0.1, 0)))
+    state = Frame(RUN, 1, 0, 0.0, plant().reset(np.array([1])).copy())
+    a, b = (made.state(state)[0].frame.values for made in (free, limited))
+    assert np.abs(a).max() > 0.05
+    assert same_bits(b, np.clip(a, -0.05, 0.05))
 
 
 def test_a_lost_sample_asks_for_the_episode_again_and_the_repeat_gives_the_model(responder):
@@ -183,6 +215,20 @@ def test_the_law_is_answered_whatever_the_order_in_which_its_parts_arrive():
     assert (answers[0].values[1] == 0).all()
 
 
+def test_each_of_two_plants_is_answered_with_its_own_target(responder):
+    responder.target(Frame(0, 0, 0, 0.0, plant().target + 1.0, plant=9))
+    responder.model(Frame(RUN, 0, 0, 0.0, models()))
+    responder.policy(Frame(RUN, 4, 0, 0.0, np.full((1, 4, 8), 0.2)))
+    responder.start(start(4, (1, -1, 0, 0)))
+    states = plant().reset(np.array([1])).copy()
+    answers = [
+        [responder.state(Frame(RUN, 4, k, 0.0, states, p))[0].frame.values.copy() for p in (0, 9)]
+        for k in range(2)
+    ]
+    assert not same_bits(*answers[0])
+    assert all(same_bits(a, b) for a, b in zip(*answers, strict=True))
+
+
 def test_states_of_two_plants_are_not_mixed_into_one_model(responder):
     responder.target(Frame(0, 0, 0, 0.0, plant().target, plant=9))
     responder.start(start(1, (1, 2, 0.1, 0)))
@@ -286,8 +332,7 @@ def test_a_run_of_a_stranger_fills_no_memory(responder, monkeypatch):
         for k in range(2000):
             assert len(responder.state(Frame(run, 1, k, 0.0, states + k))) == 1
         assert sum(known.nbytes for known in responder._runs.values()) <= 100_000
-    costs = np.array([[1.0, 30.0, COMPLETED]])
-    (failure,) = responder.cost(Frame(119, 1, 1999, 1.0, costs))
+    (failure,) = responder.cost(Frame(119, 1, 1999, 1.0, COSTS))
     assert isinstance(failure, ModelFailure) and not failure.retry
     assert "more than 100000 bytes; explore fewer seeds at once" in failure.reason
     with pytest.raises(FrameError, match="expected less than 100000 bytes of all runs"):
@@ -311,7 +356,7 @@ def test_states_of_one_number_count_with_what_keeps_them(responder, monkeypatch)
     responder.start(start(1, (1, 2, 0.1, 0)))
     for k in range(400):
         responder.state(Frame(RUN, 1, k, 0.0, np.ones((1, 1))))
-    (failure,) = responder.cost(Frame(RUN, 1, 399, 1.0, np.array([[1.0, 30.0, COMPLETED]])))
+    (failure,) = responder.cost(Frame(RUN, 1, 399, 1.0, COSTS))
     assert "more than 100000 bytes" in failure.reason
 
 
@@ -343,22 +388,31 @@ def test_a_state_that_contradicts_an_exploration_takes_back_its_model_once(respo
     assert isinstance(failure, ModelFailure) and "two different states came" in failure.reason
     assert len(responder.state(last)) == 1
     assert responder.start(start(1, (1, 2, 0.1, 0))) == [failure]
+    assert responder.cost(replace(model.frame, step=30, values=COSTS)) == [failure]
 
 
-@pytest.mark.parametrize("when", ["before", "after"])
-def test_without_signatures_an_episode_with_two_different_policies_is_not_answered(responder, when):
-    responder.model(Frame(RUN, 0, 0, 0.0, models()))
-    good, forged = (Frame(RUN, 4, 0, 0.0, np.full((1, 4, 8), gain)) for gain in (0.1, 0.2))
-    state = Frame(RUN, 4, 0, 0.0, plant().reset(np.array([1])))
-    first, second = (forged, good) if when == "before" else (good, forged)
-    responder.policy(first)
-    responder.start(start(4, (1, -1, 0.0, 0)))
-    assert len(responder.policy(first)) == 0
+@pytest.mark.parametrize("what", ["policy", "model"])
+def test_without_signatures_an_episode_with_two_different_policies_or_models_is_not_answered(
+    responder, what
+):
+    told = {
+        "policy": Frame(RUN, 4, 1, 0.0, np.full((1, 4, 8), 0.1)),
+        "model": Frame(RUN, 0, 1, 0.0, models()),
+    }
+    state = Frame(RUN, 4, 0, 0.0, plant().reset(np.array([1])).copy())
+    handlers = {"policy": responder.policy, "model": responder.model}
+    begin = replace(start(4, (1, -1, 0.0, 0)), step=1)
+    for name, handle in handlers.items():
+        handle(told[name])
+    responder.start(begin)
+    assert handlers[what](told[what]) == []
     assert len(responder.state(state)) == 1
-    with pytest.raises(FrameError, match="two different policies came for episode 4"):
-        responder.policy(second)
+    with pytest.raises(FrameError, match=r"two different .* came .*; expected one tuner"):
+        handlers[what](replace(told[what], values=1.5 * told[what].values))
     assert responder.state(state) == [] and responder.answering(state) is None
     assert responder.waits_for() == ["one tuner (different policies or models came)"]
-    responder.policy(Frame(RUN, 5, 0, 0.0, good.values))
-    responder.start(start(5, (1, -1, 0.0, 0)))
-    assert len(responder.state(Frame(RUN, 5, 0, 0.0, state.values))) == 1
+    # Those of the next one are in no doubt.
+    responder.policy(replace(told["policy"], episode=5, step=2))
+    responder.model(replace(told["model"], step=2))
+    responder.start(replace(begin, episode=5, step=2))
+    assert len(responder.state(replace(state, episode=5))) == 1
