@@ -12,14 +12,15 @@ import pytest
 from loop_interfaces.episodes import episode_name
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import ModelFailure
-from loop_interfaces.topics import COMPLETED, POLICY, START, VOID
-from tests.small import dispatcher_of
+from loop_interfaces.topics import COMPLETED, MODEL, POLICY, START, VOID
+from tests.small import dispatcher_of, same_bits
 from tuner_node.batch import Batch
-from tuner_node.dispatch import MAX_TARGET_BYTES, Dispatcher
+from tuner_node.dispatch import MAX_TARGET_BYTES, MAX_TARGETS, Dispatcher
 from tuner_node.errors import DispatchError
-from tuner_node.pair import FOREIGN_PLANT_GRACE
+from tuner_node.pair import FOREIGN_PLANT_GRACE, REMEMBERED
 
 RUN = 42
+EXPLORATION = Batch(np.array([[3.0, 4.0, 0.1, 0.0]]), None)
 
 
 def dispatcher(pairs: int = 1, **settings) -> Dispatcher:
@@ -53,6 +54,10 @@ def costs_of(frame: Frame) -> Frame:
 def void_of(frame: Frame) -> Frame:
     values = np.tile([0.0, 0.0, VOID], (len(frame.values), 1))
     return Frame(frame.run, frame.episode, 3, 1.0, values)
+
+
+def model_of(frame: Frame, gain: float = 1.0, plant: int = 0) -> Frame:
+    return Frame(RUN, frame.episode, 0, 1.0, np.full((1, 9, 2), gain), plant)
 
 
 @pytest.mark.parametrize("pairs", [1, 2, 3, 5])
@@ -138,6 +143,22 @@ def test_two_different_costs_of_one_episode_end_the_run():
         served.cost(0, replace(cost, values=np.nextafter(cost.values, 9.0)), 0.0)
 
 
+def test_answers_of_the_last_16_episodes_can_be_contradicted_and_of_none_before():
+    assert REMEMBERED == 16
+    served, costs = dispatcher(), []
+    for now in range(20):
+        ((_, start),) = starts(served.assign(batch(1), float(now)))
+        costs.append(costs_of(start))
+        served.cost(0, costs[-1], float(now))
+        assert served.result() is not None
+    others = [replace(cost, values=cost.values + 1.0) for cost in costs]
+    for forgotten in others[:4]:
+        assert served.cost(0, forgotten, 20.0) == []
+    for known in others[4:]:
+        with pytest.raises(DispatchError, match=r"two different messages on episode/cost answer"):
+            served.cost(0, known, 20.0)
+
+
 def test_two_different_targets_of_the_run_s_plant_end_the_run():
     served = dispatcher(plant=5)
     target = Frame(0, 0, 0, 0.0, np.arange(3.0), 5)
@@ -166,6 +187,21 @@ def test_targets_of_ever_new_plants_fill_no_memory():
     served.cost(0, replace(costs_of(start), plant=3), 1.0)  # the run's plant is known from now on
     for plant in range(30):
         assert served.target(0, Frame(0, 0, 0, 0.0, values, plant), 2.0) == []
+
+
+def test_the_target_of_the_run_s_plant_has_room_as_soon_as_that_is_known():
+    served = dispatcher()
+    for plant in range(MAX_TARGETS):
+        served.target(0, Frame(0, 0, 0, 0.0, np.zeros(2), plant), 0.0)
+    own = Frame(0, 0, 0, 0.0, np.ones(2), 99)
+    with pytest.raises(FrameError, match="expected the targets of at most 64 plants"):
+        served.target(0, own, 0.0)
+    ((_, start),) = starts(served.assign(batch(1), 0.0))
+    served.cost(0, replace(costs_of(start), plant=99), 1.0)
+    assert served.target(0, own, 2.0) == []
+    result = served.result()
+    assert result is not None and result.target is not None
+    assert result.target.tolist() == [1.0, 1.0]
 
 
 def test_another_plant_ends_the_run_only_where_that_of_the_run_never_was():
@@ -213,8 +249,7 @@ def test_an_episode_that_fails_when_it_is_run_again_is_told_from_a_cost_that_is_
 
 def test_two_different_models_of_one_episode_end_the_run():
     served = dispatcher()
-    rows = np.array([[3.0, 4.0, 0.1, 0.0]])
-    ((_, first),) = starts(served.assign(Batch(rows, None), 0.0))
+    ((_, first),) = starts(served.assign(EXPLORATION, 0.0))
     model = Frame(RUN, first.episode, 0, 1.0, np.ones((1, 7)))
     served.model(0, model, 0.0)
     served.model(0, model, 0.0)
@@ -225,10 +260,58 @@ def test_two_different_models_of_one_episode_end_the_run():
         served.model(0, replace(model, values=2 * model.values), 0.0)
 
 
+def test_a_model_of_another_plant_is_refused_and_that_of_the_run_s_is_taken():
+    served = dispatcher(plant=5)
+    ((_, start),) = starts(served.assign(EXPLORATION, 0.0))
+    with pytest.raises(FrameError, match="expected a model of plant 5, got one of 6"):
+        served.model(0, model_of(start, plant=6), 0.0)
+    served.cost(0, replace(costs_of(start), plant=5), 0.0)
+    assert served.result() is None
+    served.model(0, model_of(start, plant=5), 0.0)
+    assert served.result() is not None
+
+
+@pytest.mark.parametrize("first", ["cost", "model"])
+def test_no_result_of_an_attempt_that_failed_is_used(first):
+    served = dispatcher()
+    ((_, start),) = starts(served.assign(EXPLORATION, 0.0))
+    if first == "cost":
+        served.cost(0, costs_of(start), 0.0)
+        failure = ModelFailure(RUN, start.episode, True, "a state was lost")
+        ((_, again),) = starts(served.failure(0, failure, 0.0))
+        served.model(0, model_of(again, 2.0), 0.0)
+    else:
+        served.model(0, model_of(start), 0.0)
+        ((_, again),) = starts(served.cost(0, void_of(start), 0.0))
+        served.cost(0, costs_of(again), 0.0)
+    assert served.result() is None
+    served.cost(0, costs_of(again), 0.0)
+    served.model(0, model_of(again, 2.0), 0.0)
+    result = served.result()
+    assert result is not None and same_bits(result.models, model_of(again, 2.0).values)
+
+
+@pytest.mark.parametrize("retry", [True, False])
+def test_a_failed_model_of_another_run_neither_ends_nor_repeats_an_episode(retry):
+    served = dispatcher()
+    ((_, start),) = starts(served.assign(EXPLORATION, 0.0))
+    assert served.failure(0, ModelFailure(RUN + 1, start.episode, retry, "no"), 0.0) == []
+    assert served.notes == [] and served.episodes() == [start.episode]
+
+
+def test_whoever_does_not_answer_is_sent_the_models_too_as_they_were_published():
+    served, models = dispatcher(), np.ones((1, 9, 2))
+    served.models(models, 1)
+    models += 1.0  # the training works on
+    served.assign(batch(1), 0.0)
+    again = [send for _, send in served.tick(3.0)]
+    assert [send.topic for send in again] == [MODEL, POLICY, START]
+    assert again[0].frame.step == 1 and same_bits(again[0].frame.values, np.ones((1, 9, 2)))
+
+
 def test_a_model_that_comes_again_and_again_is_no_answer_of_a_silent_plant():
     served = dispatcher(episode_timeout=10.0)
-    rows = np.array([[3.0, 4.0, 0.1, 0.0]])
-    ((_, first),) = starts(served.assign(Batch(rows, None), 0.0))
+    ((_, first),) = starts(served.assign(EXPLORATION, 0.0))
     for now in range(1, 10):
         served.model(0, Frame(RUN, first.episode, 0, 1.0, np.ones((1, 7))), float(now))
         assert served.notes == []
@@ -300,8 +383,7 @@ def test_the_work_of_a_pair_that_died_while_all_were_busy_goes_to_the_first_free
 
 def test_an_exploratory_episode_is_done_with_its_model_and_fails_with_its_reason():
     served = dispatcher()
-    exploratory = Batch(np.array([[1.0, 2.0, 0.1, 0.0]]), None)
-    ((_, start),) = starts(served.assign(exploratory, 0.0))
+    ((_, start),) = starts(served.assign(EXPLORATION, 0.0))
     served.cost(0, costs_of(start), 0.0)
     assert served.result() is None
     ((_, again),) = starts(
@@ -312,7 +394,7 @@ def test_an_exploratory_episode_is_done_with_its_model_and_fails_with_its_reason
     result = served.result()
     assert result is not None
     assert result.models is not None
-    ((_, last),) = starts(served.assign(exploratory, 0.0))
+    ((_, last),) = starts(served.assign(EXPLORATION, 0.0))
     with pytest.raises(DispatchError, match="no reduced model: p is too large"):
         served.failure(0, ModelFailure(RUN, last.episode, False, "p is too large"), 0.0)
     with pytest.raises(

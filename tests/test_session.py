@@ -14,6 +14,7 @@ from tests.small import dispatcher_of, parameters, same_bits, train_here
 from tuner_node import training_state
 from tuner_node.batch import Batch
 from tuner_node.build import build_training
+from tuner_node.errors import DispatchError
 from tuner_node.session import Session
 from tuner_node.training import Training
 
@@ -121,6 +122,22 @@ def test_a_session_that_was_asked_to_stop_ends_with_its_iteration_and_can_be_con
     while not again.session.done:
         again.episode()
     assert same(again.session.training, undisturbed())
+
+
+def test_a_session_that_joined_the_network_again_asks_for_what_is_under_way():
+    loop = Loop(build_training(values()))
+    start, loop.start = loop.start, None
+    assert start is not None
+    loop.take(loop.session.begin(5.0))
+    assert loop.start is not None
+    assert loop.start.episode == start.episode and same_bits(loop.start.values, start.values)
+
+
+def test_a_result_that_the_training_cannot_use_ends_it_with_its_sentence():
+    loop = Loop(build_training(values()))
+    loop.session.training.plant = 2  # the run was begun with another one
+    with pytest.raises(DispatchError, match="the plant has other parameters"):
+        loop.episode()
 
 
 def test_stopping_a_paused_session_ends_it_at_once():

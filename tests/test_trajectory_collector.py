@@ -128,6 +128,7 @@ def test_samples_of_a_wrong_shape_are_refused_and_change_nothing(shape):
     for take in (served.state, served.action):
         with pytest.raises(FrameError, match=r"expected a sample of shape \(1, 2\) for step 3"):
             take(0, forged)
+    assert not served.state(0, replace(forged, run=RUN + 1))  # of any shape
     feed(served, 0, start)
     served.cost(0, costs_of(start), 0.0)
     assert served.result() is not None
@@ -142,6 +143,19 @@ def test_a_state_of_a_wrong_size_that_came_before_the_target_is_not_taken():
     ((_, again),) = starts(served.cost(0, costs_of(start), 0.0))
     assert again.episode == start.episode + 1
     assert "two different states came for step 3" in served.notes[-1]
+
+
+def test_the_cost_of_an_attempt_whose_samples_were_lost_does_not_end_the_next_one():
+    served = dispatcher()
+    served.target(0, Frame(0, 0, 0, 0.0, np.ones(2)), 0.0)
+    ((_, start),) = starts(served.assign(observed(1), 0.0))
+    feed(served, 0, start, lose_state=7)
+    served.cost(0, costs_of(start), 0.0)
+    ((_, again),) = starts(served.tick(1.0))
+    assert starts(served.tick(1.9)) == []  # it takes longer than the last samples may
+    feed(served, 0, again)
+    served.cost(0, costs_of(again), 2.0)
+    assert served.result() is not None and len(served.notes) == 1
 
 
 @pytest.mark.parametrize("kind", ["state", "action"])
