@@ -70,6 +70,7 @@ def test_big_endian_bytes_are_read():
         (lambda m: setattr(m.layout.dim[0], "size", 2**31), "at most"),
         (lambda m: setattr(m.layout, "data_offset", 4), "data_offset"),
         (lambda m: m.data.append(1.0), "numbers"),
+        (lambda m: m.data.__setitem__(3, float("nan")), "NaN"),
         (lambda m: m.data.__setitem__(6, float("nan")), "NaN"),
         (lambda m: m.data.__setitem__(6, float("inf")), "NaN or infinity"),
         (lambda m: m.data.__setitem__(0, -1.0), "run"),
@@ -84,6 +85,20 @@ def test_what_is_not_the_interface_is_refused(change, expected):
     change(bad)
     with pytest.raises(FrameError, match=expected):
         ArrayCodec(labels).decode(serialize_message(bad))
+
+
+@pytest.mark.parametrize("known", [False, True], ids=["first", "like the one before"])
+def test_what_follows_the_numbers_is_padding_to_4_bytes_or_refused(known):
+    codec = ArrayCodec(("env", "x"))
+    raw = codec.encode(frame_of((2, 4)))
+    for more in range(12):
+        if known:
+            codec.decode(raw)
+        if more < 4:
+            assert codec.decode(raw + bytes(more)).values.shape == (2, 4)
+        else:
+            with pytest.raises(FrameError, match="got another length"):
+                codec.decode(raw + bytes(more))
 
 
 def test_messages_of_ever_other_shapes_leave_little_behind():

@@ -126,6 +126,17 @@ def test_two_different_actions_for_one_state_void_the_episode():
     assert protocol.contradiction == ""
 
 
+@pytest.mark.parametrize("environment", [0, 1])
+def test_an_action_that_differs_in_one_environment_voids_the_episode(environment):
+    protocol = plant_protocol()
+    (send,) = protocol.start(start(1), 0.0)
+    first = answer(kept(send.frame))
+    protocol.action(first, 0.0)
+    other = first.values.copy()
+    other[environment, -1] += 1e-12
+    assert is_void(*protocol.action(replace(first, values=other), 0.0))
+
+
 def test_a_void_episode_is_not_declared_void_again_by_what_comes_later():
     protocol = plant_protocol()
     (send,) = protocol.start(start(1), 0.0)

@@ -313,8 +313,12 @@ def test_a_start_may_carry_seeds_of_the_noise() -> None:
             protocol.start(start(5, wrong), 0.0)
 
 
-def test_rollouts_have_a_noise_of_their_own_and_the_evaluation_one_for_all_controllers() -> None:
-    values = parameters(measurement_noise=0.05, iterations=4, seeds=2, evaluation_fields=3)
+@pytest.mark.parametrize("kind", ["measurement_noise", "process_noise"])
+def test_rollouts_have_a_noise_of_their_own_and_the_evaluation_one_for_all_controllers(
+    kind: str,
+) -> None:
+    noise: dict[str, Any] = {kind: 0.05}
+    values = parameters(**noise, iterations=4, seeds=2, evaluation_fields=3)
     training, seen = build_training(values), []
     original = training.next_batch
 
@@ -327,8 +331,7 @@ def test_rollouts_have_a_noise_of_their_own_and_the_evaluation_one_for_all_contr
     training.next_batch = watched  # type: ignore[method-assign]
     train(training, LocalPair(values), lambda row: None)
     adapt = np.concatenate([rows for phase, rows in seen if phase != "evaluate"])
-    noise = adapt[:, StartColumn.NOISE]
-    assert len(np.unique(noise)) == len(noise)
+    assert len(np.unique(adapt[:, StartColumn.NOISE])) == len(adapt)
     (closing,) = (rows for phase, rows in seen if phase == "evaluate")
     table = closing[:, StartColumn.NOISE].reshape(2, 3, 3)
     assert (table == table[0, 0]).all() and len(np.unique(table)) == 3

@@ -13,7 +13,7 @@ from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
 from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.model_rows import ModelRows, pack
-from loop_interfaces.signature import design_digest
+from loop_interfaces.signature import DESIGN, design_digest
 from loop_interfaces.topics import (
     COMPLETED,
     COST,
@@ -314,6 +314,14 @@ def test_a_model_of_a_controller_with_other_parameters_is_refused_also_when_it_c
         loop.tuner.model(0, replace(own.frame, time=time), 0.0)
     result = loop.tuner.result()
     assert result is not None and np.array_equal(result.models, own.frame.values)
+
+
+@pytest.mark.parametrize("name", DESIGN)
+def test_a_model_that_is_identified_otherwise_has_another_signature(name):
+    known = asdict(DesignSettings(N_A, N_S, 1.0, 1.0))
+    other = "dmdc" if name == "identification" else known[name] + 1
+    assert design_digest(known | {name: other}) != design_digest(known)
+    assert {*DESIGN, "n_a", "action_limit"} == {*known}  # an action has the one, D the other
 
 
 def test_a_run_with_a_controller_that_does_not_sign_is_void_as_soon_as_another_signs():

@@ -10,7 +10,7 @@ import pytest
 
 from controller_node.order import study_orders
 from loop_interfaces.model_rows import unpack
-from loop_interfaces.topics import COMPLETED, StartColumn
+from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn
 from pdeloop.in_process import LocalPair, train
 from tests.small import parameters, same_bits, train_here
 from tuner_node import checkpoint, training_state
@@ -69,6 +69,20 @@ def test_a_bad_warm_start_is_identified_again_and_only_that_one():
     assert training.phase == "adapt"
     # Both begin with the law that was measured to be better than no control.
     assert same_bits(training.starts(), training.warm_starts())
+
+
+def test_of_a_basis_that_is_given_up_only_rollouts_without_control_are_kept():
+    values = parameters(optimizer="gauss_newton", rollouts=18, identification_attempts=2)
+    training, pair = build_training(values), LocalPair(values)
+    for _ in range(2):
+        result = pair.run(training.next_batch())
+        if training.phase == "check":
+            result.costs[1, CostColumn.MEAN] = result.costs[0, CostColumn.MEAN] + 1.0
+        training.finish(result)
+        pair.follow(training)
+    assert training.phase == "identify"
+    (kept,) = training.measured[0]
+    assert not kept.actions.any()
 
 
 def test_a_diverged_rollout_never_reaches_the_policy():
