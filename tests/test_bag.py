@@ -12,6 +12,7 @@ import struct
 import sys
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,9 +34,10 @@ from loop_interfaces.episodes import episode_name, episode_number
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.topics import ACTION, COST, START, STATE
 from pdeloop.bags.info import describe, info_text
-from pdeloop.bags.reader import Bag
+from pdeloop.bags.reader import Bag, bags_of
 from pdeloop.bags.verify import verify
 from pdeloop.identification import identify_bag
+from recorder_node import bag as bag_module
 from recorder_node.bag import BagError, definition
 from recorder_node.recording import Recording
 from recorder_node.sources import CLOCK, DIAGNOSTICS, ROSOUT, Source, sources
@@ -156,6 +158,32 @@ def test_metadata_tells_of_every_topic_what_rosbag2_tells(tmp_path):
             assert durable == (connection.topic not in ("/left/state", "/left/action", "/clock"))
     for topic, digest in hashes.items():
         assert known[topic]["type_description_hash"] == f"RIHS01_{digest}"
+
+
+def test_the_first_and_the_last_message_are_told_also_when_they_came_in_another_order(tmp_path):
+    recording = Recording(tmp_path / "bag", WHAT)
+    for when in (5, 9, 3, 7):
+        recording.take(BY_TOPIC[STATE], when * SECOND, encode(STATE, frame(when, 1, 16)))
+    recording.close()
+    text = (tmp_path / "bag" / "metadata.yaml").read_text()
+    content = yaml.safe_load(text)["rosbag2_bagfile_information"]
+    assert content["starting_time"]["nanoseconds_since_epoch"] == 3 * SECOND
+    assert content["duration"]["nanoseconds"] == 6 * SECOND
+
+
+def test_bags_and_their_files_are_read_in_the_order_of_their_numbers(tmp_path):
+    for number in (1, 2, 10):
+        name = "bag" if number == 1 else f"bag-{number}"
+        recording = Recording(tmp_path / "run" / name, WHAT)
+        recorded_episode(recording, number)
+        recording.close()
+    bags = bags_of(tmp_path / "run")
+    assert [next(iter(bag.episodes())).number for bag in bags] == [1, 2, 10]
+    (tmp_path / "split").mkdir()
+    for number, bag in zip((1, 2, 10), bags, strict=True):
+        (bag.path / "bag.mcap").rename(tmp_path / "split" / f"split_{number}.mcap")
+    when = [message.when for message in Bag(tmp_path / "split").messages()]
+    assert when == sorted(when)
 
 
 @pytest.mark.parametrize("source", [*WHAT, DIAGNOSTICS, ROSOUT], ids=lambda s: s.channel.topic)
@@ -286,6 +314,35 @@ def test_a_full_disk_stops_the_recording_and_keeps_what_was_written(tmp_path):
         episodes = [e for e in Bag(disk / "bag").episodes() if not e.missing]
         assert len(episodes) > 5
         assert len(list(Bag(disk / "bag").messages())) >= len(episodes) * 104
+
+
+def test_of_a_batch_that_the_disk_refuses_half_way_nothing_is_left(tmp_path, monkeypatch):
+    monkeypatch.setattr(bag_module, "LARGEST", 10_000)
+    recording = Recording(tmp_path / "bag", WHAT)
+    recorded_episode(recording, 7)
+    recording.flush()
+    size = (tmp_path / "bag" / "bag.mcap").stat().st_size
+    file = recording._file._file
+
+    class Full:
+        """A file on a disk that is full after half of a batch."""
+
+        room = 500
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(file, name)
+
+        def write(self, data: Any) -> int:
+            if not self.room:
+                raise OSError(28, "No space left on device")
+            written, self.room = int(file.write(data[: self.room])), 0
+            return written
+
+    monkeypatch.setattr(recording._file, "_file", Full())
+    with pytest.raises(BagError, match=r"No space left on device; recording stopped"):
+        for episode in range(8, 20):
+            recorded_episode(recording, episode, steps=30)
+    assert (tmp_path / "bag" / "bag.mcap").stat().st_size == size
 
 
 def test_what_is_no_bag_is_a_clear_error(tmp_path):
@@ -433,15 +490,34 @@ def test_a_small_file_that_becomes_gigabytes_is_refused_in_one_sentence(tmp_path
     assert int(ended.stdout) < 300
 
 
+SCHEMA = Schema(id=1, name="a/msg/B", encoding="ros2msg", data=b"")
+TOPIC = McapChannel(id=1, topic="/a", message_encoding="cdr", metadata={}, schema_id=1)
+
+
+def message_bytes(size: int) -> bytes:
+    return struct.pack("<BQHIQQ", 5, 22 + size, 1, 0, 1, 1) + bytes(size)
+
+
+@pytest.mark.parametrize("more", [-1, 0, 1, 100])
+def test_a_chunk_of_another_size_than_it_says_is_refused(tmp_path, more):
+    message = message_bytes(8)
+    made = chunk(zstandard.compress(message), len(message) + more)
+    bag = Bag(crafted(tmp_path / "bag", *map(record_bytes, (SCHEMA, TOPIC, made))))
+    if more:
+        with pytest.raises(BagError, match="it is damaged"):
+            list(bag.messages())
+    else:
+        assert [len(found.data) for found in bag.messages()] == [8]
+
+
 def test_many_chunks_are_bounded_together(tmp_path):
     size = 30 * 2**20
-    message = struct.pack("<BQHIQQ", 5, 22 + size, 1, 0, 1, 1) + bytes(size)
-    schema = record_bytes(Schema(id=1, name="a/msg/B", encoding="ros2msg", data=b""))
-    topic = McapChannel(id=1, topic="/a", message_encoding="cdr", metadata={}, schema_id=1)
+    message = message_bytes(size)
+    known = [record_bytes(SCHEMA), record_bytes(TOPIC)]
     chunks = [record_bytes(chunk(zstandard.compress(message), len(message)))]
-    bag = Bag(crafted(tmp_path / "two", schema, record_bytes(topic), *chunks * 2))
+    bag = Bag(crafted(tmp_path / "two", *known, *chunks * 2))
     assert [len(found.data) for found in bag.messages()] == [size, size]
-    bag = Bag(crafted(tmp_path / "twenty", schema, record_bytes(topic), *chunks * 20))
+    bag = Bag(crafted(tmp_path / "twenty", *known, *chunks * 20))
     with pytest.raises(BagError, match=r"decompresses to more than 100 times its size"):
         list(bag.messages())
 

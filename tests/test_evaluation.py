@@ -43,6 +43,26 @@ def test_a_run_says_who_controlled_and_evaluates_to_its_own_costs(finished, caps
     assert costs == result["costs_by_field"]
 
 
+def test_a_noisy_run_evaluates_to_its_own_costs(tmp_path, capsys):
+    noise = "    measurement_noise: 0.05\n    process_noise: 0.02\n"
+    (tmp_path / "noisy.yaml").write_text(SMALL.read_text() + noise)
+    words = ["--in-process", "--rollouts", "13", "--out", str(tmp_path / "run")]
+    assert main(["train", str(tmp_path / "noisy.yaml"), *words]) == 0
+    capsys.readouterr()
+    assert main(["evaluate", str(tmp_path / "run"), "--json"]) == 0
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert json.loads(capsys.readouterr().out) == result["costs_by_field"]
+
+
+def test_the_mean_field_is_one_whatever_the_seed(finished, capsys):
+    found = []
+    for seed in ("1", "2"):
+        assert main(["evaluate", str(finished), "--mean-field", "--seed", seed, "--json"]) == 0
+        found.append(json.loads(capsys.readouterr().out))
+    assert found[0] == found[1]
+    assert {len(fields) for seeds in found[0].values() for fields in seeds} == {1}
+
+
 def test_a_policy_that_is_no_better_than_no_control_is_told_with_its_seed():
     costs = {
         "none": np.array([[4.0, 5.0], [4.0, 5.0]]),

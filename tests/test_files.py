@@ -11,6 +11,7 @@ import re
 import shutil
 import zipfile
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,9 +25,11 @@ from pdeloop import domain, live
 from pdeloop.cli import FAILED, main
 from pdeloop.report.data import gather
 from pdeloop.training_run import unused
-from tests.small import SMALL
+from tests.small import SMALL, parameters
 from tuner_node import checkpoint, training_state
+from tuner_node.build import build_training
 from tuner_node.run_folder import RunFolder, RunFolderError
+from tuner_node.run_store import open_run
 
 by_both = pytest.mark.parametrize("finished", ["two_point", "gauss_newton"], indirect=True)
 
@@ -380,3 +383,39 @@ def test_a_part_that_a_crash_left_is_replaced(tmp_path):
     write_atomically(tmp_path / "file", b"new ", b"content")
     assert (tmp_path / "file").read_bytes() == b"new content"
     assert not (tmp_path / "file.part").exists()
+
+
+def test_every_start_of_a_tuner_has_a_number_of_its_own_and_the_folder_to_itself(tmp_path):
+    """Also one that is started by hand: `pdeloop train` locks the folder itself."""
+    values = parameters(out=str(tmp_path / "run"), resume=False)
+    for incarnation in (1, 2, 3):
+        with ExitStack() as locks, ExitStack() as others:
+            _, identity = open_run(values, build_training(values), locks, print)
+            assert identity.incarnation == incarnation
+            values["resume"] = True
+            with pytest.raises(RunFolderError, match="another process works on the run"):
+                open_run(values, build_training(values), others, print)
+
+
+def test_a_checkpoint_that_could_not_be_written_is_written_when_it_can(tmp_path, monkeypatch):
+    values, told = parameters(out=str(tmp_path / "run"), resume=False), []
+    with ExitStack() as locks:
+        writer, _ = open_run(values, build_training(values), locks, told.append)
+        assert writer is not None
+        writer.note({"event": "phase"})
+        with monkeypatch.context() as full:
+            full.setattr(
+                checkpoint, "write_part", lambda path, *content: os.open(path, os.O_RDONLY)
+            )
+            writer.keep(now=0.0, force=True)
+        assert "cannot write the checkpoint" in told[-1]
+        assert not (tmp_path / "run" / "checkpoint").exists()
+        writer.keep(now=1e6)  # nothing has happened since
+        assert (tmp_path / "run" / "checkpoint").exists()
+
+
+def test_a_line_after_one_that_a_full_disk_cut_off_is_whole(tmp_path):
+    path = tmp_path / "progress.jsonl"
+    path.write_bytes(b'{"event": "a"}\n{"event": "cut')
+    RunFolder(tmp_path).note({"event": "b"})
+    assert path.read_bytes() == b'{"event": "a"}\n{"event": "cut\n{"event": "b"}\n'
