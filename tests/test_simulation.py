@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from controller_node.responder import Responder
 from pde_sim_node.taken_actions import Episode, TakenActions
 from tests.simulation.audit import audit, shrunk, verdict
 from tests.simulation.disk import Disk
@@ -45,6 +46,15 @@ def test_the_auditor_finds_a_plant_that_takes_any_action_and_the_smallest_plan(
     monkeypatch.setattr(Episode, "contradicted_by", lambda self, action: False)
     assert verdict(bad)[1] in ("AssertionError: another policy", "AssertionError: other costs")
     assert shrunk(bad) == replace(bad, duplicates=0.0, faults=(rival,))
+
+
+def test_the_auditor_finds_a_controller_that_compares_no_cost_with_what_it_has_answered(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    bad = Plan(1, faults=(Fault(0.065, "early cost"),))
+    assert verdict(bad)[0] == "error"
+    monkeypatch.setattr(Responder, "_compare_claims", lambda self, cost: [])
+    assert verdict(bad)[1] == "AssertionError: another policy"
 
 
 @pytest.mark.parametrize("power", [False, True])

@@ -15,6 +15,7 @@ from typing import Any
 from loop_interfaces.episodes import EPISODES_PER_START
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.protocol import ModelFailure, Publication
+from loop_interfaces.signature import digest_of
 from loop_interfaces.topics import (
     ACTION,
     COST,
@@ -27,6 +28,7 @@ from loop_interfaces.topics import (
     TARGET,
     VOID,
     CostColumn,
+    StartColumn,
     Topic,
 )
 from tests.simulation.disk import Disk
@@ -92,6 +94,10 @@ class History:
         """Plants that the loop's own controller has answered."""
         self._taken_back: set[tuple[int, int]] = set()
         """Pairs and episodes whose cost is void, which the tuner that began them has not heard."""
+        self._early: list[int] = []
+        """Episodes of the first pair of which a cost was forged before their end."""
+        self._begun = 0
+        """The last episode that its tuner began there."""
         self._answers_forged = False
         """Whether what a controller sends now answers a forged state."""
         self._cut: set[tuple[str, str]] = set()
@@ -123,8 +129,12 @@ class History:
     def unopposed(self) -> bool:
         """Whether a forged message, or the answer to a forged state, came to a process that the
         true one with its header never reached, or contradicted too late for the run.
+
+        A cost in the middle of an episode plant and controller contradict together, once the tuner has
+        begun a later one, if both are there all the time and heard.
         """
-        return bool(self._taken_back) or not self._forgeries <= self._heard
+        early = [number for number in self._early if self.plan.hides or number == self._begun]
+        return bool(self._taken_back or early) or not self._forgeries <= self._heard
 
     def send(self, writer: Process, sent: Publication | ModelFailure, pair: int) -> None:
         """Bring a message to who reads its topic in the namespace of a pair, as the network at that
@@ -138,6 +148,8 @@ class History:
         raw = self._codecs[topic].encode(sent.frame)
         if topic.latched:
             self._latched[writer.name, pair, topic] = raw
+        if topic is START and writer.name == "tuner" and not pair:
+            self._begun = max(self._begun, sent.frame.episode)
         if topic is COST and _is_void(sent.frame):
             self._taken_back.add((pair, sent.frame.episode))
         self._sent.append((topic, raw, pair))
@@ -332,6 +344,12 @@ class History:
             self._at(end, lambda: self._call("tuner", "resume", until_done=True))
         elif kind == "stop tuner":
             self._call("tuner", "stop")
+        elif kind == "early cost":
+            self._forge_cost()
+        elif kind == "episode ahead":
+            self._call("tuner", "pause")
+            self._at(self.time + duration * self.rng.random(), self._forge_episode)
+            self._at(end, lambda: self._call("tuner", "resume", until_done=True))
         elif kind == "replay" and self._sent:
             topic, raw, pair = self.rng.choice(self._sent)
             for process in self._reading(topic, pair):
@@ -349,6 +367,50 @@ class History:
             disk = Disk(random.Random(self.plan.seed + 3))
             self._join(TunerProcess(self, "rival tuner", disk, run=RUN + 1))
             self._at(end, lambda: self._end("rival tuner"))
+
+    def _forge_cost(self) -> None:
+        """Say in the middle of an episode that it is completed, to all readers at the same time."""
+        plant = self._processes.get("plant")
+        if not isinstance(plant, PlantProcess):
+            return
+        lockstep, horizon = plant.lockstep, plant.lockstep.plant.horizon
+        state = lockstep.last_state
+        if state is None or not 0 < lockstep.step < horizon:
+            return
+        rows = lockstep.plant.episode_costs().rows()
+        raw = self._codecs[COST].encode(replace(state, step=horizon, values=rows))
+        self._early.append(state.episode)
+
+        def arrive() -> None:
+            for process in self._reading(COST, 0):
+                frame = self._codecs[COST].decode(raw)
+                self._handing(process, partial(process.take, COST, frame, 0))
+
+        self._later(arrive)
+
+    def _forge_episode(self) -> None:
+        """Begin the episode after the tuner's last one, with other rows, another policy and its D."""
+        latched = {
+            topic: self._codecs[topic].decode(raw)
+            for (writer, pair, topic), raw in self._latched.items()
+            if (writer, pair) == ("tuner", 0)
+        }
+        start = latched.get(START)
+        if start is None or not len(start.values):
+            return
+        rows, sent = start.values.copy(), []
+        rows[:, StartColumn.SEED] += 1
+        signed: list[Any] = [rows, self.values["action_limit"]]
+        if POLICY in latched and rows[0, StartColumn.EXCITATION] < 0:
+            values = 1.5 * latched[POLICY].values
+            signed += [values, digest_of(latched[MODEL].values)]
+            sent.append(
+                (POLICY, replace(latched[POLICY], episode=start.episode + 1, values=values))
+            )
+        forged = replace(start, episode=start.episode + 1, values=rows, plant=digest_of(*signed))
+        for topic, frame in (*sent, (START, forged)):
+            for process in self._reading(topic, 0):
+                self._carry("", process, topic, self._codecs[topic].encode(frame), 0)
 
     def _call(self, name: str, how: str, until_done: bool = False) -> None:
         """An operator's call of a service."""

@@ -22,6 +22,8 @@ KINDS = {
     "replay": 6,  # a message from before is delivered again
     "second controller": 14,  # that was told something else, or answers anything and does not sign
     "second tuner": 5,  # of a training of its own, on the same plant and controller
+    "early cost": 6,  # a completed one in the middle of an episode, with the ids and the plant's time
+    "episode ahead": 6,  # policy and start of the next one, signed, from somebody else
     "forgery": 8,  # beside each message on a topic comes one with the same header and other values
 }
 """Faults, and how often each is drawn."""
@@ -30,8 +32,10 @@ FORGED = (
     *("model/identified", "samples"),
 )
 """Topics on which messages are forged."""
-HOSTILE = ("second controller", "second tuner", "forgery")
+HOSTILE = ("second controller", "second tuner", "early cost", "episode ahead", "forgery")
 """Faults after which a training may also end with an error that names the cause."""
+HIDING = ("crash", "power cut", "bit rot", "cut", "stop tuner", "second controller")
+"""Faults by which plant, controller or tuner may miss what contradicts a cost that came too early."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +71,10 @@ class Plan:
     @property
     def hostile(self) -> bool:
         return self.damage > 0.0 or any(fault.kind in HOSTILE for fault in self.faults)
+
+    @property
+    def hides(self) -> bool:
+        return self.damage > 0.0 or any(fault.kind in HIDING for fault in self.faults)
 
     @property
     def names(self) -> tuple[str, ...]:
