@@ -11,13 +11,14 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from loop_interfaces.isolation import loopback_environment
 from loop_interfaces.problem import find_problem
 from pdeloop.domain import own_domain
-from pdeloop.supervisor import die_with_parent, node_command
+from pdeloop.supervisor import die_with, node_command
 
 ANSWER = 300.0
 """Longest silence of a process that was asked something, in s."""
@@ -123,7 +124,7 @@ class Bench:
                 text=True,
                 env=environment or self.environment,
                 process_group=0,  # Ctrl-C in the terminal reaches the measuring program only
-                preexec_fn=die_with_parent,
+                preexec_fn=partial(die_with, os.getpid()),
             )
         self._started.append(process)
         return BenchProcess(process, log)

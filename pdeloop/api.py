@@ -26,7 +26,7 @@ from pdeloop.finished_run import FinishedRun, load_run
 from pdeloop.in_process import LocalPair
 from pdeloop.interruption import Interruption
 from pdeloop.pairs import Transport
-from pdeloop.training_run import begin, carry_out
+from pdeloop.training_run import begin, carry_out, resuming
 from tuner_node.build import build_training
 
 __all__ = ["Problem", "identify", "problem", "train"]
@@ -259,9 +259,7 @@ def train(
         try:
             carry_out(folder, values, Transport(not over_topics), display, lambda: None)
         except Interruption as reason:
-            raise RuntimeError(
-                f"stopped by {reason}; continue with: pdeloop train --resume {folder}"
-            ) from None
+            raise RuntimeError(f"stopped by {reason}; continue with: {resuming(folder)}") from None
         finally:
             display.close()
         return load_run(folder)

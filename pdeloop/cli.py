@@ -7,41 +7,29 @@ Exit codes: docs/command-line.md.
 from __future__ import annotations
 
 import argparse
-import contextlib
 import importlib
 import os
 import sys
 import traceback
 from collections.abc import Callable, Sequence
 
+from loop_interfaces.start import STOPPED_BY_SIGNAL, begin, what_to_install
 from pdeloop.interruption import Interruption
+from pdeloop.output import complain, drop_unwritable
 
-DONE, FAILED, CRASHED, INTERRUPTED, NOBODY_READS = 0, 1, 70, 130, 141
+DONE, FAILED, CRASHED, INTERRUPTED, NOBODY_READS = 0, 1, 70, STOPPED_BY_SIGNAL, 141
 """Exit codes; 2, a command that is not understood, is argparse's."""
 COMMANDS = (
     *("train", "evaluate", "identify", "bag", "monitor", "reproduce"),
     *("report", "study", "problems", "new", "check"),
 )
 """The modules of `pdeloop.commands`, in the order of the help."""
-_EXTRAS = {
-    "rosbags": "record",
-    "mcap": "record",
-    "matplotlib": "report",
-    "jinja2": "report",
-    "aiohttp": "monitor",
-    "gymnasium": "gym",
-    "distributed": "cluster",
-    "cmaes": "bench",
-    "osqp": "bench",
-}
-"""Modules that only some commands need, and the extra that installs them."""
-_ROS = ("rclpy", "rcl_interfaces", "rosgraph_msgs", "rosidl_runtime_py", "builtin_interfaces")
-_MESSAGES = ("_msgs", "_srvs")
-"""Names and endings of the modules of ROS 2."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Console script `pdeloop`."""
+    if arguments is None:  # the process is this command's own
+        begin("pdeloop")
     if "_ARGCOMPLETE" in os.environ:  # called by a shell, to complete a line
         import argcomplete
 
@@ -53,6 +41,15 @@ def run(
     make_parser: Callable[[], argparse.ArgumentParser], arguments: Sequence[str] | None = None
 ) -> int:
     """Exit code of the command in `arguments`. Every error a user can cause is one line on stderr."""
+    try:
+        return _run(make_parser, arguments)
+    finally:
+        drop_unwritable()
+
+
+def _run(
+    make_parser: Callable[[], argparse.ArgumentParser], arguments: Sequence[str] | None
+) -> int:
     try:
         parser = make_parser()
         options, unknown = parser.parse_known_args(arguments)
@@ -67,22 +64,15 @@ def run(
         # and controller's refusals.
         return _failed(str(error))
     except ModuleNotFoundError as error:
-        module = (error.name or "").split(".")[0]
-        if module in _ROS or module.endswith(_MESSAGES):
-            return _failed(
-                f"needs {module}: source an installed ROS 2 Jazzy, or pip install 'pdeloop[ros]'"
-            )
-        extra = _EXTRAS.get(module)
-        if extra is None:
-            return _crashed()
-        return _failed(f"needs {module}: pip install 'pdeloop[{extra}]'")
+        needed = what_to_install(error)
+        return _crashed() if needed is None else _failed(needed)
     except (KeyboardInterrupt, Interruption) as reason:
-        print(f"pdeloop: stopped by {str(reason) or 'SIGINT'}", file=sys.stderr)
+        complain(f"stopped by {str(reason) or 'SIGINT'}")
         return INTERRUPTED
     except BrokenPipeError:
-        with contextlib.suppress(OSError, ValueError):  # or the interpreter would try it again
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return NOBODY_READS
+    except MemoryError as error:
+        return _failed(f"not enough memory ({error}): take a smaller problem, or fewer at once")
     except OSError as error:
         where = f" ({error.filename})" if error.filename else ""
         return _failed(f"{error.strerror or error}{where}")
@@ -91,7 +81,7 @@ def run(
 
 
 def _failed(text: str) -> int:
-    print(f"pdeloop: {text}", file=sys.stderr)
+    complain(text)
     return FAILED
 
 

@@ -12,6 +12,7 @@ from typing import Any, TextIO
 
 from rich.console import Console
 
+from pdeloop.output import complain, drop_unwritable
 from pdeloop.progress import Progress
 from tuner_node.narration import Narration
 
@@ -19,11 +20,33 @@ _MOST_AT_ONCE = 4_000_000
 """Bytes of progress.jsonl that are read in one go."""
 
 
+class StreamConsole(Console):
+    """Lines and a bar on a stream, for work that goes on where that cannot be written any more."""
+
+    def __init__(self, stream: TextIO) -> None:
+        super().__init__(file=stream, highlight=False, soft_wrap=True)
+
+    def on_broken_pipe(self) -> None:
+        """Of a reader who has left. It ends the command: rich would do so with 1."""
+        raise BrokenPipeError
+
+    def print(self, *objects: Any, **how: Any) -> None:
+        """What is not written (a full disk) is lost, and so are the lines after it."""
+        try:
+            super().print(*objects, **how)
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            complain(f"no more lines can be written ({error.strerror}); the work goes on")
+            self.quiet = True
+            drop_unwritable()
+
+
 class Display:
     """Shows a training of `seeds` seeds from `seed` on, row by row."""
 
     def __init__(self, seed: int, seeds: int, stream: TextIO | None = None) -> None:
-        self._console = Console(file=stream or sys.stdout, highlight=False, soft_wrap=True)
+        self._console = StreamConsole(stream or sys.stdout)
         self._narration = Narration(seed, seeds)
         self._progress: Progress | None = None
 

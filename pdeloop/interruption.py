@@ -1,12 +1,14 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The end of a command by a signal, or by an operator's request."""
+"""The end of work that can be continued: by a signal, an operator's request, a reader who leaves."""
 
 from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from types import FrameType
+
+from loop_interfaces.start import on_signals
+from pdeloop.output import complain
 
 
 class Interruption(BaseException):
@@ -14,32 +16,33 @@ class Interruption(BaseException):
 
 
 @contextmanager
-def interruptible(continue_with: str) -> Iterator[Callable[[], None]]:
+def interruptible(continue_with: str, *, at_once: bool = True) -> Iterator[Callable[[], None]]:
     """SIGINT, SIGTERM and SIGHUP raise Interruption within the block, once.
 
     Yields a function to be called now and then, which raises it, too: an exception that comes in the
-    middle of a finalizer or a callback of some library is lost. What leaves the block says which
-    command continues the work.
+    middle of a finalizer or a callback of some library is lost. at_once: without it only that function
+    raises it, so that nothing else is left half done. What leaves the block says which command
+    continues the work.
     """
     caught: list[str] = []
 
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        if not caught:  # the way out is not interrupted again
-            caught.append(signal.Signals(number).name)
-            raise Interruption(caught[0])
+    def interrupt(name: str) -> None:
+        caught.append(name)
+        if at_once and len(caught) == 1:  # the way out is not interrupted again
+            check()
 
     def check() -> None:
         if caught:
             raise Interruption(caught[0])
 
-    numbers = [signal.SIGINT, signal.SIGTERM]
-    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # as nohup leaves it
-        numbers.append(signal.SIGHUP)
-    known = {n: signal.signal(n, interrupt) for n in numbers}
+    known = on_signals(interrupt)
     try:
         yield check
     except Interruption as reason:
         raise Interruption(f"{reason}; continue with: {continue_with}") from None
+    except BrokenPipeError:
+        complain(f"nobody reads the output; continue with: {continue_with}")
+        raise
     finally:
-        for number, handler in known.items():
-            signal.signal(number, handler)
+        for number, handler in known.items():  # nor is the rest of the way
+            signal.signal(number, signal.SIG_IGN if caught else handler)

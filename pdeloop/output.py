@@ -1,10 +1,13 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Data on stdout for scripts, and tables for people."""
+"""Data on stdout for scripts, tables for people, lines on stderr."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
+import os
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,6 +15,24 @@ from typing import Any
 def print_json(value: Any) -> None:
     """One line of JSON. A number that JSON has no word for is null."""
     print(json.dumps(_strict(value), allow_nan=False))
+
+
+def complain(text: str) -> None:
+    """One line on stderr, where it can be written."""
+    with contextlib.suppress(OSError):
+        print(f"pdeloop: {text}", file=sys.stderr)
+
+
+def drop_unwritable() -> None:
+    """Let stdout and stderr lead to /dev/null where they cannot be written (a full disk, no reader).
+
+    What waits in them would be tried again with all that follows, at last by the interpreter.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def aligned(rows: Sequence[Sequence[str]], names: int = 1) -> list[str]:

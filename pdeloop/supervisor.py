@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from loop_interfaces.files import open_own
@@ -155,7 +156,7 @@ class Supervisor:
                 stderr=subprocess.STDOUT,
                 env=self._environment,
                 start_new_session=True,  # Ctrl-C in the terminal reaches the supervisor only
-                preexec_fn=die_with_parent,
+                preexec_fn=partial(die_with, os.getpid()),
             )
         keep_on(child.process.pid, child.cores)
         child.started, child.due = now, None
@@ -188,7 +189,7 @@ def node_command(name: str, *ros_arguments: str) -> list[str]:
     """The command that runs a node with this interpreter."""
     # The log is the child's output: a second one by rcl's logging library would only repeat it.
     own = ("--ros-args", "--disable-external-lib-logs")
-    return [sys.executable, "-m", f"{name}.node", *own, *ros_arguments]
+    return [sys.executable, "-m", "loop_interfaces.start", name, *own, *ros_arguments]
 
 
 def keep_on(process: int, cores: Sequence[int]) -> None:
@@ -208,6 +209,8 @@ _LIBC = ctypes.CDLL(None, use_errno=True)
 _PR_SET_PDEATHSIG = 1
 
 
-def die_with_parent() -> None:
-    """For `preexec_fn`: the child is killed when the process that started it ends."""
+def die_with(parent: int) -> None:
+    """For `preexec_fn`: the child is killed when the process `parent`, which started it, ends."""
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:  # it ended before that
+        os._exit(1)

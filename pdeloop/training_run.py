@@ -6,6 +6,7 @@ from __future__ import annotations
 import importlib.util
 import itertools
 import os
+import shlex
 import sys
 import threading
 import time
@@ -95,10 +96,15 @@ def run(folder: Path, values: dict[str, Any], transport: Transport, as_json: boo
     stream = sys.stderr if as_json else sys.stdout
     display = Display(values["seed"], values["seeds"], stream)
     started = time.monotonic()
-    again = f"pdeloop train --resume {folder}" + " --in-process" * transport.in_process
     try:
-        with interruptible(again) as check:
+        # Over topics every node that was started must be known, and every bag finished.
+        with interruptible(
+            resuming(folder, in_process=transport.in_process), at_once=transport.in_process
+        ) as check:
             carry_out(folder, values, transport, display, check)
+    except Interruption:
+        if not (folder / "result.json").exists():  # which is written last
+            raise
     finally:
         display.close()
     summary = RunFolder(folder).result()
@@ -111,6 +117,11 @@ def run(folder: Path, values: dict[str, Any], transport: Transport, as_json: boo
     for text in narration.warnings(summary):
         display.warn(text)
     return int(narration.failed(summary))
+
+
+def resuming(folder: Path, *, in_process: bool = False) -> str:
+    """The command that continues the training in `folder`, to be typed."""
+    return f"pdeloop train --resume {shlex.quote(str(folder))}" + " --in-process" * in_process
 
 
 def carry_out(
@@ -147,7 +158,7 @@ def _train_here(
         except OSError as error:
             raise RunFolderError(
                 f"cannot write the results to {folder}: {error.strerror}; make room and "
-                f"continue with: pdeloop train --resume {folder} --in-process"
+                f"continue with: {resuming(folder, in_process=True)}"
             ) from error
 
 
@@ -157,7 +168,7 @@ def _train_over_topics(
     if importlib.util.find_spec("rclpy") is None:
         raise NodeError(
             "needs rclpy: source an installed ROS 2 Jazzy, or pip install 'pdeloop[ros]', or train "
-            f"without ROS: pdeloop train --resume {folder} --in-process"
+            f"without ROS: {resuming(folder, in_process=True)}"
         )
     logs = folder / "logs"
     make_own_folder(logs)

@@ -6,18 +6,20 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import os
 import shutil
 import signal
 import subprocess
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import aiohttp
 import pytest
 
-from pdeloop.supervisor import die_with_parent
+from pdeloop.supervisor import die_with
 
 COMMAND = [
     "chromium",
@@ -165,7 +167,7 @@ def browser(folder: Path) -> Iterator[Browser]:
             stdout=log,
             stderr=log,
             start_new_session=True,
-            preexec_fn=die_with_parent,
+            preexec_fn=partial(die_with, os.getpid()),
         )
     port_file = profile / "DevToolsActivePort"
     try:

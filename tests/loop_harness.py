@@ -214,7 +214,7 @@ class Processes:
         for pid in self.left_behind():
             with contextlib.suppress(OSError):
                 words = Path(f"/proc/{pid}/cmdline").read_bytes().decode().split("\0")
-                if f"{node}.node" in words:
+                if node in words:
                     found.append(pid)
         return found
 

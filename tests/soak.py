@@ -206,7 +206,7 @@ class _Training:
                 if mark not in (entry / "environ").read_bytes():
                     continue
                 command = (entry / "cmdline").read_bytes().decode(errors="replace")
-                found += [(int(entry.name), n) for n in NODES if f"{n}.node" in command]
+                found += [(int(entry.name), n) for n in NODES if f"{n}\0" in command]
         return sorted(found)
 
     def _end_of(self, supervisor: subprocess.Popen[bytes], *, kill: bool = False) -> None:

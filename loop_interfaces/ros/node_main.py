@@ -3,11 +3,9 @@
 
 import contextlib
 import os
-import signal
 import sys
 import traceback
 from collections.abc import Callable, Iterator
-from types import FrameType
 from typing import Any, Protocol
 
 import rclpy
@@ -18,6 +16,7 @@ from rclpy.utilities import remove_ros_args, try_shutdown
 from loop_interfaces.isolation import PROFILE, check_profile, is_confined, outside_sockets
 from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.parameters import take_over
+from loop_interfaces.start import on_signals
 
 CRASHED = 70
 """Exit code after a bug; 1 means that the node was asked for something it cannot do."""
@@ -35,6 +34,15 @@ def ros_node(
 
     make_loop: NodeLoop for a node of the loop, Observer for one that observes it.
     """
+    signals: list[str] = []
+    loop: Any = None
+
+    def stop(name: str) -> None:
+        signals.append(name)
+        if loop is not None:
+            loop.stop(name)
+
+    on_signals(stop)
     try:
         check_profile()
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
@@ -52,15 +60,8 @@ def ros_node(
                 f"{', '.join(outside)}); expected the loopback interface only, or PDELOOP_NETWORK=1"
             )
         loop = make_loop(node)
-
-        def stop(number: int, frame: FrameType | None) -> None:
-            loop.stop(signal.Signals(number).name)
-
-        numbers = [signal.SIGINT, signal.SIGTERM]
-        if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # as nohup leaves it
-            numbers.append(signal.SIGHUP)
-        for number in numbers:
-            signal.signal(number, stop)
+        for name_of_signal in signals:  # before there was a loop
+            loop.stop(name_of_signal)
         yield node, loop
     finally:
         if node is not None:

@@ -6,6 +6,8 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
+import shlex
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -72,9 +74,8 @@ def carry_out(
     name: of the command; study_in: the study for a folder; remarks: lines that follow the table,
     from its rows.
     """
-    from rich.console import Console
-
     from loop_interfaces.files import write_atomically
+    from pdeloop.display import StreamConsole
     from pdeloop.interruption import interruptible
     from pdeloop.progress import Progress
     from pdeloop.study.executors import cluster, processes
@@ -90,7 +91,7 @@ def carry_out(
         )
     folder: Path = options.out or Path("runs") / f"{name}-{timestamp()}"
     study = study_in(folder)
-    console = Console(stderr=options.json, highlight=False, soft_wrap=True)
+    console = StreamConsole(sys.stderr if options.json else sys.stdout)
     progress = Progress(console, name, "trainings")
     executor = (
         partial(cluster, options.scheduler)
@@ -98,7 +99,7 @@ def carry_out(
         else partial(processes, options.processes)
     )
     try:
-        with interruptible(f"pdeloop {name} --out {folder}"):
+        with interruptible(shlex.join(["pdeloop", name, "--out", str(folder)])):
             failures = run(
                 study,
                 folder,

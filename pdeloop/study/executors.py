@@ -6,6 +6,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import multiprocessing
+import os
 import signal
 import warnings
 from collections.abc import Iterator, Mapping
@@ -16,7 +17,7 @@ from typing import Any
 from loop_interfaces.affinity import usable_cores
 from pde_sim_node.solver.workers import use_cores
 from pdeloop.study.description import StudyError
-from pdeloop.supervisor import die_with_parent
+from pdeloop.supervisor import die_with
 
 CONNECTING = 10.0
 """Seconds in which a scheduler has to answer."""
@@ -32,7 +33,8 @@ def processes(count: int | None = None) -> Iterator[Executor]:
     """
     context = multiprocessing.get_context("spawn")
     others = {process.pid for process in multiprocessing.active_children()}
-    with ProcessPoolExecutor(count or len(usable_cores()), context, _begin) as pool:
+    workers = count or len(usable_cores())
+    with ProcessPoolExecutor(workers, context, _begin, (os.getpid(),)) as pool:
         try:
             yield pool
         except BaseException:
@@ -43,11 +45,11 @@ def processes(count: int | None = None) -> Iterator[Executor]:
             raise
 
 
-def _begin() -> None:
+def _begin(parent: int) -> None:
     """In a process that is about to train. Ctrl-C is for its parent, which then ends it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    die_with_parent()
+    die_with(parent)
     use_cores(usable_cores()[:1])  # the others have trainings of their own
 
 

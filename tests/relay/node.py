@@ -116,6 +116,10 @@ class RelayNode:
         return 0
 
 
-if __name__ == "__main__":
+def main() -> int:
     keep_on_this_machine()
-    sys.exit(node_main("relay_node", None, RelayNode, Observer))
+    return node_main("relay_node", None, RelayNode, Observer)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

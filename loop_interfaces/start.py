@@ -1,0 +1,109 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The start of a process: its standard streams, its signals, what is not installed. It imports little.
+
+The console scripts of the nodes are here; `python -m loop_interfaces.start NODE` does the same.
+"""
+
+import importlib
+import os
+import signal
+import sys
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+STOPPED_BY_SIGNAL = 130
+"""Exit code."""
+_EXTRAS = {
+    "rosbags": "record",
+    "mcap": "record",
+    "matplotlib": "report",
+    "jinja2": "report",
+    "aiohttp": "monitor",
+    "gymnasium": "gym",
+    "distributed": "cluster",
+    "cmaes": "bench",
+    "osqp": "bench",
+}
+"""Modules that only some commands and nodes need, and the extra that installs them."""
+_ROS = ("rclpy", "rcl_interfaces", "rosgraph_msgs", "rosidl_runtime_py", "builtin_interfaces")
+_MESSAGES = ("_msgs", "_srvs")
+"""Names and endings of the modules of ROS 2."""
+
+
+def begin(program: str) -> None:
+    """The first thing of a process. Until it has handlers of its own, a signal ends it, with one line.
+
+    Most of a start is imports, and an exception within those of compiled code is lost, or becomes
+    another: so none is raised.
+    """
+    _open_streams()
+
+    def end(name: str) -> None:
+        try:
+            os.write(2, f"{program}: stopped by {name}\n".encode())
+        finally:
+            os._exit(STOPPED_BY_SIGNAL)
+
+    on_signals(end)
+
+
+def _open_streams() -> None:
+    """Let each standard stream that is closed (`>&-`) lead to /dev/null.
+
+    Otherwise the next file or socket that is opened would take its number, and what is printed.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            descriptor = os.open(os.devnull, os.O_RDWR)
+            os.set_inheritable(descriptor, True)
+            setattr(sys, name, os.fdopen(descriptor, mode))
+
+
+def on_signals(handler: Callable[[str], None]) -> dict[signal.Signals, Any]:
+    """Let SIGINT, SIGTERM and SIGHUP (a closed terminal) call `handler` with their name.
+
+    Returns the handlers of before.
+    """
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # as nohup leaves it
+        numbers.append(signal.SIGHUP)
+
+    def handle(number: int, frame: object) -> None:
+        handler(signal.Signals(number).name)
+
+    return {number: signal.signal(number, handle) for number in numbers}
+
+
+def what_to_install(error: ModuleNotFoundError) -> str | None:
+    """Which module is not there, and how to install it; None for one that nothing here installs."""
+    module = (error.name or "").split(".")[0]
+    if module in _ROS or module.endswith(_MESSAGES):
+        return f"needs {module}: source an installed ROS 2 Jazzy, or pip install 'pdeloop[ros]'"
+    extra = _EXTRAS.get(module)
+    return extra and f"needs {module}: pip install 'pdeloop[{extra}]'"
+
+
+def run(node: str) -> int:
+    """The `main` of a node, in whose package it is `node.main`."""
+    begin(node)
+    try:
+        module = importlib.import_module(f"{node}.node")
+    except ModuleNotFoundError as error:
+        if (needed := what_to_install(error)) is None:
+            raise
+        print(f"{node}: {needed}", file=sys.stderr)
+        return 1
+    code: int = module.main()
+    return code
+
+
+pde_sim_node = partial(run, "pde_sim_node")
+controller_node = partial(run, "controller_node")
+tuner_node = partial(run, "tuner_node")
+recorder_node = partial(run, "recorder_node")
+viewer_node = partial(run, "viewer_node")
+
+if __name__ == "__main__":
+    del sys.argv[0]  # so that the node's name stands there
+    sys.exit(run(sys.argv[0]))
