@@ -36,6 +36,7 @@ from loop_interfaces.topics import ACTION, COST, START, STATE
 from pdeloop.bags.info import describe, info_text
 from pdeloop.bags.reader import Bag, bags_of
 from pdeloop.bags.verify import verify
+from pdeloop.cli import main
 from pdeloop.identification import identify_bag
 from recorder_node import bag as bag_module
 from recorder_node.bag import BagError, definition
@@ -587,6 +588,17 @@ def test_a_bag_of_the_version_before_is_read_verified_and_identified_from(tmp_pa
         recorded, again = map(float, re.findall(r"re(?:corded|computed) (\S+?)(?:,|$)", text))
         assert again == pytest.approx(recorded, rel=1e-6), text
     assert identify_bag(OLD, {}).steps > 0
+
+
+def test_what_was_compared_is_numbers_and_nothing_compared_is_nothing_verified(tmp_path, capsys):
+    main(["bag", "verify", str(OLD), "--json"])
+    assert json.loads(capsys.readouterr().out)["compared"]["costs"] == 1 + 8 + 2 * 2 + 3
+    without = Path(shutil.copytree(OLD, tmp_path / "bag"))
+    (without / "parameters.json").unlink()
+    assert main(["bag", "verify", str(without)]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("pdeloop: nothing was recomputed")
+    assert "its parameters are not in the bag" in line
 
 
 def test_a_bag_is_written_without_ros(tmp_path):

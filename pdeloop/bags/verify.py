@@ -8,7 +8,6 @@ run again, too: every recorded policy, with its models, must be one that it asks
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -42,11 +41,15 @@ class Report:
 
     bag: str
     episodes: int = 0
-    compared: Counter[str] = field(default_factory=Counter)
+    compared: dict[str, int] = field(default_factory=dict)
     differences: list[str] = field(default_factory=list)
     count: int = 0
     incomplete: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+
+    def count_compared(self, what: str, number: int) -> None:
+        """Note that so many of something were compared."""
+        self.compared[what] = self.compared.get(what, 0) + number
 
     def differs(self, text: str) -> None:
         """Note a difference."""
@@ -56,7 +59,7 @@ class Report:
 
     def compare(self, what: str, where: str, recorded: Array, again: Array) -> bool:
         """Count a comparison of two arrays and note the first entry that differs."""
-        self.compared[what] += len(recorded)
+        self.count_compared(what, len(recorded))
         if recorded.shape != again.shape:
             self.differs(f"{where}: recorded shape {recorded.shape}, recomputed {again.shape}")
             return False
@@ -182,7 +185,8 @@ class _Run:
         while unseen and (batch := training.next_batch()) is not None:
             for key in _keys(batch.rows, batch.policies, training.generation):
                 found = len(unseen.pop(key, ()))
-                self._report.compared["policies"] += found * (not batch.exploratory)
+                if not batch.exploratory:
+                    self._report.count_compared("policies", found)
             if batch.policies is not None and (
                 known := self._models.pop(training.generation, None)
             ):

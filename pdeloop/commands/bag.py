@@ -7,6 +7,7 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
+from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import Commands, add_equation, add_json, allow_equation, command
 from pdeloop.output import print_json
 
@@ -36,7 +37,7 @@ def add(commands: Commands) -> None:
         _bag_verify,
         help="recompute states, actions, costs, models and policies",
         description="Recompute states, actions, costs, models and policies, and compare them to "
-        "the bit. Exit code 1 if anything differs.",
+        "the bit. Exit code 1 if anything differs, or nothing can be recomputed.",
         example="pdeloop bag verify runs/burgers-20260101-120000-1",
     )
     info.add_argument("bag", type=Path, metavar="BAG", help="folder of a bag or of a run")
@@ -75,4 +76,7 @@ def _bag_verify(options: argparse.Namespace) -> int:
         print_json(asdict(report))
     else:
         print(report.text())
+    if not report.compared:
+        why = "; ".join(report.notes) or "no episode is complete"
+        raise ParameterError(f"nothing was recomputed, so nothing is verified: {why}")
     return 1 if report.count else 0
