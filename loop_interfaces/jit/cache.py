@@ -2,18 +2,23 @@
 """How functions are compiled, and when a compiled one on disk is out of date.
 
 Numba keeps compiled functions beside the source (or in the user's cache folder where that cannot be
-written) and takes them for current while the file that holds the function is unchanged. What the
-function calls from other files does not count. So the name of what is kept on disk here, which is also
-that of its file, has a `fingerprint` of all the sources it is made of.
+written; `kept_on_disk` knows a third) and takes them for current while the file that holds the function
+is unchanged. What the function calls from other files does not count. So the name of what is kept on
+disk here, which is also that of its file, has a `fingerprint` of all the sources it is made of.
 """
 
 import hashlib
 import inspect
+import os
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any, TypeVar
 
 import numba
+
+from loop_interfaces.files import private_folder
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -36,11 +41,23 @@ def named_by_sources(function: F, *sources: ModuleType | Callable[..., Any]) -> 
     return function
 
 
+def kept_on_disk(compile_with_cache: Callable[[], Any]) -> Any:
+    """What Numba compiles and keeps, in a private temporary folder where it knows no other."""
+    try:
+        return compile_with_cache()
+    except RuntimeError:  # neither the sources' folder nor the user's cache folder can be written
+        folder = Path(tempfile.gettempdir()) / f"pdeloop-compiled-{os.getuid()}"
+        private_folder(folder)
+        numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
+        return compile_with_cache()
+
+
 def cached_njit(*sources: ModuleType | Callable[..., Any]) -> Callable[[F], F]:
     """Compile, keep on disk, and run without the interpreter's lock; sources: what it calls."""
 
     def compiled(function: F) -> F:
-        made: F = numba.njit(named_by_sources(function, *sources), cache=True, nogil=True)
+        named = named_by_sources(function, *sources)
+        made: F = kept_on_disk(lambda: numba.njit(named, cache=True, nogil=True))
         return made
 
     return compiled

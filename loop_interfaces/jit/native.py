@@ -14,7 +14,7 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 
-from loop_interfaces.jit.cache import jit, named_by_sources
+from loop_interfaces.jit.cache import jit, kept_on_disk, named_by_sources
 from loop_interfaces.jit.simd import intrinsic, read_word
 
 CLOCK = np.dtype(
@@ -87,7 +87,8 @@ class MachineCode:
         """Its address."""
         if self._code is None:
             function = named_by_sources(self._function, *self._sources)
-            self._code = numba.cfunc(self._signature, cache=True)(function)
+            compiled = numba.cfunc(self._signature, cache=True)
+            self._code = kept_on_disk(lambda: compiled(function))
         address: int = self._code.address
         return address
 
