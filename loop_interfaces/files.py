@@ -26,7 +26,12 @@ def write_atomically(path: Path, *content: bytes | memoryview) -> None:
     The content is on the disk before the name points to it, and the name before this returns. After
     an OSError, of a full disk or no permission, the old or the new file is there.
     """
-    write_part(path, *content).replace(path)
+    part = write_part(path, *content)
+    try:
+        part.replace(path)
+    except OSError:  # a folder is there
+        part.unlink()
+        raise
     sync_folder(path.parent)
 
 

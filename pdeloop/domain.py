@@ -7,6 +7,7 @@ import contextlib
 import fcntl
 import os
 import random
+import re
 import socket
 import tempfile
 from collections.abc import Iterator
@@ -32,7 +33,7 @@ def given_domain() -> int | None:
     chosen = os.environ.get("ROS_DOMAIN_ID")
     if not chosen:
         return None
-    if not chosen.isdigit() or int(chosen) > 232:
+    if not re.fullmatch("[0-9]+", chosen) or int(chosen) > 232:
         raise DomainError(f"ROS_DOMAIN_ID is {chosen!r}; expected a whole number from 0 to 232")
     return int(chosen)
 

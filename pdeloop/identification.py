@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,10 +23,10 @@ from loop_interfaces.model_rows import ModelRows, pack
 from loop_interfaces.parameters import as_recorded, model_order, table
 from loop_interfaces.spec import ParameterError
 from loop_interfaces.topics import COMPLETED, CostColumn
-from pdeloop.bags.episodes import RecordedEpisode
-from pdeloop.bags.reader import Bag
 from pdeloop.data_file import read_measurements
-from recorder_node.bag import BagError
+
+if TYPE_CHECKING:
+    from pdeloop.bags.episodes import RecordedEpisode
 
 Trajectories = Sequence[tuple[Array, Array]]
 
@@ -116,6 +116,9 @@ def identify_bag(
     replace those of the recorded run, which replace the defaults; episode, environment: only this
     one; otherwise the exploratory episodes, or all if there are none.
     """
+    from pdeloop.bags.reader import Bag  # here, as it needs the extra `record`
+    from recorder_node.bag import BagError
+
     bag = Bag(path)
     chosen = [e for e in bag.episodes() if episode in (None, e.number) and _usable(e)]
     if any(e.exploratory for e in chosen):
@@ -147,7 +150,7 @@ def _identified(
     given: Mapping[str, Any],
 ) -> Identified:
     if given.get("reduced_order", 0) > target.size:
-        raise BagError(
+        raise ParameterError(
             f"expected an order of at most {target.size}, the numbers of a state, got "
             f"{given['reduced_order']}"
         )
@@ -160,7 +163,7 @@ def _identified(
     defaults = {spec.name: spec.default for spec in table()} | {"reduced_order": 0}
     order = model_order({**defaults, **values}) or (study and study.suggested)
     if not order:
-        raise BagError(f"no order can be suggested: {none}; or give one with --order")
+        raise ParameterError(f"no order can be suggested: {none}; or give one with --order")
     own = {"n_a": trajectories[0][1].shape[1], "reduced_order": order, "dmdc_order": order}
     settings = DesignSettings.of({**defaults, **values, **own})
     if given.get("dmdc_rank") and settings.identification != "dmdc":
@@ -182,7 +185,7 @@ def save(found: Identified, path: Path) -> None:
     try:
         write_atomically(path, content.getvalue())
     except OSError as error:
-        raise BagError(f"cannot write {path}: {error.strerror}") from error
+        raise ParameterError(f"cannot write {path}: {error.strerror}") from error
 
 
 def _usable(episode: RecordedEpisode) -> bool:

@@ -247,4 +247,5 @@ def draw(values: Mapping[str, Any], path: Path) -> None:
     ax.set_xlabel("x (m)")
     known = figure.axes[plant.equation.actuated].get_legend_handles_labels()
     figure.legend(*known, loc="outside upper center", ncols=3, frameon=False)
-    figure.savefig(path, dpi=150)
+    # Without a format a folder would become the name of a file beside it.
+    figure.savefig(path, dpi=150, format=path.suffix[1:] or "png")

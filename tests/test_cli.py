@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pdeloop.cli import main
+from pdeloop.domain import DomainError, given_domain
 from tests.small import SMALL, parameters, same_bits, train_here
 from tuner_node import checkpoint
 from tuner_node.run_folder import RunFolder
@@ -210,6 +212,51 @@ def test_a_checkpoint_of_another_run_is_not_taken(tmp_path, capsys):
     text = capsys.readouterr().out
     assert text.count("belongs to another run; beginning again from the start") == 2
     assert (tmp_path / "b" / "policy.npz").read_bytes() == policy
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["train", "burgers", "--out", ""], "argument --out: it is empty; expected a path"),
+        (["report", "run", "--out", ""], "argument --out: it is empty"),
+        (["check", "burgers", "--picture", ""], "argument --picture: it is empty"),
+        (["train", "burgers", "--out", os.fsdecode(b"a\xff")], "'a\\udcff' is no UTF-8"),
+    ],
+)
+def test_what_is_no_path_is_not_understood(capsys, words, said):
+    with pytest.raises(SystemExit) as usage:
+        main(words)
+    assert usage.value.code == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_domain_is_written_in_ordinary_digits(monkeypatch):
+    monkeypatch.setenv("ROS_DOMAIN_ID", "²")
+    with pytest.raises(DomainError, match="expected a whole number from 0 to 232"):
+        given_domain()
+
+
+def test_an_equation_that_is_not_the_runs_is_refused(tmp_path, capsys):
+    out = tmp_path / "run"
+    assert train(out) == 0
+    capsys.readouterr()
+    for command in (["evaluate", str(out)], ["report", str(out)]):
+        assert "--equation is kdv, and that of the run is burgers" in error_of(
+            capsys, *command, "--equation", "kdv"
+        )
+    assert not (out / "report").exists()
+    assert main(["evaluate", str(out), "--equation", "burgers"]) == 0
+    (out / "result.json").unlink()
+    words = ("train", "--resume", str(out), "--in-process", "--equation", "kdv")
+    assert "--equation is kdv" in error_of(capsys, *words)
+
+
+def test_a_folder_in_the_place_of_a_file_is_left_as_it_was(tmp_path, capsys):
+    (tmp_path / "there").mkdir()
+    path, data = str(tmp_path / "there"), "examples/measurements.csv"
+    assert "Is a directory" in error_of(capsys, "identify", "--data", data, "--out", path)
+    assert "Is a directory" in error_of(capsys, "check", str(SMALL), "--picture", path)
+    assert list(tmp_path.rglob("*")) == [tmp_path / "there"]
 
 
 def test_a_folder_that_another_process_works_on_is_left_alone(tmp_path, capsys):

@@ -471,6 +471,7 @@ for words in (["monitor"], ["report", run], ["bag", "info", run],
     with contextlib.redirect_stderr(said):
         code = main(words)
     print("@", code, " ".join(words[:2]), "|", said.getvalue().replace(chr(10), "|"))
+assert main(["identify", "--data", "examples/measurements.csv"]) == 0
 """
     done = python("-c", code)
     lines = [line for line in done.stdout.splitlines() if line.startswith("@")]

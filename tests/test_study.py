@@ -233,6 +233,9 @@ def test_the_command_runs_continues_and_refuses_another_study(
     file.write_text(json.dumps(CONTENT))
     assert main(["study", str(file), "--out", str(out)]) == 1
     assert "holds another study" in capsys.readouterr().err
+    a_training = next(out.rglob("parameters.yaml")).parent
+    assert main(["study", str(file), "--out", str(a_training)]) == 1
+    assert f"{a_training} holds a run" in capsys.readouterr().err
     assert main(["study", "--out", str(tmp_path / "none")]) == 1
     assert "no study in" in capsys.readouterr().err
     words = (str(file), "--out", str(tmp_path / "new"), "--scheduler")

@@ -9,6 +9,7 @@ is not enough: either the code was installed under that name, as an entry point 
 import hashlib
 import importlib
 import os
+import shlex
 import sys
 from collections.abc import Mapping
 from importlib.metadata import EntryPoint, entry_points
@@ -38,10 +39,11 @@ def configured_equation(name: str, environment: Mapping[str, str] = os.environ) 
     """
     allowed = {identity(item.strip()) for item in environment.get(ALLOWED, "").split(",")}
     if ":" in name and identity(name) not in allowed:
+        quoted = shlex.quote(name)
         raise ValueError(
             f"the equation {name!r} is code, which is not run because a file names it; if you trust "
-            f"it, name it yourself: --equation {name}, or for nodes and workers {ALLOWED}={name} in "
-            "the environment"
+            f"it, name it yourself: --equation {quoted}, or for nodes and workers {ALLOWED}={quoted} "
+            "in the environment"
         )
     return load_equation(name)
 

@@ -5,10 +5,16 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import asdict
-from pathlib import Path
 
 from loop_interfaces.spec import ParameterError
-from pdeloop.commands.common import Commands, add_equation, add_json, allow_equation, command
+from pdeloop.commands.common import (
+    Commands,
+    a_path,
+    add_equation,
+    add_json,
+    allow_equation,
+    command,
+)
 from pdeloop.output import print_json
 
 
@@ -40,16 +46,16 @@ def add(commands: Commands) -> None:
         "the bit. Exit code 1 if anything differs, or nothing can be recomputed.",
         example="pdeloop bag verify runs/burgers-20260101-120000-1",
     )
-    info.add_argument("bag", type=Path, metavar="BAG", help="folder of a bag or of a run")
+    info.add_argument("bag", type=a_path, metavar="BAG", help="folder of a bag or of a run")
     verify.add_argument(
         "bag",
-        type=Path,
+        type=a_path,
         metavar="BAG",
         nargs="+",
         help="folder of a bag, or of a run with all its bags",
     )
     verify.add_argument(
-        "--parameters", type=Path, metavar="FILE", help="instead of those in the bag"
+        "--parameters", type=a_path, metavar="FILE", help="instead of those in the bag"
     )
     add_equation(verify)
     for action in (info, verify):

@@ -7,10 +7,16 @@ import argparse
 from collections.abc import Callable
 from dataclasses import asdict
 from math import nan
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pdeloop.commands.common import Commands, add_equation, add_json, allow_equation, command
+from pdeloop.commands.common import (
+    Commands,
+    a_path,
+    add_equation,
+    add_json,
+    allow_equation,
+    command,
+)
 from pdeloop.output import print_json
 
 if TYPE_CHECKING:
@@ -55,7 +61,7 @@ def add(commands: Commands) -> None:
     add_equation(check)
     check.add_argument(
         "--picture",
-        type=Path,
+        type=a_path,
         metavar="FILE",
         help="draw initial fields, target and the actuators' supports to this .png",
     )

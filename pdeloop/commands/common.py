@@ -5,10 +5,12 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from pathlib import Path
 from typing import TypeAlias
 
 from loop_interfaces.parameters import PROBLEM, TUNER, flags
 from loop_interfaces.problem import shipped_problems
+from loop_interfaces.spec import ParameterError
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 """Where a command adds its parser."""
@@ -42,6 +44,17 @@ def command(
     return parser
 
 
+def a_path(text: str) -> Path:
+    """The type of an argument that is a path: not empty, as from an unset variable, and UTF-8."""
+    if not text:
+        raise argparse.ArgumentTypeError("it is empty; expected a path")
+    try:
+        str(Path(text).absolute()).encode()
+    except UnicodeEncodeError:  # YAML, JSON and HTML that name it could not be written
+        raise argparse.ArgumentTypeError(f"{text!a} is no UTF-8; take another name") from None
+    return Path(text)
+
+
 def add_equation(parser: argparse._ActionsContainer) -> None:
     """The flag --equation; see `allow_equation`."""
     parser.add_argument(
@@ -59,6 +72,18 @@ def allow_equation(options: argparse.Namespace) -> dict[str, str]:
     from pde_sim_node.equations import allow
 
     return {"equation": allow(options.equation)}
+
+
+def refuse_other_equation(options: argparse.Namespace, *equations: str) -> None:
+    """ParameterError if --equation names none of these, which those of a run are."""
+    from pde_sim_node.equations import identity
+
+    named = options.equation
+    if named is not None and identity(named) not in map(identity, equations):
+        raise ParameterError(
+            f"--equation is {named}, and that of the run is {', '.join(equations)}; leave it out, or "
+            "name the run's"
+        )
 
 
 def add_problem(

@@ -5,15 +5,16 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 
 from pdeloop.commands.common import (
     DEFAULTS,
     Commands,
+    a_path,
     add_equation,
     add_json,
     allow_equation,
     command,
+    refuse_other_equation,
 )
 from pdeloop.output import print_json
 
@@ -28,7 +29,7 @@ def add(commands: Commands) -> None:
         description="Roll out no control, LQT and the adapted policy of a finished run.",
         example="pdeloop evaluate runs/burgers-20260101-120000-1 --fields 60 --seed 7",
     )
-    evaluate.add_argument("folder", type=Path, metavar="DIR", help="folder of a finished run")
+    evaluate.add_argument("folder", type=a_path, metavar="DIR", help="folder of a finished run")
     evaluate.add_argument(
         "--fields", type=int, default=10, metavar="N", help="sampled initial fields [10]"
     )
@@ -53,6 +54,7 @@ def _evaluate(options: argparse.Namespace) -> int:
     DEFAULTS["evaluation_fields"].check(options.fields, "--fields")
     DEFAULTS["evaluation_seed"].check(options.seed, "--seed")
     run = load_run(options.folder)
+    refuse_other_equation(options, run.values["equation"])
     costs = evaluate(run, fields=options.fields, seed=options.seed, mean_field=options.mean_field)
     if options.json:
         print_json({name: table.tolist() for name, table in costs.items()})

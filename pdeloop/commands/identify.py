@@ -4,11 +4,10 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from loop_interfaces.parameters import IDENTIFICATION
 from loop_interfaces.spec import ParameterError
-from pdeloop.commands.common import Commands, add_json, command
+from pdeloop.commands.common import Commands, a_path, add_json, command
 from pdeloop.output import print_json
 
 
@@ -26,10 +25,10 @@ def add(commands: Commands) -> None:
         example="pdeloop identify --data examples/measurements.csv --out model.npz",
     )
     source = identify.add_mutually_exclusive_group(required=True)
-    source.add_argument("--bag", type=Path, metavar="BAG", help="folder of a bag or of a run")
+    source.add_argument("--bag", type=a_path, metavar="BAG", help="folder of a bag or of a run")
     source.add_argument(
         "--data",
-        type=Path,
+        type=a_path,
         metavar="FILE",
         help="states, actions, target and sampling time as .npz or .csv (docs/identification.md)",
     )
@@ -51,7 +50,7 @@ def add(commands: Commands) -> None:
     add("--environment", type=int, metavar="M", help="only this environment of each episode")
     add("--state-weight", type=float, metavar="Q", help="q of Q = q I [that of the run, or 1]")
     add("--action-weight", type=float, metavar="R", help="r of R = r I [that of the run, or 1]")
-    add("--out", type=Path, metavar="FILE", help="write A, B, U, K_a, K_b, s_r to this .npz")
+    add("--out", type=a_path, metavar="FILE", help="write A, B, U, K_a, K_b, s_r to this .npz")
     add_json(identify)
 
 

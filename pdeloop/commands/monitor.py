@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
 import webbrowser
-from pathlib import Path
 
 from loop_interfaces.spec import ParameterError
-from pdeloop.commands.common import Commands, command
+from pdeloop.commands.common import Commands, a_path, command
 
 PORT = 8420
 
@@ -31,7 +31,7 @@ def add(commands: Commands) -> None:
     add(
         "folder",
         nargs="?",
-        type=Path,
+        type=a_path,
         metavar="DIR",
         help="folder of a run: show this one only [the newest that runs]",
     )
@@ -62,10 +62,10 @@ def _monitor(options: argparse.Namespace) -> int:
         raise ParameterError(f"no run in {folder}; give the folder of one, or none")
     finder = Finder(folder, given_domain())
     if folder is not None and finder.find() is None:
-        way = "continue it with: pdeloop train --resume"
+        way, quoted = "continue it with: pdeloop train --resume", shlex.quote(str(folder))
         if (folder / "result.json").exists():
             way = "it is finished and is shown by: pdeloop report"
-        raise ParameterError(f"no loop works on the run in {folder}; {way} {folder}")
+        raise ParameterError(f"no loop works on the run in {folder}; {way} {quoted}")
     from pdeloop.monitor.node import show_loops  # here, as it needs ROS
 
     page = Page(options.environment)

@@ -4,9 +4,15 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
-from pdeloop.commands.common import Commands, add_equation, allow_equation, command
+from pdeloop.commands.common import (
+    Commands,
+    a_path,
+    add_equation,
+    allow_equation,
+    command,
+    refuse_other_equation,
+)
 
 
 def add(commands: Commands) -> None:
@@ -20,18 +26,21 @@ def add(commands: Commands) -> None:
         example="pdeloop report runs/paper",
     )
     report.add_argument(
-        "folder", type=Path, metavar="DIR", help="folder of a finished run or reproduction"
+        "folder", type=a_path, metavar="DIR", help="folder of a finished run or reproduction"
     )
     add_equation(report)
-    report.add_argument("--out", type=Path, metavar="DIR", help="[DIR/report]")
+    report.add_argument("--out", type=a_path, metavar="DIR", help="[DIR/report]")
 
 
 def _report(options: argparse.Namespace) -> int:
+    from pdeloop.report.data import gather
     from pdeloop.report.page import report
 
     allow_equation(options)
-    page, missing = report(options.folder, options.out)
-    for sentence in missing:
+    data = gather(options.folder)
+    refuse_other_equation(options, *(one.first.values["equation"] for one in data.problems))
+    page = report(data, options.out)
+    for sentence in data.missing:
         print(f"not shown: {sentence}")
     print(f"report in {page}")
     return 0

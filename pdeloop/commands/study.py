@@ -14,7 +14,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from loop_interfaces.spec import ParameterError
-from pdeloop.commands.common import Commands, add_equation, add_json, allow_equation, command
+from pdeloop.commands.common import (
+    Commands,
+    a_path,
+    add_equation,
+    add_json,
+    allow_equation,
+    command,
+)
 from pdeloop.output import print_json
 
 if TYPE_CHECKING:
@@ -36,7 +43,7 @@ def add(commands: Commands) -> None:
     study.add_argument(
         "file",
         nargs="?",
-        type=Path,
+        type=a_path,
         metavar="STUDY.yaml",
         help="problems, seeds, variants, settings",
     )
@@ -47,7 +54,7 @@ def add(commands: Commands) -> None:
 def add_execution(parser: argparse.ArgumentParser) -> None:
     """The flags that say where a study's trainings run, and what is printed; see `carry_out`."""
     name, add = parser.prog.rpartition(" ")[2], parser.add_argument
-    add("--out", type=Path, metavar="DIR", help=f"folder of the results [runs/{name}-TIME]")
+    add("--out", type=a_path, metavar="DIR", help=f"folder of the results [runs/{name}-TIME]")
     add("--processes", type=int, metavar="N", help="trainings at the same time [one a core]")
     add(
         "--scheduler",

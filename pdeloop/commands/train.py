@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from loop_interfaces.problem import shipped_problems
 from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import (
     Commands,
+    a_path,
     add_equation,
     add_flags,
     add_json,
@@ -17,6 +17,7 @@ from pdeloop.commands.common import (
     allow_equation,
     command,
     given_flags,
+    refuse_other_equation,
 )
 
 
@@ -42,14 +43,14 @@ def add(commands: Commands) -> None:
     add = method.add_argument
     add(
         "--model",
-        type=Path,
+        type=a_path,
         metavar="FILE",
         help="start from this model of `pdeloop identify --out` instead of identifying one",
     )
     run = train.add_argument_group("run")
     add = run.add_argument
-    add("--out", type=Path, metavar="DIR", help="folder of the results [runs/PROBLEM-TIME]")
-    add("--resume", type=Path, metavar="DIR", help="continue the interrupted run in DIR")
+    add("--out", type=a_path, metavar="DIR", help="folder of the results [runs/PROBLEM-TIME]")
+    add("--resume", type=a_path, metavar="DIR", help="continue the interrupted run in DIR")
     add(
         "--in-process",
         action="store_true",
@@ -104,7 +105,9 @@ def _train(options: argparse.Namespace) -> int:
                 "--resume continues a run with its own parameters; "
                 "give it alone (or with --in-process)"
             )
-        return run(options.resume, reopen(options.resume), transport, options.json)
+        values = reopen(options.resume)
+        refuse_other_equation(options, values["equation"])
+        return run(options.resume, values, transport, options.json)
     if options.problem is None:
         raise ParameterError(
             f"no problem given; expected one of {', '.join(shipped_problems())}, a YAML file, "

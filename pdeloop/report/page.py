@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 
 from loop_interfaces.files import make_own_folder, write_atomically
 from pdeloop.report import figures, learning
-from pdeloop.report.data import ProblemData, ReportData, gather
+from pdeloop.report.data import ProblemData, ReportData
 from pdeloop.report.style import COLOURS, NAMES, STYLE
 from pdeloop.reproduction import PAPER, beside_the_paper
 from pdeloop.study.run import ASKED
@@ -44,14 +44,12 @@ class Picture(NamedTuple):
     png: str
 
 
-def report(folder: Path, out: Path | None) -> tuple[Path, list[str]]:
-    """Write the report of the run or reproduction in `folder` to `out`, DIR/report if not given.
+def report(data: ReportData, out: Path | None) -> Path:
+    """Write a report to `out`, DIR/report if not given; returns the path of the page.
 
-    Returns the path of the page, and a sentence for each thing that cannot be shown. RunFolderError
-    where there is nothing to report, or the report cannot be written.
+    RunFolderError where it cannot be written.
     """
-    data = gather(folder)
-    target = out or folder / "report"
+    target = out or data.folder / "report"
     page = target / "index.html"
     try:
         if out:
@@ -67,7 +65,7 @@ def report(folder: Path, out: Path | None) -> tuple[Path, list[str]]:
         write_atomically(page, _page(data, shared, own).encode())
     except OSError as error:
         raise RunFolderError(f"cannot write the report to {target}: {error.strerror}") from error
-    return page, data.missing
+    return page
 
 
 def _save(target: Path, name: str, heading: str, caption: str, figure: Figure) -> Picture:

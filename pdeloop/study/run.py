@@ -9,6 +9,7 @@ DIR/PROBLEM/VARIANT/SEED/     parameters.yaml, policy.npz, result.json of a fini
 from __future__ import annotations
 
 import json
+import shlex
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import (
@@ -50,12 +51,14 @@ class Failure(NamedTuple):
 
 def keep(folder: Path, study: Study) -> None:
     """Begin a study in `folder`. StudyError if there is another one, or it cannot be written."""
+    if (folder / "parameters.yaml").exists():
+        raise StudyError(f"{folder} holds a run; choose another folder")
     try:
         if (folder / ASKED).exists():
             if kept(folder) != study:
                 raise StudyError(
-                    f"{folder} holds another study; choose another folder, or give --out {folder} "
-                    "alone to continue the one there"
+                    f"{folder} holds another study; choose another folder, or give "
+                    f"--out {shlex.quote(str(folder))} alone to continue the one there"
                 )
             return
         make_folder(folder)
