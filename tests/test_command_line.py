@@ -266,6 +266,22 @@ def test_a_signal_ends_any_command_and_the_start_of_a_node_with_one_line(
         assert (done.returncode, done.stderr) == (130, f"{program}: stopped by {name}\n")
 
 
+def test_a_node_ends_with_its_code_and_nothing_after_it(tmp_path: Path) -> None:
+    (tmp_path / "short").mkdir()
+    (tmp_path / "short" / "node.py").write_text(
+        "import atexit\n\natexit.register(print, 'late')\n\n"
+        "def main():\n    print('done')\n    return 75\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-m", "loop_interfaces.start", "short"],
+        env={**os.environ, "PYTHONPATH": f"{ROOT}:{tmp_path}"},
+        capture_output=True,
+        text=True,
+        timeout=LIMIT,
+    )
+    assert (done.returncode, done.stdout) == (75, "done\n")
+
+
 def test_a_signal_may_wait_until_it_is_asked_for() -> None:
     known = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     done = False
