@@ -5,13 +5,15 @@ from __future__ import annotations
 
 import csv
 import io
+from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass
+from math import isfinite, nan
 from pathlib import Path
 
 import numpy as np
 
-from loop_interfaces.array_files import read_arrays
+from loop_interfaces.array_files import MAX_ARRAY_BYTES, read_arrays
 from loop_interfaces.arrays import Array
 from loop_interfaces.files import FileError, read_bounded
 
@@ -19,6 +21,7 @@ __all__ = ["Measurements", "read_measurements"]
 
 MAX_TEXT_BYTES = 2**28
 """Of a .csv file."""
+MAX_TRAJECTORIES = 100_000
 LARGEST = 1e100
 """Magnitude of a number, so that squares and their sums stay finite."""
 NAMES = ("states", "actions", "target", "sample_time")
@@ -121,6 +124,8 @@ def _npz(path: Path) -> Measurements:
     for name in NAMES:
         if arrays[name].dtype.kind not in "fiu":
             raise ValueError(f"expected real numbers in {name}, got {arrays[name].dtype}")
+    if (size := 8 * sum(arrays[name].size for name in NAMES)) > MAX_ARRAY_BYTES:
+        raise ValueError(f"expected at most {MAX_ARRAY_BYTES // 8} numbers, got {size // 8}")
     states, actions, target, times = (arrays[name].astype(np.float64) for name in NAMES)
     if times.size != 1:
         raise ValueError(f"expected one number as sample_time, got shape {times.shape}")
@@ -130,13 +135,16 @@ def _npz(path: Path) -> Measurements:
             "expected states (K, N + 1, n_z) and actions (K, N, n_a) of K trajectories, got shapes "
             f"{states.shape} and {actions.shape}"
         )
+    if several:
+        _check_count(len(states))
     pairs = zip(states, actions, strict=True) if several else [(states, actions)]
     return Measurements(list(pairs), target, float(times.reshape(())))
 
 
 def _csv(path: Path) -> Measurements:
     raw = read_bounded(path, MAX_TEXT_BYTES, "give the same as .npz (docs/identification.md)")
-    lines = csv.reader(io.StringIO(raw.decode("utf-8-sig", errors="replace"), newline=""))
+    text = io.TextIOWrapper(io.BytesIO(raw), "utf-8-sig", errors="replace", newline="")
+    lines = csv.reader(text)
     try:
         return _table(line for line in lines if line)
     except csv.Error as error:
@@ -151,7 +159,7 @@ def _table(lines: Iterator[list[str]]) -> Measurements:
         raise ValueError(
             f"expected the names t, z..., a... in the first line, got '{','.join(head)[:60]}'"
         )
-    rows, target = [], None
+    numbers, target = array("d"), None
     for number, line in enumerate(lines, 2):
         if len(line) != len(head):
             raise ValueError(f"expected {len(head)} values in row {number}, got {len(line)}")
@@ -160,15 +168,17 @@ def _table(lines: Iterator[list[str]]) -> Measurements:
                 raise ValueError(
                     f"expected one row whose t is the word target, got another, {number}"
                 )
-            target = _numbers(line[1 : 1 + n_z], number)
+            target = np.array(_numbers(line[1 : 1 + n_z], number))
             continue
-        rows.append(_numbers(line, number))
-        if not np.isfinite(rows[-1][0]):
+        row = _numbers(line, number)
+        if not isfinite(row[0]):
             raise ValueError(f"expected a time t in row {number}, got '{line[0]}'")
+        numbers.extend(row)
     if target is None:
         raise ValueError("expected a row whose t is the word target")
-    table = np.array(rows).reshape(-1, len(head))
+    table = np.array(numbers).reshape(-1, len(head))
     starts = 1 + np.flatnonzero(~(np.diff(table[:, 0]) > 0))
+    _check_count(len(starts))
     parts = [part for part in np.split(table, starts) if len(part) > 1]
     steps = np.concatenate([np.diff(part[:, 0]) for part in parts] or [np.ones(1)])
     if not np.allclose(steps, steps[0], rtol=1e-3):
@@ -179,9 +189,15 @@ def _table(lines: Iterator[list[str]]) -> Measurements:
     )
 
 
-def _numbers(texts: list[str], row: int) -> Array:
+def _check_count(trajectories: int) -> None:
+    """ValueError for so many that each takes more memory than its numbers."""
+    if trajectories > MAX_TRAJECTORIES:
+        raise ValueError(f"expected at most {MAX_TRAJECTORIES} trajectories, got {trajectories}")
+
+
+def _numbers(texts: list[str], row: int) -> list[float]:
     """The numbers of a row; an empty place is NaN."""
     try:
-        return np.array([float(text) if text.strip() else np.nan for text in texts])
+        return [float(text) if text.strip() else nan for text in texts]
     except ValueError as error:
         raise ValueError(f"expected numbers in row {row}: {error}") from None

@@ -117,6 +117,22 @@ def test_other_files_and_larger_ones_are_refused(
     refused(EXAMPLE, "larger than 100 bytes; give the same as .npz")
 
 
+def test_more_trajectories_or_numbers_than_memory_may_take_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "own.npz"
+    monkeypatch.setattr(data_file, "MAX_TRAJECTORIES", 2)
+    np.savez(path, **arrays(states=np.zeros((3, 2, 0)), actions=np.zeros((3, 1, 0))))
+    refused(path, "at most 2 trajectories, got 3")
+    path = tmp_path / "own.csv"
+    path.write_text("t,z1,a1\ntarget,0,\n" + "0,1,1\n" * 4)
+    refused(path, "at most 2 trajectories, got 3")
+    monkeypatch.setattr(data_file, "MAX_ARRAY_BYTES", 8 * 100)
+    path = tmp_path / "own.npz"
+    np.savez(path, **arrays(states=np.zeros((61, 4), dtype=np.int8)))
+    refused(path, "at most 100 numbers, got 369")
+
+
 def refused(path: Path, words: str) -> None:
     with pytest.raises(ValueError, match=words) as failed:
         read_measurements(path)
