@@ -14,6 +14,8 @@ from loop_interfaces.files import FileError, open_ordinary
 MAX_ARRAY_BYTES = 2**30
 """Of all arrays in a file of policies or models."""
 Arrays = Mapping[str, NDArray[Any]]
+_TYPES: Mapping[str, type] = {"f": np.float64, "i": np.int64, "b": np.bool_}
+"""What is written of each NumPy kind; others would give other results, or cannot be written again."""
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -58,6 +60,7 @@ def taken(
 ) -> NDArray[Any]:
     """The array of this name, of this NumPy kind and shape (None: of any length), or a FileError.
 
+    Numbers have the type with which they are written: 8 bytes, in this machine's order.
     finite: whether infinity is refused as well as NaN in floating-point numbers.
     """
     if name not in arrays:
@@ -66,10 +69,12 @@ def taken(
     fits = array.ndim == len(shape) and all(
         expected in (None, length) for expected, length in zip(shape, array.shape, strict=True)
     )
-    if array.dtype.kind != kind or not fits:
+    typed = array.dtype.kind == kind and array.dtype == _TYPES.get(kind, array.dtype)
+    if not (typed and fits):
+        expected_type = np.dtype(_TYPES[kind]).name if kind in _TYPES else "text"
         raise FileError(
-            f"expected '{name}' of kind {kind!r} and shape {shape}, "
-            f"got {array.dtype.kind!r} and {array.shape}"
+            f"expected '{name}' of type {expected_type} and shape {shape}, "
+            f"got {array.dtype} and {array.shape}"
         )
     if kind == "f" and (not np.isfinite(array).all() if finite else np.isnan(array).any()):
         raise FileError(f"'{name}' is not finite")

@@ -48,8 +48,9 @@ def write_part(path: Path, *content: bytes | memoryview) -> Path:
                 file.write(piece)
             file.flush()
             os.fsync(file.fileno())
-    except OSError:
+    except OSError as error:
         part.unlink(missing_ok=True)
+        error.filename = error.filename or str(path)  # a write that fails does not know it
         raise
     return part
 
@@ -151,11 +152,26 @@ def read_bounded(path: Path, most: int, instead: str = "") -> bytes:
 def read_json(path: Path) -> dict[str, Any]:
     """The object in a JSON file. FileError if there is none."""
     try:
-        content = json.loads(read_bounded(path, MAX_JSON_BYTES))
+        content = parse_json(read_bounded(path, MAX_JSON_BYTES))
     except FileError:
         raise
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise FileError(f"{path} is no JSON: {error}") from error
     if not isinstance(content, dict):
         raise FileError(f"{path} holds no JSON object")
     return content
+
+
+def parse_json(text: str | bytes) -> Any:
+    """What a text in JSON says. ValueError if it is none, or has a number of more than 64 bits."""
+    try:
+        return json.loads(text, parse_int=_whole)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+
+
+def _whole(digits: str) -> int:
+    """A whole number that NumPy can hold, and a floating-point number, too."""
+    if len(digits) > 20 or not -(2**63) <= (number := int(digits)) < 2**63:
+        raise ValueError(f"expected whole numbers of at most 64 bits, got {digits[:20]}...")
+    return number

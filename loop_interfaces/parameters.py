@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from loop_interfaces.spec import Spec
+from loop_interfaces.spec import Spec, check
 
 MAX_SEED = 2**53 - 1
 ROLLOUTS = 80
@@ -264,6 +264,15 @@ def as_recorded(values: Mapping[str, Any]) -> dict[str, Any]:
     """Parameters of a run or a bag: one that knows no identification had the only one there was."""
     old = "dmdc_rank" in values and "identification" not in values
     return {**values, **({"identification": "dmdc"} if old else {})}
+
+
+def recorded_values(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The checked parameters of a run or a bag, with the present defaults of what it does not know.
+
+    Others, `physical.*` among them, are kept as they are. ParameterError where one is out of range.
+    """
+    given = as_recorded(values)
+    return {**given, **check(table(), given)}
 
 
 def model_order(values: Mapping[str, Any]) -> int:

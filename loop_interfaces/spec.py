@@ -17,9 +17,13 @@ from typing import Any
 
 import yaml
 
+from loop_interfaces.files import FileError, read_bounded
+
 Value = bool | int | float | str | list[str] | list[float]
 MAX_YAML_BYTES = 1_000_000
 MAX_PARAMETERS = 10_000
+_SHOWN = 200
+"""Characters of a wrong value in an error."""
 _FILE_NAME = re.compile(r"[^\W_][\w.-]{,99}")
 _EXPONENT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)[eE][+-]?\d+")
 
@@ -107,7 +111,7 @@ class Spec:
         if good is None:
             called = called or f"parameter '{self.name}'"
             raise ParameterError(
-                f"{called} is {value!r}; expected {self.range}"
+                f"{called} is {_shown(value)}; expected {self.range}"
                 + (f" ({self.unit})" if self.unit else "")
                 + (exponent_hint(value) if self.type is float else "")
             )
@@ -144,7 +148,8 @@ class Spec:
         if self.file_name:
             return value if _FILE_NAME.fullmatch(str(value)) else None
         if isinstance(value, (int, float)) and not isinstance(value, bool):
-            if not math.isfinite(value) or (self.positive and value <= 0):
+            infinite = isinstance(value, float) and not math.isfinite(value)
+            if infinite or (self.positive and value <= 0):
                 return None
             if self.minimum is not None and value < self.minimum:
                 return None
@@ -161,6 +166,14 @@ class Spec:
         number = replace(self, default=0.0)
         found = [number._coerce(item) for item in value]
         return None if None in found else [float(item) for item in found]
+
+
+def _shown(value: object) -> str:
+    """A value as Python writes it, its beginning if that is long."""
+    if isinstance(value, int) and abs(value) >= 2**1000:  # Python writes no more than 4300 digits
+        return "a number of more than 300 digits"
+    text = repr(value)
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
 
 
 def _plain(number: float) -> str:
@@ -212,12 +225,9 @@ def read_yaml(path: Path) -> dict[str, Any]:
 def read_document(path: Path) -> Any:
     """The content of a YAML file of bounded size. ParameterError when it cannot be read."""
     try:
-        with path.open("rb") as file:
-            raw = file.read(MAX_YAML_BYTES + 1)
-    except OSError as error:
-        raise ParameterError(f"cannot read {path}: {error.strerror}") from error
-    if len(raw) > MAX_YAML_BYTES:
-        raise ParameterError(f"{path} is larger than {MAX_YAML_BYTES} bytes; not a parameter file")
+        raw = read_bounded(path, MAX_YAML_BYTES, "expected a parameter file")
+    except FileError as error:
+        raise ParameterError(str(error)) from error
     try:
         return yaml.safe_load(raw)
     except (yaml.YAMLError, UnicodeDecodeError, ValueError, RecursionError) as error:

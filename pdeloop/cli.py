@@ -72,7 +72,10 @@ def _run(
     except BrokenPipeError:
         return NOBODY_READS
     except MemoryError as error:
-        return _failed(f"not enough memory ({error}): take a smaller problem, or fewer at once")
+        return _failed(
+            f"not enough memory{f' ({error})' if str(error) else ''}: take a smaller problem, or fewer "
+            "at once"
+        )
     except OSError as error:
         where = f" ({error.filename})" if error.filename else ""
         return _failed(f"{error.strerror or error}{where}")

@@ -18,9 +18,9 @@ def print_json(value: Any) -> None:
 
 
 def complain(text: str) -> None:
-    """One line on stderr, where it can be written."""
+    """One line on stderr, where it can be written; a terminal does not obey what a file says."""
     with contextlib.suppress(OSError):
-        print(f"pdeloop: {text}", file=sys.stderr)
+        print(f"pdeloop: {printable(text)}", file=sys.stderr)
 
 
 def drop_unwritable() -> None:
@@ -33,6 +33,15 @@ def drop_unwritable() -> None:
             stream.flush()
         except OSError:
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def printable(text: str) -> str:
+    r"""A text with what is no character to be seen, such as a terminal's escape sequences, in words.
+
+    >>> printable("red " + chr(27) + "[31m")
+    'red \\x1b[31m'
+    """
+    return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
 
 
 def aligned(rows: Sequence[Sequence[str]], names: int = 1) -> list[str]:

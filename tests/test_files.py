@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import io
 import json
@@ -20,9 +21,17 @@ import numpy as np
 import pytest
 
 from loop_interfaces import array_files
-from loop_interfaces.files import FileError, open_own, private_folder, write_atomically
+from loop_interfaces.files import (
+    FileError,
+    open_own,
+    private_folder,
+    read_json,
+    write_atomically,
+)
+from loop_interfaces.spec import ParameterError, read_document
 from pdeloop import domain, live
 from pdeloop.cli import FAILED, main
+from pdeloop.commands import new
 from pdeloop.report.data import gather
 from pdeloop.training_run import unused
 from tests.small import SMALL, parameters
@@ -77,6 +86,9 @@ def arrays_like(good: np.ndarray) -> Iterator[np.ndarray]:
             np.full_like(good, np.nan),
             np.full_like(good, np.inf),
             np.zeros(good.shape, np.int64),
+            good.astype(np.float32),
+            good.astype(np.longdouble),
+            good.astype(">f8"),
         )
     yield np.zeros(good.shape, dtype=[("a", float)])
 
@@ -121,13 +133,30 @@ def test_damaged_policies_are_refused_in_one_sentence(run):
 def test_a_damaged_result_is_refused_in_one_sentence(run):
     folder, path = RunFolder(run), run / "result.json"
     good = json.loads(path.read_text())
-    things = (None, 1, -1e300, float("nan"), "text", [], {}, [[]], [1, 2], [{"seed": 7}], True)
+    things = (
+        None,
+        1,
+        10**400,
+        -1e300,
+        float("nan"),
+        "text",
+        [],
+        {},
+        [[]],
+        [1, 2],
+        [{"seed": 7}],
+        True,
+    )
     wrong = [json.dumps(thing) for thing in things] + ["{" * 50_000, "[" * 50_000, '{"a":' * 50_000]
-    for name in ("costs_by_field", "history", "seed", "seeds"):
+    for name in ("costs_by_field", "history", "seed", "seeds", "rollouts", "environment"):
         wrong += [json.dumps(good | {name: thing}) for thing in things]
     row = dict(good["history"][0])
-    for name in ("rollouts", "seed"):
+    for name in ("rollouts", "seed", "accepted"):
         wrong += [json.dumps(good | {"history": [row | {name: thing}]}) for thing in things]
+    counted = good["rollouts"][0]
+    wrong += [json.dumps(good | {"rollouts": [counted | {"check": thing}]}) for thing in things]
+    del counted["total"]
+    wrong += [json.dumps(good | {"rollouts": [counted]})]
     for name in ("none", "lqt", "adapted"):
         costs = [good["costs_by_field"] | {name: thing} for thing in things]
         wrong += [json.dumps(good | {"costs_by_field": c}) for c in costs]
@@ -172,7 +201,9 @@ def test_forged_checkpoints_with_a_good_checksum_are_passed_over(run, capsys):
         sealed(good | {"phase": np.array("sleep")}),
         sealed(good | {"history": np.array("[")}),
     ]
-    wrong += [sealed(good | {"phase": np.array(phase)}) for phase in ("identify", "check")]
+    wrong += [sealed(good | {"phase": np.array(phase)}) for phase in ("identify", "check", "adapt")]
+    history = ('[{"seed": "x", "rollouts": null}]', f'[{{"seed": 0, "rollouts": {10**30}}}]')
+    wrong += [sealed(good | {"history": np.array(text)}) for text in history]
     values = RunFolder(run).values()
     for content in wrong:
         path.write_bytes(content)
@@ -248,7 +279,41 @@ def test_a_checkpoint_of_any_size_is_read_but_none_that_unpacks_to_more_than_it_
     assert not usable and "bytes of arrays; expected at most" in sentence
 
 
+def test_json_that_nothing_can_hold_is_refused(tmp_path):
+    path = tmp_path / "result.json"
+    for text in ("[" * 100_000, f'{{"a": {"9" * 5000}}}', f'{{"a": {-(2**63) - 1}}}'):
+        path.write_text(text)
+        with pytest.raises(FileError, match="is no JSON"):
+            read_json(path)
+    path.write_text(f'{{"a": {-(2**63)}}}')
+    assert read_json(path) == {"a": -(2**63)}
+
+
+def test_what_cannot_be_written_is_named_and_no_half_of_it_stays(tmp_path, monkeypatch):
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left") as failed:
+        write_atomically(tmp_path / "file", b"content")
+    assert failed.value.filename == str(tmp_path / "file")
+    with pytest.raises(FileError, match=f"cannot write to {tmp_path}/my-pde: No space left"):
+        new.write("my-pde", tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_terminal_does_not_obey_what_a_file_says(tmp_path, capsys):
+    path = tmp_path / "study.yaml"
+    path.write_text('problems: ["\\e[31mred\\a"]\n')
+    assert main(["study", str(path), "--out", str(tmp_path / "out")]) == FAILED
+    error = capsys.readouterr().err
+    assert "\\x1b[31mred\\x07" in error and "\x1b" not in error
+
+
 def test_a_pipe_in_place_of_a_file_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "study.yaml")
+    with pytest.raises(ParameterError, match="no ordinary file"):
+        read_document(tmp_path / "study.yaml")
     os.mkfifo(tmp_path / "policy.npz")
     with pytest.raises(FileError, match="no ordinary file"):
         array_files.read_arrays(tmp_path / "policy.npz")

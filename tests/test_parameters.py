@@ -49,6 +49,13 @@ def test_a_bad_value_is_refused_with_name_value_and_range(name, value, words):
     assert words in str(refusal.value)
 
 
+def test_a_value_of_any_length_is_refused_in_a_short_sentence():
+    for name, value in (("seed", 10**5000), ("length", 10**5000), ("start", "x" * 10**6)):
+        with pytest.raises(Refused, match=f"^parameter '{name}' is .*; expected") as refusal:
+            SPECS[name].check(value)
+        assert len(str(refusal.value)) < 400
+
+
 def test_defaults_are_within_their_own_ranges():
     for spec in table():
         assert spec.check(spec.default) == spec.default

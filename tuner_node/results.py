@@ -10,8 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.topics import COMPLETED
+from tuner_node.budget import PURPOSES
 from tuner_node.rollouts import EVALUATED
 from tuner_node.training import Training
+
+WORDS = ("event", "role", "model")
+"""Entries of a row of the history that are no numbers."""
 
 
 def check_result(content: Mapping[str, Any], seed: int, seeds: int) -> None:
@@ -27,23 +31,38 @@ def check_result(content: Mapping[str, Any], seed: int, seeds: int) -> None:
         )
     if not tables[0].size:
         raise ValueError("its 'costs_by_field' are empty")
-    history = content.get("history")
-    for row in history if isinstance(history, list) else [None]:
-        if not isinstance(row, dict) or not all(
-            isinstance(value, (int, float, str)) for value in row.values()
-        ):
-            raise ValueError("its 'history' is not a list of rows")
-        if type(row.get("rollouts")) is not int or row.get("seed") not in range(seed, seed + seeds):
-            raise ValueError("its 'history' has a row without 'seed' or 'rollouts'")
-    versions = content.get("versions", {})
-    if not isinstance(versions, dict):
-        raise ValueError("its 'versions' are no table")
+    check_history(content.get("history"), seed, seeds)
+    counted, kinds = content.get("rollouts", []), (*PURPOSES.values(), "total")
+    if counted != [] and not (
+        isinstance(counted, list)
+        and len(counted) == seeds
+        and all(isinstance(row, dict) for row in counted)
+        and all(type(row.get(kind)) is int for row in counted for kind in kinds)
+    ):
+        raise ValueError(f"its 'rollouts' are not a table of {', '.join(kinds)} for each seed")
+    if not all(_texts(content.get(name, {})) for name in ("versions", "environment")):
+        raise ValueError("its 'versions' or 'environment' are no table of texts")
     controller = content.get("controller", {})
     nodes = controller.get("nodes", []) if isinstance(controller, dict) else None
     several = content.get("several_publishers", {})
     lists = [nodes, *several.values()] if isinstance(several, dict) else [None]
     if not all(isinstance(n, list) and all(isinstance(node, str) for node in n) for n in lists):
         raise ValueError("its 'controller' or 'several_publishers' is no table of lists of nodes")
+
+
+def check_history(history: object, seed: int, seeds: int) -> None:
+    """A ValueError unless these are the rows of the optimisers of these seeds."""
+    for row in history if isinstance(history, list) else [None]:
+        if not isinstance(row, dict) or not all(
+            isinstance(value, str if name in WORDS else (int, float)) for name, value in row.items()
+        ):
+            raise ValueError("its 'history' is not a list of rows of numbers")
+        if type(row.get("rollouts")) is not int or row.get("seed") not in range(seed, seed + seeds):
+            raise ValueError("its 'history' has a row without 'seed' or 'rollouts'")
+
+
+def _texts(table: object) -> bool:
+    return isinstance(table, dict) and all(isinstance(text, str) for text in table.values())
 
 
 def policy_arrays(training: Training) -> dict[str, NDArray[Any]]:

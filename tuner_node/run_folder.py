@@ -31,8 +31,16 @@ from loop_interfaces import model_rows
 from loop_interfaces.array_files import read_arrays, taken
 from loop_interfaces.files import make_folder, open_own, read_json, write_atomically
 from loop_interfaces.frames import MAX_ID
-from loop_interfaces.parameters import EXECUTION, PLANT, RECORDER, VIEWER, as_recorded, table
-from loop_interfaces.spec import ParameterError, check, read_yaml, yaml_text
+from loop_interfaces.parameters import (
+    EXECUTION,
+    PLANT,
+    RECORDER,
+    VIEWER,
+    as_recorded,
+    recorded_values,
+    table,
+)
+from loop_interfaces.spec import ParameterError, read_yaml, yaml_text
 from tuner_node.results import check_result, policy_arrays, summarise, versions
 from tuner_node.training import Training
 
@@ -111,8 +119,9 @@ class RunFolder:
             return self._identify(identity, known["parameters"])
         except RunFolderError:
             raise
+        except OSError as error:
+            raise RunFolderError(f"cannot write to {self.path}: {error.strerror}") from error
         except (
-            OSError,
             LookupError,
             TypeError,
             ValueError,
@@ -155,8 +164,10 @@ class RunFolder:
 
     def values(self) -> dict[str, Any]:
         """The parameters of the training here, with the present defaults of what is not in its file."""
-        given = as_recorded(self.parameters())
-        return {**given, **check(table(), given)}
+        try:
+            return recorded_values(self.parameters())
+        except ParameterError as error:
+            raise RunFolderError(f"{self.path}/parameters.yaml cannot be used: {error}") from error
 
     def _check_same(self, known: Mapping[str, Any], now: Mapping[str, Any]) -> None:
         """RunFolderError showing every difference that would change the results.

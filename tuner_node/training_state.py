@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from loop_interfaces import model_rows
 from loop_interfaces.array_files import taken
+from loop_interfaces.files import parse_json
 from tuner_node.budget import PURPOSES
 from tuner_node.optimizers.trajectories import (
     record_arrays,
@@ -18,6 +19,7 @@ from tuner_node.optimizers.trajectories import (
     taken_trajectory,
     trajectory_arrays,
 )
+from tuner_node.results import check_history
 from tuner_node.training import Training
 
 PHASES = (*PURPOSES, "done")
@@ -56,6 +58,7 @@ def restore(training: Training, arrays: Arrays) -> None:
     restored = Training(training.settings, training.make_optimizer)
     try:
         _fill(restored, arrays)
+        restored.next_batch()  # there is one, or the training is done
     except (ValueError, LookupError, TypeError, OverflowError) as error:
         raise ValueError(f"does not fit this training ({error})") from error
     vars(training).update(vars(restored))
@@ -71,7 +74,7 @@ def _fill(training: Training, arrays: Arrays) -> None:
     training.steps = int(taken(arrays, "steps", "i", ()))
     training.attempts = taken(arrays, "attempts", "i", (seeds,)).tolist()
     training.pending = taken(arrays, "pending", "i", (None,)).tolist()
-    training.history = json.loads(str(taken(arrays, "history", "U", ())))
+    training.history = parse_json(str(taken(arrays, "history", "U", ())))
     training.worse = taken(arrays, "worse", "b", (seeds,)).tolist()
     n_z = None
     if "models" in arrays:
@@ -98,13 +101,12 @@ def _fill(training: Training, arrays: Arrays) -> None:
 
 def _check(training: Training) -> None:
     """A ValueError unless this is a state that a training can be in."""
-    phase, pending, history = training.phase, training.pending, training.history
+    phase, pending, settings = training.phase, training.pending, training.settings
     if phase not in PHASES:
         raise ValueError(f"its phase is {phase!r}; expected one of {', '.join(PHASES)}")
-    if not set(pending) <= set(range(training.settings.seeds)) or min(training.attempts) < 0:
+    if not set(pending) <= set(range(settings.seeds)) or min(training.attempts) < 0:
         raise ValueError("its seeds or attempts are out of range")
-    if not isinstance(history, list) or not all(isinstance(row, dict) for row in history):
-        raise ValueError("its history is not a list of rows")
+    check_history(training.history, settings.seed, settings.seeds)
     if training.models is None and phase != "identify":
         raise ValueError("it has no models")
     if training.evaluation is None and phase == "done":
@@ -112,5 +114,5 @@ def _check(training: Training) -> None:
     if not pending and phase in ("identify", "check"):
         raise ValueError("it has no seed to identify")
     explored = training.target is not None and None not in training.explorations
-    if training.settings.trajectories and phase != "identify" and not explored:
+    if settings.trajectories and phase != "identify" and not explored:
         raise ValueError("it has no target, or not all explorations")

@@ -8,8 +8,10 @@ import re
 from importlib.util import find_spec
 from keyword import iskeyword
 from pathlib import Path
+from shutil import rmtree
 from string import Template
 
+from loop_interfaces.files import FileError, write_atomically
 from loop_interfaces.problem import shipped_problems
 from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import Commands, command
@@ -54,9 +56,13 @@ def write(name: str, into: Path) -> tuple[list[Path], str]:
         f"{name}.yaml": "problem.yaml.txt",
         f"test_{module}.py": "test.py.txt",
     }
-    for file, template in files.items():
-        text = (_TEMPLATES / template).read_text()
-        (folder / file).write_text(Template(text).substitute(filled))
+    try:
+        for file, template in files.items():
+            text = Template((_TEMPLATES / template).read_text()).substitute(filled)
+            write_atomically(folder / file, text.encode())
+    except OSError as error:
+        rmtree(folder, ignore_errors=True)
+        raise FileError(f"cannot write to {folder}: {error.strerror}") from error
     return [folder / file for file in files], f"{folder / module}.py:{kind}"
 
 

@@ -13,6 +13,7 @@ from pdeloop.commands.common import (
     command,
     refuse_other_equation,
 )
+from pdeloop.output import printable
 
 
 def add(commands: Commands) -> None:
@@ -41,6 +42,6 @@ def _report(options: argparse.Namespace) -> int:
     refuse_other_equation(options, *(one.first.values["equation"] for one in data.problems))
     page = report(data, options.out)
     for sentence in data.missing:
-        print(f"not shown: {sentence}")
+        print(f"not shown: {printable(sentence)}")
     print(f"report in {page}")
     return 0
