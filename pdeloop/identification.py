@@ -20,7 +20,7 @@ from loop_interfaces.arrays import Array
 from loop_interfaces.episodes import episode_name
 from loop_interfaces.files import write_atomically
 from loop_interfaces.model_rows import ModelRows, pack
-from loop_interfaces.parameters import as_recorded, model_order, table
+from loop_interfaces.parameters import as_recorded, model_order, recorded_values, table
 from loop_interfaces.spec import ParameterError
 from loop_interfaces.topics import COMPLETED, CostColumn
 from pdeloop.data_file import read_measurements
@@ -138,7 +138,8 @@ def identify_bag(
                 sources.append({"episode": one.number, "environment": env})
     if not trajectories:
         raise BagError(f"the chosen episodes have no environment {environment}")
-    known = as_recorded(bag.parameters().get(chosen[-1].key[1], {}))
+    told = as_recorded(bag.parameters().get(chosen[-1].key[1], {}))
+    known = {name: value for name, value in recorded_values(told).items() if name in told}
     return _identified(trajectories, target, sources, known, given)
 
 

@@ -11,6 +11,9 @@ import sqlite3
 import struct
 import sys
 from collections import Counter
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +35,12 @@ from rosbags.interfaces import QosDurability
 
 from loop_interfaces.episodes import episode_name, episode_number
 from loop_interfaces.frames import ArrayCodec, Frame
+from loop_interfaces.spec import ParameterError
 from loop_interfaces.topics import ACTION, COST, START, STATE
+from pdeloop.bags.episodes import EpisodeIndex, RecordedEpisode
 from pdeloop.bags.info import describe, info_text
 from pdeloop.bags.reader import Bag, bags_of
-from pdeloop.bags.verify import verify
+from pdeloop.bags.verify import _Run, verify
 from pdeloop.cli import main
 from pdeloop.identification import identify_bag
 from recorder_node import bag as bag_module
@@ -61,7 +66,11 @@ def encode(topic, content: Frame) -> bytes:
 
 
 def recorded_episode(
-    recording: Recording, episode: int = 7, steps: int = 5, skip: int = -1
+    recording: Recording,
+    episode: int = 7,
+    steps: int = 5,
+    skip: int = -1,
+    cost: Mapping[str, Any] = {},
 ) -> None:
     """An episode as the loop would send it, a message a millisecond."""
     when = episode * SECOND
@@ -77,7 +86,8 @@ def recorded_episode(
         if step != skip:
             take(STATE, frame(step, 1, 16, episode=episode))
         take(ACTION, frame(step, 1, 4, episode=episode))
-    take(COST, Frame(RUN, episode, steps, 0.0, np.array([(1.0, 5.0, -1.0)]), 99))
+    usual = Frame(RUN, episode, steps, 0.0, np.array([(1.0, 5.0, -1.0)]), 99)
+    take(COST, replace(usual, **cost))
 
 
 def written(folder: Path, **how: int) -> Path:
@@ -533,6 +543,94 @@ def test_hostile_records_are_one_sentence_or_no_messages(tmp_path, length):
             assert "cannot be read, it is damaged" in str(error) and "\n" not in str(error)
 
 
+@pytest.mark.parametrize("name", ["/\x1b]0;title\x07", "/two\nlines", "/" + "x" * 300])
+def test_a_name_that_is_not_to_be_printed_is_refused(tmp_path, name):
+    topic = McapChannel(id=1, topic=name, message_encoding="cdr", metadata={}, schema_id=0)
+    with pytest.raises(BagError, match=r"damaged: a topic's name or type is '[ -~]+'; expected"):
+        describe(crafted(tmp_path / "topic", record_bytes(topic)))
+
+
+def test_the_records_of_a_chunk_are_read_one_by_one(tmp_path):
+    """Those before one that is cut off have come when that is reached."""
+    topic = McapChannel(id=1, topic="/a", message_encoding="cdr", metadata={}, schema_id=0)
+    message = struct.pack("<BQHIQQ", 5, 22, 1, 0, 1, 1)
+    content = record_bytes(topic) + message * 2 + message[:5]
+    cut = record_bytes(chunk(zstandard.compress(content), len(content)))
+    messages = Bag(crafted(tmp_path / "bag", cut)).messages()
+    assert [next(messages).topic for _ in range(2)] == ["/a", "/a"]
+    with pytest.raises(BagError, match="damaged"):
+        next(messages)
+
+
+def test_what_is_no_ordinary_file_in_a_bag_is_not_waited_for(tmp_path):
+    bag = written(tmp_path)
+    for name in ("parameters.json", "metadata.yaml", "bag.mcap"):
+        (bag / name).unlink()
+        os.mkfifo(bag / name)
+        with pytest.raises(BagError, match=f"{name} cannot be read: it is no ordinary file"):
+            describe(bag)
+        (bag / name).unlink()
+        (bag / name).touch()
+
+
+@pytest.mark.parametrize(
+    ("change", "lacking"),
+    [
+        ({"step": 2**52}, f"lacks {2**52 + 1 - 6} of {2**52 + 1} states"),
+        ({"step": 0}, "lacks steps: its cost is of step 0"),
+        ({"values": np.zeros((1, 0))}, "lacks its cost"),
+        ({"values": np.zeros((1, 1))}, "lacks its cost"),
+    ],
+)
+def test_a_cost_that_no_episode_has_makes_it_incomplete(tmp_path, change, lacking):
+    recording = Recording(tmp_path / "bag", WHAT)
+    recorded_episode(recording, cost=change)
+    recording.close()
+    assert lacking in info_text(describe(tmp_path / "bag"))
+    with pytest.raises(BagError, match="no complete episode"):
+        identify_bag(tmp_path / "bag", {})
+
+
+def test_states_of_several_shapes_make_an_episode_incomplete(tmp_path):
+    recording = Recording(tmp_path / "bag", WHAT)
+    recording.take(BY_TOPIC[STATE], 7 * SECOND, encode(STATE, frame(0, 2, 16)))
+    recorded_episode(recording, skip=0)
+    recording.close()
+    text = info_text(describe(tmp_path / "bag"))
+    assert "lacks states of one shape, a row for each environment" in text
+
+
+def test_many_open_episodes_are_looked_through_seldom(monkeypatch):
+    index, looked = EpisodeIndex(), 0
+
+    def over(*_: object) -> bool:
+        nonlocal looked
+        looked += 1
+        return False
+
+    monkeypatch.setattr(RecordedEpisode, "over", over)
+    start = np.array([(3.0, -1.0, 0.0, 0.0)])
+    for episode in range(2000):
+        raw = encode(START, Frame(RUN, episode, 0, 0.0, start))
+        index.take(BY_TOPIC[START], episode, raw)
+        assert index.take_over(episode) == []
+    assert looked < 10 * 2000
+    assert len(index.take_over(None)) == 2000
+
+
+@pytest.mark.parametrize("value", [None, "x", {}, [], True, -1, 10**30])
+@pytest.mark.parametrize("name", ["seed", "sensor_delays", "state_weight", "evaluation_fields"])
+def test_parameters_of_a_bag_that_are_none_are_refused(tmp_path, name, value):
+    bag = Path(shutil.copytree(OLD, tmp_path / "bag"))
+    content = json.loads((bag / "parameters.json").read_text())
+    ((run, values),) = content.items()
+    words = f"parameter '{name}' is .*; expected|parameters.json cannot be read: expected whole"
+    (bag / "parameters.json").write_text(json.dumps({run: values | {name: value}}))
+    for read in (verify, partial(identify_bag, given={})):
+        with pytest.raises((ParameterError, BagError), match=words):
+            read(bag)
+
+
 def test_a_damaged_chunk_is_noticed_by_its_checksum(tmp_path):
     path = written(tmp_path) / "bag.mcap"
     content = path.read_bytes()
@@ -582,6 +680,7 @@ def test_a_bag_of_the_version_before_is_read_verified_and_identified_from(tmp_pa
     assert (report.incomplete, len(report.notes)) == ([], 2), report.text()
     assert "another fingerprint of the plant" in report.notes[0]
     assert "the tuner's rollouts not known" in report.notes[1]  # its budget had other parts
+    assert report.compared["targets"] == 1
     assert report.compared["costs"] == 1 + 8 + 2 * 2 + 3
     assert report.compared["steps"] == 30 * report.compared["costs"]
     for text in report.differences:  # on another machine than that which recorded it
@@ -599,6 +698,14 @@ def test_what_was_compared_is_numbers_and_nothing_compared_is_nothing_verified(t
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("pdeloop: nothing was recomputed")
     assert "its parameters are not in the bag" in line
+
+
+def test_another_target_than_the_plants_is_a_difference(monkeypatch):
+    target = Bag(OLD).target()
+    assert target is not None
+    monkeypatch.setattr(Bag, "target", lambda bag: target + 1.0)
+    monkeypatch.setattr(_Run, "finish", lambda run: None)
+    assert verify(OLD).differences[0].startswith("target of run 1299076055067259, entry [0, 0]")
 
 
 def test_a_bag_is_written_without_ros(tmp_path):

@@ -27,6 +27,7 @@ from loop_interfaces.topics import (
     VOID,
     CostColumn,
     StartColumn,
+    start_rows,
 )
 from recorder_node.sources import Source
 
@@ -115,12 +116,17 @@ class RecordedEpisode:
             return [*lacking, "its cost"]
         if self.void:
             return [*lacking, "an end: it is void"]
+        if self.horizon < 1:
+            return [*lacking, "steps: its cost is of step 0"]
         for samples, count, name in (
             (self.states, self.horizon + 1, "states"),
             (self.actions, self.horizon, "actions"),
         ):
-            lost = sum(step not in samples for step in range(count))
+            lost = count - sum(step < count for step in samples)
             lacking += [f"{lost} of {count} {name}"] if lost else []
+            shapes = {frame.values.shape for frame in samples.values()}
+            if len(shapes) > 1 or any(shape[0] != self.environments for shape in shapes):
+                lacking.append(f"{name} of one shape, a row for each environment")
         return lacking
 
     def trajectory(self) -> tuple[Array, Array]:
@@ -165,6 +171,8 @@ class EpisodeIndex:
         self._over: deque[Key] = deque(maxlen=REMEMBERED)
         self._models: dict[Key, Frame] = {}
         """By namespace, run and number of the models."""
+        self._since = 0
+        """Calls of `take_over` since it looked for the last time."""
 
     def take(self, source: Source, when: int, raw: bytes) -> RecordedEpisode | None:
         """Note a message that arrived at `when` (ns); the episode that it is about, if any."""
@@ -174,20 +182,30 @@ class EpisodeIndex:
             return None
         try:
             frame = source.codec.decode(raw)
+            rows = start_rows(frame) if source.array is START else frame.values
         except FrameError:
             return None
         if source.array is MODEL:
             self._models[source.namespace, frame.run, frame.step] = frame
             return None
-        if source.array in (START, COST) and not len(frame.values):
+        if source.array in (START, COST) and not len(rows):
             return None  # the run is over: no episode
+        if source.array is COST and rows.shape[1] != len(CostColumn):
+            return None
         episode = self._find((source.namespace, frame.run, frame.episode), when)
         if episode is not None:
             episode.put(source, frame)
         return episode
 
     def take_over(self, now: int | None) -> list[RecordedEpisode]:
-        """Take out the episodes of which nothing more is expected at time `now` (ns); None: all."""
+        """Take out the episodes of which nothing more is expected at time `now` (ns); None: all.
+
+        It looks as often as leaves the work of a call the same, however many episodes are open.
+        """
+        self._since += 1
+        if now is not None and self._since < len(self._open):
+            return []
+        self._since = 0
         newest = max((e.number for e in self._open.values()), default=-1)
         done = [
             episode for episode in self._open.values() if now is None or episode.over(now, newest)

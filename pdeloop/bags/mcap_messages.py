@@ -5,7 +5,7 @@ A file is read with the library `mcap`, record by record up to its last whole on
 summary: the file of a recorder that was killed has none.
 
 What a file may make its reader do is bounded: it may decompress to RATIO times its size and SLACK
-bytes more.
+bytes more, and its records are read one by one.
 """
 
 from __future__ import annotations
@@ -15,23 +15,29 @@ import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from io import BytesIO
 from pathlib import Path
 from typing import IO, cast
 
 import lz4.frame
 import zstandard
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError, RecordLengthLimitExceeded
+from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, McapRecord, Schema
 from mcap.records import Message as McapMessage
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
+from loop_interfaces.files import FileError, open_ordinary, read_bounded
 from recorder_node.bag import METADATA, BagError
 
 RATIO, SLACK = 100, 64 * 2**20
 """A file of n bytes may decompress to RATIO n + SLACK bytes."""
 MAX_TEXT = 100_000_000
-"""Bytes that are read of a text beside the bag."""
+"""Bytes of a text beside the bag."""
+MAX_NAME = 256
+"""Characters of a topic's name or type, which ROS and DDS allow."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +57,9 @@ def read(path: Path) -> Iterator[Message]:
     try:
         for record in _records(path):
             if isinstance(record, Schema):
-                types[record.id] = record.name
+                types[record.id] = _name(record.name)
             elif isinstance(record, Channel):
+                _name(record.topic)
                 channels[record.id] = record
             elif isinstance(record, McapMessage):
                 if (channel := channels.get(record.channel_id)) is None:
@@ -68,16 +75,26 @@ def read(path: Path) -> Iterator[Message]:
         raise BagError(f"{path} cannot be read: {error.strerror}") from error
 
 
+def _name(text: str) -> str:
+    """A topic's name or type, which is printed. ValueError if it is none."""
+    if len(text) > MAX_NAME or not text.isprintable():
+        raise ValueError(
+            f"a topic's name or type is {text[:40]!r}; expected at most {MAX_NAME} characters that "
+            "can be printed"
+        )
+    return text
+
+
 def finished(path: Path) -> bool:
     """Whether the recorder of the file at `path` came to its end, which repeats the magic bytes."""
-    with path.open("rb") as file:
+    with open_ordinary(path) as file:
         file.seek(-min(len(MAGIC), path.stat().st_size), os.SEEK_END)
         return file.read() == MAGIC
 
 
 def _records(path: Path) -> Iterator[McapRecord]:
     """The records of a file, those in its chunks, too."""
-    with path.open("rb") as file:
+    with open_ordinary(path) as file:
         size = os.fstat(file.fileno()).st_size
         left = RATIO * size + SLACK
         for record in _whole_records(file, size):
@@ -91,7 +108,24 @@ def _records(path: Path) -> Iterator[McapRecord]:
                     f"and {SLACK} bytes; expected less of a recording. If it is one, convert it "
                     "to an uncompressed bag (ros2 bag convert)"
                 )
-            yield from breakup_chunk(_decompressed(record), validate_crc=True)
+            yield from _in_chunk(_decompressed(record))
+
+
+def _in_chunk(chunk: Chunk) -> Iterator[McapRecord]:
+    """The records of a chunk, one by one: a small file may have millions."""
+    get_chunk_data_stream(chunk, validate_crc=True)
+    whole = _WholeReads(BytesIO(chunk.data), len(chunk.data))
+    stream = ReadDataStream(cast("IO[bytes]", whole))
+    while stream.count < len(chunk.data):
+        opcode, size = stream.read1(), stream.read8()
+        if opcode == Opcode.MESSAGE:
+            yield McapMessage.read(stream, size)
+        elif opcode == Opcode.CHANNEL:
+            yield Channel.read(stream)
+        elif opcode == Opcode.SCHEMA:
+            yield Schema.read(stream)
+        else:
+            stream.read(size)
 
 
 class _WholeReads:
@@ -156,11 +190,8 @@ def files(folder: Path) -> list[Path]:
 
 
 def text_of(path: Path) -> str:
-    """The beginning of a text file beside a bag; empty if there is none."""
+    """The content of a text file beside a bag; empty if there is none."""
     try:
-        with path.open("rb") as file:
-            return file.read(MAX_TEXT).decode(errors="replace")
-    except FileNotFoundError:
-        return ""
-    except OSError as error:
-        raise BagError(f"{path} cannot be read: {error.strerror}") from error
+        return read_bounded(path, MAX_TEXT).decode(errors="replace") if path.exists() else ""
+    except FileError as error:
+        raise BagError(str(error)) from error

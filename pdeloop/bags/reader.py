@@ -6,7 +6,6 @@ A bag was not finished if its recorder was killed, or the disk was full.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator
 from functools import cache
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.files import parse_json
 from loop_interfaces.topics import TARGET
 from pdeloop.bags.episodes import EpisodeIndex, RecordedEpisode
 from pdeloop.bags.mcap_messages import Message, files, finished, read, text_of
@@ -60,9 +60,9 @@ class Bag:
     def parameters(self) -> dict[int, dict[str, Any]]:
         """The nodes' parameters by run, as far as the bag or the run's folder knows them."""
         try:
-            content = json.loads(text_of(self.path / PARAMETERS) or "{}")
+            content = parse_json(text_of(self.path / PARAMETERS) or "{}")
             return {int(run): dict(values) for run, values in content.items()}
-        except (ValueError, TypeError, AttributeError, RecursionError) as error:
+        except (ValueError, TypeError, AttributeError) as error:
             raise BagError(f"{self.path / PARAMETERS} cannot be read: {error}") from error
 
     def episodes(self) -> Iterator[RecordedEpisode]:

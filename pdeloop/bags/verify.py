@@ -1,9 +1,10 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`pdeloop bag verify`: computes a recorded run again and compares it bit by bit.
 
-Every complete episode is run again from its seeds, policies and models (or the excitation's seed):
-initial fields, actions, states, costs, and the reduced model after exploration. The whole training is
-run again, too: every recorded policy, with its models, must be one that it asks for.
+The target is the plant's. Every complete episode is run again from its seeds, policies and models (or
+the excitation's seed): initial fields, actions, states, costs, and the reduced model after exploration.
+The whole training is run again, too: every recorded policy, with its models, must be one that it asks
+for.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from controller_node.identification import DesignSettings, design
 from loop_interfaces import model_rows
 from loop_interfaces.arrays import Array
 from loop_interfaces.frames import Frame
-from loop_interfaces.parameters import PLANT, as_recorded, table, with_budget
-from loop_interfaces.spec import check, read_yaml
+from loop_interfaces.parameters import PLANT, recorded_values, with_budget
+from loop_interfaces.spec import ParameterError, read_yaml
 from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn, noise_seeds
 from pde_sim_node.build import fingerprint
 from pdeloop.bags.episodes import RecordedEpisode
@@ -104,13 +105,13 @@ def verify(*paths: Path, parameters: Path | None = None) -> Report:
     given = None if parameters is None else read_yaml(parameters)
     runs: dict[int, _Run] = {}
     for bag in bags:
-        known = bag.parameters()
+        known, target = bag.parameters(), bag.target()
         for episode in bag.episodes():
             report.episodes += 1
             number = episode.key[1]
             if number not in runs:
                 values = _complete(known.get(number)) if given is None else given
-                runs[number] = _Run(number, values, report)
+                runs[number] = _Run(number, values, report, target)
             runs[number].episode(episode)
     for run in runs.values():
         run.finish()
@@ -128,7 +129,13 @@ def _complete(values: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
 class _Run:
     """The episodes of one run, and what they must be."""
 
-    def __init__(self, number: int, values: Mapping[str, Any] | None, report: Report) -> None:
+    def __init__(
+        self,
+        number: int,
+        values: Mapping[str, Any] | None,
+        report: Report,
+        target: Array | None,
+    ) -> None:
         self._name, self._report = f"run {number}", report
         self._rollouts: dict[bytes, list[str]] = {}
         """What was recorded, in words, by what identifies a rollout (`_keys`)."""
@@ -142,10 +149,16 @@ class _Run:
             )
             return
         self._given = set(values)
-        self._values = with_budget({**check(table(), {}), **as_recorded(values)})
+        try:
+            self._values = with_budget(recorded_values(values))
+        except ParameterError as error:
+            raise ParameterError(f"{self._name}: {error}") from error
         self._pair = LocalPair(self._values)
         self._fingerprint = fingerprint(self._values)
         self._same_plant = True
+        if target is not None:
+            own = self._pair.plant.target[np.newaxis]
+            report.compare("targets", f"target of {self._name}", target[np.newaxis], own)
 
     def episode(self, episode: RecordedEpisode) -> None:
         """Check one episode."""
