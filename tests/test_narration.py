@@ -135,6 +135,11 @@ def test_a_gain_on_a_law_that_is_worse_than_no_control_is_told_against_no_contro
     assert not any("no less" in line for line in closing_lines("kdv", summary(), ""))
 
 
+def test_a_plant_that_costs_nothing_without_control_has_no_share_of_that():
+    costs = {"none": [0.0, 0.0], "lqt": [2.0, 3.0], "adapted": [1.0, 2.0]}
+    assert "adaptation 1.5" in closing_lines("kdv", summary(costs=costs), "")[3]
+
+
 def test_what_adapted_nothing_is_no_gain():
     lines = closing_lines("kdv", summary(changed=[False, False]), "")
     assert not any("LQT;" in line or "% below" in line for line in lines)

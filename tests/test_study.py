@@ -190,6 +190,7 @@ def test_a_worker_with_other_versions_is_refused_or_accepted_on_request(
         ({"problems": []}, "'problems' is"),
         ({"problems": ["kdv", "kdv"]}, "names that differ"),
         ({"seeds": 0}, "'seeds' is 0"),
+        ({"seeds": 10**12}, "at most 1000000, or a list"),
         ({"seeds": [1, "2"]}, "'seeds' is"),
         ({"variants": ["a"]}, "'variants' is"),
         ({"variants": {"../a": {}}}, "expected a name of letters"),

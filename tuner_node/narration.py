@@ -125,7 +125,7 @@ def closing_lines(problem: str, summary: Row, folder: object) -> list[str]:
         f"  mean stage cost after adaptation {cost('adapted')}",
     ]
     none, lqt, adapted = (sum(summary["costs"][name]) for name in ("none", "lqt", "adapted"))
-    if comparable and not diverged["none"] and lqt >= none:
+    if comparable and not diverged["none"] and lqt >= none > 0:
         share = 100 * (1 - adapted / none)
         lines.append(
             "  the LQT law costs no less than no control; the adapted one costs "

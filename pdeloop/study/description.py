@@ -14,6 +14,8 @@ from loop_interfaces.spec import read_yaml
 from pdeloop.training_run import resolve
 from tuner_node.build import build_training
 
+MAX_SEEDS = 1_000_000
+"""Of a study that gives their number."""
 _NAME = re.compile(r"[\w.+-]{1,60}")
 
 
@@ -58,10 +60,12 @@ class Study:
         problems, seeds = content.get("problems"), content.get("seeds", 1)
         if not isinstance(problems, list) or not problems:
             raise StudyError(f"'problems' is {problems!r}; expected a list of names or YAML files")
-        if type(seeds) is int and seeds > 0:
+        if type(seeds) is int and 0 < seeds <= MAX_SEEDS:
             seeds = range(seeds)
         elif not isinstance(seeds, list) or not seeds or any(type(s) is not int for s in seeds):
-            raise StudyError(f"'seeds' is {seeds!r}; expected how many, or a list of them")
+            raise StudyError(
+                f"'seeds' is {seeds!r}; expected how many, at most {MAX_SEEDS}, or a list of them"
+            )
         variants, settings = content.get("variants", {"default": {}}), content.get("settings", {})
         curves = content.get("curves", False)
         if type(curves) is not bool:
