@@ -26,8 +26,9 @@ from pdeloop.finished_run import FinishedRun, load_run
 from pdeloop.in_process import LocalPair
 from pdeloop.interruption import Interruption
 from pdeloop.pairs import Transport
-from pdeloop.training_run import begin, carry_out, resuming
+from pdeloop.training_run import begin, carry_out
 from tuner_node.build import build_training
+from tuner_node.run_folder import resuming
 
 __all__ = ["Problem", "identify", "problem", "train"]
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 import importlib.util
 import itertools
 import os
-import shlex
 import sys
 import threading
 import time
@@ -32,7 +31,7 @@ from pdeloop.pairs import LoopNode, Transport
 from pdeloop.supervisor import Child, NodeError, Supervisor, node_command
 from tuner_node import narration
 from tuner_node.build import build_training
-from tuner_node.run_folder import RunFolder, RunFolderError, timestamp
+from tuner_node.run_folder import RunFolder, RunFolderError, resuming, timestamp
 from tuner_node.run_store import RunWriter
 
 BUILT_IN = {"nodes": [], "law": "affine"}
@@ -99,7 +98,7 @@ def run(folder: Path, values: dict[str, Any], transport: Transport, as_json: boo
     try:
         # Over topics every node that was started must be known, and every bag finished.
         with interruptible(
-            resuming(folder, in_process=transport.in_process), at_once=transport.in_process
+            resuming(folder) + " --in-process" * transport.in_process, at_once=transport.in_process
         ) as check:
             carry_out(folder, values, transport, display, check)
     except Interruption:
@@ -117,11 +116,6 @@ def run(folder: Path, values: dict[str, Any], transport: Transport, as_json: boo
     for text in narration.warnings(summary):
         display.warn(text)
     return int(narration.failed(summary))
-
-
-def resuming(folder: Path, *, in_process: bool = False) -> str:
-    """The command that continues the training in `folder`, to be typed."""
-    return f"pdeloop train --resume {shlex.quote(str(folder))}" + " --in-process" * in_process
 
 
 def carry_out(
@@ -158,7 +152,7 @@ def _train_here(
         except OSError as error:
             raise RunFolderError(
                 f"cannot write the results to {folder}: {error.strerror}; make room and "
-                f"continue with: {resuming(folder, in_process=True)}"
+                f"continue with: {resuming(folder)} --in-process"
             ) from error
 
 
@@ -168,7 +162,7 @@ def _train_over_topics(
     if importlib.util.find_spec("rclpy") is None:
         raise NodeError(
             "needs rclpy: source an installed ROS 2 Jazzy, or pip install 'pdeloop[ros]', or train "
-            f"without ROS: {resuming(folder, in_process=True)}"
+            f"without ROS: {resuming(folder)} --in-process"
         )
     logs = folder / "logs"
     make_own_folder(logs)

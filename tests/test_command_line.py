@@ -176,15 +176,6 @@ def test_a_bug_is_a_traceback_and_a_code_of_its_own(monkeypatch, capsys) -> None
     assert "Traceback" in capsys.readouterr().err
 
 
-def test_too_little_memory_is_one_line(monkeypatch, capsys) -> None:
-    def large() -> dict[str, Path]:
-        raise MemoryError("1 PiB for an array")
-
-    monkeypatch.setattr(problems, "shipped_problems", large)
-    assert main(["problems"]) == 1
-    assert capsys.readouterr().err == "pdeloop: not enough memory: 1 PiB for an array\n"
-
-
 def test_a_machine_without_ros_is_told_what_to_do(monkeypatch, capsys, tmp_path: Path) -> None:
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda n: None if n == "rclpy" else find(n))

@@ -17,6 +17,7 @@ import fcntl
 import json
 import os
 import secrets
+import shlex
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -64,6 +65,11 @@ class RunFolderError(ValueError):
     """The folder cannot be used as asked; the text says why and what to do."""
 
 
+def resuming(folder: Path) -> str:
+    """The command that continues the training in `folder`, to be typed."""
+    return f"pdeloop train --resume {shlex.quote(str(folder))}"
+
+
 @dataclass(frozen=True)
 class RunIdentity:
     """run: the id in every frame of this training; incarnation: starts of its tuner so far.
@@ -88,7 +94,7 @@ class RunFolder:
         if (self.path / "parameters.yaml").exists():
             raise RunFolderError(
                 f"{self.path} already holds a run; choose another folder, delete this one, "
-                f"or continue it with: pdeloop train --resume {self.path} "
+                f"or continue it with: {resuming(self.path)} "
                 "(a tuner_node with -p resume:=true)"
             )
         try:
@@ -233,7 +239,7 @@ class RunFolder:
         if not path.exists():
             raise RunFolderError(
                 f"no results in {self.path}: the run is not finished; "
-                f"continue it with: pdeloop train --resume {self.path}"
+                f"continue it with: {resuming(self.path)}"
             )
         values = self.values()
         n_a, seeds = values["n_a"], values["seeds"]
@@ -250,8 +256,8 @@ class RunFolder:
             }
         except ValueError as error:
             raise RunFolderError(
-                f"{path} cannot be read ({error}); write it anew: delete it and result.json, then "
-                f"pdeloop train --resume {self.path}"
+                f"{path} cannot be read ({error}); write it anew: delete it and "
+                f"result.json, then {resuming(self.path)}"
             ) from error
 
     def result(self) -> dict[str, Any]:
@@ -264,8 +270,8 @@ class RunFolder:
             return content
         except (ValueError, TypeError) as error:
             raise RunFolderError(
-                f"{path} cannot be used ({error}); is the run finished? Else delete it, and: "
-                f"pdeloop train --resume {self.path}"
+                f"{path} cannot be used ({error}); is the run finished? Else delete it, "
+                f"and: {resuming(self.path)}"
             ) from error
 
     def _identify(self, identity: RunIdentity, parameters: Mapping[str, Any]) -> RunIdentity:
