@@ -141,16 +141,20 @@ class RemoteParameters:
         self.close()
 
     def _call(self, client: Any, request: Any) -> Generator[None, None, Any]:
-        """The answer to a request, which is made again when it stays out."""
-        while True:
-            while not client.service_is_ready():
-                yield
-            future, again_at = client.call_async(request), time.monotonic() + UNANSWERED
-            while not future.done() and time.monotonic() <= again_at:
-                yield
-            if future.done():
-                return future.result()
+        """The answer to a request, which is made again when it stays out.
+
+        The first answer counts, also to an earlier one: a node that computes for long answers all late.
+        """
+        asked: list[Any] = []
+        again_at = 0.0
+        while not (done := [future for future in asked if future.done()]):
+            if time.monotonic() >= again_at and client.service_is_ready():
+                asked.append(client.call_async(request))
+                again_at = time.monotonic() + UNANSWERED
+            yield
+        for future in asked:
             client.remove_pending_request(future)
+        return done[0].result()
 
     def close(self) -> None:
         """Drop the clients; nothing is asked any more."""

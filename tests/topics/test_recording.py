@@ -340,10 +340,12 @@ MATCHING = """
 import sys, time
 import rclpy, rclpy.executors
 from std_msgs.msg import String
+from loop_interfaces.ros import parameters
 from loop_interfaces.ros.peers import Peers
 from recorder_node.matching import PATIENCE, Matching
 
 rclpy.init()
+parameters.UNANSWERED = 0.0  # every answer comes later than that
 served = sys.argv[1] == "served"
 plant = rclpy.create_node("plant", start_parameter_services=served)
 publisher = plant.create_publisher(String, "state", 1)
