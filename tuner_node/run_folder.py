@@ -3,8 +3,8 @@
 
 parameters.yaml    the resolved parameters, in ROS form: what defines the training
 run.json           the run's id on the network, how often its tuner was started, whether an
-                   operator has paused it, what defines the training, and why nobody may
-                   continue it, if so
+                   operator has paused it, the plant's fingerprint if it was given (0: not),
+                   what defines the training, and why nobody may continue it, if so
 progress.jsonl     what happened, one JSON object a line, as it happened
 checkpoint         the training's state (tuner_node.checkpoint), and the one before
 policy.npz         policy (S, n_a, 2 n_s), lqt (the same), model rows (S, rows, n_s), seeds (S,)
@@ -122,7 +122,8 @@ class RunFolder:
             identity = RunIdentity(int(known["run"]), int(known["incarnation"]) + 1, paused)
             if not (0 < identity.run < MAX_ID and 0 < identity.incarnation < 2**21):
                 raise ValueError("ids out of range")
-            return self._identify(identity, known["parameters"])
+            plant = {"plant": parameters.get("plant", 0)}
+            return self._identify(identity, known["parameters"] | plant)
         except RunFolderError:
             raise
         except OSError as error:
@@ -279,6 +280,7 @@ class RunFolder:
             "run": identity.run,
             "incarnation": identity.incarnation,
             "paused": identity.paused,
+            "plant": parameters.get("plant", 0),
             "parameters": {k: v for k, v in parameters.items() if k not in TRANSIENT},
         }
         write_atomically(self.path / "run.json", json.dumps(content).encode())
