@@ -7,16 +7,18 @@ keeps nothing that the latched topics do not give it back after a restart, excep
 exploratory episode: if it missed some, it says so and the episode is run again.
 """
 
-from collections import Counter, OrderedDict, deque
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from controller_node.answered_steps import AnsweredSteps
 from controller_node.exploration import Exploration
 from controller_node.identification import DesignSettings
 from controller_node.policy import ProjectedLaw
+from controller_node.run_state import Answering, Models, RunState, digest_of_start
 from loop_interfaces import model_rows
 from loop_interfaces.episodes import episode_name
 from loop_interfaces.frames import KEPT_ARRAY, Frame, FrameError
@@ -26,7 +28,6 @@ from loop_interfaces.topics import (
     ACTION,
     COMPLETED,
     MAX_GAIN,
-    VOID,
     CostColumn,
     StartColumn,
     start_rows,
@@ -35,72 +36,10 @@ from loop_interfaces.topics import (
 MAX_RUNS = 8
 """Runs, and plants, that are remembered. The least recently used is dropped first, but never the one
 that was answered last, whatever else comes in."""
-MAX_KEPT = 4
-"""Policies, and sets of reduced models, that are kept of a run: a stranger's beside the tuner's."""
 MAX_BYTES = 2**29
 """Bytes that are kept of all runs together, and half as many of targets. Less recently used ones are
 dropped for a newer one; a run that has no room alone is refused, and an exploratory episode without
 room gives no model."""
-
-
-@dataclass(frozen=True)
-class Answering:
-    """What answers the states of an episode of a plant: made with its first one.
-
-    law: None where the controller explores; signature: what the actions carry, see
-    loop_interfaces.signature.
-    """
-
-    plant: int
-    episode: int
-    law: ProjectedLaw | None
-    signature: float
-
-
-@dataclass(frozen=True)
-class _Models:
-    """Reduced models as a tuner has sent them: their number, which episodes name, and a digest."""
-
-    number: int
-    digest: int
-    rows: list[model_rows.ModelRows]
-
-
-@dataclass
-class _Run:
-    """What came in the name of one run, and what was made of it. policies, models: the newest ones."""
-
-    start: Frame | None = None
-    exploration: Exploration | None = None
-    """Of the episode, if it explores."""
-    policies: deque[Frame] = field(default_factory=lambda: deque(maxlen=MAX_KEPT))
-    models: deque[_Models] = field(default_factory=lambda: deque(maxlen=MAX_KEPT))
-    answering: Answering | None = None
-    """Dropped with whatever arrives that changes it."""
-
-    @property
-    def nbytes(self) -> int:
-        frames = [
-            frame.values.nbytes for frame in (self.start, *self.policies) if frame is not None
-        ]
-        rows = [model for models in self.models for model in models.rows]
-        matrices = [a.nbytes for model in rows for a in (model.U, model.A, model.B)]
-        samples = self.exploration.nbytes if self.exploration else 0
-        # The law has a copy of every U.
-        return sum(frames) + 2 * sum(matrices) + samples
-
-    def policies_of(self, episode: int) -> list[Frame]:
-        """All that came for an episode."""
-        return [policy for policy in self.policies if policy.episode == episode]
-
-    def models_of(self, number: int) -> list[_Models]:
-        """All that came under a number."""
-        return [models for models in self.models if models.number == number]
-
-    def episode_start(self, frame: Frame) -> Frame | None:
-        """The start of the frame's episode, if it is the one this run is in."""
-        start = self.start
-        return start if start is not None and start.episode == frame.episode else None
 
 
 class Responder:
@@ -113,7 +52,7 @@ class Responder:
     def __init__(self, settings: DesignSettings) -> None:
         self._settings = settings
         self._targets: OrderedDict[int, np.ndarray] = OrderedDict()
-        self._runs: OrderedDict[int, _Run] = OrderedDict()
+        self._runs: OrderedDict[int, RunState] = OrderedDict()
         self._served = (-1, -1)
         """Run and plant of the last answer."""
         self._pending: Frame | None = None
@@ -128,13 +67,7 @@ class Responder:
         """Why the last episode's identification gave no model; empty if it did."""
         self._ended = (-1, -1)
         """Run and episode of the last cost."""
-        self._attended = (-1, -1, -1)
-        """Run, plant and episode whose states were answered from the first one on."""
-        self._furthest = -1
-        """The last step of it that was answered."""
-        self._claimed = (-1, -1, -1), -1
-        """The same of an episode, and the step to which it went by its cost: further than was
-        answered."""
+        self._steps = AnsweredSteps()
 
     @property
     def run(self) -> int | None:
@@ -232,7 +165,7 @@ class Responder:
         if digest not in [known.digest for known in before]:
             n_a = self._settings.n_a
             rows = [model_rows.unpack(rows.copy(), n_a) for rows in frame.values]
-            run.models.append(_Models(frame.step, digest, rows))
+            run.models.append(Models(frame.step, digest, rows))
             run.answering = None
             if before:
                 raise FrameError(
@@ -268,9 +201,6 @@ class Responder:
             taken_back = exploration.take_back(frame.plant)
             actions = exploration.actions(frame.step)
         self._pending, self._served, self.episode = None, (frame.run, frame.plant), frame.episode
-        ids = *self._served, self.episode
-        if frame.step == 0 and ids != self._attended:
-            self._attended, self._furthest = ids, 0
         self.advance_counters(1, frame.step, frame.step)
         time = answering.signature or frame.time
         return [Publication(ACTION, replace(frame, time=time, values=actions)), *taken_back]
@@ -279,11 +209,7 @@ class Responder:
         """Account for states of the present episode that were answered: the last and the furthest."""
         self.answered += answers
         self.step = step
-        ids = *self._served, self.episode
-        if self._attended == ids:
-            self._furthest = max(self._furthest, furthest)
-        if self._claimed[0] == ids and furthest >= self._claimed[1]:
-            self._claimed = (-1, -1, -1), -1
+        self._steps.answered((*self._served, self.episode), furthest)
 
     def answering(self, state: Frame) -> Answering | None:
         """What answers the states of an episode, like one that was answered before.
@@ -312,9 +238,11 @@ class Responder:
             self.last_cost = float(completed[:, CostColumn.MEAN].mean()) if len(completed) else None
         run = self._runs.get(frame.run)
         start = run.episode_start(frame) if run else None
-        taken_back = self._compare_claims(frame)
+        contradiction = self._steps.contradiction(frame)
         if run is None or start is None or run.exploration is None:
-            return taken_back
+            if not contradiction:
+                return []
+            return [ModelFailure(frame.run, frame.episode, False, contradiction)]
         if frame.values.shape != (len(start.values), len(CostColumn)):
             raise FrameError(
                 f"expected costs of shape {(len(start.values), len(CostColumn))}, "
@@ -328,32 +256,12 @@ class Responder:
             self.counters["identifications failed" if self.failure else "models identified"] += 1
         return [outcomes[frame.plant]] if frame.plant in outcomes else []
 
-    def _compare_claims(self, cost: Frame) -> list[Publication | ModelFailure]:
-        """That the plant gives an episode up that by a cost went further than its states were answered.
-
-        One of the two alone is no contradiction: a second controller may have answered the others, or
-        a second plant be slower.
-        """
-        ids = cost.run, cost.plant, cost.episode
-        if not (cost.values[:, -1:] == VOID).any():
-            if ids == self._attended and cost.step > self._furthest:
-                self._claimed = ids, cost.step
-            return []
-        if ids != self._claimed[0] or cost.step >= self._claimed[1]:
-            return []
-        reason = (
-            f"a cost says that it went to step {self._claimed[1]}, and the plant gave it up at step "
-            f"{cost.step}"
-        )
-        self._claimed = (-1, -1, -1), -1
-        return [ModelFailure(cost.run, cost.episode, False, reason)]
-
     def waits_for(self) -> list[str]:
         """Topics that the state waiting for its answer still lacks; empty when none waits."""
         pending = self._pending
         if pending is None:
             return []
-        run = self._runs.get(pending.run, _Run())
+        run = self._runs.get(pending.run, RunState())
         start = run.episode_start(pending)
         lacking = [] if start else ["episode/start"]
         lacking += [] if pending.plant in self._targets else ["target"]
@@ -361,13 +269,13 @@ class Responder:
             models, policies = run.models_of(start.step), run.policies_of(pending.episode)
             lacking += [] if models else ["model"]
             lacking += [] if policies else ["policy"]
-            if models and policies and self._named(run, start) is None:
+            if models and policies and run.named(start, self._settings.action_limit) is None:
                 lacking.append("one tuner (different policies or models came)")
         return lacking
 
-    def _run(self, number: int, more: int) -> _Run:
+    def _run(self, number: int, more: int) -> RunState:
         """What is known of a run, of which `more` bytes come. FrameError if there is no room."""
-        run = self._runs.setdefault(number, _Run())
+        run = self._runs.setdefault(number, RunState())
         _forget(self._runs, number, self._served[0])
         if not self._has_room(number, more):
             raise FrameError(f"expected less than {MAX_BYTES} bytes of all runs together")
@@ -412,41 +320,17 @@ class Responder:
             return None
         law, named = None, None
         if run.exploration is None:
-            if (named := self._named(run, start)) is None:
+            if (named := run.named(start, self._settings.action_limit)) is None:
                 return None
             law = self._law(start, *named, target)
-        signed = signature(self._digest(start, named), target) if start.plant else NOT_SIGNED
+        signed = NOT_SIGNED
+        if start.plant:
+            digest = digest_of_start(start, named, self._settings.action_limit)
+            signed = signature(digest, target)
         run.answering = Answering(frame.plant, frame.episode, law, signed)
         return run.answering
 
-    def _named(self, run: _Run, start: Frame) -> tuple[Frame, _Models] | None:
-        """Policies and models of the run's episode, None while they have not arrived.
-
-        Of several those that the start signs, or the newest if it signs none of them; None if it
-        signs nothing.
-        """
-        found = [
-            (policy, models)
-            for models in run.models_of(start.step)
-            for policy in run.policies_of(start.episode)
-        ]
-        fitting = [named for named in found if len(named[0].values) == len(start.values)]
-        if len(fitting) > 1:
-            signed = [named for named in fitting if self._digest(start, named) == start.plant]
-            return (signed or fitting)[-1] if start.plant else None
-        return next(iter(fitting or found), None)
-
-    def _digest(self, start: Frame, named: tuple[Frame, _Models] | None) -> int:
-        """D, see loop_interfaces.signature. named: policies and models, None where it explores."""
-        published: list[Any] = [start.values, self._settings.action_limit]
-        if named is not None:
-            policy, models = named
-            published += [policy.values, models.digest]
-        return digest_of(*published)
-
-    def _law(
-        self, start: Frame, policy: Frame, models: _Models, target: np.ndarray
-    ) -> ProjectedLaw:
+    def _law(self, start: Frame, policy: Frame, models: Models, target: np.ndarray) -> ProjectedLaw:
         """The law set for an episode."""
         index = start.values[:, StartColumn.MODEL].astype(np.int64)
         if len(policy.values) != len(index):

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from controller_node.responder import Responder
+from controller_node.answered_steps import AnsweredSteps
 from pde_sim_node.taken_actions import Episode, TakenActions
 from tests.simulation.audit import audit, shrunk, verdict
 from tests.simulation.disk import Disk
@@ -53,7 +53,7 @@ def test_the_auditor_finds_a_controller_that_compares_no_cost_with_what_it_has_a
 ):
     bad = Plan(1, faults=(Fault(0.065, "early cost"),))
     assert verdict(bad)[0] == "error"
-    monkeypatch.setattr(Responder, "_compare_claims", lambda self, cost: [])
+    monkeypatch.setattr(AnsweredSteps, "contradiction", lambda self, cost: "")
     assert verdict(bad)[1] == "AssertionError: another policy"
 
 

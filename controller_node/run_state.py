@@ -1,0 +1,110 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""What a controller keeps of a run: what came in its name, and what answers its episode. Pure."""
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+from controller_node.exploration import Exploration
+from controller_node.policy import ProjectedLaw
+from loop_interfaces import model_rows
+from loop_interfaces.frames import Frame
+from loop_interfaces.signature import digest_of
+
+MAX_KEPT = 4
+"""Policies, and sets of reduced models, that are kept of a run: a stranger's beside the tuner's."""
+
+
+@dataclass(frozen=True)
+class Answering:
+    """What answers the states of an episode of a plant: made with its first one.
+
+    law: None where the controller explores; signature: what the actions carry, see
+    loop_interfaces.signature.
+    """
+
+    plant: int
+    episode: int
+    law: ProjectedLaw | None
+    signature: float
+
+
+@dataclass(frozen=True)
+class Models:
+    """Reduced models as a tuner has sent them: their number, which episodes name, and a digest."""
+
+    number: int
+    digest: int
+    rows: list[model_rows.ModelRows]
+
+
+Named: TypeAlias = tuple[Frame, Models]
+"""Policies and models that answer an episode."""
+
+
+@dataclass
+class RunState:
+    """What came in the name of one run, and what was made of it. policies, models: the newest ones."""
+
+    start: Frame | None = None
+    exploration: Exploration | None = None
+    """Of the episode, if it explores."""
+    policies: deque[Frame] = field(default_factory=lambda: deque(maxlen=MAX_KEPT))
+    models: deque[Models] = field(default_factory=lambda: deque(maxlen=MAX_KEPT))
+    answering: Answering | None = None
+    """Dropped with whatever arrives that changes it."""
+
+    @property
+    def nbytes(self) -> int:
+        """Of all arrays that are kept."""
+        frames = [
+            frame.values.nbytes for frame in (self.start, *self.policies) if frame is not None
+        ]
+        rows = [model for models in self.models for model in models.rows]
+        matrices = [a.nbytes for model in rows for a in (model.U, model.A, model.B)]
+        samples = self.exploration.nbytes if self.exploration else 0
+        # The law has a copy of every U.
+        return sum(frames) + 2 * sum(matrices) + samples
+
+    def policies_of(self, episode: int) -> list[Frame]:
+        """All that came for an episode."""
+        return [policy for policy in self.policies if policy.episode == episode]
+
+    def models_of(self, number: int) -> list[Models]:
+        """All that came under a number."""
+        return [models for models in self.models if models.number == number]
+
+    def episode_start(self, frame: Frame) -> Frame | None:
+        """The start of the frame's episode, if it is the one this run is in."""
+        start = self.start
+        return start if start is not None and start.episode == frame.episode else None
+
+    def named(self, start: Frame, action_limit: float) -> Named | None:
+        """Policies and models of the run's episode, None while they have not arrived.
+
+        Of several those that the start signs, or the newest if it signs none of them; None if it
+        signs nothing.
+        """
+        found = [
+            (policy, models)
+            for models in self.models_of(start.step)
+            for policy in self.policies_of(start.episode)
+        ]
+        fitting = [named for named in found if len(named[0].values) == len(start.values)]
+        if len(fitting) > 1:
+            signed = [
+                named
+                for named in fitting
+                if digest_of_start(start, named, action_limit) == start.plant
+            ]
+            return (signed or fitting)[-1] if start.plant else None
+        return next(iter(fitting or found), None)
+
+
+def digest_of_start(start: Frame, named: Named | None, action_limit: float) -> int:
+    """D of an episode, see loop_interfaces.signature. named: None where it explores."""
+    published: list[Any] = [start.values, action_limit]
+    if named is not None:
+        policy, models = named
+        published += [policy.values, models.digest]
+    return digest_of(*published)
