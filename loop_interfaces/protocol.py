@@ -11,6 +11,7 @@ import json
 from dataclasses import dataclass
 
 from loop_interfaces.frames import Frame
+from loop_interfaces.text import printable
 from loop_interfaces.topics import Topic
 
 STOPPED = 75
@@ -65,6 +66,5 @@ class ModelFailure:
 
 
 def _one_line(text: str) -> str:
-    """A text from the network as it may be printed: nothing that a terminal or an encoding acts on."""
-    words = " ".join(text[:MAX_REASON].split())
-    return "".join(c if c.isprintable() else "?" for c in words)
+    """The beginning of a text from the network, as it may be printed."""
+    return printable(" ".join(text[:MAX_REASON].split()))[:MAX_REASON]

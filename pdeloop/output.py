@@ -11,6 +11,8 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from loop_interfaces.text import printable
+
 
 def print_json(value: Any) -> None:
     """One line of JSON. A number that JSON has no word for is null."""
@@ -33,15 +35,6 @@ def drop_unwritable() -> None:
             stream.flush()
         except OSError:
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
-
-
-def printable(text: str) -> str:
-    r"""A text with what is no character to be seen, such as a terminal's escape sequences, in words.
-
-    >>> printable("red " + chr(27) + "[31m")
-    'red \\x1b[31m'
-    """
-    return "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in text)
 
 
 def aligned(rows: Sequence[Sequence[str]], names: int = 1) -> list[str]:

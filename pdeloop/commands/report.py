@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 
+from loop_interfaces.text import printable
 from pdeloop.commands.common import (
     Commands,
     a_path,
@@ -13,7 +14,6 @@ from pdeloop.commands.common import (
     command,
     refuse_other_equation,
 )
-from pdeloop.output import printable
 
 
 def add(commands: Commands) -> None:
