@@ -63,8 +63,8 @@ def test_a_recorded_run_is_complete_and_everything_in_it_is_recomputed(recorded)
     assert {"pde_sim_node", "tuner_node"} <= {m.name for m in messages if hasattr(m, "msg")}
 
 
-def rewrite(bag: Path, frame: Frame) -> None:
-    """Change the last bit of the first number of `frame` where it is in the bag."""
+def rewrite(bag: Path, frame: Frame, number: int = 0) -> None:
+    """Change the last bit of the number at this place of `frame`, where it is in the bag."""
     messages = list(Bag(bag).messages())
     (bag / "bag.mcap").rename(bag / "old")
     topics = {message.topic: message.type for message in messages}
@@ -74,7 +74,7 @@ def rewrite(bag: Path, frame: Frame) -> None:
     for message in messages:
         data, place = bytearray(message.data), message.data.find(values)
         if place > 0 and data[place - 40 : place - 16] == ids:
-            data[place] ^= 1
+            data[place + 8 * number] ^= 1
             changed += 1
         writer.write(message.topic, message.when, bytes(data))
     writer.close()
@@ -82,21 +82,23 @@ def rewrite(bag: Path, frame: Frame) -> None:
     (bag / "again" / "bag.mcap").rename(bag / "bag.mcap")
 
 
-@pytest.mark.parametrize("topic", ["state", "action", "policy", "cost", "model", "start"])
+@pytest.mark.parametrize("topic", ["state", "action", "policy", "cost", "model", "models", "start"])
 def test_verify_finds_a_single_bit_that_was_changed(recorded, tmp_path, topic):
     copy = tmp_path / "bag"
     shutil.copytree(recorded / "bag", copy)
     episodes = list(Bag(copy).episodes())
     exploratory, adapting = episodes[0], episodes[4]
+    of_A = np.size(Bag(copy).target()) * exploratory.model.values.shape[2]  # after U; no law uses A
     frame, words = {
         "state": (adapting.states[17], f"z_17 of episode {adapting.name}"),
         "action": (adapting.actions[12], f"a_12 of episode {adapting.name}"),
         "policy": (adapting.policy, f"policy of episode {adapting.name}"),
         "cost": (adapting.cost, f"cost of episode {adapting.name}"),
         "model": (exploratory.model, f"model of episode {exploratory.name}"),
+        "models": (adapting.bases, f"models number {adapting.bases.step} of run"),
         "start": (adapting.start, f"of episode {adapting.name}"),
     }[topic]
-    rewrite(copy, frame)
+    rewrite(copy, frame, of_A if topic == "models" else 0)
     report = verify(copy)
     assert report.count > 0
     assert any(words in text for text in report.differences), report.text()
