@@ -689,9 +689,11 @@ def test_a_bag_of_the_version_before_is_read_verified_and_identified_from(tmp_pa
     assert identify_bag(OLD, {}).steps > 0
 
 
-def test_what_was_compared_is_numbers_and_nothing_compared_is_nothing_verified(tmp_path, capsys):
+def test_what_was_compared_is_numbers_and_what_cannot_be_verified_is_refused(tmp_path, capsys):
     main(["bag", "verify", str(OLD), "--json"])
     assert json.loads(capsys.readouterr().out)["compared"]["costs"] == 1 + 8 + 2 * 2 + 3
+    assert main(["bag", "verify", str(OLD), "--equation", "kdv"]) == 1
+    assert "--equation is kdv, and that of the run is burgers" in capsys.readouterr().err
     without = Path(shutil.copytree(OLD, tmp_path / "bag"))
     (without / "parameters.json").unlink()
     assert main(["bag", "verify", str(without)]) == 1

@@ -120,6 +120,17 @@ def verify(*paths: Path, parameters: Path | None = None) -> Report:
     return report
 
 
+def equations(*paths: Path, parameters: Path | None = None) -> list[str]:
+    """The equations that `verify` runs with the same arguments, as far as they are known."""
+    if parameters is not None:
+        known = [read_yaml(parameters)]
+    else:
+        known = [
+            run for path in paths for bag in bags_of(path) for run in bag.parameters().values()
+        ]
+    return sorted({str(values["equation"]) for values in known if "equation" in values})
+
+
 def _complete(values: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
     """The parameters of a run, None without those that only its plant can tell."""
     told = values is not None and any(spec.name in values for spec in PLANT)

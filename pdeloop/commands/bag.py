@@ -14,6 +14,7 @@ from pdeloop.commands.common import (
     add_json,
     allow_equation,
     command,
+    refuse_other_equation,
 )
 from pdeloop.output import print_json
 
@@ -74,9 +75,11 @@ def _bag_info(options: argparse.Namespace) -> int:
 
 
 def _bag_verify(options: argparse.Namespace) -> int:
-    from pdeloop.bags.verify import verify
+    from pdeloop.bags.verify import equations, verify
 
     allow_equation(options)
+    if known := equations(*options.bag, parameters=options.parameters):
+        refuse_other_equation(options, *known)
     report = verify(*options.bag, parameters=options.parameters)
     if options.json:
         print_json(asdict(report))
