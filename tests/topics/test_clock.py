@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -64,18 +65,35 @@ def newest_time(out: Path) -> float:
     return float(last)
 
 
-def test_a_clock_that_jumps_forth_and_back_changes_nothing(loop: Processes, tmp_path: Path):
+@pytest.fixture
+def faketime() -> Iterator[Path]:
+    """The library of faketime. Its files in shared memory outlive a process that is killed."""
     found = list(Path("/usr/lib").glob("*/faketime/libfaketime.so.1"))
     if not found:
         pytest.skip("needs Debian's faketime (make packages)")
-    library = found[0]
+    before = shared_memory()
+    yield found[0]
+    for name in shared_memory() - before:
+        _, _, owner = name.rpartition("_")
+        if not Path("/proc", owner).exists():
+            Path("/dev/shm", name).unlink(missing_ok=True)
+
+
+def shared_memory() -> set[str]:
+    """The names of faketime's files in shared memory, each with the id of its process."""
+    return {path.name for path in Path("/dev/shm").glob("*faketime_*")}
+
+
+def test_a_clock_that_jumps_forth_and_back_changes_nothing(
+    faketime: Path, loop: Processes, tmp_path: Path
+):
     offset = tmp_path / "offset"
     offset.write_text("+0d\n")
     out = tmp_path / "run"
     with operator(loop) as desk:
         loop.forks = False  # the library must be there when a program starts
         loop.environment |= {
-            "LD_PRELOAD": str(library),
+            "LD_PRELOAD": str(faketime),
             "FAKETIME_TIMESTAMP_FILE": str(offset),
             "FAKETIME_CACHE_DURATION": "1",  # a jump is seen within so many seconds
             "FAKETIME_DONT_FAKE_MONOTONIC": "1",
