@@ -682,8 +682,12 @@ def test_a_bag_of_the_version_before_is_read_verified_and_identified_from(tmp_pa
     assert "the tuner's rollouts not known" in report.notes[1]  # its budget had other parts
     assert report.compared["targets"] == 1
     assert report.compared["costs"] == 1 + 8 + 2 * 2 + 3
-    assert report.compared["steps"] == 30 * report.compared["costs"]
-    for text in report.differences:  # on another machine than that which recorded it
+    steps, compared = 30 * report.compared["costs"], report.compared["steps"]
+    if report.differences:  # another processor than the recording one's: up to the first of each
+        assert 0 < compared <= steps
+    else:
+        assert compared == steps
+    for text in report.differences:
         recorded, again = map(float, re.findall(r"re(?:corded|computed) (\S+?)(?:,|$)", text))
         assert again == pytest.approx(recorded, rel=1e-6), text
     assert identify_bag(OLD, {}).steps > 0
