@@ -24,11 +24,17 @@ from pde_sim_node.equations import (
     KortewegDeVries,
     KuramotoSivashinsky,
     KuramotoSivashinsky22,
+    RandomModes,
     Schrodinger,
     Wave,
     allow,
     configured_equation,
     load_equation,
+)
+from pde_sim_node.equations.random_modes import (
+    AllenCahnModes,
+    BurgersModes,
+    KortewegDeVriesModes,
 )
 
 ALL = pytest.mark.parametrize("kind", EQUATIONS.values(), ids=EQUATIONS.keys())
@@ -77,6 +83,26 @@ def test_initial_fields_and_targets_are_those_of_the_method() -> None:
     np.testing.assert_allclose(KortewegDeVries().target(x), np.sin(np.pi * x / 10))
 
 
+@pytest.mark.parametrize("name", ["burgers", "allen-cahn", "kdv"])
+def test_random_modes_change_the_initial_field_alone(name: str) -> None:
+    """Operators, nonlinearity and target of the paper's equation, and the spectrum of the docstring."""
+    plain, rich = EQUATIONS[name](), EQUATIONS[f"{name}-modes"]()
+    assert isinstance(rich, RandomModes)
+    x, k = grid(plain), 2 * np.pi / plain.length * np.arange(65)
+    assert rich.length == plain.length
+    np.testing.assert_array_equal(rich.linear_operator(k), plain.linear_operator(k))
+    np.testing.assert_array_equal(rich.multiplier(k), plain.multiplier(k))
+    np.testing.assert_array_equal(rich.target(x), plain.target(x))
+    assert [rich.nonlinearity(u) for u in (-1.5, 0.3)] == [
+        plain.nonlinearity(u) for u in (-1.5, 0.3)
+    ]
+    fields = np.array([rich.initial_field(x, np.random.default_rng(s)) for s in range(400)])
+    power = np.mean(np.abs(np.fft.rfft(fields) / len(x)) ** 2, axis=0)
+    # E |u_j|^2 = rms^2/(2 J) for each of the J modes: alpha^2 + beta^2 = 2 on average, over 4.
+    np.testing.assert_allclose(power[1:5], rich.rms**2 / 8, rtol=0.25)
+    np.testing.assert_allclose(np.delete(power, slice(1, 5)), 0.0, atol=1e-28)
+
+
 @pytest.mark.parametrize("number, energy", [(1, 0.2609), (2, 0.4382), (3, 1.5876)])
 def test_the_equilibria_of_kuramoto_sivashinsky(number: int, energy: float) -> None:
     """At rest, and with the energies of Cvitanovic, Davidchack, Siminos (2010), table 5.1."""
@@ -117,11 +143,11 @@ def derivatives(equation: Equation, u: np.ndarray, w: float, x: np.ndarray) -> n
     """u_t of u = 0.3 + sin(w x) (and v = cos(2 w x), where there are two), by hand."""
     s, c, v = np.sin(w * x), np.cos(w * x), np.cos(2 * w * x)
     match equation:
-        case Burgers():
+        case Burgers() | BurgersModes():
             return -u * w * c - equation.viscosity * w**2 * s
-        case AllenCahn():
+        case AllenCahn() | AllenCahnModes():
             return -(equation.diffusivity**2) * w**2 * s - equation.potential * (u**3 - u)
-        case KortewegDeVries():
+        case KortewegDeVries() | KortewegDeVriesModes():
             return w**3 * c + 6 * u * w * c
         case KuramotoSivashinsky() | KuramotoSivashinsky22():
             return -u * w * c + w**2 * s - w**4 * s
