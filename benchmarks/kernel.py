@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pde_sim_node.equations import EQUATIONS, Equation
-from pde_sim_node.solver.reference import ReferenceStep
 from pde_sim_node.supports import indicator_supports
+from spectral_solver.reference import ReferenceStep
 
 BATCHES = (1, 2, 12, 64)
 SECONDS = 0.25

@@ -1,7 +1,7 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`python -m benchmarks optimum`: how good can a policy be?
 
-Two limits, both with exact gradients (`pde_sim_node.solver.adjoint`) of the noise-free plant:
+Two limits, both with exact gradients (`spectral_solver.adjoint`) of the noise-free plant:
 
 - the optimum of the policy class: the law a = K_a U^T z + b with the least mean stage cost over
   many initial fields of the training distribution, U as the training of that seed identifies it,

@@ -13,11 +13,11 @@ from pde_sim_node.actuators import actuator_supports
 from pde_sim_node.arguments import grid_points, internal_steps, positive, whole
 from pde_sim_node.equations import Equation, LinearEquation
 from pde_sim_node.equations.base import result_of
-from pde_sim_node.solver.exact import exact_step
-from pde_sim_node.solver.kernel import etdrk4_step
-from pde_sim_node.solver.memory import StepSettings
-from pde_sim_node.solver.pointwise import all_finite
-from pde_sim_node.solver.workers import ParallelStep
+from spectral_solver.exact import exact_step
+from spectral_solver.kernel import etdrk4_step
+from spectral_solver.memory import StepSettings
+from spectral_solver.pointwise import all_finite
+from spectral_solver.workers import ParallelStep
 
 DIVERGED_COST = 1e9
 """Mean stage cost of an environment that diverged: very bad, and finite."""

@@ -2,7 +2,7 @@
 """Mean stage costs with their exact gradients: of actions, of policies, and of the initial fields.
 
 With the adjoint eta_k = dJ/dz_k, eta_T = 0, of J = 1/(MT) sum (q |z_k - z_r|^2 + r |a_k|^2) and
-the transposed derivative of the plant's own step (`pde_sim_node.solver.adjoint`),
+the transposed derivative of the plant's own step (`spectral_solver.adjoint`),
 
     g_k   = (df/da)^T eta_{k+1} + 2r/(MT) a_k
     eta_k = (df/dz)^T eta_{k+1} + 2q/(MT) (z_k - z_r) + U K_a^T g_k
@@ -20,8 +20,8 @@ from numpy.typing import ArrayLike
 
 from loop_interfaces.arrays import Array
 from pde_sim_node.plant import EpisodeCosts, Plant
-from pde_sim_node.solver.adjoint import adjoint_of
 from pdeloop.episode import EpisodeRecord, Law, finite_array, finite_basis, rollout
+from spectral_solver.adjoint import adjoint_of
 
 __all__ = ["CostGradient", "Gradients", "features"]
 

@@ -10,9 +10,9 @@ from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from pde_sim_node.equations import Burgers
 from pde_sim_node.plant import Plant
-from pde_sim_node.solver.adjoint import Adjoint
 from pdeloop.episode import projected_law, rollout
 from pdeloop.gradients import Gradients
+from spectral_solver.adjoint import Adjoint
 from tests.plants import Advection, plant_of
 
 PROBLEMS = ("burgers", "allen-cahn", "kdv")

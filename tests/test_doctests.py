@@ -10,7 +10,14 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ("loop_interfaces", "pde_sim_node", "controller_node", "tuner_node", "pdeloop")
+PACKAGES = (
+    "loop_interfaces",
+    "spectral_solver",
+    "pde_sim_node",
+    "controller_node",
+    "tuner_node",
+    "pdeloop",
+)
 MODULES = [
     ".".join(path.relative_to(ROOT).with_suffix("").parts)
     for package in PACKAGES

@@ -19,9 +19,9 @@ from pde_sim_node.equations import (
     load_equation,
 )
 from pde_sim_node.plant import DIVERGED_COST, Plant
-from pde_sim_node.solver import workers
-from pde_sim_node.solver.kernel import fine_length
-from pde_sim_node.solver.reference import ReferenceStep
+from spectral_solver import workers
+from spectral_solver.kernel import fine_length
+from spectral_solver.reference import ReferenceStep
 from tests.interpreter import python
 from tests.plants import plant_of
 
@@ -512,7 +512,7 @@ def test_a_users_equation_is_compiled_once_for_all_processes(tmp_path: Path) -> 
     path = tmp_path / "fisher.py"
     program = (
         "import sys; from pde_sim_node.equations import load_equation;"
-        "from pde_sim_node.solver.pointwise import pointwise_loop;"
+        "from spectral_solver.pointwise import pointwise_loop;"
         "pointwise_loop(load_equation(sys.argv[1]).nonlinearity)"
     )
 

@@ -19,7 +19,7 @@ from pde_sim_node.equations import (
     Wave,
 )
 from pde_sim_node.plant import Plant
-from pde_sim_node.solver.exact import exact_propagator
+from spectral_solver.exact import exact_propagator
 from tests.plants import plant_of
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from loop_interfaces.jit.simd import WIDTH
-from pde_sim_node.solver.fft import fft, is_transform_length, plane_size
-from pde_sim_node.solver.memory import Constants, aligned, lay_out
-from pde_sim_node.solver.spectra import TRANSFORM, analyse, synthesise
+from spectral_solver.fft import fft, is_transform_length, plane_size
+from spectral_solver.memory import Constants, aligned, lay_out
+from spectral_solver.spectra import TRANSFORM, analyse, synthesise
 
 PLAN = np.dtype(
     [

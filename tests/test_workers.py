@@ -15,8 +15,8 @@ import pytest
 
 from pde_sim_node.equations import Burgers
 from pde_sim_node.plant import Plant
-from pde_sim_node.solver import workers
-from pde_sim_node.solver.workers import SolverThreads, use_cores
+from spectral_solver import workers
+from spectral_solver.workers import SolverThreads, use_cores
 from tests.interpreter import ROOT, helps_solver, python
 
 several = pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
@@ -58,7 +58,7 @@ def test_a_small_step_is_compiled_code_alone_and_a_large_one_is_shared() -> None
     program = """
 import os, threading
 import numpy as np
-from pde_sim_node.solver import workers
+from spectral_solver import workers
 from pde_sim_node.equations import Burgers
 from pde_sim_node.plant import Plant
 from tests.test_workers import P1, rollout
@@ -86,7 +86,7 @@ def test_helpers_leave_the_core_that_their_process_is_kept_on() -> None:
     program = f"""
 import sys
 from loop_interfaces.affinity import pin_process
-from pde_sim_node.solver import workers
+from spectral_solver import workers
 from pde_sim_node.equations import Burgers
 from pde_sim_node.plant import Plant
 from tests.test_workers import P1, rollout

@@ -29,7 +29,7 @@ from loop_interfaces.ros.parameters import declare
 from loop_interfaces.spec import Spec
 from loop_interfaces.topics import COST, MODEL, POLICY, START, CostColumn
 from pde_sim_node.build import build_plant
-from pde_sim_node.solver.workers import use_cores
+from spectral_solver.workers import use_cores
 
 PARAMETERS = (
     Spec("solver_pin", -1, -1, 4095).means("core to measure the solver on; -1: all cores"),

@@ -15,9 +15,9 @@ from importlib import metadata
 from typing import Any
 
 from loop_interfaces.affinity import usable_cores
-from pde_sim_node.solver.workers import use_cores
 from pdeloop.study.description import StudyError
 from pdeloop.supervisor import die_with
+from spectral_solver.workers import use_cores
 
 CONNECTING = 10.0
 """Seconds in which a scheduler has to answer."""

@@ -12,7 +12,7 @@ from scipy.fft import irfft, rfft
 
 from loop_interfaces.arrays import Array
 from pde_sim_node.equations import Equation
-from pde_sim_node.solver.etdrk4 import etdrk4_coefficients
+from spectral_solver.etdrk4 import etdrk4_coefficients
 
 
 class ReferenceStep:

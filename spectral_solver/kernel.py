@@ -22,13 +22,13 @@ from loop_interfaces.jit import native, simd
 from loop_interfaces.jit.cache import jit
 from loop_interfaces.jit.native import call_c
 from loop_interfaces.jit.simd import WIDTH, fma, read, splat, whole_lanes
-from pde_sim_node.solver import fft, spectra
-from pde_sim_node.solver.batch_step import environments_of
-from pde_sim_node.solver.etdrk4 import etdrk4_coefficients
-from pde_sim_node.solver.fft import is_transform_length, plane_size
-from pde_sim_node.solver.memory import Constants, StepSettings, begin_plan, lay_out, step_plan_type
-from pde_sim_node.solver.pointwise import pointwise_loop
-from pde_sim_node.solver.spectra import (
+from spectral_solver import fft, spectra
+from spectral_solver.batch_step import environments_of
+from spectral_solver.etdrk4 import etdrk4_coefficients
+from spectral_solver.fft import is_transform_length, plane_size
+from spectral_solver.memory import Constants, StepSettings, begin_plan, lay_out, step_plan_type
+from spectral_solver.pointwise import pointwise_loop
+from spectral_solver.spectra import (
     TRANSFORM,
     analyse,
     forward,
@@ -43,7 +43,7 @@ from pde_sim_node.solver.spectra import (
     rfft_unpack,
     synthesise,
 )
-from pde_sim_node.solver.workers import ParallelStep
+from spectral_solver.workers import ParallelStep
 
 PLAN = step_plan_type(
     ("pointwise", np.int64),  # address of the compiled nonlinearity

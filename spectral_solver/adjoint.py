@@ -40,10 +40,10 @@ from loop_interfaces.jit.native import call_c
 from loop_interfaces.jit.simd import load, read, splat, write
 from pde_sim_node.equations import Equation, LinearEquation
 from pde_sim_node.plant import Plant
-from pde_sim_node.solver import fft, kernel, spectra
-from pde_sim_node.solver.kernel import PLAN, force, internal_step
-from pde_sim_node.solver.memory import aligned
-from pde_sim_node.solver.spectra import (
+from spectral_solver import fft, kernel, spectra
+from spectral_solver.kernel import PLAN, force, internal_step
+from spectral_solver.memory import aligned
+from spectral_solver.spectra import (
     analyse,
     forward,
     get,

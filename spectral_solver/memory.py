@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from loop_interfaces.jit.simd import WIDTH, whole_lanes
 from pde_sim_node.equations import Equation, Field, Spectrum
 from pde_sim_node.equations.base import result_of
-from pde_sim_node.solver.fft import is_transform_length, radices_of, twiddles_of
-from pde_sim_node.solver.spectra import TRANSFORM
+from spectral_solver.fft import is_transform_length, radices_of, twiddles_of
+from spectral_solver.spectra import TRANSFORM
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

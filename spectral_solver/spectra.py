@@ -19,7 +19,7 @@ import numpy as np
 
 from loop_interfaces.jit.cache import jit
 from loop_interfaces.jit.simd import backwards, fma, load, minus_product, read, splat, store, write
-from pde_sim_node.solver.fft import fft, times
+from spectral_solver.fft import fft, times
 
 Complex = Any
 """A pair (real, imaginary) of lanes."""

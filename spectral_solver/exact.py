@@ -18,12 +18,12 @@ from loop_interfaces.jit import native, simd
 from loop_interfaces.jit.cache import jit
 from loop_interfaces.jit.simd import WIDTH, fma, read, splat, whole_lanes
 from pde_sim_node.equations import Spectrum
-from pde_sim_node.solver import fft, spectra
-from pde_sim_node.solver.batch_step import environments_of
-from pde_sim_node.solver.fft import plane_size
-from pde_sim_node.solver.memory import Constants, StepSettings, begin_plan, lay_out, step_plan_type
-from pde_sim_node.solver.spectra import analyse, get, plus_product, put, synthesise
-from pde_sim_node.solver.workers import ParallelStep
+from spectral_solver import fft, spectra
+from spectral_solver.batch_step import environments_of
+from spectral_solver.fft import plane_size
+from spectral_solver.memory import Constants, StepSettings, begin_plan, lay_out, step_plan_type
+from spectral_solver.spectra import analyse, get, plus_product, put, synthesise
+from spectral_solver.workers import ParallelStep
 
 LINEAR_PLAN = step_plan_type(
     ("components", np.int64),

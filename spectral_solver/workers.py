@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.affinity import join_solver, usable_cores
-from pde_sim_node.solver.memory import Constants, aligned
+from spectral_solver.memory import Constants, aligned
 
 SHARED_POINTS = 90_000
 """Grid points, in all stages, from which on a step is shared: some 190 microseconds of one thread. A
