@@ -11,13 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 from loop_interfaces.topics import COMPLETED
 from pde_sim_node.actuators import actuator_supports
 from pde_sim_node.arguments import grid_points, internal_steps, positive, whole
-from pde_sim_node.equations import Equation, LinearEquation
+from pde_sim_node.compiled_step import compiled_step
+from pde_sim_node.equations import Equation
 from pde_sim_node.equations.base import result_of
-from spectral_solver.exact import exact_step
-from spectral_solver.kernel import etdrk4_step
-from spectral_solver.memory import StepSettings
 from spectral_solver.pointwise import all_finite
-from spectral_solver.workers import ParallelStep
 
 DIVERGED_COST = 1e9
 """Mean stage cost of an environment that diverged: very bad, and finite."""
@@ -179,18 +176,16 @@ class Plant:
         )
         self.field_target = self._checked("target", result_of(equation.target, self.x))
         self.target = self.field_target
-        make_step = exact_step if isinstance(equation, LinearEquation) else etdrk4_step
-        self.parallel: ParallelStep = make_step(
-            StepSettings(
-                equation=equation,
-                supports=self.supports,
-                target=self.field_target,
-                integration_time=self.integration_time,
-                steps=internal_steps(self.sample_time, self.integration_time),
-                state_weight=self.state_weight,
-                action_weight=self.action_weight,
-                bound=self.divergence_bound,
-            )
+        self.parallel = compiled_step(
+            equation,
+            2 * np.pi * np.arange(n_x // 2 + 1, dtype=np.float64) / equation.length,
+            supports=self.supports,
+            target=self.field_target,
+            integration_time=self.integration_time,
+            steps=internal_steps(self.sample_time, self.integration_time),
+            state_weight=self.state_weight,
+            action_weight=self.action_weight,
+            bound=self.divergence_bound,
         )
         self._allocate(0)
         all_finite(self.actions)  # now, and not in the first step: load or compile it

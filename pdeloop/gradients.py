@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loop_interfaces.arrays import Array
+from pde_sim_node.adjoint import adjoint_of
 from pde_sim_node.plant import EpisodeCosts, Plant
 from pdeloop.episode import EpisodeRecord, Law, finite_array, finite_basis, rollout
-from spectral_solver.adjoint import adjoint_of
 
 __all__ = ["CostGradient", "Gradients", "features"]
 

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The transpose of the plant's derivative: exact gradients of whatever depends on a trajectory.
+"""The transpose of the step's derivative: exact gradients of whatever depends on a trajectory.
 
 For z' = f(z, a), the compiled step of `kernel`, `Adjoint.pull_back` gives
 
@@ -24,6 +24,7 @@ Trapp, SIAM Review 40 (1998) (the complex step for g').
 """
 
 import ctypes
+from collections.abc import Callable
 from typing import Any
 
 import numba
@@ -38,8 +39,6 @@ from loop_interfaces.jit import cache, native, simd
 from loop_interfaces.jit.cache import cached_njit, jit
 from loop_interfaces.jit.native import call_c
 from loop_interfaces.jit.simd import load, read, splat, write
-from pde_sim_node.equations import Equation, LinearEquation
-from pde_sim_node.plant import Plant
 from spectral_solver import fft, kernel, spectra
 from spectral_solver.kernel import PLAN, force, internal_step
 from spectral_solver.memory import aligned
@@ -55,6 +54,7 @@ from spectral_solver.spectra import (
     rfft_unpack,
     synthesise,
 )
+from spectral_solver.workers import ParallelStep
 
 COMPLEX_STEP = 1e-30
 """g'(u) = Im g(u + i h)/h, without cancellation: h can be far below the rounding of u."""
@@ -203,29 +203,24 @@ def pull_back(
 
 
 class Adjoint:
-    """Gradients through a plant's step.
+    """Gradients through the compiled step of a semilinear equation.
 
     Parameters
     ----------
-    plant
-        Whose step it is; it is not changed.
+    step
+        As of `kernel.etdrk4_step`; it is not changed.
+    nonlinearity
+        Its g.
 
     Raises
     ------
     ValueError
-        The equation's nonlinearity has no derivative that can be computed.
+        The nonlinearity has no derivative that can be computed.
     """
 
-    def __init__(self, plant: Plant) -> None:
-        self._plant = plant
-        if isinstance(plant.equation, LinearEquation):
-            raise ValueError(
-                f"{plant.equation.name} is advanced by an exact propagator; expected an equation "
-                "that is integrated by ETDRK4"
-            )
-        step = plant.parallel
+    def __init__(self, step: ParallelStep, nonlinearity: Callable[[float], float]) -> None:
         self._constants = step.constants  # kept alive: the plan has its address
-        self._loop = derivative_loop(plant.equation)
+        self._loop = derivative_loop(nonlinearity)
         self._plans = np.zeros(1, PLAN_AND_TAPE)
         plan = self._plans[0]
         for name in PLAN.names or ():
@@ -241,9 +236,9 @@ class Adjoint:
         plan["scratch"] = self._scratch.ctypes.data
 
     def step(self, states: Array, actions: Array) -> Array:
-        """f(z, a) as it is recorded for the way back: the plant's own step, to the bit.
+        """f(z, a) as it is recorded for the way back: the step itself, to the bit.
 
-        Whatever diverges is not held back, as the plant does.
+        Whatever diverges is not held back, as the step does.
         """
         return self._run(states, actions, np.zeros_like(states))[0]
 
@@ -272,8 +267,8 @@ class Adjoint:
 
     def _run(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array, Array]:
         z, a, y = (np.ascontiguousarray(x, dtype=np.float64) for x in (states, actions, covectors))
-        batch, plant = len(z), self._plant
-        for what, given, size in (("states", z, plant.n_z), ("actions", a, plant.n_a)):
+        batch, plan = len(z), self._plans[0]
+        for what, given, size in (("states", z, plan["n_z"]), ("actions", a, plan["n_a"])):
             if given.shape != (batch, size):
                 raise ValueError(f"{what} must have shape ({batch}, {size}), got {given.shape}")
         if y.shape != z.shape:
@@ -284,24 +279,20 @@ class Adjoint:
 
 
 class LinearAdjoint:
-    """The same of a plant that is linear in state and action, z' = A z + B a: A^T y and B^T y."""
+    """The same of a step that is linear, z' = A z + B a: A^T y and B^T y.
 
-    def __init__(self, plant: Plant) -> None:
-        n_z, n_a = plant.n_z, plant.n_a
-        self._A_transposed, _ = plant.evaluate(np.eye(n_z), np.zeros((n_z, n_a)))
-        self._B_transposed, _ = plant.evaluate(np.zeros((n_a, n_z)), np.eye(n_a))
+    A_transposed: (n_z, n_z); B_transposed: (n_a, n_z).
+    """
+
+    def __init__(self, A_transposed: Array, B_transposed: Array) -> None:
+        self._A_transposed, self._B_transposed = A_transposed, B_transposed
 
     def pull_back(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array]:
         """A^T y and B^T y of every environment, (M, n_z) and (M, n_a)."""
         return covectors @ self._A_transposed.T, covectors @ self._B_transposed.T
 
 
-def adjoint_of(plant: Plant) -> Adjoint | LinearAdjoint:
-    """What pulls covectors back through a plant's step."""
-    return LinearAdjoint(plant) if isinstance(plant.equation, LinearEquation) else Adjoint(plant)
-
-
-def derivative_loop(equation: Equation) -> Any:
+def derivative_loop(nonlinearity: Callable[[float], float]) -> Any:
     """Machine code of u[i] = g'(u[i]), a cfunc of (double *, intp), by the complex step.
 
     Raises
@@ -310,7 +301,7 @@ def derivative_loop(equation: Equation) -> Any:
         g does not compile for a complex number, or is not analytic (|u|, max, ...): then the
         complex step does not agree with a finite difference.
     """
-    g: Any = register_jitable(error_model="numpy")(equation.nonlinearity)
+    g: Any = register_jitable(error_model="numpy")(nonlinearity)
     signature = types.void(types.CPointer(types.float64), types.intp)  # type: ignore[no-untyped-call]
     try:
 
@@ -323,19 +314,20 @@ def derivative_loop(equation: Equation) -> Any:
     except NumbaError as error:
         reason = str(error).strip().splitlines()[-1]
         raise ValueError(
-            f"the nonlinearity of {equation.name} has no derivative by the complex step; it must "
-            f"be one expression that Numba compiles for a complex number: {reason}"
+            f"the nonlinearity {nonlinearity.__qualname__} has no derivative by the complex step; it "
+            f"must be one expression that Numba compiles for a complex number: {reason}"
         ) from error
     points = np.linspace(-2.03, 2.01, 41)
     slopes = points.copy()
     loop.ctypes(slopes.ctypes.data_as(ctypes.POINTER(ctypes.c_double)), slopes.size)
     h = 1e-5
-    function = equation.nonlinearity
-    finite = np.array([(function(u + h) - function(u - h)) / (2 * h) for u in points.tolist()])
+    finite = np.array(
+        [(nonlinearity(u + h) - nonlinearity(u - h)) / (2 * h) for u in points.tolist()]
+    )
     if not np.allclose(slopes, finite, rtol=1e-5, atol=1e-5):
         raise ValueError(
-            f"the nonlinearity of {equation.name} is not an analytic function of u, so that its "
-            "derivative cannot be taken by the complex step; gradients need one without |u|, "
+            f"the nonlinearity {nonlinearity.__qualname__} is not an analytic function of u, so that "
+            "its derivative cannot be taken by the complex step; gradients need one without |u|, "
             "max, min or branches"
         )
     return loop

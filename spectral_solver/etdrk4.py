@@ -20,10 +20,12 @@ Source: Cox & Matthews, J. Comput. Phys. 176 (2002); Kassam & Trefethen, SIAM J.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pde_sim_node.equations import Spectrum
+Spectrum = NDArray[np.inexact[Any]]
 
 CONTOUR_POINTS = 32
 

@@ -17,9 +17,9 @@ from numba.extending import register_jitable
 from loop_interfaces.jit import native, simd
 from loop_interfaces.jit.cache import jit
 from loop_interfaces.jit.simd import WIDTH, fma, read, splat, whole_lanes
-from pde_sim_node.equations import Spectrum
 from spectral_solver import fft, spectra
 from spectral_solver.batch_step import environments_of
+from spectral_solver.etdrk4 import Spectrum
 from spectral_solver.fft import plane_size
 from spectral_solver.memory import Constants, StepSettings, begin_plan, lay_out, step_plan_type
 from spectral_solver.spectra import analyse, get, plus_product, put, synthesise
@@ -111,18 +111,18 @@ propagate = environments_of(LINEAR_PLAN, advance, native, simd, fft, spectra)
 
 
 def exact_step(settings: StepSettings) -> ParallelStep:
-    """The step z_{k+1} = f(z_k, a_k) of a `LinearEquation`, made ready.
+    """The step z_{k+1} = f(z_k, a_k) of a linear equation, made ready.
 
-    ValueError for an operator of the wrong shape or that is not finite, and where E overflows.
+    ValueError where E overflows.
     """
-    equation, n_x, n_z = settings.equation, settings.n_x, settings.target.size
+    n_x, n_z = settings.n_x, settings.target.size
     time = settings.steps * settings.integration_time
-    e, f = exact_propagator(settings.operator("linear_operator"), time)
-    forced = f[:, :, equation.actuated].T[:, None] * np.fft.rfft(settings.supports, axis=0).T / n_x
+    e, f = exact_propagator(settings.linear_operator, time)
+    forced = f[:, :, settings.actuated].T[:, None] * np.fft.rfft(settings.supports, axis=0).T / n_x
 
     constants = Constants()
     plan = begin_plan(LINEAR_PLAN, settings, constants)
-    plan["components"] = components = len(equation.components)
+    plan["components"] = components = n_z // n_x
     plan["e"] = constants.add_spectra(np.moveaxis(e, 0, 2))
     plan["b"] = constants.add_spectra(forced)
     plane, modes = plane_size(n_x // 2), int(plan["modes"])

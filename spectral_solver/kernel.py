@@ -155,14 +155,14 @@ def etdrk4_step(settings: StepSettings) -> ParallelStep:
     """The step z_{k+1} = f(z_k, a_k) of a semilinear equation, made ready.
 
     The nonlinearity is dealiased on a grid of at least 3/2 n_z points; exactly that where 3/2 n_z
-    is 16 * 2^i * 3^j, else the next such number. ValueError for operators of the wrong shape or
-    that are not finite, and a nonlinearity that does not compile.
+    is 16 * 2^i * 3^j, else the next such number. ValueError where L grows beyond all bounds within
+    an internal step, and for a nonlinearity that does not compile.
     """
     n_z, steps = settings.n_x, settings.steps
     fine = fine_length(n_z)
-    c = etdrk4_coefficients(settings.operator("linear_operator"), settings.integration_time)
+    c = etdrk4_coefficients(settings.linear_operator, settings.integration_time)
     # The compiled transform leaves out the factor 1/4m.
-    m = settings.operator("multiplier") / (4 * fine)
+    m = settings.multiplier / (4 * fine)
 
     constants = Constants()
     plan = begin_plan(PLAN, settings, constants)
@@ -174,7 +174,7 @@ def etdrk4_step(settings: StepSettings) -> ParallelStep:
     plan["f2m"], plan["f3m"] = spectra(2 * c.f2 * m), spectra(c.f3 * m)
     plan["f"] = spectra(c.f1 + 4 * c.f2 + c.f3)
     plan["supports"] = spectra(np.fft.rfft(settings.supports, axis=0).T / n_z)
-    plan["pointwise"] = pointwise_loop(settings.equation.nonlinearity)
+    plan["pointwise"] = pointwise_loop(settings.nonlinearity)
     plane, modes = plane_size(max(fine, n_z // 2)), int(plan["modes"])
     size = lay_out(
         plan,

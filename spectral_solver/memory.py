@@ -1,7 +1,7 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The input of a compiled step: its settings, and the layout of constants and scratch in memory."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,21 +9,26 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from loop_interfaces.jit.simd import WIDTH, whole_lanes
-from pde_sim_node.equations import Equation, Field, Spectrum
-from pde_sim_node.equations.base import result_of
+from spectral_solver.etdrk4 import Spectrum
 from spectral_solver.fft import is_transform_length, radices_of, twiddles_of
 from spectral_solver.spectra import TRANSFORM
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StepSettings:
-    """A sampling time of a plant, as `Plant` has it; `steps` are the internal ones.
+    """A sampling time of d/dt F[u](k) = L(k) F[u](k) + m(k) F[g(u)](k) + F[sum_j Phi_j a_j](k).
 
-    supports (n_x, n_a): Phi_j(x_i); target (c n_x,): state of the stage cost, of c components;
-    bound: magnitude beyond which a state has diverged.
+    linear_operator: L, (n_x//2 + 1,) or, of c components, (n_x//2 + 1, c, c), where the step is exact;
+    multiplier: m, (n_x//2 + 1,); nonlinearity: g, which Numba can compile for a float64; both are of no
+    meaning to the exact step; actuated: the component that is forced; supports (n_x, n_a): Phi_j(x_i);
+    target (c n_x,): state of the stage cost; steps: internal ones; bound: magnitude beyond which a
+    state has diverged.
     """
 
-    equation: Equation
+    linear_operator: Spectrum
+    multiplier: Spectrum
+    nonlinearity: Callable[[float], float]
+    actuated: int = 0
     supports: NDArray[np.float64]
     target: NDArray[np.float64]
     integration_time: float
@@ -36,30 +41,6 @@ class StepSettings:
     def n_x(self) -> int:
         """Grid points."""
         return len(self.supports)
-
-    @property
-    def wavenumbers(self) -> Field:
-        """2 pi j / L of the real FFT, (n_x//2 + 1,)."""
-        modes = np.arange(self.n_x // 2 + 1, dtype=np.float64)
-        return 2 * np.pi * modes / self.equation.length
-
-    def operator(self, name: str) -> Spectrum:
-        """L(k) or m(k), the equation's method of that name; ValueError for a wrong shape or NaN."""
-        values = result_of(getattr(self.equation, name), self.wavenumbers)
-        modes, components = self.n_x // 2 + 1, len(self.equation.components)
-        shape = (modes,) if components == 1 else (modes, components, components)
-        if not isinstance(values, np.ndarray) or values.dtype.kind not in "iufc":
-            got = repr(values)
-        elif values.shape != shape:
-            got = f"shape {values.shape}"
-        elif not np.isfinite(values).all():
-            got = "NaN or infinity"
-        else:
-            return values
-        raise ValueError(
-            f"{name} of the equation must return an array of {' x '.join(map(str, shape))} "
-            f"finite numbers for k of shape ({modes},), got {got}"
-        )
 
 
 def step_plan_type(*own: tuple[str, Any]) -> np.dtype[np.void]:

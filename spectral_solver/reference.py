@@ -5,14 +5,23 @@ It is the step of `etdrk4` (equations and sources there) for the real FFT v of t
 nonlinear part on the dealiased grid and the forcing of the held action, N(v) = m F[g(u)] + F_a.
 """
 
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.fft import irfft, rfft
 
 from loop_interfaces.arrays import Array
-from pde_sim_node.equations import Equation
-from spectral_solver.etdrk4 import etdrk4_coefficients
+from spectral_solver.etdrk4 import Spectrum, etdrk4_coefficients
+
+
+class SemilinearEquation(Protocol):
+    """u_t = L u + m g(u) + sum_j Phi_j a_j on [0, length), as `pde_sim_node.equations.Equation`."""
+
+    @property
+    def length(self) -> float: ...
+    def linear_operator(self, k: Array) -> Spectrum: ...
+    def multiplier(self, k: Array) -> Spectrum: ...
+    def nonlinearity(self, u: float) -> float: ...
 
 
 class ReferenceStep:
@@ -21,7 +30,7 @@ class ReferenceStep:
     Parameters
     ----------
     equation
-        u_t = L u + m g(u) + sum_j Phi_j a_j.
+        L(k), m(k), g(u) and the length of the domain.
     supports : (n_z, n_a) array
         Phi_j(x_i).
     integration_time
@@ -44,7 +53,7 @@ class ReferenceStep:
 
     def __init__(
         self,
-        equation: Equation,
+        equation: SemilinearEquation,
         supports: Array,
         *,
         integration_time: float,
