@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import os
+import shlex
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -54,8 +55,9 @@ def _run(
         parser = make_parser()
         options, unknown = parser.parse_known_args(arguments)
         if unknown:
-            asked = f"{parser.prog} {getattr(options, 'name', '')}".strip()
-            parser.error(f"unrecognized arguments: {' '.join(unknown)}; see `{asked} --help`")
+            refuse = getattr(options, "refuse", parser.error)
+            asked = getattr(options, "prog", parser.prog)
+            refuse(f"unrecognized arguments: {shlex.join(unknown)}; see `{asked} --help`")
         code: int = options.command(options)
         sys.stdout.flush()  # here, where it can still be said that nobody reads
         return code
@@ -102,7 +104,7 @@ def parser() -> argparse.ArgumentParser:
         epilog="example: pdeloop train burgers (every command has an example in its --help)",
     )
     root.add_argument("--version", action="version", version=f"pdeloop {_version()}")
-    commands = root.add_subparsers(required=True, metavar="COMMAND", dest="name")
+    commands = root.add_subparsers(required=True, metavar="COMMAND")
     for name in COMMANDS:
         # Imported here, where `main` catches Ctrl-C: it takes most of a short command's time.
         importlib.import_module(f"pdeloop.commands.{name}").add(commands)

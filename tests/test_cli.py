@@ -277,13 +277,23 @@ def test_a_file_that_expands_without_end_is_refused(tmp_path, capsys):
     assert "more than 10000 parameters" in error_of(capsys, "train", str(tmp_path / "bomb.yaml"))
 
 
-def test_an_option_that_is_not_known_names_the_commands_help(capsys):
+@pytest.mark.parametrize(
+    ("words", "command"),
+    [
+        (["train", str(SMALL), "--horizon", "2"], "train"),
+        (["new", "my", "pde"], "new"),
+        (["bag", "verify", "a", "--bogus"], "bag verify"),
+        (["monitor", "b", "c"], "monitor"),
+    ],
+)
+def test_words_that_are_not_known_name_the_commands_help(capsys, words, command):
     with pytest.raises(SystemExit) as end:
-        main(["train", str(SMALL), "--horizon", "2"])
+        main(words)
     assert end.value.code == 2
-    assert (
-        "unrecognized arguments: --horizon 2; see `pdeloop train --help`" in capsys.readouterr().err
-    )
+    usage, *_, told = capsys.readouterr().err.splitlines()
+    assert usage.startswith(f"usage: pdeloop {command} ")
+    assert told.startswith(f"pdeloop {command}: error: unrecognized arguments: ")
+    assert told.endswith(f"see `pdeloop {command} --help`")
 
 
 def test_an_error_names_the_flag(capsys, tmp_path):

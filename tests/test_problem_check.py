@@ -1,10 +1,8 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""`pdeloop check` and `pdeloop new`: modes and steps against theory, a template that passes."""
+"""`pdeloop check`: modes and steps against theory, and what it refuses."""
 
 from __future__ import annotations
 
-import importlib.util
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -91,53 +89,6 @@ def test_an_exploration_that_diverges_is_told() -> None:
     found = named(divergence_bound=0.5)
     assert found["exploration"][0] is False and "diverges at step" in found["exploration"][1]
     assert "order" not in found
-
-
-def test_what_new_writes_runs_and_passes_its_own_test(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PDELOOP_EQUATIONS", "")
-    assert main(["new", "my-pde"]) == 0
-    *_, told, _ = capsys.readouterr().out.splitlines()
-    words = told.removeprefix("next: pdeloop ").split()
-    assert main(["check", "my-pde/my-pde.yaml"]) == FAILED  # a file alone runs no code
-    assert "name it yourself: --equation" in capsys.readouterr().err
-    assert main([*words, "--json"]) == 0
-    findings = json.loads(capsys.readouterr().out)
-    assert len(findings) == 5 and all(one["good"] for one in findings)
-    assert (tmp_path / "my-pde.png").read_bytes().startswith(b"\x89PNG")
-    spec = importlib.util.spec_from_file_location("own", tmp_path / "my-pde" / "test_my_pde.py")
-    assert spec is not None and spec.loader is not None
-    own = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(own)
-    own.test_a_small_wave_grows_as_the_linear_part_says()
-
-
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("../x", "is no name"),
-        ("9x", "is no name"),
-        ("burgers", "shipped"),
-        ("a" * 61, "is no name"),
-        ("class", "Python has 'class' already"),
-        ("numpy", "Python has 'numpy' already"),
-    ],
-)
-def test_new_refuses_a_name(name: str, words: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["new", name]) == FAILED
-    assert words in capsys.readouterr().err
-
-
-def test_new_overwrites_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "own").mkdir()
-    assert main(["new", "own"]) == FAILED
-    assert "there already" in capsys.readouterr().err
-    assert list((tmp_path / "own").iterdir()) == []
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ def command(
         epilog=f"example: {example}",
     )
     if run is not None:
-        parser.set_defaults(command=run, refuse=parser.error)
+        parser.set_defaults(command=run, refuse=parser.error, prog=parser.prog)
     return parser
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import builtins
 import re
 from importlib.util import find_spec
 from keyword import iskeyword
@@ -25,21 +26,18 @@ def write(name: str, into: Path) -> tuple[list[Path], str]:
     """Write class, YAML and test of a PDE into a new folder; the files, and what --equation names.
 
     name: of the problem and its folder, small letters, digits, '-' and '_'; into: where the folder
-    goes. ParameterError for another name, a shipped problem's or a Python module's, and a folder that
-    is there.
+    goes. ParameterError for another name, one that a shipped problem, Python, pytest or the class's
+    own file uses, and a folder that exists.
     """
     if len(name) > 60 or not _NAME.fullmatch(name):
         raise ParameterError(
-            f"'{name[:80]}' is no name of a problem; expected small letters, digits, '-' and '_', "
-            "beginning with a letter"
+            f"'{name[:80]}' cannot be the name of a problem; expected small letters, digits, '-' and "
+            "'_', beginning with a letter, such as my-pde"
         )
-    if name in shipped_problems():
-        raise ParameterError(f"'{name}' is a shipped problem; take another name")
     module = name.replace("-", "_")
-    if iskeyword(module) or _is_module(module):
-        raise ParameterError(f"Python has '{module}' already; take another name")
     words = module.split("_")
     kind = "".join(word.capitalize() for word in words)
+    _refuse_taken(name, module, kind)
     filled = {
         "name": name,
         "module": module,
@@ -64,6 +62,22 @@ def write(name: str, into: Path) -> tuple[list[Path], str]:
         rmtree(folder, ignore_errors=True)
         raise FileError(f"cannot write to {folder}: {error.strerror}") from error
     return [folder / file for file in files], f"{folder / module}.py:{kind}"
+
+
+def _refuse_taken(name: str, module: str, kind: str) -> None:
+    """ParameterError if a problem, its module or its class cannot have this name."""
+    another = "; take another name"
+    if module in {problem.replace("-", "_") for problem in shipped_problems()}:
+        raise ParameterError(f"'{name}' is a shipped problem{another}")
+    if iskeyword(module) or _is_module(module):
+        raise ParameterError(f"Python has '{module}' already{another}")
+    if iskeyword(kind) or hasattr(builtins, kind):
+        raise ParameterError(f"its class would be '{kind}', which Python has already{another}")
+    imports = re.findall(r"import (.+)", (_TEMPLATES / "equation.py.txt").read_text())
+    if kind in ", ".join(imports).split(", "):
+        raise ParameterError(f"its class would be '{kind}', which its own file imports{another}")
+    if module == "conftest" or module.startswith("test_"):
+        raise ParameterError(f"pytest would take {module}.py for its own{another}")
 
 
 def _is_module(name: str) -> bool:
