@@ -1,0 +1,286 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Plants that no equation of the compiled solver describes, each as z_{k+1} = f(z_k, a_k) in NumPy.
+
+Every step takes a batch: states (M, n_z) and actions (M, n_a) to states (M, n_z).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from loop_interfaces.arrays import Array
+
+
+def runge_kutta(rate: Callable[[Array], Array], z: Array, duration: float, steps: int) -> Array:
+    """Classical Runge-Kutta of fourth order in so many steps."""
+    h = duration / steps
+    for _ in range(steps):
+        k1 = rate(z)
+        k2 = rate(z + h / 2 * k1)
+        k3 = rate(z + h / 2 * k2)
+        k4 = rate(z + h * k3)
+        z = z + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    return z
+
+
+def modes(rng: np.random.Generator, n: int, count: int, rms: float) -> Array:
+    """A random sum of the lowest Fourier modes on n points; see `RandomModes`."""
+    phases = 2 * np.pi * np.outer(np.arange(1, count + 1), np.arange(n) / n)
+    cosines, sines = rng.standard_normal((2, count))
+    field: Array = rms / np.sqrt(count) * (cosines @ np.cos(phases) + sines @ np.sin(phases))
+    return field
+
+
+def supports(n: int, n_a: int, width: float) -> Array:
+    """Equally spaced indicators on n points, (n_a, n)."""
+    x = (np.arange(n) + 0.5) / n
+    centres = (np.arange(n_a) + 0.5) / n_a
+    distance = np.abs((x - centres[:, None] + 0.5) % 1 - 0.5)
+    return (distance < width / 2).astype(np.float64)
+
+
+def difference(z: Array, order: int, spacing: float) -> Array:
+    """Central first or second derivative on a ring, along the last axis."""
+    after, before = np.roll(z, -1, axis=-1), np.roll(z, 1, axis=-1)
+    if order == 1:
+        return (after - before) / (2 * spacing)
+    return (after - 2 * z + before) / spacing**2
+
+
+class AllenCahnInhomogeneous:
+    """Allen-Cahn with a potential that depends on x, V(x) = 5 (1 + sin(2 pi x/L)/2), L = 2."""
+
+    n_z, n_a = 128, 12
+    sample_time, horizon = 0.01, 80
+    state_weight, action_weight, exploration_variance = 1.0, 0.05, 0.1
+    reduced_order = 24
+
+    def __init__(self) -> None:
+        x = np.arange(self.n_z) / self.n_z
+        self.target = -np.cos(2 * np.pi * x)
+        self.potential = 5 * (1 + 0.5 * np.sin(2 * np.pi * x))
+        self.shapes = supports(self.n_z, self.n_a, 0.05)
+
+    def initial_state(self, rng: np.random.Generator) -> Array:
+        return modes(rng, self.n_z, 4, 0.8)
+
+    def step(self, z: Array, a: Array) -> Array:
+        force, dx = a @ self.shapes, 2 / self.n_z
+
+        def rate(u: Array) -> Array:
+            return 2.5e-3 * difference(u, 2, dx) - self.potential * (u**3 - u) + force
+
+        return runge_kutta(rate, z, self.sample_time, 2)
+
+
+class ReactionDiffusionInhomogeneous(AllenCahnInhomogeneous):
+    """u_t = (D(x) u_x)_x + r(x) u - u^3 + a: diffusion and growth that depend on x."""
+
+    action_weight = 0.5
+
+    def __init__(self) -> None:
+        super().__init__()
+        x = np.arange(self.n_z) / self.n_z
+        self.target = 0.5 * np.cos(2 * np.pi * x)
+        self.diffusion = 0.02 * (1 + 0.8 * np.cos(2 * np.pi * (x + 0.5 / self.n_z)))
+        self.growth = 3 * np.sin(4 * np.pi * x)
+
+    def step(self, z: Array, a: Array) -> Array:
+        force, dx = a @ self.shapes, 2 / self.n_z
+
+        def rate(u: Array) -> Array:
+            flux = self.diffusion * (np.roll(u, -1, axis=-1) - u) / dx
+            diffused = (flux - np.roll(flux, 1, axis=-1)) / dx
+            return diffused + self.growth * u - u**3 + force
+
+        return runge_kutta(rate, z, self.sample_time, 4)
+
+
+class FitzHughNagumo:
+    """FitzHugh-Nagumo on a ring, actuated in the voltage: two components, one after the other."""
+
+    n_z, n_a = 128, 8
+    sample_time, horizon = 0.2, 100
+    state_weight, action_weight, exploration_variance = 1.0, 1.0, 0.1
+    reduced_order = 16
+    components = 2
+
+    def __init__(self) -> None:
+        self.target = np.zeros(self.n_z)
+        self.shapes = supports(self.n_z // 2, self.n_a, 0.1)
+
+    def initial_state(self, rng: np.random.Generator) -> Array:
+        n = self.n_z // 2
+        return np.concatenate([modes(rng, n, 4, 0.6), modes(rng, n, 4, 0.2)])
+
+    def step(self, z: Array, a: Array) -> Array:
+        n, force = self.n_z // 2, a @ self.shapes
+
+        def rate(state: Array) -> Array:
+            v, w = state[..., :n], state[..., n:]
+            dv = difference(v, 2, 20 / n) + v - v**3 - w + force
+            return np.concatenate([dv, 0.08 * (v - 0.8 * w)], axis=-1)
+
+        return runge_kutta(rate, z, self.sample_time, 8)
+
+
+class GrayScott(FitzHughNagumo):
+    """Gray-Scott on a ring, actuated in the fed component; the target is a half-way mixture."""
+
+    sample_time, horizon = 1.0, 100
+    action_weight, exploration_variance = 100.0, 1e-5
+
+    def __init__(self) -> None:
+        super().__init__()
+        n = self.n_z // 2
+        self.target = np.concatenate([np.full(n, 0.6), np.full(n, 0.2)])
+
+    def initial_state(self, rng: np.random.Generator) -> Array:
+        n = self.n_z // 2
+        u, v = 0.6 + modes(rng, n, 4, 0.1), 0.2 + modes(rng, n, 4, 0.05)
+        return np.concatenate([np.clip(u, 0.05, 1.0), np.clip(v, 0.01, 1.0)])
+
+    def step(self, z: Array, a: Array) -> Array:
+        n, force = self.n_z // 2, a @ self.shapes
+
+        def rate(state: Array) -> Array:
+            u, v = state[..., :n], state[..., n:]
+            reaction = u * v * v
+            du = 2e-1 * difference(u, 2, 1.0) - reaction + 0.04 * (1 - u) + force
+            dv = 1e-1 * difference(v, 2, 1.0) + reaction - 0.1 * v
+            return np.concatenate([du, dv], axis=-1)
+
+        return runge_kutta(rate, z, self.sample_time, 4)
+
+
+class SineGordon(FitzHughNagumo):
+    """Sine-Gordon, u_tt = u_xx - sin u + a, on a ring: a wave equation with kinks."""
+
+    sample_time, horizon = 0.1, 100
+    exploration_variance = 0.3
+
+    def initial_state(self, rng: np.random.Generator) -> Array:
+        n = self.n_z // 2
+        return np.concatenate([modes(rng, n, 4, 1.0), np.zeros(n)])
+
+    def step(self, z: Array, a: Array) -> Array:
+        n, force = self.n_z // 2, a @ self.shapes
+
+        def rate(state: Array) -> Array:
+            u, w = state[..., :n], state[..., n:]
+            dw = difference(u, 2, 10 / n) - np.sin(u) - 0.05 * w + force
+            return np.concatenate([w, dw], axis=-1)
+
+        return runge_kutta(rate, z, self.sample_time, 4)
+
+
+class BurgersBetweenWalls:
+    """Burgers on [0, 1] with u = 0 at both walls, cell by cell, actuated inside."""
+
+    n_z, n_a = 96, 6
+    sample_time, horizon = 0.05, 100
+    state_weight, action_weight, exploration_variance = 1.0, 1.0, 0.1
+    reduced_order = 16
+
+    def __init__(self) -> None:
+        self.x = np.arange(1, self.n_z + 1) / (self.n_z + 1)
+        self.target = 0.2 * np.sin(np.pi * self.x)
+        self.shapes = supports(self.n_z, self.n_a, 0.1)
+
+    def initial_state(self, rng: np.random.Generator) -> Array:
+        waves = np.sin(np.pi * np.outer(np.arange(1, 6), self.x))
+        state: Array = 0.5 / np.sqrt(2.5) * rng.standard_normal(5) @ waves
+        return state
+
+    def step(self, z: Array, a: Array) -> Array:
+        force, dx = a @ self.shapes, 1 / (self.n_z + 1)
+
+        def rate(u: Array) -> Array:
+            whole = np.pad(u, [(0, 0)] * (u.ndim - 1) + [(1, 1)])
+            flux = 0.5 * whole**2
+            advection = (flux[..., 2:] - flux[..., :-2]) / (2 * dx)
+            diffusion = (whole[..., 2:] - 2 * u + whole[..., :-2]) / dx**2
+            return 0.01 * diffusion - advection + force
+
+        return runge_kutta(rate, z, self.sample_time, 24)
+
+
+class Lorenz96:
+    """Lorenz-96 with 40 variables and forcing 8, eight of them actuated: chaotic, no PDE."""
+
+    n_z, n_a = 40, 8
+    sample_time, horizon = 0.05, 100
+    state_weight, action_weight, exploration_variance = 1.0, 0.1, 4.0
+    reduced_order = 24
+
+    def __init__(self) -> None:
+        self.target = np.zeros(self.n_z)
+        self.shapes = np.repeat(np.eye(self.n_a), self.n_z // self.n_a, axis=1)
+
+    def initial_state(self, rng: np.random.Generator) -> Array:
+        z = 8 + rng.standard_normal((1, self.n_z))
+        for _ in range(100):
+            z = self.step(z, np.zeros((1, self.n_a)))
+        state: Array = z[0]
+        return state
+
+    def step(self, z: Array, a: Array) -> Array:
+        force = 8 + a @ self.shapes
+
+        def rate(x: Array) -> Array:
+            ahead, behind = np.roll(x, -1, axis=-1), np.roll(x, 1, axis=-1)
+            return (ahead - np.roll(x, 2, axis=-1)) * behind - x + force
+
+        return runge_kutta(rate, z, self.sample_time, 2)
+
+
+class CoupledPendulums:
+    """Sixteen pendulums on a ring with springs between them, every second one driven, to rest."""
+
+    n_z, n_a = 32, 8
+    sample_time, horizon = 0.1, 100
+    state_weight, action_weight, exploration_variance = 1.0, 0.1, 1.0
+    reduced_order = 24
+
+    def __init__(self) -> None:
+        self.target = np.zeros(self.n_z)
+        self.shapes = np.eye(16)[::2]
+
+    def initial_state(self, rng: np.random.Generator) -> Array:
+        return np.concatenate([rng.normal(0.0, 1.0, 16), rng.normal(0.0, 0.5, 16)])
+
+    def step(self, z: Array, a: Array) -> Array:
+        torque = a @ self.shapes
+
+        def rate(state: Array) -> Array:
+            angle, speed = state[..., :16], state[..., 16:]
+            springs = 0.5 * (np.roll(angle, 1, axis=-1) - 2 * angle + np.roll(angle, -1, axis=-1))
+            dv = springs - np.sin(angle) - 0.05 * speed + torque
+            return np.concatenate([speed, dv], axis=-1)
+
+        return runge_kutta(rate, z, self.sample_time, 4)
+
+
+class RandomLinear:
+    """A random linear system of 64 states, slightly unstable, with four inputs."""
+
+    n_z, n_a = 64, 4
+    sample_time, horizon = 1.0, 100
+    state_weight, action_weight, exploration_variance = 1.0, 1.0, 0.01
+    reduced_order = 16
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(64)
+        A = rng.standard_normal((self.n_z, self.n_z)) / np.sqrt(self.n_z)
+        self.A = 1.02 * A / np.abs(np.linalg.eigvals(A)).max()
+        self.B = rng.standard_normal((self.n_z, self.n_a))
+        self.target = np.zeros(self.n_z)
+
+    def initial_state(self, rng: np.random.Generator) -> Array:
+        return rng.standard_normal(self.n_z)
+
+    def step(self, z: Array, a: Array) -> Array:
+        after: Array = z @ self.A.T + a @ self.B.T
+        return after

@@ -1,0 +1,218 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""`python -m benchmarks general`: what a training is worth on plants that nobody tuned it for.
+
+Every case of `benchmarks.families` is trained at each budget and seed, and compared on held-out fields
+with no control, with its own first law, with the best affine law and with the limit of any controller
+(`--bounds`, by exact gradients; kept in benchmarks/families/bounds.json). Finished trainings are kept
+in a folder, so that an interrupted run continues where it stood. Constants of the method are chosen on
+`--tuning` seeds; tables are about the others.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import pdeloop
+from benchmarks.families.cases import CASES, Case
+from loop_interfaces.files import make_folder, read_json
+from pdeloop.study.executors import processes
+
+__all__ = ["run", "text"]
+
+TABLE_SEEDS = 200
+"""First seed of the trainings in a table."""
+TUNING_SEEDS = 100
+"""First seed of the trainings with which constants of the method may be chosen."""
+EVALUATION = 2000
+"""Evaluation seed of the held-out fields in a table; `TUNING` has others."""
+TUNING_EVALUATION = 1000
+BOUNDS = Path(__file__).parent / "families" / "bounds.json"
+BOUND_FIELDS = 48
+"""Initial fields that the best affine law is optimised on."""
+
+
+def run(
+    cases: Sequence[str] = (),
+    *,
+    seeds: int = 6,
+    budgets: Sequence[int] = (20, 40),
+    fields: int = 10,
+    tuning: bool = False,
+    bounds: bool = False,
+    jobs: int | None = None,
+    folder: Path = Path("runs/general"),
+) -> dict[str, Any]:
+    """Train on every case and compare.
+
+    Parameters
+    ----------
+    cases
+        Names, or beginnings of names; none: all.
+    seeds
+        Trainings of each case and budget.
+    budgets
+        Rollouts of a training in all, explorations and checks among them.
+    fields
+        Held-out initial fields.
+    tuning
+        Use the seeds and held-out fields with which constants may be chosen.
+    bounds
+        Work out the best affine law and the limit of any controller first, and keep them.
+    jobs
+        Processes; one a core if not given.
+    folder
+        Where finished trainings are kept.
+    """
+    chosen = {
+        name: case for name, case in CASES.items() if not cases or name.startswith(tuple(cases))
+    }
+    if not chosen:
+        raise ValueError(f"no case begins with {' or '.join(cases)}; known: {', '.join(CASES)}")
+    evaluation = TUNING_EVALUATION if tuning else EVALUATION
+    first = TUNING_SEEDS if tuning else TABLE_SEEDS
+    tasks = [
+        (name, budget, seed)
+        for name in chosen
+        for budget in budgets
+        for seed in range(first, first + seeds)
+    ]
+    make_folder(folder)
+    rows, began = [], time.monotonic()
+    with processes(jobs) as pool:
+        if bounds:
+            for name, found in zip(chosen, pool.map(bound, chosen), strict=True):
+                keep_bound(name, found)
+        work = partial(train, fields=fields, evaluation=evaluation, folder=folder.resolve())
+        for task, row in zip(tasks, pool.map(work, tasks), strict=True):
+            rows.append(row)
+            print(
+                f"{task[0]}, {task[1]} rollouts, seed {task[2]}: "
+                f"{row.get('error') or number(row['adapted'])} "
+                f"({len(rows)} of {len(tasks)}, {time.monotonic() - began:.0f} s)",
+                file=sys.stderr,
+                flush=True,
+            )
+    known = read_json(BOUNDS) if BOUNDS.exists() and not tuning else {}
+    return {"rows": rows, "bounds": {name: known[name] for name in chosen if name in known}}
+
+
+def train(
+    task: tuple[str, int, int], *, fields: int, evaluation: int, folder: Path
+) -> dict[str, Any]:
+    """One training; its costs on the held-out fields, or the error that ended it."""
+    name, budget, seed = task
+    label = f"{name}, {budget}, {seed}, {evaluation}, {fields}"
+    path = folder / f"{hashlib.sha256(label.encode()).hexdigest()[:16]}.json"
+    if path.exists():
+        found: dict[str, Any] = read_json(path)
+        return found
+    row: dict[str, Any] = {"case": name, "budget": budget, "seed": seed}
+    began = time.process_time()
+    try:
+        done = trained(
+            CASES[name],
+            rollouts=budget,
+            seed=seed,
+            evaluation_fields=fields,
+            evaluation_seed=evaluation,
+        )
+        row |= {key: done.costs[key][0].mean().item() for key in ("none", "lqt", "adapted")}
+        row["by_field"] = {key: done.costs[key][0].tolist() for key in ("lqt", "adapted")}
+        row["spent"] = done.rollouts[0]
+    except (ValueError, RuntimeError) as error:
+        row["error"] = " ".join(str(error).split())
+    row["seconds"] = time.process_time() - began
+    path.write_text(json.dumps(row))
+    return row
+
+
+def trained(case: Case, **settings: Any) -> Any:
+    """The finished run of a case."""
+    return pdeloop.train(case.base, **case.parameters(), **settings)
+
+
+def bound(name: str) -> dict[str, float]:
+    """Costs of the best affine law and of the best inputs on the held-out fields of the table."""
+    from benchmarks.optimum import evaluation_seeds, optimise_inputs, optimise_law
+
+    case, drawn = CASES[name], evaluation_seeds(EVALUATION, 10)
+    given = case.parameters()
+    found: dict[str, float] = {}
+    try:
+        _, law, costs = optimise_law(
+            case.base,
+            TUNING_SEEDS,
+            fields=BOUND_FIELDS,
+            evaluations={EVALUATION: drawn},
+            tolerance=2e-3,
+            given=given,
+        )
+        found["affine"] = float(np.mean(costs["optimum"][EVALUATION]))
+        ends = [optimise_inputs(case.base, s, law=law, tolerance=2e-3, given=given) for s in drawn]
+        found["limit"] = float(np.mean([end.cost for (end,) in ends]))
+    except ValueError as error:
+        print(f"{name}: no bounds ({error})", file=sys.stderr)
+    return found
+
+
+def keep_bound(name: str, found: Mapping[str, float]) -> None:
+    """Write the bounds of a case beside those of the others."""
+    known = read_json(BOUNDS) if BOUNDS.exists() else {}
+    known[name] = dict(found)
+    BOUNDS.write_text(json.dumps(dict(sorted(known.items())), indent=1) + "\n")
+
+
+def summaries(result: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """A row for each case: means over the seeds, and the worst seed against its own first law."""
+    found = []
+    names = dict.fromkeys(row["case"] for row in result["rows"])
+    for name in names:
+        own = [row for row in result["rows"] if row["case"] == name]
+        summary: dict[str, Any] = {"case": name, "group": CASES[name].group}
+        summary |= result["bounds"].get(name, {})
+        good = [row for row in own if "error" not in row]
+        summary["failed"] = len(own) - len(good)
+        for budget in dict.fromkeys(row["budget"] for row in good):
+            rows = [row for row in good if row["budget"] == budget]
+            for key in ("none", "lqt", "adapted"):
+                summary[f"{key} {budget}"] = float(np.mean([row[key] for row in rows]))
+            ratios = [row["adapted"] / row["lqt"] for row in rows]
+            summary[f"ratios {budget}"] = ratios
+            summary["worst"] = max([*ratios, summary.get("worst", -math.inf)])
+        found.append(summary)
+    return sorted(found, key=lambda each: -each.get("worst", math.inf))
+
+
+def text(result: Mapping[str, Any]) -> str:
+    """A Markdown table, what lost most against its own first law first."""
+    budgets = list(dict.fromkeys(row["budget"] for row in result["rows"]))
+    head = ["case", "no control", "first law", *(f"{budget} rollouts" for budget in budgets)]
+    head += ["best affine law", "limit", "adapted / first law, each seed", "failed"]
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    for each in summaries(result):
+        known = [budget for budget in budgets if f"none {budget}" in each]
+        cells = [each["case"]]
+        cells += [number(each[f"{key} {known[0]}"]) if known else "-" for key in ("none", "lqt")]
+        cells += [number(each.get(f"adapted {budget}")) for budget in budgets]
+        cells += [number(each.get(key)) for key in ("affine", "limit")]
+        ratios = each.get(f"ratios {known[0]}", ()) if known else ()
+        cells += [" ".join(f"{ratio:.2f}" for ratio in ratios), str(each["failed"] or "")]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def number(cost: float | None) -> str:
+    """A cost, that a rollout diverged, or that there is none."""
+    if cost is None:
+        return "-"
+    return f"{cost:.4g}" if cost < 1e6 else "diverged"
