@@ -1,7 +1,7 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The plant: M sampled PDEs side by side, each z_{k+1} = f(z_k, a_k)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,7 @@ from pde_sim_node.compiled_step import compiled_step
 from pde_sim_node.equations import Equation
 from pde_sim_node.equations.base import result_of
 from spectral_solver.pointwise import all_finite
+from spectral_solver.workers import ParallelStep
 
 DIVERGED_COST = 1e9
 """Mean stage cost of an environment that diverged: very bad, and finite."""
@@ -176,9 +177,16 @@ class Plant:
         )
         self.field_target = self._checked("target", result_of(equation.target, self.x))
         self.target = self.field_target
-        self.parallel = compiled_step(
-            equation,
-            2 * np.pi * np.arange(n_x // 2 + 1, dtype=np.float64) / equation.length,
+        self.parallel = self._make_step()
+        self._allocate(0)
+        all_finite(self.actions)  # now, and not in the first step: load or compile it
+
+    def _make_step(self) -> ParallelStep:
+        """The compiled step of this plant."""
+        modes = np.arange(len(self.x) // 2 + 1, dtype=np.float64)
+        return compiled_step(
+            self.equation,
+            2 * np.pi * modes / self.equation.length,
             supports=self.supports,
             target=self.field_target,
             integration_time=self.integration_time,
@@ -187,8 +195,16 @@ class Plant:
             action_weight=self.action_weight,
             bound=self.divergence_bound,
         )
-        self._allocate(0)
-        all_finite(self.actions)  # now, and not in the first step: load or compile it
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the compiled step, which holds addresses of this process: a copy makes its own."""
+        return {name: value for name, value in vars(self).items() if name != "parallel"}
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        """Continue where the plant was when it was pickled or copied, to the bit."""
+        vars(self).update(state)
+        self.parallel = self._make_step()
+        self._bind()
 
     def __repr__(self) -> str:
         return (

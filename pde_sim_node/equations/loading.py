@@ -6,12 +6,14 @@ is not enough: either the code was installed under that name, as an entry point 
 ``pdeloop.equations``, or the user has allowed it (see `configured_equation`).
 """
 
+import copyreg
 import hashlib
 import importlib
 import os
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
@@ -152,4 +154,25 @@ def load_file(path: Path) -> ModuleType:
     except Exception as error:
         del sys.modules[module.__name__]
         raise ValueError(f"the equation file {str(path)!r} cannot be executed: {error}") from error
+    for kind in vars(module).values():
+        own = isinstance(kind, type) and issubclass(kind, Equation)
+        if own and kind.__module__ == module.__name__:
+            copyreg.pickle(kind, _reduced)  # by its file: no other process can import the module
     return module
+
+
+def _reduced(equation: Any) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+    """How an equation that came from a file is made again."""
+    kind = type(equation)
+    file = sys.modules[kind.__module__].__file__
+    return _made_again, (file, kind.__module__, kind.__qualname__, asdict(equation))
+
+
+def _made_again(file: str, module: str, name: str, values: Mapping[str, Any]) -> Any:
+    """The pickled equation; ValueError if its file is another one by now."""
+    found = load_file(Path(file))
+    if found.__name__ != module:
+        raise ValueError(
+            f"the equation file {file!r} has changed since the plant was pickled: make the plant again"
+        )
+    return vars(found)[name](**values)
