@@ -1,0 +1,23 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A model from the arrays that it was written as."""
+
+from __future__ import annotations
+
+from loop_method.models.base import Arrays, FieldModel, text_of
+from loop_method.models.finite_difference import FiniteDifferenceModel
+from loop_method.models.linear import LinearModel
+from loop_method.models.spectral import SpectralModel
+
+FORMS = {
+    "spectral": SpectralModel.from_arrays,
+    "finite-difference": FiniteDifferenceModel.from_arrays,
+    "linear": LinearModel.from_arrays,
+}
+
+
+def model_of(arrays: Arrays) -> FieldModel:
+    """The model whose `arrays` these are, the same to the bit; ValueError for no such form."""
+    form = text_of(arrays, "form")
+    if form not in FORMS:
+        raise ValueError(f"a field model is of the form {form!r}; expected one of {list(FORMS)}")
+    return FORMS[form](arrays)

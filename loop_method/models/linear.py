@@ -1,0 +1,100 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A linear model of the whole state, for plants that are no equation on a grid, and its fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from loop_interfaces.arrays import Array
+from loop_interfaces.jit.cache import cached_njit
+from loop_method.models.base import Arrays, Samples, text_of
+
+
+@dataclass(frozen=True, eq=False)
+class LinearModel:
+    """z_{k+1} = A z_k + B a_k + c.
+
+    Attributes
+    ----------
+    kind : str
+    A : (n_z, n_z) array
+    B : (n_z, n_a) array
+    constant : (n_z,) array
+        c.
+    """
+
+    kind: str
+    A: Array
+    B: Array
+    constant: Array
+
+    @property
+    def n_z(self) -> int:
+        return len(self.constant)
+
+    @property
+    def n_a(self) -> int:
+        return int(self.B.shape[1])
+
+    def step(self, states: Array, actions: Array) -> Array:
+        after = np.tile(self.constant, (len(states), 1))
+        add_products(np.ascontiguousarray(states), np.ascontiguousarray(self.A.T), after)
+        add_products(np.ascontiguousarray(actions), np.ascontiguousarray(self.B.T), after)
+        return after
+
+    def pull_back(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array]:
+        on_states, on_actions = np.zeros(states.shape), np.zeros(actions.shape)
+        y = np.ascontiguousarray(covectors)
+        add_products(y, np.ascontiguousarray(self.A), on_states)
+        add_products(y, np.ascontiguousarray(self.B), on_actions)
+        return on_states, on_actions
+
+    def linearise(self, state: Array, action: Array) -> tuple[Array, Array]:
+        return self.A.copy(), self.B.copy()
+
+    def arrays(self) -> Arrays:
+        return {
+            "form": np.array("linear"),
+            "kind": np.array(self.kind),
+            "A": self.A,
+            "B": self.B,
+            "constant": self.constant,
+        }
+
+    @staticmethod
+    def from_arrays(arrays: Arrays) -> LinearModel:
+        """The model of `arrays`."""
+        A, B, constant = (np.asarray(arrays[name]) for name in ("A", "B", "constant"))
+        return LinearModel(text_of(arrays, "kind"), A, B, constant)
+
+
+@cached_njit()
+def add_products(rows: Array, matrix: Array, totals: Array) -> None:
+    """totals += rows @ matrix, one row after the other: BLAS rounds by how many there are."""
+    for m in range(len(rows)):
+        for i in range(rows.shape[1]):
+            value = rows[m, i]
+            for j in range(matrix.shape[1]):
+                totals[m, j] += value * matrix[i, j]
+
+
+def fit_linear(samples: Samples, kind: str, ridge: float) -> LinearModel | None:
+    """Least squares on the change of the state.
+
+    ridge: of normalised columns; those of the state have one unit, each input its own.
+    """
+    n_z, n_a = samples.before.shape[1], samples.actions.shape[1]
+    columns = np.hstack([samples.before, samples.actions, np.ones((len(samples), 1))])
+    scale = np.sqrt(np.mean(columns**2, axis=0))
+    scale[:n_z] = np.sqrt(np.mean(samples.before**2))
+    scale = np.where(scale > 0.0, scale, 1.0)
+    columns = columns / scale
+    gram = columns.T @ columns / len(samples) + ridge * np.eye(len(scale))
+    moment = columns.T @ (samples.after - samples.before) / len(samples)
+    found = np.linalg.solve(gram, moment) / scale[:, None]
+    if not np.isfinite(found).all():
+        return None
+    A, B = np.eye(n_z) + found[:n_z].T, found[n_z : n_z + n_a].T
+    return LinearModel(kind, *(np.ascontiguousarray(x) for x in (A, B, found[-1])))
