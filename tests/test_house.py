@@ -13,9 +13,10 @@ from tests.interpreter import ROOT, python
 KNOWS = {
     "loop_interfaces": set(),
     "spectral_solver": {"loop_interfaces"},
+    "loop_method": {"loop_interfaces", "spectral_solver"},
     "pde_sim_node": {"loop_interfaces", "spectral_solver"},
-    "controller_node": {"loop_interfaces"},
-    "tuner_node": {"loop_interfaces"},
+    "controller_node": {"loop_interfaces", "loop_method"},
+    "tuner_node": {"loop_interfaces", "loop_method"},
     "recorder_node": {"loop_interfaces"},
     "viewer_node": {"loop_interfaces"},
 }

@@ -31,13 +31,13 @@ class FieldModel(Protocol):
     """
 
     @property
-    def kind(self) -> str: ...  # noqa: D102
+    def kind(self) -> str: ...
 
     @property
-    def n_z(self) -> int: ...  # noqa: D102
+    def n_z(self) -> int: ...
 
     @property
-    def n_a(self) -> int: ...  # noqa: D102
+    def n_a(self) -> int: ...
 
     def step(self, states: Array, actions: Array) -> Array:
         """The states (M, n_z) a sampling time later, under actions (M, n_a).

@@ -29,9 +29,7 @@ MOST_FACTORS = 5
 def features_of(components: int, degree: int = 3) -> tuple[Feature, ...]:
     """Those of a field of so many components, up to degree 3; pure powers up to `degree`."""
     orders = {1: 3, 2: 3 if components == 1 else 2}
-    monomials = [
-        m for p in (1, 2, 3) for m in combinations_with_replacement(range(components), p)
-    ]
+    monomials = [m for p in (1, 2, 3) for m in combinations_with_replacement(range(components), p)]
     monomials += [(c,) * p for c in range(components) for p in range(4, degree + 1)]
     return tuple((m, j) for m in monomials for j in range(orders.get(len(m), 1)))
 
@@ -72,9 +70,7 @@ class FiniteDifferenceModel:
     @cached_property
     def table(self) -> NDArray[np.int64]:
         """Rows: number of factors, the factors, and the order, of each feature."""
-        rows = [
-            [len(m), *m, *(-1,) * (MOST_FACTORS - len(m)), order] for m, order in self.features
-        ]
+        rows = [[len(m), *m, *(-1,) * (MOST_FACTORS - len(m)), order] for m, order in self.features]
         return np.array(rows, dtype=np.int64)
 
     def step(self, states: Array, actions: Array) -> Array:

@@ -75,7 +75,9 @@ def _coefficients(
     X = X / scale
     gram, moment = X.transpose(0, 2, 1) @ X, X.transpose(0, 2, 1) @ y
     eye = np.eye(X.shape[2])
-    shared = np.linalg.solve(gram.sum(axis=0) + settings.coefficient_ridge * eye, moment.sum(axis=0))
+    shared = np.linalg.solve(
+        gram.sum(axis=0) + settings.coefficient_ridge * eye, moment.sum(axis=0)
+    )
     found = np.broadcast_to(shared, moment.shape)
     if ridge is not None:
         own = np.linalg.solve(gram + ridge / len(X) * eye, moment - gram @ shared)

@@ -29,9 +29,7 @@ def predicted(model: FieldModel, rollout: Measured, steps: int) -> Array:
     return states
 
 
-def errors(
-    model: FieldModel, rollouts: Sequence[Measured], target: Array, worst: float
-) -> Array:
+def errors(model: FieldModel, rollouts: Sequence[Measured], target: Array, worst: float) -> Array:
     """E = sum |error|^2 / sum |z - z_r|^2 of each rollout, at most `worst`.
 
     Of a rollout that ends in values that are not finite, those before count.

@@ -30,8 +30,8 @@ class FieldModelSettings:
     symbol_ridge : float
         Of a symbol that is free at every wavenumber, per mean square of its column, 0 to 1e-3.
     clip : float
-        Largest |z| in powers above the third, per max |z| measured, 1 to 10: a polynomial of high degree
-        says nothing beyond the data.
+        Largest |z| in powers above the third, per max |z| measured, 1 to 10: a polynomial of high
+        degree says nothing beyond the data.
     point_passes, point_samples : int
         As `passes` and `samples`, of coefficients that depend on the place.
     point_substeps : int

@@ -19,7 +19,7 @@ from scipy.fft import irfft, rfft
 
 from loop_interfaces.arrays import Array
 from loop_method.models.base import Arrays, linearised, text_of
-from pde_sim_node.solver.etdrk4 import Coefficients, etdrk4_coefficients
+from spectral_solver.etdrk4 import Coefficients, etdrk4_coefficients
 
 Spectrum = NDArray[np.complex128]
 

@@ -34,7 +34,7 @@ from loop_interfaces.arrays import Array
 from loop_method.models.base import Samples
 from loop_method.models.columns import least_squares, orthonormal
 from loop_method.models.settings import FieldModelSettings
-from loop_method.models.spectral import Spectrum, SpectralModel
+from loop_method.models.spectral import SpectralModel, Spectrum
 
 ORDERS = (4, 2, 2, 1, 1, 1, 1)
 """Of the highest derivative in the symbols of z, z^2, ..; (ik)^3 of z^2 lets the first pass explode."""

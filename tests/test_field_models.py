@@ -1,0 +1,137 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Models of the whole field: exact derivatives, the same bits in any batch, arrays and back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from loop_method.models import Measured, affine_law
+from loop_method.models.files import model_of
+from loop_method.models.finite_difference import FiniteDifferenceModel, features_of
+from loop_method.models.linear import LinearModel
+from loop_method.models.prediction import errors, predicted
+from loop_method.models.spectral import SpectralModel
+
+
+def spectral(n_z=24, degree=3, clip=np.inf):
+    rng = np.random.default_rng(degree)
+    modes, k = n_z // 2 + 1, 1j * np.arange(n_z // 2 + 1)
+    return SpectralModel(
+        kind=f"poly{degree}",
+        linear=0.1 * k + 0.02 * k**2,
+        multipliers=np.array([0.05 * k, 0.1 * np.ones(modes)])[: min(degree - 1, 2)],
+        polynomials=rng.normal(size=(min(degree - 1, 2), degree - 1)) * 0.5,
+        B=rng.normal(size=(n_z, 2)),
+        constant=rng.normal(size=n_z),
+        substeps=3,
+        clip=clip,
+    )
+
+
+def finite_difference(components, degree=3, n_x=9):
+    rng = np.random.default_rng(components)
+    features = features_of(components, degree)
+    C = 0.03 * rng.normal(size=(len(features), components, n_x))
+    n_z = components * n_x
+    B, c = rng.normal(size=(n_z, 2)), rng.normal(size=n_z)
+    return FiniteDifferenceModel("x1e-5", features, C, B, c, 3)
+
+
+def linear(n_z=10):
+    rng = np.random.default_rng(0)
+    return LinearModel(
+        "linear", rng.normal(size=(n_z, n_z)), rng.normal(size=(n_z, 2)), rng.normal(size=n_z)
+    )
+
+
+MODELS = {
+    "squares": lambda: spectral(degree=2),
+    "cubes": lambda: spectral(degree=3),
+    "degree 7": lambda: spectral(degree=7, clip=1.1),
+    "odd": lambda: spectral(n_z=25),
+    "one component": lambda: finite_difference(1, 5),
+    "two components": lambda: finite_difference(2),
+    "linear": linear,
+}
+
+
+@pytest.fixture(params=MODELS, scope="module")
+def model(request):
+    return MODELS[request.param]()
+
+
+def points(model, count=3):
+    rng = np.random.default_rng(1)
+    states = 0.5 * rng.normal(size=(count, model.n_z))
+    return states, rng.normal(size=(count, model.n_a)), rng.normal(size=(count, model.n_z))
+
+
+def test_covectors_are_pulled_back_by_the_exact_transpose(model):
+    z, a, y = points(model)
+    on_z, on_a = model.pull_back(z, a, y)
+    rng = np.random.default_rng(2)
+    dz, da = rng.normal(size=z.shape), rng.normal(size=a.shape)
+    h = 1e-6
+    slope = (model.step(z + h * dz, a + h * da) - model.step(z - h * dz, a - h * da)) / (2 * h)
+    expected = np.sum(y * slope, axis=1)
+    found = np.sum(on_z * dz, axis=1) + np.sum(on_a * da, axis=1)
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
+
+
+def test_the_linearisation_is_the_derivative_and_transposed_what_pulls_back(model):
+    z, a, y = points(model)
+    A, B = model.linearise(z[0], a[0])
+    on_z, on_a = model.pull_back(z, a, y)
+    np.testing.assert_allclose(y[0] @ A, on_z[0], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(y[0] @ B, on_a[0], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["one component", "two components", "linear"])
+def test_rows_do_not_depend_on_what_stands_beside_them(name):
+    model = MODELS[name]()
+    z, a, y = points(model, 9)
+    together = model.step(z, a), *model.pull_back(z, a, y)
+    for i in range(9):
+        one = slice(i, i + 1)
+        alone = model.step(z[one], a[one]), *model.pull_back(z[one], a[one], y[one])
+        for all_of_them, own in zip(together, alone, strict=True):
+            assert np.array_equal(all_of_them[one], own)
+
+
+def test_a_model_comes_back_from_its_arrays_to_the_bit(model, tmp_path):
+    np.savez(tmp_path / "model.npz", **model.arrays())
+    with np.load(tmp_path / "model.npz", allow_pickle=False) as arrays:
+        again = model_of(dict(arrays))
+    z, a, y = points(model)
+    assert again.kind == model.kind and (again.n_z, again.n_a) == (model.n_z, model.n_a)
+    assert np.array_equal(again.step(z, a), model.step(z, a))
+    assert np.array_equal(again.pull_back(z, a, y)[0], model.pull_back(z, a, y)[0])
+
+
+def test_arrays_of_no_such_form_are_refused_in_words():
+    arrays = linear().arrays() | {"form": np.array("cubist")}
+    with pytest.raises(ValueError, match="expected one of"):
+        model_of(arrays)
+
+
+def test_a_model_predicts_itself_under_actions_and_under_a_law():
+    model = linear()
+    model = LinearModel(model.kind, 0.1 * model.A, model.B, model.constant)
+    rng = np.random.default_rng(3)
+    law = affine_law(rng.normal(size=(2, 10)) * 0.1, rng.normal(size=2))
+    z, actions, states = rng.normal(size=(1, 10)), [], []
+    for k in range(7):
+        states.append(z[0])
+        actions.append(law(k, z)[0])
+        z = model.step(z, actions[-1][None])
+    whole = Measured(np.array([*states, z[0]]), np.array(actions))
+    closed = Measured(np.array(states), np.array(actions), law)
+    assert np.array_equal(predicted(model, whole, 7), whole.states)
+    assert errors(model, [whole, closed], np.zeros(10), 2.0).tolist() == [0.0, 0.0]
+
+
+def test_a_model_that_overflows_counts_as_the_worst():
+    model = LinearModel("linear", 1e200 * np.eye(3), np.zeros((3, 1)), np.zeros(3))
+    rollout = Measured(np.ones((6, 3)), np.zeros((5, 1)))
+    assert errors(model, [rollout], np.zeros(3), 2.0).tolist() == [2.0]
