@@ -14,9 +14,9 @@ from controller_node import law
 from controller_node.law import LAW, act, control
 from controller_node.policy import ProjectedLaw
 from controller_node.responder import Responder
-from loop_interfaces.fast_path import channel
-from loop_interfaces.fast_path.handler import FastPath, fast_handler, plan_type
-from loop_interfaces.fast_path.messages import FIRST, STEP, TIME, write_answer
+from fast_path import channel
+from fast_path.handler import FastPath, fast_handler, plan_type
+from fast_path.messages import FIRST, STEP, TIME, write_answer
 from loop_interfaces.frames import MAX_ID, ArrayCodec, Frame
 from loop_interfaces.jit.simd import load_unaligned
 from loop_interfaces.topics import ACTION

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numba.extending import register_jitable
 
-from loop_interfaces.fast_path import channel
-from loop_interfaces.fast_path.handler import FastPath, fast_handler, plan_type
-from loop_interfaces.fast_path.messages import (
+from fast_path import channel
+from fast_path.handler import FastPath, fast_handler, plan_type
+from fast_path.messages import (
     FIRST,
     SAMPLE_BATCH,
     STEP,

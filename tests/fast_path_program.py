@@ -12,7 +12,7 @@ import numpy as np
 import rclpy
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
-from loop_interfaces.fast_path.channel import CAPACITY, LARGE
+from fast_path.channel import CAPACITY, LARGE
 from loop_interfaces.frames import HEADER
 from loop_interfaces.ros.endpoints import raw_subscription, samples_qos
 from loop_interfaces.ros.node_loop import NodeLoop

@@ -12,10 +12,11 @@ from tests.interpreter import ROOT, python
 
 KNOWS = {
     "loop_interfaces": set(),
+    "fast_path": {"loop_interfaces"},
     "spectral_solver": {"loop_interfaces"},
     "loop_method": {"loop_interfaces", "spectral_solver"},
-    "pde_sim_node": {"loop_interfaces", "spectral_solver"},
-    "controller_node": {"loop_interfaces", "loop_method"},
+    "pde_sim_node": {"loop_interfaces", "fast_path", "spectral_solver"},
+    "controller_node": {"loop_interfaces", "fast_path", "loop_method"},
     "tuner_node": {"loop_interfaces", "loop_method"},
     "recorder_node": {"loop_interfaces"},
     "viewer_node": {"loop_interfaces"},

@@ -29,7 +29,7 @@ from loop_interfaces.samples import ACTION_KIND, STATE_KIND
 from loop_interfaces.topics import ACTION, SAMPLES, STATE, Topic
 
 if TYPE_CHECKING:  # not every node needs the compiler
-    from loop_interfaces.fast_path.handler import FastPath
+    from fast_path.handler import FastPath
 
 HOUSEKEEPING = 0.05
 """Seconds between two rounds of the executor and of the node's slow duties."""

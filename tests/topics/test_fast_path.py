@@ -23,7 +23,7 @@ def test_plant_and_controller_answer_with_the_bytes_of_the_ordinary_path(loop: P
 RESTLESS = """
 import gc, math, sys, time
 from collections import Counter
-from loop_interfaces.fast_path.handler import FastPath
+from fast_path.handler import FastPath
 from loop_interfaces.ros.node_loop import NodeLoop
 from {0}.node import main
 interrupted, disarm, run = [], FastPath.disarm, NodeLoop.run

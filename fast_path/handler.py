@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from numba import carray, types  # type: ignore[attr-defined, unused-ignore]
 
-from loop_interfaces.fast_path import messages
-from loop_interfaces.fast_path.channel import RclChannel
-from loop_interfaces.fast_path.messages import EXPECTED, OwnMessage, expected_header
+from fast_path import messages
+from fast_path.channel import RclChannel
+from fast_path.messages import EXPECTED, OwnMessage, expected_header
 from loop_interfaces.frames import ArrayCodec, Frame
 from loop_interfaces.jit import cache, native, simd
 from loop_interfaces.jit.native import MachineCode, pointer_to
