@@ -11,7 +11,7 @@ import numpy as np
 from numba.extending import register_jitable
 
 from controller_node import law
-from controller_node.law import LAW, act, control
+from controller_node.law import LAW, act
 from controller_node.policy import ProjectedLaw
 from controller_node.responder import Responder
 from fast_path import channel
@@ -50,11 +50,9 @@ handler = fast_handler(PLAN, respond, law)
 
 
 def load_compiled() -> None:
-    """Load all that the controller has compiled, or compile it."""
+    """Load what is compiled, or compile it."""
     channel.load_compiled()
     handler()
-    nothing = np.zeros((0, 1))
-    control(np.zeros(1, LAW), nothing, nothing)
 
 
 class ControllerFastPath(FastPath):

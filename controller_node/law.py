@@ -120,3 +120,9 @@ def control(
 ) -> None:
     """Write the actions (M, n_a) that answer the states (M, n_z)."""
     act(laws[0], states.ctypes.data, actions.ctypes.data, len(states))
+
+
+def load_compiled() -> None:
+    """Load the law, or compile it."""
+    nothing = np.zeros((0, 1))
+    control(np.zeros(1, LAW), nothing, nothing)

@@ -10,13 +10,16 @@ Messages, order and parameters: docs/interfaces.md. The protocol is controller_n
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
 
 from rclpy.node import Node
 from std_msgs.msg import String
 
 from controller_node.diagnostics import ControllerDiagnostics
-from controller_node.fast_path import ControllerFastPath, load_compiled
 from controller_node.identification import DesignSettings
+from controller_node.law import load_compiled
 from controller_node.responder import Responder
 from loop_interfaces import topics
 from loop_interfaces.affinity import pin_process
@@ -30,6 +33,9 @@ from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.node_main import node_main
 from loop_interfaces.ros.parameters import declare, given_parameters
 from loop_interfaces.topics import Topic
+
+FAST_PATH = import_module("controller_node.fast_path") if find_spec("fast_path") else None
+"""Answers states in compiled code, where that can be had; without it the responder answers all."""
 
 Handler = Callable[[Frame], Sequence[Publication | ModelFailure]]
 
@@ -45,6 +51,8 @@ class ControllerNode:
         self._responder = responder
         self._diagnostics = ControllerDiagnostics(responder)
         load_compiled()  # before there is a publisher: a peer that discovers one expects answers
+        if FAST_PATH:
+            FAST_PATH.load_compiled()
         self.join(node, loop)
         order = model_order(values) or "suggested by the data"
         node.get_logger().info(f"{values['problem']}: tracking law, order {order}")
@@ -64,8 +72,10 @@ class ControllerNode:
             topics.COST: responder.cost,
         }
         states = loop.receive(topics.STATE, self._on_state)
-        self._fast_path = ControllerFastPath(responder, states.codec)
-        loop.answer_fast(states, self._senders[topics.ACTION], self._fast_path)
+        self._fast_path: Any = None
+        if FAST_PATH:
+            self._fast_path = FAST_PATH.ControllerFastPath(responder, states.codec)
+            loop.answer_fast(states, self._senders[topics.ACTION], self._fast_path)
         for topic, handler in handlers.items():
             loop.receive(topic, partial(self._on_other, handler))
         loop.receive(topics.PAUSED, self._on_paused)
@@ -73,7 +83,8 @@ class ControllerNode:
 
     def _on_state(self, frame: Frame) -> None:
         self._perform(self._responder.state(frame))
-        self._fast_path.last_state = frame
+        if self._fast_path:
+            self._fast_path.last_state = frame
 
     def _on_other(self, handler: Handler, frame: Frame) -> None:
         self._perform(handler(frame))

@@ -9,6 +9,8 @@ Messages, order and parameters: docs/interfaces.md. The protocol is pde_sim_node
 
 import sys
 from dataclasses import fields
+from importlib import import_module
+from importlib.util import find_spec
 from typing import Any
 
 from rclpy.node import Node
@@ -30,9 +32,11 @@ from loop_interfaces.topics import ACTION, COST, PAUSED, START, STATE, TARGET
 from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.diagnostics import PlantDiagnostics
 from pde_sim_node.equations import configured_equation
-from pde_sim_node.fast_path import PlantFastPath, load_compiled
 from pde_sim_node.lockstep import Lockstep, Timing
 from pde_sim_node.run_record import RunRecord
+
+FAST_PATH = import_module("pde_sim_node.fast_path") if find_spec("fast_path") else None
+"""Answers actions in compiled code, where that can be had; without it the lock-step answers all."""
 
 
 def declare_parameters(node: Node) -> dict[str, Any]:
@@ -61,8 +65,9 @@ class PlantNode:
         values = declare_parameters(node)
         pin_process(values["pin"])
         plant = build_plant(values)
-        if plant.instruments.ideal:  # what instruments do to a step is not compiled
-            load_compiled()  # before there is a publisher: a peer that discovers one expects answers
+        if FAST_PATH and plant.instruments.ideal:  # what instruments do to a step is not compiled
+            # Before there is a publisher: a peer that discovers one expects answers.
+            FAST_PATH.load_compiled()
         domain = node.context.get_domain_id()
         self._run_record = RunRecord(node.get_fully_qualified_name(), domain)
         self._lockstep = Lockstep(
@@ -97,9 +102,9 @@ class PlantNode:
         self._clock_wanted = False
         loop.receive(START, self._on_start)
         self._actions = actions = loop.receive(ACTION, self._on_action)
-        self._fast_path: PlantFastPath | None = None
-        if self._lockstep.plant.instruments.ideal:
-            self._fast_path = PlantFastPath(self._lockstep, actions.codec, self._batcher)
+        self._fast_path: Any = None
+        if FAST_PATH and self._lockstep.plant.instruments.ideal:
+            self._fast_path = FAST_PATH.PlantFastPath(self._lockstep, actions.codec, self._batcher)
             loop.answer_fast(actions, self._senders[STATE], self._fast_path)
         loop.introspection.report("lock-step", self._diagnostics.report)
         loop.introspection.offer("~/pause", self._pause)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import itertools
 import os
@@ -15,8 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import controller_node.fast_path
-import pde_sim_node.fast_path
+import controller_node.law
 from loop_interfaces.files import FileError, make_own_folder
 from loop_interfaces.isolation import NETWORK, loopback_environment
 from loop_interfaces.problem import load_parameters
@@ -49,8 +49,10 @@ def resolve(problem: str, options: Mapping[str, Any]) -> dict[str, Any]:
     notice.start()
     try:
         build_plant(values)
-        controller_node.fast_path.load_compiled()
-        pde_sim_node.fast_path.load_compiled()
+        controller_node.law.load_compiled()
+        if importlib.util.find_spec("fast_path"):
+            for node in ("controller_node", "pde_sim_node"):
+                importlib.import_module(f"{node}.fast_path").load_compiled()
     finally:
         notice.cancel()
     physical = asdict(build_equation(values))

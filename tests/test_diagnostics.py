@@ -117,7 +117,7 @@ def test_a_node_is_not_there_before_it_can_answer(module, monkeypatch):
     own = {spec.name for spec in taken_by(module.__name__.split(".")[0])} | {"problem"}
     known = {name: value for name, value in parameters().items() if name in own}
     monkeypatch.setattr(module, declaring, lambda *given: known)
-    monkeypatch.setattr(module, "load_compiled", MagicMock(side_effect=CompilingError))
+    monkeypatch.setattr(module.FAST_PATH, "load_compiled", MagicMock(side_effect=CompilingError))
     monkeypatch.setattr(module, "given_parameters", lambda node: {})
     with pytest.raises(CompilingError):
         kind(MagicMock(), loop)

@@ -64,7 +64,7 @@ def cached_njit(*sources: ModuleType | Callable[..., Any]) -> Callable[[F], F]:
 
 
 def fingerprint(*sources: ModuleType | Callable[..., Any]) -> str:
-    """A digest of source texts; of a function's whole module, which it may use."""
+    """A digest of the names, which compiled code refers to, and texts of modules, or functions' own."""
     digest = hashlib.sha256()
     for source in sources:
         module = inspect.getmodule(source) or source
@@ -74,5 +74,5 @@ def fingerprint(*sources: ModuleType | Callable[..., Any]) -> str:
             text = (
                 repr(source.__code__.co_code) if isinstance(source, FunctionType) else repr(source)
             )
-        digest.update(text.encode())
+        digest.update(f"{getattr(module, '__name__', '')}\0{text}".encode())
     return digest.hexdigest()[:16]

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
@@ -28,9 +28,6 @@ from loop_interfaces.ros.suspend_watchdog import SuspendWatchdog
 from loop_interfaces.samples import ACTION_KIND, STATE_KIND
 from loop_interfaces.topics import ACTION, SAMPLES, STATE, Topic
 
-if TYPE_CHECKING:  # not every node needs the compiler
-    from fast_path.handler import FastPath
-
 HOUSEKEEPING = 0.05
 """Seconds between two rounds of the executor and of the node's slow duties."""
 IDLE_HOUSEKEEPING = 0.5
@@ -43,6 +40,24 @@ BUSY = 20
 """Messages since the last round that make a stream."""
 SERVING = 0.02
 """Seconds in which a round begins callbacks of the executor: queued requests are answered together."""
+
+
+class FastChannel(Protocol):
+    """A subscription and a publisher that this thread shares with the middleware's: `RclChannel`."""
+
+    def open(self, subscription: Any, publisher: Any, guard: Any) -> bool: ...
+    def close(self) -> None: ...
+    def next_message(self) -> bytes | None: ...
+    def newly_dropped(self) -> int: ...
+
+
+class FastPath(Protocol):
+    """Answers one topic's messages on another while the node's thread waits: `fast_path.handler`."""
+
+    @property
+    def channel(self) -> FastChannel: ...
+    def arm(self) -> bool: ...
+    def disarm(self) -> int: ...
 
 
 class _Fast(NamedTuple):

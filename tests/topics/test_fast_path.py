@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 import signal
+import sys
 from pathlib import Path
 
 import pytest
@@ -64,3 +65,21 @@ def test_a_protocol_that_changes_hands_all_the_time_loses_nothing(
         ((count, repeated),) = re.findall(r"interrupted (\d+) times, (\d+) repeated", said)
         assert int(count) > 500
         assert int(repeated) == 0
+
+
+WITHOUT = """
+import sys
+sys.modules["fast_path"] = None
+from {0}.node import FAST_PATH, main
+assert FAST_PATH is None
+sys.exit(main())
+"""
+
+
+def test_nodes_are_complete_without_the_fast_path(loop: Processes, tmp_path: Path) -> None:
+    """The package is not there: every message goes through the protocols, and gives the same bits."""
+    for package in ("pde_sim_node", "controller_node"):
+        words = "-c", WITHOUT.format(package), "--ros-args", *PARAMETERS
+        loop.program(sys.executable, *words, name=package)
+    loop.wait(start_tuner(loop, tmp_path / "run"), LIMIT)
+    assert_same_training(tmp_path / "run", in_process())
