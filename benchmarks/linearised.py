@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.problem import load_parameters
+from loop_method.seeds import Purpose, derive
 from pde_sim_node.build import build_plant
 from pdeloop.episode import Law, rollout
 from pdeloop.problem_check import linearisation
-from tuner_node.seeds import Purpose, derive
 
 FIELDS = 10
 

@@ -17,13 +17,14 @@ from scipy import linalg, sparse
 from threadpoolctl import threadpool_limits
 
 from benchmarks.warm_start import warm_start
-from controller_node import lqt
 from controller_node.identification import identify
-from controller_node.lqt import Gains
 from controller_node.policy import excitation
-from controller_node.reduced_model import ReducedModel
 from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import unpack
+from loop_method.design import lqt
+from loop_method.design.lqt import Gains
+from loop_method.reduce.reduced_model import ReducedModel
+from loop_method.seeds import Purpose, derive
 from pde_sim_node.build import build_plant
 from pde_sim_node.measurement import InstrumentedPlant
 from pde_sim_node.plant import Plant
@@ -31,7 +32,6 @@ from pdeloop.episode import Law, projected_law, rollout
 from pdeloop.in_process import LocalPair, train
 from pdeloop.study.training import require_environment
 from tuner_node.build import build_training
-from tuner_node.seeds import Purpose, derive
 
 Values = Mapping[str, Any]
 Method = Callable[..., tuple[LocalPair, Law, int]]

@@ -37,11 +37,11 @@ from loop_interfaces.arrays import Array
 from loop_interfaces.files import make_folder
 from loop_interfaces.model_rows import unpack
 from loop_interfaces.problem import load_parameters
+from loop_method.seeds import Purpose, derive
 from pde_sim_node.build import build_plant
 from pdeloop.gradients import Gradients, features
 from pdeloop.in_process import LocalPair
 from pdeloop.reproduction import PAPER
-from tuner_node.seeds import Purpose, derive
 
 __all__ = ["run", "text"]
 

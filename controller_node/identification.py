@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
-from controller_node import dmdc, lqt, regression
-from controller_node.field_law import field_law
-from controller_node.order import study_orders
 from controller_node.policy import ProjectedLaw
-from controller_node.reduced_model import ReducedModel
 from loop_interfaces.model_rows import ModelRows, pack
 from loop_interfaces.parameters import model_order
+from loop_method.design import lqt
+from loop_method.design.field_law import field_law
+from loop_method.reduce import dmdc, regression
+from loop_method.reduce.order import study_orders
+from loop_method.reduce.reduced_model import ReducedModel
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from controller_node.lqt import track as track
-    from controller_node.order import study_orders as study_orders
-    from controller_node.reduced_model import ReducedModel as ReducedModel
+    from loop_method.design.lqt import track as track
+    from loop_method.reduce.order import study_orders as study_orders
+    from loop_method.reduce.reduced_model import ReducedModel as ReducedModel
     from pde_sim_node.plant import Plant as Plant
     from pdeloop.api import Problem as Problem
     from pdeloop.api import identify as identify
@@ -42,9 +42,9 @@ if TYPE_CHECKING:
     from pdeloop.plots import plot_training as plot_training
 
 _NAMES = {
-    "controller_node.lqt": ("track",),
-    "controller_node.order": ("study_orders",),
-    "controller_node.reduced_model": ("ReducedModel",),
+    "loop_method.design.lqt": ("track",),
+    "loop_method.reduce.order": ("study_orders",),
+    "loop_method.reduce.reduced_model": ("ReducedModel",),
     "pde_sim_node.plant": ("Plant",),
     "pdeloop.api": ("Problem", "identify", "problem", "train"),
     "pdeloop.data_file": ("read_measurements",),

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from controller_node import identification
-from controller_node.reduced_model import ReducedModel
 from loop_interfaces.arrays import Array
 from loop_interfaces.problem import load_parameters
+from loop_method.reduce.reduced_model import ReducedModel
 from pde_sim_node.build import build_equation, build_plant
 from pde_sim_node.equations import allow
 from pde_sim_node.plant import Plant

@@ -13,6 +13,7 @@ from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import pack
 from loop_interfaces.parameters import noisy
 from loop_interfaces.topics import CostColumn
+from loop_method.seeds import Purpose, derive, evaluation_noise
 from pde_sim_node.build import build_equation
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.finished_run import FinishedRun
@@ -21,7 +22,6 @@ from pdeloop.output import aligned
 from tuner_node.batch import Batch
 from tuner_node.rollouts import EVALUATED
 from tuner_node.run_folder import RunFolderError
-from tuner_node.seeds import Purpose, derive, evaluation_noise
 
 ROUNDED = 0.1
 """Relative difference of a mean cost that other rounding may explain where the field is chaotic."""

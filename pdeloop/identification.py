@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from controller_node.identification import DesignSettings, design
-from controller_node.order import OrderStudy, study_orders
 from loop_interfaces.arrays import Array
 from loop_interfaces.episodes import episode_name
 from loop_interfaces.files import write_atomically
@@ -23,6 +22,7 @@ from loop_interfaces.model_rows import ModelRows, pack
 from loop_interfaces.parameters import as_recorded, model_order, recorded_values, table
 from loop_interfaces.spec import ParameterError
 from loop_interfaces.topics import COMPLETED, CostColumn
+from loop_method.reduce.order import OrderStudy, study_orders
 from pdeloop.data_file import read_measurements
 
 if TYPE_CHECKING:

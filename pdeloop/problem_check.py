@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from controller_node.identification import DesignSettings, design
-from controller_node.order import study_orders
 from loop_interfaces.arrays import Array
 from loop_interfaces.parameters import INSTRUMENTS
+from loop_method.reduce.order import study_orders
 from pde_sim_node.build import build_plant
 from pde_sim_node.equations import LinearEquation
 from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD, Plant

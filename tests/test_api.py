@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import pdeloop
+from loop_method.seeds import Purpose, derive
 from pdeloop.cli import main
 from pdeloop.interruption import Interruption
 from tests.interpreter import python
 from tests.small import SMALL, same_bits
-from tuner_node.seeds import Purpose, derive
 
 TWO_POINT = {"optimizer": "two_point", "rollouts": 7, "evaluation_fields": 3, "seed": 5}
 

@@ -27,8 +27,8 @@ from benchmarks.methods import (
     evaluation_fields,
     measure,
 )
-from controller_node import lqt
-from controller_node.reduced_model import ReducedModel
+from loop_method.design import lqt
+from loop_method.reduce.reduced_model import ReducedModel
 from pde_sim_node.build import build_plant
 from pde_sim_node.measurement import InstrumentedPlant
 from pde_sim_node.plant import DIVERGED_COST, Plant

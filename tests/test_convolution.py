@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loop_interfaces.field_models.convolution import ConvolutionModel, fit_convolutions
-from tuner_node.optimizers.simulation import Loop, improve, mismatch, mismatch_of_pieces
+from loop_method.adapt.simulation import Loop, improve, mismatch, mismatch_of_pieces
+from loop_method.field_models.convolution import ConvolutionModel, fit_convolutions
 
 Array = np.ndarray
 N_Z, N_A, STEPS = 16, 3, 60

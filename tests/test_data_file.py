@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from controller_node.regression import exact_regression
+from loop_method.reduce.regression import exact_regression
 from pdeloop import data_file
 from pdeloop.cli import FAILED, main
 from pdeloop.data_file import read_measurements

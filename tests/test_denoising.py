@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tuner_node.optimizers.trajectories import denoised
+from loop_method.adapt.trajectories import denoised
 
 SIGMA = 0.1
 

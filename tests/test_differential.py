@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from benchmarks.warm_start import warm_start
-from loop_interfaces.field_models.differential import DifferentialModel, fit_differential
 from loop_interfaces.problem import load_parameters
+from loop_method.adapt.simulation import Loop, adjoint_gradient, mismatch
+from loop_method.field_models.differential import DifferentialModel, fit_differential
 from pdeloop.in_process import LocalPair
-from tuner_node.optimizers.simulation import Loop, adjoint_gradient, mismatch
 
 N_Z, N_A = 65, 2
 

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from controller_node.dmdc import truncated_dmdc
-from controller_node.reduced_model import ReducedModel
+from loop_method.reduce.dmdc import truncated_dmdc
+from loop_method.reduce.reduced_model import ReducedModel
 from tests.linear_system import assert_recovered, lift, linear_system, trajectory
 
 N_S, N_A, STEPS = 3, 2, 40

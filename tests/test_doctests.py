@@ -13,6 +13,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = (
     "loop_interfaces",
     "spectral_solver",
+    "loop_method",
     "pde_sim_node",
     "controller_node",
     "tuner_node",

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from controller_node.field_law import field_law, finite_horizon, reproducing
 from controller_node.identification import DesignSettings, design
-from loop_interfaces.field_models.convolution import ConvolutionModel
 from loop_interfaces.model_rows import ModelRows
+from loop_method.design.field_law import field_law, finite_horizon, reproducing
+from loop_method.field_models.convolution import ConvolutionModel
 
 Array = np.ndarray
 N_Z, N_A, STEPS = 24, 3, 64

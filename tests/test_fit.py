@@ -9,9 +9,9 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from tuner_node.optimizers.fit import LocalModel, extended_basis, fit
-from tuner_node.optimizers.selection import KAPPAS, Comparison, choices, mismatches
-from tuner_node.optimizers.sensitivity import (
+from loop_method.adapt.fit import LocalModel, extended_basis, fit
+from loop_method.adapt.selection import KAPPAS, Comparison, choices, mismatches
+from loop_method.adapt.sensitivity import (
     ReducedTrajectory,
     damped_step,
     expand,

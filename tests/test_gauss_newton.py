@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from controller_node.lqt import track
-from controller_node.reduced_model import ReducedModel
-from loop_interfaces.field_models.convolution import ConvolutionModel, fit_convolutions
+from loop_method.adapt import Context, GaussNewton, Rollout, RolloutResult, Trajectory
+from loop_method.adapt.proposals import Proposer, chaotic
+from loop_method.adapt.simulation import mismatch, mismatch_of_pieces
+from loop_method.adapt.trajectories import Records
+from loop_method.design.lqt import track
+from loop_method.field_models.convolution import ConvolutionModel, fit_convolutions
+from loop_method.reduce.reduced_model import ReducedModel
 from tests.small import parameters, same_bits, train_here
-from tuner_node.optimizers import Context, GaussNewton, Rollout, RolloutResult, Trajectory
-from tuner_node.optimizers.proposals import Proposer, chaotic
-from tuner_node.optimizers.simulation import mismatch, mismatch_of_pieces
-from tuner_node.optimizers.trajectories import Records
 
 N_Z, N_S, N_A, T = 7, 4, 2, 80
 Q, R = 1.0, 0.2

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from loop_interfaces.parameters import TUNER
-from tuner_node.optimizers import GaussNewton, Optimizer, RolloutResult, TwoPoint
-from tuner_node.optimizers.two_point import direction
-from tuner_node.seeds import field_seed
+from loop_method.adapt import GaussNewton, Optimizer, RolloutResult, TwoPoint
+from loop_method.adapt.two_point import direction
+from loop_method.seeds import field_seed
 
 SHAPE = (2, 6)
 N_A, N_S = 2, 3

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from controller_node.order import study_orders
+from loop_method.reduce.order import study_orders
 from tests.linear_system import linear_system, trajectory
 
 Array = np.ndarray

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from controller_node import dmdc
-from controller_node.regression import exact_regression
+from loop_method.reduce import dmdc
+from loop_method.reduce.regression import exact_regression
 from tests.linear_system import assert_recovered, lift, linear_system, trajectory
 from tuner_node.exploration import least_variance
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from loop_interfaces.topics import CostColumn
+from loop_method.seeds import Purpose, derive
 from pdeloop.cli import main
 from pdeloop.finished_run import reduction
 from pdeloop.in_process import LocalPair
@@ -17,7 +18,6 @@ from pdeloop.reproduction import LEARNED, beside_the_paper, reproduction_in, run
 from pdeloop.study.table import beside_no_control, rows
 from tests.small import parameters, same_bits, train_here
 from tuner_node.batch import Batch
-from tuner_node.seeds import Purpose, derive
 
 
 def test_what_costs_no_less_than_no_control_is_named():

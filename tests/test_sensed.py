@@ -8,13 +8,13 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 import pdeloop
-from loop_interfaces.field_models.sensed import SensedModel, fit_sensed, grid_points, interpolated
+from loop_method.adapt import Context, GaussNewton, Rollout, RolloutResult, Trajectory
+from loop_method.adapt.base import Record
+from loop_method.adapt.proposals.sensed import SensedProposals
+from loop_method.adapt.simulation import Loop
+from loop_method.field_models.sensed import SensedModel, fit_sensed, grid_points, interpolated
 from pdeloop.episode import rollout
 from tests.small import same_bits
-from tuner_node.optimizers import Context, GaussNewton, Rollout, RolloutResult, Trajectory
-from tuner_node.optimizers.base import Record
-from tuner_node.optimizers.proposals.sensed import SensedProposals
-from tuner_node.optimizers.simulation import Loop
 
 Array = np.ndarray
 SENSORS = 8

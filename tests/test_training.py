@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from controller_node.order import study_orders
 from loop_interfaces.model_rows import unpack
 from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn
+from loop_method.reduce.order import study_orders
 from pdeloop.in_process import LocalPair, train
 from tests.small import parameters, same_bits, train_here
 from tuner_node import checkpoint, training_state

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tuner_node.optimizers.two_point import direction, gradient
-from tuner_node.seeds import field_seed
+from loop_method.adapt.two_point import direction, gradient
+from loop_method.seeds import field_seed
 
 SHAPE = (3, 4)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from loop_interfaces.arrays import Array
 from loop_interfaces.topics import COMPLETED, MAX_GAIN, START_COLUMNS, CostColumn
-from tuner_node.optimizers import Rollout, RolloutResult, Trajectory
+from loop_method.adapt import Rollout, RolloutResult, Trajectory
 
 UNKNOWN_PLANT = -1
 """The plant's fingerprint before the first cost."""

@@ -15,11 +15,11 @@ from loop_interfaces.model_rows import unpack
 from loop_interfaces.parameters import model_order, noisy
 from loop_interfaces.signature import design_digest
 from loop_interfaces.spec import ParameterError
+from loop_method.adapt import Context, GaussNewton, Optimizer, TwoPoint
+from loop_method.adapt.gauss_newton import FIELDS
 from tuner_node.batch import UNKNOWN_PLANT, TrainingSettings
 from tuner_node.dispatch import Dispatcher
 from tuner_node.exploration import least_variance
-from tuner_node.optimizers import Context, GaussNewton, Optimizer, TwoPoint
-from tuner_node.optimizers.gauss_newton import FIELDS
 from tuner_node.rollouts import CHECK, EXPLORATION
 from tuner_node.run_folder import RunIdentity
 from tuner_node.training import Training

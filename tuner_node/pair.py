@@ -10,9 +10,9 @@ from loop_interfaces.frames import Frame, FrameError, digest
 from loop_interfaces.protocol import Publication
 from loop_interfaces.signature import NOT_SIGNED, signature, signature_in
 from loop_interfaces.topics import COST, VOID, CostColumn
+from loop_method.adapt import Trajectory
 from tuner_node.batch import Batch
 from tuner_node.errors import ContradictionError, DispatchError
-from tuner_node.optimizers import Trajectory
 from tuner_node.trajectory_collector import TrajectoryCollector
 
 PairPublication = tuple[int, Publication]

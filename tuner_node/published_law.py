@@ -7,7 +7,7 @@ import numpy as np
 
 from loop_interfaces.model_rows import ModelRows
 from loop_interfaces.topics import MAX_GAIN
-from tuner_node.optimizers import Rollout, Trajectory
+from loop_method.adapt import Rollout, Trajectory
 
 TOLERANCE = 1e-6
 """Relative difference of actions that rounding may explain."""

@@ -11,9 +11,9 @@ import numpy as np
 
 from loop_interfaces.arrays import Array
 from loop_interfaces.topics import StartColumn
+from loop_method.adapt import Rollout
+from loop_method.seeds import Purpose, derive, evaluation_noise
 from tuner_node.batch import TrainingSettings
-from tuner_node.optimizers import Rollout
-from tuner_node.seeds import Purpose, derive, evaluation_noise
 
 EXPLORATION = 1
 """Rollouts of an exploration."""

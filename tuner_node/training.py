@@ -27,11 +27,11 @@ import numpy as np
 from loop_interfaces import model_rows
 from loop_interfaces.arrays import Array
 from loop_interfaces.topics import COMPLETED, CostColumn
+from loop_method.adapt import Context, Optimizer, Record, Rollout, Trajectory
 from tuner_node import rollouts
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, TrainingSettings, batch_of
 from tuner_node.budget import Budget
 from tuner_node.errors import ContradictionError
-from tuner_node.optimizers import Context, Optimizer, Record, Rollout, Trajectory
 from tuner_node.published_law import check_law
 from tuner_node.rollouts import CHECK, EVALUATED, EXPLORATION
 

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from loop_interfaces import model_rows
 from loop_interfaces.array_files import taken
 from loop_interfaces.files import parse_json
-from tuner_node.budget import PURPOSES
-from tuner_node.optimizers.trajectories import (
+from loop_method.adapt.trajectories import (
     record_arrays,
     taken_record,
     taken_trajectory,
     trajectory_arrays,
 )
+from tuner_node.budget import PURPOSES
 from tuner_node.results import check_history
 from tuner_node.training import Training
 

@@ -13,7 +13,7 @@ from loop_interfaces.arrays import Array
 from loop_interfaces.episodes import episode_name
 from loop_interfaces.frames import KEPT_ARRAY, Frame, FrameError
 from loop_interfaces.topics import COMPLETED
-from tuner_node.optimizers import Trajectory
+from loop_method.adapt import Trajectory
 
 MAX_BYTES = 2**30
 """Bytes that are kept of the samples of one episode, whoever sends them."""

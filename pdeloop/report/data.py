@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from controller_node.order import OrderStudy, study_orders
 from controller_node.policy import ProjectedLaw
 from loop_interfaces.array_files import read_arrays, taken
 from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import ModelRows, unpack
+from loop_method.reduce.order import OrderStudy, study_orders
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD, Plant
 from pdeloop.episode import rollout

@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from controller_node.order import OrderStudy
 from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import ModelRows
+from loop_method.reduce.order import OrderStudy
 from pdeloop.report.data import Behaviour, ProblemData
 from pdeloop.report.style import COLOURS, FIELD_MAP, GAIN_MAP, NAMES, image, plain_log
 

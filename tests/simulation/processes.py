@@ -32,6 +32,7 @@ from loop_interfaces.topics import (
     TARGET,
     Topic,
 )
+from loop_method.adapt.proposals import Proposer
 from pde_sim_node import build as plant_build
 from pde_sim_node.lockstep import Lockstep, Timing
 from pde_sim_node.plant import Plant
@@ -39,7 +40,6 @@ from tests.simulation.disk import Disk
 from tests.small import parameters
 from tuner_node import training_state
 from tuner_node.build import build_dispatcher, build_training
-from tuner_node.optimizers.proposals import Proposer
 from tuner_node.run_folder import RunIdentity
 from tuner_node.session import Session
 

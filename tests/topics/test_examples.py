@@ -18,13 +18,13 @@ import pytest
 
 from loop_interfaces.model_rows import unpack
 from loop_interfaces.problem import load_parameters
+from loop_method.seeds import Purpose, derive
 from pde_sim_node.build import build_plant
 from pde_sim_node.equations import ALLOWED, Equation, load_equation
 from pdeloop.cli import main
 from tests.loop_harness import ROOT, Processes, until
 from tests.small_loop import LIMIT
 from tests.topics.test_foreign import INTERFACES, code_block, documented_command
-from tuner_node.seeds import Purpose, derive
 
 pytestmark = pytest.mark.topics
 PAGE = (ROOT / "docs" / "bring-your-own.md").read_text()

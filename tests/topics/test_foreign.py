@@ -12,9 +12,9 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 from loop_interfaces.model_rows import unpack
+from loop_method.seeds import Purpose, derive
 from tests.loop_harness import ROOT, Processes
 from tests.small_loop import LIMIT
-from tuner_node.seeds import Purpose, derive
 
 pytestmark = pytest.mark.topics
 INTERFACES = (ROOT / "docs" / "interfaces.md").read_text()

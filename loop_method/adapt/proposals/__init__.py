@@ -14,5 +14,5 @@ of four kinds, the first that applies:
 `proposer` chooses; `reproducing` fits and judges the models of the whole field.
 """
 
-from tuner_node.optimizers.proposals.proposal import Proposal as Proposal
-from tuner_node.optimizers.proposals.proposer import Proposer as Proposer
+from loop_method.adapt.proposals.proposal import Proposal as Proposal
+from loop_method.adapt.proposals.proposer import Proposer as Proposer

@@ -11,11 +11,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from loop_interfaces.arrays import Array
-from loop_interfaces.field_models import FieldModel
-from tuner_node.optimizers.base import Record
-from tuner_node.optimizers.fit import extended_basis
-from tuner_node.optimizers.proposals.proposal import MODES, TRUST, Proposal, spread
-from tuner_node.optimizers.simulation import Loop, improve
+from loop_method.adapt.base import Record
+from loop_method.adapt.fit import extended_basis
+from loop_method.adapt.proposals.proposal import MODES, TRUST, Proposal, spread
+from loop_method.adapt.simulation import Loop, improve
+from loop_method.field_models import FieldModel
 
 # Measured initial fields that a law is improved on, the newest.
 _FIELDS = 8

@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from loop_interfaces.arrays import Array
-from loop_interfaces.field_models import FieldModel
-from loop_interfaces.field_models.convolution import fit_convolutions
-from loop_interfaces.field_models.differential import fit_differential
-from tuner_node.optimizers.base import Record
-from tuner_node.optimizers.simulation import Loop, mismatch, mismatch_of_pieces
+from loop_method.adapt.base import Record
+from loop_method.adapt.simulation import Loop, mismatch, mismatch_of_pieces
+from loop_method.field_models import FieldModel
+from loop_method.field_models.convolution import fit_convolutions
+from loop_method.field_models.differential import fit_differential
 
 # A model has to reproduce the last rollouts up to this share of their error energy. With noise the
 # local models are further from the plant, and so may these be.

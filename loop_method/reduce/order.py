@@ -2,7 +2,7 @@
 """Which order n_s the data support: errors of models on steps that they were not fitted to.
 
 Every trajectory is cut into pieces; each of four times every fourth piece is held out, and the others
-give U, A and B (see `controller_node.regression`). On a held-out piece z_0 .. z_N the model is away
+give U, A and B (see `loop_method.reduce.regression`). On a held-out piece z_0 .. z_N the model is away
 from the measurement by
 
     one step    z_{k+1} - U (A U^T z_k + B a_k)
@@ -26,9 +26,15 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import linalg
 from threadpoolctl import threadpool_limits
 
-from controller_node.reduced_model import ReducedModel, Trajectory, numerical_rank, pieces, steps_of
-from controller_node.regression import fit
 from loop_interfaces.arrays import Array
+from loop_method.reduce.reduced_model import (
+    ReducedModel,
+    Trajectory,
+    numerical_rank,
+    pieces,
+    steps_of,
+)
+from loop_method.reduce.regression import fit
 
 ORDERS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 28, 32, 40, 48, 64)
 FOLDS, PIECES = 4, 8

@@ -10,20 +10,20 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from loop_interfaces.arrays import Array
-from tuner_node.optimizers.base import Context, Record
-from tuner_node.optimizers.proposals import chaotic, local, whole_field
-from tuner_node.optimizers.proposals.proposal import COMPARED, Proposal
-from tuner_node.optimizers.proposals.reproducing import (
+from loop_method.adapt.base import Context, Record
+from loop_method.adapt.proposals import chaotic, local, whole_field
+from loop_method.adapt.proposals.proposal import COMPARED, Proposal
+from loop_method.adapt.proposals.reproducing import (
     REPRODUCED,
     REPRODUCED_NOISY,
     ranks,
     reproducing_model,
     steps_of,
 )
-from tuner_node.optimizers.proposals.sensed import MOST_SENSORS, SensedProposals
-from tuner_node.optimizers.selection import LOCAL
-from tuner_node.optimizers.simulation import Loop
-from tuner_node.optimizers.trajectories import denoised
+from loop_method.adapt.proposals.sensed import MOST_SENSORS, SensedProposals
+from loop_method.adapt.selection import LOCAL
+from loop_method.adapt.simulation import Loop
+from loop_method.adapt.trajectories import denoised
 
 # The smallest weight of a rollout in the fit of a model of the whole field.
 _LEAST_WEIGHT = 0.05

@@ -6,7 +6,7 @@ import scipy.linalg
 
 from loop_interfaces.array_files import Arrays, taken
 from loop_interfaces.arrays import Array
-from tuner_node.optimizers.base import Record, RolloutResult, State, Trajectory
+from loop_method.adapt.base import Record, RolloutResult, State, Trajectory
 
 
 def trajectory_arrays(name: str, trajectory: Trajectory | Record) -> State:

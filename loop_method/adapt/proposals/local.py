@@ -11,13 +11,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from loop_interfaces.arrays import Array
-from tuner_node.optimizers.base import Record
-from tuner_node.optimizers.fit import LocalModel, extended_basis, fit
-from tuner_node.optimizers.proposals.proposal import LEAST_FALL, MODES, Proposal
-from tuner_node.optimizers.proposals.reproducing import steps_of
-from tuner_node.optimizers.selection import KAPPAS, LOCAL, RIDGES, Comparison, choices, mismatches
-from tuner_node.optimizers.sensitivity import damped_step
-from tuner_node.optimizers.simulation import Loop
+from loop_method.adapt.base import Record
+from loop_method.adapt.fit import LocalModel, extended_basis, fit
+from loop_method.adapt.proposals.proposal import LEAST_FALL, MODES, Proposal
+from loop_method.adapt.proposals.reproducing import steps_of
+from loop_method.adapt.selection import KAPPAS, LOCAL, RIDGES, Comparison, choices, mismatches
+from loop_method.adapt.sensitivity import damped_step
+from loop_method.adapt.simulation import Loop
 
 # Coordinates that the cubic part of a model acts on, at most.
 _CUBIC_MODES = 12

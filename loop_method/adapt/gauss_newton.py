@@ -32,7 +32,7 @@ from threadpoolctl import threadpool_limits
 
 from loop_interfaces.array_files import Arrays, taken
 from loop_interfaces.arrays import Array
-from tuner_node.optimizers.base import (
+from loop_method.adapt.base import (
     Context,
     Record,
     Rollout,
@@ -43,9 +43,9 @@ from tuner_node.optimizers.base import (
     require_positive,
     require_results,
 )
-from tuner_node.optimizers.proposals import Proposer
-from tuner_node.optimizers.trajectories import Records
-from tuner_node.seeds import field_seed
+from loop_method.adapt.proposals import Proposer
+from loop_method.adapt.trajectories import Records
+from loop_method.seeds import field_seed
 
 __all__ = ["GaussNewton"]
 

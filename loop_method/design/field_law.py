@@ -3,7 +3,7 @@
 
 POD modes of an exploratory episode are the directions in which the fields are large, and a law needs
 those that it senses: for an unstable plant these differ, as by the end of the episode the field is
-saturated. A model of the whole field (`loop_interfaces.field_models`) that reproduces the episode is
+saturated. A model of the whole field (`loop_method.field_models`) that reproduces the episode is
 linearised at the target, with e = z - z_r,
 
     e_{k+1} = A e_k + B a_k + d,        d = f(z_r, 0) - z_r,
@@ -24,12 +24,12 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import linalg
 
-from controller_node.reduced_model import Trajectory, leading_modes, pieces, steps_of
 from loop_interfaces.arrays import Array
-from loop_interfaces.field_models import FieldModel
-from loop_interfaces.field_models.convolution import fit_convolutions
-from loop_interfaces.field_models.differential import fit_differential
 from loop_interfaces.model_rows import ModelRows
+from loop_method.field_models import FieldModel
+from loop_method.field_models.convolution import fit_convolutions
+from loop_method.field_models.differential import fit_differential
+from loop_method.reduce.reduced_model import Trajectory, leading_modes, pieces, steps_of
 
 LARGEST = 512
 """Points of a field, at most: the work grows with their third power."""

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from loop_interfaces.array_files import taken
 from loop_interfaces.arrays import Array
-from tuner_node.optimizers.base import (
+from loop_method.adapt.base import (
     Rollout,
     RolloutResult,
     Row,
@@ -34,7 +34,7 @@ from tuner_node.optimizers.base import (
     require_positive,
     require_results,
 )
-from tuner_node.seeds import DIRECTION_STREAM, field_seed
+from loop_method.seeds import DIRECTION_STREAM, field_seed
 
 
 class TwoPoint:

@@ -12,12 +12,12 @@ from dataclasses import replace
 import numpy as np
 
 from loop_interfaces.arrays import Array
-from loop_interfaces.field_models.sensed import SHARED, SensedModel, fit_sensed, interpolated
-from tuner_node.optimizers.base import Record
-from tuner_node.optimizers.fit import extended_basis
-from tuner_node.optimizers.proposals.proposal import COMPARED, TRUST, Proposal, spread
-from tuner_node.optimizers.proposals.reproducing import REPRODUCED
-from tuner_node.optimizers.simulation import Loop, improve
+from loop_method.adapt.base import Record
+from loop_method.adapt.fit import extended_basis
+from loop_method.adapt.proposals.proposal import COMPARED, TRUST, Proposal, spread
+from loop_method.adapt.proposals.reproducing import REPRODUCED
+from loop_method.adapt.simulation import Loop, improve
+from loop_method.field_models.sensed import SHARED, SensedModel, fit_sensed, interpolated
 
 # More point sensors than this are taken for a field.
 MOST_SENSORS = 32

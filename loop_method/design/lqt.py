@@ -29,8 +29,8 @@ from numpy.typing import NDArray
 from scipy import linalg
 from threadpoolctl import threadpool_limits
 
-from controller_node.reduced_model import ReducedModel
 from loop_interfaces.arrays import Array
+from loop_method.reduce.reduced_model import ReducedModel
 
 # A direction that the inputs move by less than this, relative to the model's size, counts as out of
 # reach.

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from scipy import linalg
 from threadpoolctl import threadpool_limits
 
-from controller_node.reduced_model import ReducedModel, leading_modes, numerical_rank, steps_of
+from loop_method.reduce.reduced_model import ReducedModel, leading_modes, numerical_rank, steps_of
 
 
 def truncated_dmdc(

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from loop_interfaces.arrays import Array
-from tuner_node.optimizers.fit import LocalModel
-from tuner_node.optimizers.sensitivity import ReducedTrajectory, predict_difference
+from loop_method.adapt.fit import LocalModel
+from loop_method.adapt.sensitivity import ReducedTrajectory, predict_difference
 
 # Ridges of the quadratic part.
 RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)

@@ -8,7 +8,7 @@ Y = [a_0 .. a_{N-1}] (one column per step),
 
 the solution of least norm where there are several. States are projected and inputs are kept whole, so
 that there is no second rank to choose and nothing depends on the unit of the inputs. The truncated
-regression of `controller_node.dmdc` is the same where the states have no more than n_s modes and p
+regression of `loop_method.reduce.dmdc` is the same where the states have no more than n_s modes and p
 keeps everything; with p < n_s + n_a it cuts into the inputs.
 
 References
@@ -26,8 +26,8 @@ from numpy.typing import ArrayLike
 from scipy import linalg
 from threadpoolctl import threadpool_limits
 
-from controller_node.reduced_model import ReducedModel, Steps, leading_modes, steps_of
 from loop_interfaces.arrays import Array
+from loop_method.reduce.reduced_model import ReducedModel, Steps, leading_modes, steps_of
 
 
 def exact_regression(

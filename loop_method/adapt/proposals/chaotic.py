@@ -12,11 +12,11 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from loop_interfaces.arrays import Array
-from loop_interfaces.field_models import FieldModel
-from tuner_node.optimizers.base import Record
-from tuner_node.optimizers.fit import extended_basis
-from tuner_node.optimizers.proposals.proposal import LEAST_FALL, MODES, TRUST, Proposal
-from tuner_node.optimizers.simulation import Loop, improve, mismatch
+from loop_method.adapt.base import Record
+from loop_method.adapt.fit import extended_basis
+from loop_method.adapt.proposals.proposal import LEAST_FALL, MODES, TRUST, Proposal
+from loop_method.adapt.simulation import Loop, improve, mismatch
+from loop_method.field_models import FieldModel
 
 # The error of a rollout is more than so many times that of its pieces; noise adds up more slowly.
 _GROWTH = 20.0

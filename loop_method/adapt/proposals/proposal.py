@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from loop_interfaces.arrays import Array
-from tuner_node.optimizers.base import Row
+from loop_method.adapt.base import Row
 
 # Coordinates of the local models and of the sensitivities, at least.
 MODES = 32

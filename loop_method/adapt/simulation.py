@@ -1,7 +1,7 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Improve a law on a model that reproduces the measured rollouts.
 
-With a model of the whole field (`loop_interfaces.field_models`) the closed loop can be simulated from
+With a model of the whole field (`loop_method.field_models`) the closed loop can be simulated from
 every initial field that was measured, and the Gauss-Newton step repeated on the simulated trajectories
 until it gains nothing more:
 
@@ -28,10 +28,10 @@ import numpy as np
 from scipy import linalg
 
 from loop_interfaces.arrays import Array
-from loop_interfaces.field_models import FieldModel
-from loop_interfaces.field_models.differential import DifferentialModel
-from tuner_node.optimizers.base import Record
-from tuner_node.optimizers.sensitivity import ISOTROPY, ReducedTrajectory, expand
+from loop_method.adapt.base import Record
+from loop_method.adapt.sensitivity import ISOTROPY, ReducedTrajectory, expand
+from loop_method.field_models import FieldModel
+from loop_method.field_models.differential import DifferentialModel
 
 # Inner steps, and the share of the objective below which a further one is not worth its time: in few
 # coordinates the gradient is no better, while the adjoint one leads on where steps are small.

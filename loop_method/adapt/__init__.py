@@ -1,0 +1,12 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Optimisers of a policy behind one interface: see `loop_method.adapt.base`."""
+
+from loop_method.adapt.base import Context as Context
+from loop_method.adapt.base import Optimizer as Optimizer
+from loop_method.adapt.base import Record as Record
+from loop_method.adapt.base import Rollout as Rollout
+from loop_method.adapt.base import RolloutResult as RolloutResult
+from loop_method.adapt.base import State as State
+from loop_method.adapt.base import Trajectory as Trajectory
+from loop_method.adapt.gauss_newton import GaussNewton as GaussNewton
+from loop_method.adapt.two_point import TwoPoint as TwoPoint
