@@ -89,7 +89,7 @@ def _rates_of_controlgym(python: str, problem: str, count: int) -> dict[str, flo
     values = chosen.values
     parameters = {
         "n_steps": 10**9,
-        "domain_length": chosen.plant().equation.length,
+        "domain_length": values["length"],
         "integration_time": values["integration_time"],
         # It counts steps by a floor division, which must not come out one short.
         "sample_time": values["sample_time"] * (1 + 1e-12),

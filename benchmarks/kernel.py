@@ -84,11 +84,11 @@ def start(problem: str, batch: int) -> tuple[Equation, NDArray[np.float64], NDAr
 
 
 def time_pdeloop(problem: str, batch: int) -> float:
-    from pde_sim_node.plant import Plant
+    from pde_sim_node.plants import SpectralPlant
 
     equation, _, actions = start(problem, batch)
     settings = {**asdict(GRIDS[problem]), "state_weight": 1.0, "action_weight": 1.0}
-    plant = Plant(equation, **settings, horizon=10**9)
+    plant = SpectralPlant(equation, **settings, horizon=10**9)
     plant.reset(np.arange(batch))
 
     def step() -> None:

@@ -26,8 +26,9 @@ from loop_method.design.lqt import Gains
 from loop_method.reduce.reduced_model import ReducedModel
 from loop_method.seeds import Purpose, derive
 from pde_sim_node.build import build_plant
-from pde_sim_node.measurement import InstrumentedPlant
+from pde_sim_node.instruments import InstrumentedPlant
 from pde_sim_node.plant import Plant
+from pde_sim_node.plants import SpectralPlant
 from pdeloop.episode import Law, projected_law, rollout
 from pdeloop.in_process import LocalPair, train
 from pdeloop.study.training import require_environment
@@ -330,6 +331,7 @@ class LikeliestField:
 
     def __init__(self, sensed: InstrumentedPlant, true: Plant, law: Law, seeds: list[int]) -> None:
         self._sensed, self._true, self._law = sensed, true, law
+        assert isinstance(true, SpectralPlant)
         draw = true.equation.initial_field
         self._candidates = np.stack([draw(true.x, np.random.default_rng(s)).ravel() for s in seeds])
         self._scale = np.sqrt(true.n_z / sensed.state_size)

@@ -19,7 +19,7 @@ def actuator_supports(
     shape: str,
     positions: Sequence[float],
 ) -> NDArray[np.float64]:
-    """Phi_j(x_i), (n_x, n_a), at the grid points x (n_x,); the arguments are those of `Plant`.
+    """Phi_j(x_i), (n_x, n_a), at the grid points x (n_x,); the arguments are those of `SpectralPlant`.
 
     ValueError where they do not fit each other or the equation.
     """

@@ -30,6 +30,7 @@ from loop_interfaces.samples import ACTION_KIND, NO_TIME, SAMPLE_HEADER, STATE_K
 from loop_interfaces.signature import NOT_SIGNED
 from loop_interfaces.topics import STATE
 from pde_sim_node.lockstep import Lockstep
+from pde_sim_node.plants.batch import BatchPlant
 
 if TYPE_CHECKING:
     from loop_interfaces.ros.endpoints import SampleBatcher
@@ -112,7 +113,10 @@ class PlantFastPath(FastPath):
 
     def __init__(self, lockstep: Lockstep, actions: ArrayCodec, batcher: SampleBatcher) -> None:
         super().__init__(handler, PLAN, actions, STATE)
+        assert isinstance(lockstep.plant, BatchPlant)
+        assert lockstep.plant.parallel is not None
         self._lockstep, self._plant, self._batcher = lockstep, lockstep.plant, batcher
+        self._parallel = lockstep.plant.parallel
         self._clock = MonotonicClock(self.plan["clock"])
         self._log = np.zeros((0, 0))
         self.suspended = False
@@ -127,9 +131,9 @@ class PlantFastPath(FastPath):
             return False
         if not self.expect(state, action, state.values.shape):
             return False
-        if plant.parallel.shared:
+        if self._parallel.shared:
             return False
-        plan["code"], plan["step_plan"] = plant.parallel.code, plant.parallel.plans.ctypes.data
+        plan["code"], plan["step_plan"] = self._parallel.code, self._parallel.plans.ctypes.data
         for name in ("states", "actions", "totals", "diverged_step"):
             plan[name] = getattr(plant, name).ctypes.data
         plan["batch"], plan["step"] = plant.batch, plant.step_index

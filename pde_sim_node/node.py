@@ -29,7 +29,7 @@ from loop_interfaces.ros.parameters import declare, given_parameters, on_change
 from loop_interfaces.samples import ACTION_KIND, clock_message
 from loop_interfaces.spec import Spec
 from loop_interfaces.topics import ACTION, COST, PAUSED, START, STATE, TARGET
-from pde_sim_node.build import build_plant, fingerprint
+from pde_sim_node.build import build_plant
 from pde_sim_node.diagnostics import PlantDiagnostics
 from pde_sim_node.equations import configured_equation
 from pde_sim_node.lockstep import Lockstep, Timing
@@ -65,7 +65,7 @@ class PlantNode:
         values = declare_parameters(node)
         pin_process(values["pin"])
         plant = build_plant(values)
-        if FAST_PATH and plant.instruments.ideal:  # what instruments do to a step is not compiled
+        if FAST_PATH and plant.parallel is not None:
             # Before there is a publisher: a peer that discovers one expects answers.
             FAST_PATH.load_compiled()
         domain = node.context.get_domain_id()
@@ -73,7 +73,7 @@ class PlantNode:
         self._lockstep = Lockstep(
             plant,
             Timing(**{spec.name: values[spec.name] for spec in PLANT if spec.live}),
-            fingerprint=fingerprint(values),
+            fingerprint=plant.definition.fingerprint,
             paused=self._run_record.paused,
             signed_run=self._run_record.signed,
         )
@@ -103,7 +103,7 @@ class PlantNode:
         loop.receive(START, self._on_start)
         self._actions = actions = loop.receive(ACTION, self._on_action)
         self._fast_path: Any = None
-        if FAST_PATH and self._lockstep.plant.instruments.ideal:
+        if FAST_PATH and self._lockstep.plant.parallel is not None:
             self._fast_path = FAST_PATH.PlantFastPath(self._lockstep, actions.codec, self._batcher)
             loop.answer_fast(actions, self._senders[STATE], self._fast_path)
         loop.introspection.report("lock-step", self._diagnostics.report)

@@ -2,7 +2,7 @@
 """Mean stage costs with their exact gradients: of actions, of policies, and of the initial fields.
 
 With the adjoint eta_k = dJ/dz_k, eta_T = 0, of J = 1/(MT) sum (q |z_k - z_r|^2 + r |a_k|^2) and
-the transposed derivative of the plant's own step (`spectral_solver.adjoint`),
+the transposed derivative of the plant's own step (`pde_sim_node.plant.Adjoint`),
 
     g_k   = (df/da)^T eta_{k+1} + 2r/(MT) a_k
     eta_k = (df/dz)^T eta_{k+1} + 2q/(MT) (z_k - z_r) + U K_a^T g_k
@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loop_interfaces.arrays import Array
-from pde_sim_node.adjoint import adjoint_of
 from pde_sim_node.plant import EpisodeCosts, Plant
 from pdeloop.episode import EpisodeRecord, Law, finite_array, finite_basis, rollout
 
@@ -68,7 +67,7 @@ class Gradients:
     Raises
     ------
     ValueError
-        The plant has noise, limits or sensors, or its equation's nonlinearity no derivative.
+        The plant has no derivatives, or noise, limits or sensors.
 
     Examples
     --------
@@ -81,13 +80,8 @@ class Gradients:
     """
 
     def __init__(self, plant: Plant) -> None:
-        if not plant.instruments.ideal:
-            raise ValueError(
-                "exact gradients are of a plant without noise, limits and sensors: leave "
-                "measurement_noise, process_noise, action_limit and sensors at 0"
-            )
         self.plant = plant
-        self._adjoint = adjoint_of(plant)
+        self._adjoint = plant.adjoint()
 
     def of_actions(self, actions: ArrayLike, fields: ArrayLike) -> CostGradient:
         """J and dJ/da of given actions.

@@ -17,7 +17,7 @@ from controller_node.policy import ProjectedLaw, excitations
 from loop_interfaces import model_rows
 from loop_interfaces.arrays import Array
 from loop_interfaces.topics import CostColumn, StartColumn, noise_seeds
-from pde_sim_node.build import build_plant, fingerprint
+from pde_sim_node.build import build_plant
 from pde_sim_node.plant import Plant
 from pdeloop.episode import EpisodeRecord, Law, rollout
 from tuner_node.batch import Batch, BatchResult
@@ -32,7 +32,7 @@ class LocalPair:
 
     def __init__(self, values: Mapping[str, Any], plant: Plant | None = None) -> None:
         self.plant = plant or build_plant(values)
-        self.fingerprint = fingerprint(values)
+        self.fingerprint = self.plant.definition.fingerprint
         self._settings = DesignSettings.of(values)
         self._law: ProjectedLaw | None = None
         self._generation = 0

@@ -53,14 +53,15 @@ def plot_episode(plant: Plant, episode: EpisodeRecord, environment: int = 0) -> 
             f"environment is {environment}; expected one of the {batch} of an episode that was kept"
         )
     times = plant.sample_time * np.arange(steps + 1)
-    components, extent = plant.equation.components, (0.0, times[-1], 0.0, plant.equation.length)
+    components, axis = plant.grid.components, plant.grid.axes[0]
+    extent = (0.0, times[-1], 0.0, axis.length)
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(6.4, 1.6 + 1.7 * len(components)))
         *maps, below = figure.subplots(len(components) + 1, 1, sharex=True)
         fields = np.split(episode.fields[:, environment], len(components), axis=1)
         for ax, name, field in zip(maps, components, fields, strict=True):
             drawn = image(ax, field.T, extent, origin="lower", cmap=FIELD_MAP)
-            ax.set_ylabel("x (m)")
+            ax.set_ylabel(axis.label)
             figure.colorbar(drawn, ax=ax, label=f"{name}(x, t)", pad=0.01)
         held = episode.actions[:, environment]
         below.step(times, np.vstack([held, held[-1:]]), where="post", linewidth=0.9)

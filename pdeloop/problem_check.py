@@ -21,7 +21,6 @@ from loop_interfaces.arrays import Array
 from loop_interfaces.parameters import INSTRUMENTS
 from loop_method.reduce.order import study_orders
 from pde_sim_node.build import build_plant
-from pde_sim_node.equations import LinearEquation
 from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD, Plant
 from pdeloop.episode import EpisodeRecord, mean_field_cost, projected_law, rollout
 from tuner_node.build import build_training
@@ -91,16 +90,16 @@ def _explore(plant: Plant, values: Mapping[str, Any]) -> EpisodeRecord:
 
 def _halving(plant: Plant, values: Mapping[str, Any], explored: EpisodeRecord) -> Finding:
     """The steps of the exploration, each computed again from its state with half the step."""
-    step = plant.integration_time
-    if isinstance(plant.equation, LinearEquation):
-        return Finding("integration step", True, "none: a linear equation is advanced exactly")
+    finer = plant.refined()
+    if finer is None:
+        return Finding("integration step", True, "none: the plant has no step that can be halved")
     end = int(explored.costs.diverged_step[explored.costs.diverged_step >= 0].min(initial=2**31))
     states = explored.fields[:-1][:end].reshape(-1, plant.n_z)
     actions = explored.actions[:end].reshape(-1, plant.n_a)
-    finer = _field_plant({**values, "integration_time": step / 2})
     whole, half = (which.evaluate(states, actions)[0] for which in (plant, finer))
     change = linalg.norm(half - states, axis=1)
     error = float(np.max(linalg.norm(whole - half, axis=1) / np.maximum(change, 1e-300), initial=0))
+    step = values["integration_time"]
     text = f"halving {step:g} s changes a sample by at most {100 * error:.2g} % of its own change"
     if error > STEP_ERROR:
         return Finding("integration step", False, f"{text}: take {step / 2:g} s or less")
@@ -148,8 +147,8 @@ def reach(plant: Plant) -> Reach:
     eigenvalues, vectors = linalg.eig(T, left=True, right=False)
     pencils = [np.hstack([value * np.eye(count) - T, W.T @ B]) for value in eigenvalues]
     margins = [linalg.svdvals(pencil)[-1] for pencil in pencils]
-    fields = (W @ vectors).T.reshape(count, len(plant.equation.components), len(plant.x))
-    spectra = np.abs(np.fft.fft(fields)).sum(axis=1)[:, : len(plant.x) // 2 + 1]
+    fields = plant.grid.fields((W @ vectors).T)
+    spectra = np.abs(np.fft.fft(fields)).sum(axis=1)[:, : plant.grid.points // 2 + 1]
     growth = np.log(np.abs(eigenvalues)) / plant.sample_time
     order = np.argsort(-growth)
     relative = np.array(margins) / max(float(linalg.norm(B, 2)), 1e-300)
@@ -225,27 +224,30 @@ def draw(values: Mapping[str, Any], path: Path) -> None:
 
     plant = _field_plant(values)
     fields = plant.reset([MEAN_FIELD, *range(DRAWN)]).copy()
-    names = plant.equation.components
+    grid = plant.grid
+    names, axis = grid.components, grid.axes[0]
     figure = Figure(figsize=(7.0, 0.6 + 2.4 * len(names)), layout="constrained")
+    actuated = 0
     for i, (ax, name) in enumerate(
         zip(figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0], names, strict=True)
     ):
-        own = slice(i * len(plant.x), (i + 1) * len(plant.x))
-        ax.plot(plant.x, fields[1:, own].T, color="0.7", linewidth=0.8)
-        ax.plot(plant.x, fields[0, own], color="0.35", label="initial field: mean, and five drawn")
-        ax.plot(plant.x, plant.field_target[own], color="black", linestyle="--", label="target")
-        if i == plant.equation.actuated:
+        own, x = grid.part(i), axis.points
+        ax.plot(x, fields[1:, own].T, color="0.7", linewidth=0.8)
+        ax.plot(x, fields[0, own], color="0.35", label="initial field: mean, and five drawn")
+        ax.plot(x, plant.field_target[own], color="black", linestyle="--", label="target")
+        if own == plant.forced and plant.supports is not None:
+            actuated = i
             below = ax.get_xaxis_transform()
             for j, support in enumerate(plant.supports.T):
                 height = 0.12 * support / max(float(np.abs(support).max()), 1e-300)
                 label = "supports of the actuators" if j == 0 else None
                 ax.fill_between(
-                    plant.x, height, transform=below, color="#d55e00", alpha=0.45, label=label
+                    x, height, transform=below, color="#d55e00", alpha=0.45, label=label
                 )
         ax.set_ylabel(f"{name}(x)")
-        ax.set_xlim(0, plant.equation.length)
-    ax.set_xlabel("x (m)")
-    known = figure.axes[plant.equation.actuated].get_legend_handles_labels()
+        ax.set_xlim(0, axis.length)
+    ax.set_xlabel(axis.label)
+    known = figure.axes[actuated].get_legend_handles_labels()
     figure.legend(*known, loc="outside upper center", ncols=3, frameon=False)
     # Without a format a folder would become the name of a file beside it.
     figure.savefig(path, dpi=150, format=path.suffix[1:] or "png")

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from pde_sim_node.equations import Burgers, Equation
-from pde_sim_node.plant import Plant
+from pde_sim_node.plants import SpectralPlant
 
 
-def plant_of(equation: Equation, **values: Any) -> Plant:
+def plant_of(equation: Equation, **values: Any) -> SpectralPlant:
     """A plant with both weights 1, and of one internal step a sample, where nothing else is said."""
     values.setdefault("integration_time", values["sample_time"])
-    return Plant(equation, **({"state_weight": 1.0, "action_weight": 1.0} | values))
+    return SpectralPlant(equation, **({"state_weight": 1.0, "action_weight": 1.0} | values))
 
 
 @dataclass(frozen=True, kw_only=True)

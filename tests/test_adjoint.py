@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from loop_interfaces.problem import load_parameters
-from pde_sim_node.adjoint import adjoint_of
 from pde_sim_node.build import build_plant
 from pde_sim_node.equations import Burgers
-from pde_sim_node.plant import Plant
+from pde_sim_node.plants import SpectralPlant
 from pdeloop.episode import projected_law, rollout
 from pdeloop.gradients import Gradients
 from tests.plants import Advection, plant_of
@@ -18,7 +17,7 @@ from tests.plants import Advection, plant_of
 PROBLEMS = ("burgers", "allen-cahn", "kdv")
 
 
-def shipped(problem: str, **changes: object) -> Plant:
+def shipped(problem: str, **changes: object) -> SpectralPlant:
     return build_plant({**load_parameters(problem, {}), **changes})
 
 
@@ -27,7 +26,9 @@ def derivative(f, h: float) -> np.ndarray:
     return (8 * (f(h) - f(-h)) - (f(2 * h) - f(-2 * h))) / (12 * h)
 
 
-def somewhere(plant: Plant, batch: int = 3) -> tuple[np.ndarray, np.ndarray, np.random.Generator]:
+def somewhere(
+    plant: SpectralPlant, batch: int = 3
+) -> tuple[np.ndarray, np.ndarray, np.random.Generator]:
     """States off the initial manifold, actions, and a generator for more."""
     rng = np.random.default_rng(5)
     states = plant.reset(np.arange(batch)).copy()
@@ -45,7 +46,7 @@ def test_the_transposed_step_agrees_with_finite_differences_of_the_plant(problem
     states, actions, rng = somewhere(plant)
     y, dz = rng.standard_normal((2, *states.shape))
     da = rng.standard_normal(actions.shape)
-    on_states, on_actions = adjoint_of(plant).pull_back(states, actions, y)
+    on_states, on_actions = plant.adjoint().pull_back(states, actions, y)
     for change_z, change_a in ((dz, 0 * da), (0 * dz, da)):
         moved = derivative(
             lambda s, z=change_z, a=change_a: plant.evaluate(states + s * z, actions + s * a)[0],
@@ -63,7 +64,7 @@ def test_its_way_forward_is_the_step_of_the_plant_to_the_bit(problem, n_z):
     plant = shipped(problem, **({} if n_z is None else {"n_z": n_z}))
     states, actions, _ = somewhere(plant)
     expected = plant.evaluate(states, actions)[0]
-    assert adjoint_of(plant).step(states, actions).tobytes() == expected.tobytes()
+    assert plant.adjoint().step(states, actions).tobytes() == expected.tobytes()
 
 
 def test_of_a_linear_plant_it_is_the_transposed_matrix():
@@ -72,9 +73,7 @@ def test_of_a_linear_plant_it_is_the_transposed_matrix():
     plant = plant_of(Advection(), **grid, sample_time=0.1, integration_time=0.05)
     columns = plant.evaluate(np.eye(16), np.zeros((16, 3)))[0].T
     inputs = plant.evaluate(np.zeros((3, 16)), np.eye(3))[0].T
-    rows, on_actions = adjoint_of(plant).pull_back(
-        np.zeros((16, 16)), np.zeros((16, 3)), np.eye(16)
-    )
+    rows, on_actions = plant.adjoint().pull_back(np.zeros((16, 16)), np.zeros((16, 3)), np.eye(16))
     np.testing.assert_allclose(rows, columns, atol=1e-14)
     np.testing.assert_allclose(on_actions, inputs, atol=1e-14)
 
@@ -83,7 +82,7 @@ def test_it_is_linear_in_the_covector_and_does_not_depend_on_batch():
     plant = shipped("burgers")
     states, actions, rng = somewhere(plant, 5)
     y1, y2 = rng.standard_normal((2, *states.shape))
-    one = adjoint_of(plant)
+    one = plant.adjoint()
     both = one.pull_back(states, actions, 2 * y1 - 3 * y2)
     first, second = one.pull_back(states, actions, y1), one.pull_back(states, actions, y2)
     for total, a, b in zip(both, first, second, strict=True):
@@ -114,7 +113,7 @@ def test_a_nonlinearity_without_a_derivative_is_refused_with_the_reason():
     for kind in (Kinked, Branching):
         plant = plant_of(kind(), **grid, sample_time=0.05, integration_time=0.0025)
         with pytest.raises(ValueError, match="complex"):
-            adjoint_of(plant)
+            plant.adjoint()
 
 
 @pytest.mark.parametrize("problem", [*PROBLEMS, "wave"])

@@ -81,7 +81,7 @@ def test_what_a_session_shows_of_an_object_is_one_line(run, small) -> None:
     still = pdeloop.rollout(plant, lambda k, z: np.zeros((1, plant.n_a)), [0])
     for shown, words in (
         (pdeloop.problem("kdv", n_z=64), "Problem('kdv', n_z=64)"),
-        (plant, "Plant(burgers: state of "),
+        (plant, "SpectralPlant(burgers: state of "),
         (model, "ReducedModel(order 2: "),
         (gains, f"Gains(K_a and K_b of {plant.n_a} x 2, closed loop of spectral radius 0."),
         (pdeloop.study_orders([trajectory]), "OrderStudy(order "),

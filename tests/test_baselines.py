@@ -30,8 +30,9 @@ from benchmarks.methods import (
 from loop_method.design import lqt
 from loop_method.reduce.reduced_model import ReducedModel
 from pde_sim_node.build import build_plant
-from pde_sim_node.measurement import InstrumentedPlant
+from pde_sim_node.instruments import InstrumentedPlant
 from pde_sim_node.plant import DIVERGED_COST, Plant
+from pde_sim_node.plants.batch import BatchPlant
 from pdeloop import cli
 from pdeloop.episode import projected_law, rollout
 from pdeloop.finished_run import interval
@@ -66,14 +67,14 @@ def test_a_method_improves_on_no_control_pays_for_each_rollout_and_sees_no_field
 ) -> None:
     values = values_of(method)
     asked: list[int] = []
-    reset = Plant.reset
+    reset = BatchPlant.reset
 
-    def counted(self: Plant, seeds: Any, *rest: Any) -> Any:
+    def counted(self: BatchPlant, seeds: Any, *rest: Any) -> Any:
         asked.extend(np.ravel(seeds).tolist())
         return reset(self, seeds, *rest)
 
     nothing, free = costs(measure("no-control", {}, values))
-    monkeypatch.setattr(Plant, "reset", counted)
+    monkeypatch.setattr(BatchPlant, "reset", counted)
     if method in METHODS:
         files = measure(method, CONSTANTS.get(method, {}), values)
     else:

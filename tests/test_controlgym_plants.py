@@ -9,14 +9,14 @@ import pytest
 
 from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
-from pde_sim_node.plant import Plant
+from pde_sim_node.plants import SpectralPlant
 
 DATA = Path(__file__).parent / "data"
 SEMILINEAR = ("kuramoto-sivashinsky", "fisher", "cahn-hilliard", "ginzburg-landau")
 LINEAR = ("convection-diffusion-reaction", "wave", "schrodinger")
 
 
-def golden_and_plant(name: str, eighths: bool) -> tuple[Any, Plant]:
+def golden_and_plant(name: str, eighths: bool) -> tuple[Any, SpectralPlant]:
     golden = np.load(DATA / f"controlgym_{name.replace('-', '_')}.npz")
     values = load_parameters(name, {})
     if eighths:  # a step of which controlgym's rounding loses none

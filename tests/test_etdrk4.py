@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pde_sim_node.equations import AllenCahn, Burgers, Equation, KortewegDeVries
-from pde_sim_node.plant import Plant
+from pde_sim_node.plants import SpectralPlant
 from spectral_solver.etdrk4 import etdrk4_coefficients
 from tests.plants import plant_of
 
@@ -83,7 +83,7 @@ class Linear(Equation):
         return np.zeros_like(x)
 
 
-def small_plant(equation: Equation, n_z: int, sample_time: float, steps: int) -> Plant:
+def small_plant(equation: Equation, n_z: int, sample_time: float, steps: int) -> SpectralPlant:
     times = {"sample_time": sample_time, "integration_time": sample_time / steps, "horizon": 10}
     return plant_of(equation, n_z=n_z, n_a=1, width=0.5, **times)
 

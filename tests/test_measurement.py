@@ -11,17 +11,18 @@ import pytest
 
 from controller_node.policy import ProjectedLaw, excitation
 from loop_interfaces.frames import Frame, FrameError
+from loop_interfaces.grid import Grid
 from loop_interfaces.topics import StartColumn
 from pde_sim_node.build import build_plant, fingerprint
 from pde_sim_node.equations import Equation
-from pde_sim_node.lockstep import Lockstep, Timing
-from pde_sim_node.measurement import (
+from pde_sim_node.instruments import (
     InstrumentedPlant,
     Noise,
-    sensor_positions,
     standard_normal,
 )
+from pde_sim_node.lockstep import Lockstep, Timing
 from pde_sim_node.plant import Instruments, Plant
+from pde_sim_node.plants import SpectralPlant
 from pdeloop.in_process import LocalPair, train
 from tests.small import parameters, same_bits, train_here
 from tuner_node.build import build_training
@@ -66,9 +67,8 @@ def instrumented(
     equation: Equation | None = None, n_z: int = 32, grid: dict[str, Any] | None = None, **own: Any
 ) -> InstrumentedPlant:
     values = GRID | (grid or {})
-    return InstrumentedPlant(
-        equation or Heat(length=2.0), instruments=Instruments(**own), n_z=n_z, **values
-    )
+    plant = SpectralPlant(equation or Heat(length=2.0), n_z=n_z, **values)
+    return InstrumentedPlant(plant, Instruments(**own))
 
 
 def run(plant: Plant, seeds: list[int], noise: list[int], actions: float = 0.0) -> np.ndarray:
@@ -245,7 +245,7 @@ def test_the_published_state_is_the_history_of_the_sensors() -> None:
         for j in range(d):
             y = scale * fields[max(k - j, 0)][:, plant.positions]
             assert np.array_equal(own[:, j * n_y : (j + 1) * n_y], y)
-    y_r = np.cos(2 * np.pi * plant.x / 2.0)[plant.positions]
+    y_r = np.cos(2 * np.pi * plant.plant.x / 2.0)[plant.positions]
     np.testing.assert_allclose(plant.target[: n_y * d], scale * np.tile(y_r, d))
 
 
@@ -254,14 +254,14 @@ def test_the_weight_of_the_measurements_is_that_of_the_stage_cost() -> None:
     plant = instrumented(sensors=8, sensor_delays=4)
     o = plant.reset([0])
     error = float(np.sum((o - plant.target) ** 2))
-    field_error = float(np.sum((plant.states - np.cos(2 * np.pi * plant.x / 2.0)) ** 2))
+    field_error = float(np.sum((plant.states - np.cos(2 * np.pi * plant.plant.x / 2.0)) ** 2))
     assert error == pytest.approx(field_error, rel=1e-12)
 
 
 def test_sensors_are_equally_spaced_and_as_many_as_wanted() -> None:
     for n_z in (32, 100):
         for n_y in range(1, n_z + 1):
-            positions = sensor_positions(n_z, n_y)
+            positions = Grid.interval(1.0, n_z).equally_spaced(n_y)
             gaps = np.diff(positions)
             assert len(set(positions.tolist())) == n_y
             assert positions[0] >= 0 and positions[-1] < n_z
@@ -287,7 +287,7 @@ def test_every_option_makes_another_plant(options: dict[str, Any]) -> None:
     known = fingerprint(parameters())
     assert fingerprint(parameters(**options)) != known
     assert fingerprint(parameters(sensor_delays=9)) == known  # without sensors it has no meaning
-    assert type(build_plant(parameters())) is Plant
+    assert type(build_plant(parameters())) is SpectralPlant
     assert type(build_plant(parameters(**options))) is InstrumentedPlant
 
 

@@ -18,7 +18,8 @@ from pde_sim_node.equations import (
     Schrodinger,
     load_equation,
 )
-from pde_sim_node.plant import DIVERGED_COST, Plant
+from pde_sim_node.plant import DIVERGED_COST
+from pde_sim_node.plants import SpectralPlant
 from spectral_solver import workers
 from spectral_solver.kernel import fine_length
 from spectral_solver.reference import ReferenceStep
@@ -45,11 +46,11 @@ PROBLEMS = pytest.mark.parametrize(
 )
 
 
-def make(equation: Equation, **values: Any) -> Plant:
+def make(equation: Equation, **values: Any) -> SpectralPlant:
     return plant_of(equation, **({"horizon": 50} | values))
 
 
-def unforced(plant: Plant, steps: int) -> np.ndarray:
+def unforced(plant: SpectralPlant, steps: int) -> np.ndarray:
     action = np.zeros((1, plant.n_a))
     plant.reset([-1])
     return np.array([plant.step(action)[0].copy() for _ in range(steps)])
@@ -167,7 +168,7 @@ def test_burgers_loses_energy() -> None:
 # To the last bit
 
 
-def rollout(plant: Plant, seeds: list[int], steps: int = 4) -> dict[int, bytes]:
+def rollout(plant: SpectralPlant, seeds: list[int], steps: int = 4) -> dict[int, bytes]:
     """States and costs of an episode, by seed; the actions of an environment depend on its seed."""
     draws = [np.random.default_rng(100 + seed).normal(0, 0.3, (steps, plant.n_a)) for seed in seeds]
     history = [plant.reset(seeds).copy()]

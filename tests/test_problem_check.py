@@ -13,7 +13,7 @@ import pytest
 from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from pde_sim_node.equations import LinearEquation
-from pde_sim_node.plant import Plant
+from pde_sim_node.plants import SpectralPlant
 from pdeloop.cli import FAILED, main
 from pdeloop.problem_check import check, reach
 from tests.plants import plant_of
@@ -38,7 +38,7 @@ class Growing(LinearEquation):
         return np.zeros_like(x)
 
 
-def plant(n_a: int, width: float) -> Plant:
+def plant(n_a: int, width: float) -> SpectralPlant:
     return plant_of(Growing(), n_z=32, n_a=n_a, width=width, sample_time=0.1, horizon=5)
 
 

@@ -17,7 +17,7 @@ from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import ModelFailure
 from loop_interfaces.topics import ACTION, COMPLETED, MODEL_IDENTIFIED, VOID, CostColumn
 from pde_sim_node.build import build_plant
-from pde_sim_node.plant import Plant
+from pde_sim_node.plants import SpectralPlant
 from pdeloop.in_process import LocalPair
 from tests.small import parameters, same_bits
 from tuner_node.batch import Batch
@@ -28,7 +28,7 @@ SETTINGS = DesignSettings(n_a=4, reduced_order=4, state_weight=1.0, action_weigh
 
 
 @cache
-def plant() -> Plant:
+def plant() -> SpectralPlant:
     return build_plant(parameters())
 
 

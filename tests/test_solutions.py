@@ -18,17 +18,17 @@ from pde_sim_node.equations import (
     Schrodinger,
     Wave,
 )
-from pde_sim_node.plant import Plant
+from pde_sim_node.plants import SpectralPlant
 from spectral_solver.exact import exact_propagator
 from tests.plants import plant_of
 
 
-def make(equation: Equation, **values: Any) -> Plant:
+def make(equation: Equation, **values: Any) -> SpectralPlant:
     grid = {"n_z": 128, "n_a": 1, "width": 1.0, "sample_time": 0.1, "horizon": 1000}
     return plant_of(equation, **(grid | values))
 
 
-def held(plant: Plant, z: np.ndarray, steps: int, action: float = 0.0) -> np.ndarray:
+def held(plant: SpectralPlant, z: np.ndarray, steps: int, action: float = 0.0) -> np.ndarray:
     z = z.reshape(1, -1)
     for _ in range(steps):
         z, _ = plant.evaluate(z, np.full((1, plant.n_a), action))

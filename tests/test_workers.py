@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from pde_sim_node.equations import Burgers
-from pde_sim_node.plant import Plant
+from pde_sim_node.plants import SpectralPlant
 from spectral_solver import workers
 from spectral_solver.workers import SolverThreads, use_cores
 from tests.interpreter import ROOT, helps_solver, python
@@ -26,7 +26,7 @@ P1 = {
 }  # fmt: skip
 
 
-def rollout(plant: Plant, seeds: range, steps: int = 20) -> bytes:
+def rollout(plant: SpectralPlant, seeds: range, steps: int = 20) -> bytes:
     plant.reset(np.array(seeds))
     for _ in range(steps):
         states = plant.step(np.full((len(seeds), plant.n_a), 0.1))
@@ -36,10 +36,10 @@ def rollout(plant: Plant, seeds: range, steps: int = 20) -> bytes:
 def test_plants_in_several_threads_share_the_helpers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workers, "solver_threads", SolverThreads())
     use_cores(range(1))
-    alone = Plant(Burgers(), **P1)
+    alone = SpectralPlant(Burgers(), **P1)
     expected = [rollout(alone, range(first, first + 12)) for first in (0, 50, 100)]
     use_cores(range(4))
-    plants = [Plant(Burgers(), **P1) for _ in expected]
+    plants = [SpectralPlant(Burgers(), **P1) for _ in expected]
     found: list[list[bytes]] = [[] for _ in expected]
 
     def work(which: int) -> None:
@@ -60,10 +60,10 @@ import os, threading
 import numpy as np
 from spectral_solver import workers
 from pde_sim_node.equations import Burgers
-from pde_sim_node.plant import Plant
+from pde_sim_node.plants import SpectralPlant
 from tests.test_workers import P1, rollout
 workers.use_cores(range(3))
-plant = Plant(Burgers(), **P1)
+plant = SpectralPlant(Burgers(), **P1)
 few = rollout(plant, range(2))
 assert not plant.parallel.shared
 assert threading.active_count() == 1
@@ -88,10 +88,10 @@ import sys
 from loop_interfaces.affinity import pin_process
 from spectral_solver import workers
 from pde_sim_node.equations import Burgers
-from pde_sim_node.plant import Plant
+from pde_sim_node.plants import SpectralPlant
 from tests.test_workers import P1, rollout
 pin_process({cores[0]})
-plant = Plant(Burgers(), **P1)
+plant = SpectralPlant(Burgers(), **P1)
 rollout(plant, range(16))
 print("there", flush=True)
 sys.stdin.readline()

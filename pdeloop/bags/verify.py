@@ -23,7 +23,6 @@ from loop_interfaces.frames import Frame
 from loop_interfaces.parameters import PLANT, recorded_values, with_budget
 from loop_interfaces.spec import ParameterError, read_yaml
 from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn, noise_seeds
-from pde_sim_node.build import fingerprint
 from pdeloop.bags.episodes import RecordedEpisode
 from pdeloop.bags.reader import bags_of
 from pdeloop.episode import rollout
@@ -165,7 +164,7 @@ class _Run:
         except ParameterError as error:
             raise ParameterError(f"{self._name}: {error}") from error
         self._pair = LocalPair(self._values)
-        self._fingerprint = fingerprint(self._values)
+        self._fingerprint = self._pair.fingerprint
         self._same_plant = True
         if target is not None:
             own = self._pair.plant.target[np.newaxis]

@@ -23,7 +23,7 @@ Eigenvalues = NDArray[Any]
 
 def behaviour(problem: ProblemData) -> Figure:
     """From the mean initial field: the fields in space and time, the actions, the final profiles."""
-    shown, components = problem.behaviours, problem.plant.equation.components
+    shown, components = problem.behaviours, problem.plant.grid.components
     count, fields = len(shown), len(components)
     figure = Figure(figsize=(2.05 * count + 0.9, 1.5 + 2.0 * fields + 1.3 * (1 + fields)))
     grid = figure.subplots(
@@ -45,7 +45,7 @@ def behaviour(problem: ProblemData) -> Figure:
             ax.xaxis.set_major_locator(MaxNLocator(3))
     grid[fields, 0].set_ylabel("actions $a_j$")
     for i, name in enumerate(components):
-        own = slice(i * len(problem.plant.x), (i + 1) * len(problem.plant.x))
+        own = problem.plant.grid.part(i)
         _maps(figure, problem, own, grid[i], name, float(times[-1]))
         _profiles(problem, own, grid[fields + 1 + i], name)
     figure.legend(
@@ -61,33 +61,41 @@ def _maps(
     fields = [b.states[:, own] for b in problem.behaviours]
     # A few extreme points, a shock's tip or a divergence, would leave no contrast to the rest.
     low, high = np.nanpercentile(np.stack(fields), (0.3, 99.7))
-    length = float(problem.first.values["length"])
+    axis = problem.plant.grid.axes[0]
     for ax, values in zip(axes, fields, strict=True):
         ax.set_facecolor("0.9")
-        extent = (0.0, end, 0.0, length)
+        extent = (0.0, end, 0.0, axis.length)
         drawn = image(ax, values.T, extent, origin="lower", cmap=FIELD_MAP, vmin=low, vmax=high)
         ax.set_xlabel("t (s)")
-    axes[0].set_ylabel("x (m)")
+    axes[0].set_ylabel(axis.label)
     figure.colorbar(drawn, ax=list(axes), label=f"{name}(x, t)", aspect=14, pad=0.01, extend="both")
 
 
 def _profiles(problem: ProblemData, own: slice, axes: Sequence[Axes], name: str) -> None:
     """Its initial and final profiles, and the target."""
+    axis = problem.plant.grid.axes[0]
     for ax, b in zip(axes, problem.behaviours, strict=True):
         colour = COLOURS[b.controller]
         ax.plot(
-            problem.plant.x, b.states[0, own], ":", color="0.45", linewidth=1, label="initial field"
+            problem.plant.grid.axes[0].points,
+            b.states[0, own],
+            ":",
+            color="0.45",
+            linewidth=1,
+            label="initial field",
         )
         ax.plot(
-            problem.plant.x,
+            problem.plant.grid.axes[0].points,
             problem.plant.field_target[own],
             color="black",
             linewidth=0.9,
             label="target",
         )
-        ax.plot(problem.plant.x, b.states[-1, own], color=colour, label="final field")
-        ax.set_xlim(0, float(problem.first.values["length"]))
-        ax.set_xlabel("x (m)")
+        ax.plot(
+            problem.plant.grid.axes[0].points, b.states[-1, own], color=colour, label="final field"
+        )
+        ax.set_xlim(0, axis.length)
+        ax.set_xlabel(axis.label)
     axes[0].set_ylabel(f"{name}(x, T)")
 
 

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What stands between a field and its controller: noise, actuators that saturate, few sensors.
+"""What stands between a plant and its controller: noise, actuators that saturate, few sensors.
 
     y_k = C z_k + v_k,                      v_k ~ N(0, measurement_noise^2 I)
     z_{k+1} = f(z_k, sat(a_k)) + w_k,       w_k ~ N(0, process_noise^2 dt / dx I)
@@ -37,14 +37,15 @@ Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 20
 """
 
 import math
+from dataclasses import asdict
 from enum import IntEnum
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pde_sim_node.equations import Equation
-from pde_sim_node.plant import MEAN_FIELD, Instruments, Plant
+from loop_interfaces.arrays import Array
+from pde_sim_node.definition import Definition
+from pde_sim_node.plant import MEAN_FIELD, Adjoint, EpisodeCosts, Instruments, Plant
 
 
 class Noise(IntEnum):
@@ -66,46 +67,98 @@ def standard_normal(
     return draw
 
 
-class InstrumentedPlant(Plant):
-    """A plant behind its instruments; grid: the other parameters of `Plant`.
+class InstrumentedPlant:
+    """A plant behind instruments, itself a plant.
 
-    As `Plant`, but `reset` and `step` return what is measured, `target` is the target of that, and
-    actions saturate. `states` are the true fields. An environment is forced only after a step that
-    did not diverge, and it has diverged, too, if the forcing takes it beyond the bound. ValueError
-    for more sensors than grid points, and more delays than steps.
+    As the plant, but `reset` and `step` return what is measured, `target` is the target of that, and
+    actions saturate. `states` are the true ones. An environment is forced only after a step that did
+    not diverge, and has diverged as well if the forcing takes it beyond the bound.
+
+    Parameters
+    ----------
+    plant
+        Is advanced by this one alone from now on.
+    instruments
+        What is between.
+
+    Raises
+    ------
+    ValueError
+        There are more sensors than grid points, or more delays than steps.
     """
 
-    def __init__(self, equation: Equation, *, instruments: Instruments, **grid: Any) -> None:
-        self.instruments = instruments
-        super().__init__(equation, **grid)
-        n_x = self.x.size
-        points = sensor_positions(n_x, instruments.sensors)
+    parallel = None  # a step is more than compiled code
+
+    def __init__(self, plant: Plant, instruments: Instruments) -> None:
+        self.plant, self.instruments = plant, instruments
+        self.n_z, self.n_a, self.grid, self.forced = plant.n_z, plant.n_a, plant.grid, plant.forced
+        self.supports = plant.supports
+        self.horizon, self.sample_time = plant.horizon, plant.sample_time
+        self.state_weight, self.action_weight = plant.state_weight, plant.action_weight
+        self.divergence_bound, self.field_target = plant.divergence_bound, plant.field_target
+        points = self.grid.equally_spaced(instruments.sensors or self.grid.points)
         # A sensor measures every component at its point.
-        first = n_x * np.arange(len(equation.components))
+        first = self.grid.points * np.arange(len(self.grid.components))
         self.positions = (first[:, None] + points).ravel()
         self._delays = instruments.sensor_delays if instruments.sensors else 1
         if self._delays > self.horizon:
             raise ValueError(
                 f"sensor_delays must be at most the horizon, {self.horizon} steps, got {self._delays}"
             )
-        self._scale = math.sqrt(n_x / (points.size * self._delays))
+        self._scale = math.sqrt(self.grid.points / (points.size * self._delays))
         self._forcing = instruments.process_noise * math.sqrt(
-            self.sample_time * n_x / equation.length
+            self.sample_time * self.grid.points / self.grid.volume
         )
-        self._forced = slice(equation.actuated * n_x, (equation.actuated + 1) * n_x)
-        self.target = self._scale * np.tile(self.target[self.positions], self._delays)
+        self.target = self._scale * np.tile(self.field_target[self.positions], self._delays)
         self._seeds: list[tuple[int, int]] = []
         self._published = np.zeros((0, self.state_size))
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.plant!r}, {self.instruments!r})"
+
     @property
     def state_size(self) -> int:
+        """Numbers of a published state."""
         return self._delays * self.positions.size
 
-    def reset(
-        self, seeds: ArrayLike, noise: NDArray[np.int64] | None = None
-    ) -> NDArray[np.float64]:
+    @property
+    def definition(self) -> Definition:
+        """The plant's, with the instruments."""
+        return self.plant.definition.having(asdict(self.instruments))
+
+    @property
+    def batch(self) -> int:
+        """M of the episode under way; 0 before the first."""
+        return self.plant.batch
+
+    @property
+    def step_index(self) -> int:
+        """Steps of the episode so far."""
+        return self.plant.step_index
+
+    @property
+    def states(self) -> Array:
+        """The true states now."""
+        return self.plant.states
+
+    @property
+    def actions(self) -> Array:
+        """The actions of the last step, saturated."""
+        return self.plant.actions
+
+    @property
+    def totals(self) -> Array:
+        """Sums of the stage costs so far."""
+        return self.plant.totals
+
+    @property
+    def diverged_step(self) -> NDArray[np.int64]:
+        """See `EpisodeCosts`."""
+        return self.plant.diverged_step
+
+    def reset(self, seeds: ArrayLike, noise: NDArray[np.int64] | None = None) -> Array:
         """Begin an episode; without seeds of the noise they are 0."""
-        super().reset(seeds)
+        self.plant.reset(seeds)
         if noise is None:
             noise = np.zeros(self.batch, dtype=np.int64)
         drawn = field_seeds(seeds)
@@ -113,18 +166,18 @@ class InstrumentedPlant(Plant):
         self._published = np.tile(self._measure(), (1, self._delays))
         return self._published
 
-    def restart(self, environments: NDArray[np.intp], seeds: ArrayLike) -> NDArray[np.float64]:
+    def restart(self, environments: NDArray[np.intp], seeds: ArrayLike) -> Array:
         """As `Plant.restart`; the noise of a step stays that of this step of the episode."""
-        super().restart(environments, seeds)
+        self.plant.restart(environments, seeds)
         for m, seed in zip(environments.tolist(), field_seeds(seeds), strict=True):
             self._seeds[m] = self._seeds[m][0], seed
         self._published[environments] = np.tile(self._measure()[environments], (1, self._delays))
         return self._published
 
-    def step(self, actions: NDArray[np.float64]) -> NDArray[np.float64]:
+    def step(self, actions: Array) -> Array:
         """Hold the saturated actions for one sampling time; returns what is measured then."""
         limit = self.instruments.action_limit
-        super().step(np.clip(actions, -limit, limit) if limit else actions)
+        self.plant.step(np.clip(actions, -limit, limit) if limit else actions)
         if self._forcing:
             self._force()
         newest = self._measure()
@@ -133,19 +186,40 @@ class InstrumentedPlant(Plant):
         self._published = newest
         return newest
 
-    def _force(self) -> None:
-        step = self.step_index
-        for m, (noise_seed, field_seed) in enumerate(self._seeds):
-            if self.diverged_step[m] >= 0:
-                continue
-            draw = standard_normal(noise_seed, field_seed, step, Noise.PROCESS, self.x.size)
-            forced = self.states[m, self._forced] + self._forcing * draw
-            if np.abs(forced).max() <= self.divergence_bound:
-                self.states[m, self._forced] = forced
-            else:
-                self.diverged_step[m] = step - 1
+    def evaluate(self, states: Array, actions: Array) -> tuple[Array, Array]:
+        """The plant's, of true states and of actions that do not saturate, without noise."""
+        return self.plant.evaluate(states, actions)
 
-    def _measure(self) -> NDArray[np.float64]:
+    def episode_costs(self) -> EpisodeCosts:
+        """The plant's."""
+        return self.plant.episode_costs()
+
+    def adjoint(self) -> Adjoint:
+        """There is none: actions saturate, and the states are not those that are measured."""
+        raise ValueError(
+            "exact gradients are of a plant without noise, limits and sensors: leave "
+            "measurement_noise, process_noise, action_limit and sensors at 0"
+        )
+
+    def refined(self) -> Plant | None:
+        """The plant's, behind the same instruments."""
+        refined = self.plant.refined()
+        return None if refined is None else InstrumentedPlant(refined, self.instruments)
+
+    def _force(self) -> None:
+        plant, step = self.plant, self.step_index
+        for m, (noise_seed, field_seed) in enumerate(self._seeds):
+            if plant.diverged_step[m] >= 0:
+                continue
+            here = plant.states[m, self.forced]
+            draw = standard_normal(noise_seed, field_seed, step, Noise.PROCESS, here.size)
+            forced = here + self._forcing * draw
+            if np.abs(forced).max() <= self.divergence_bound:
+                plant.states[m, self.forced] = forced
+            else:
+                plant.diverged_step[m] = step - 1
+
+    def _measure(self) -> Array:
         """The scaled readings of the sensors now, (M, n_y)."""
         y = self.states[:, self.positions]
         sigma = self.instruments.measurement_noise
@@ -162,11 +236,3 @@ def field_seeds(seeds: ArrayLike) -> list[int]:
     """What the noise takes for the seeds of initial fields; given fields have none."""
     given = np.asarray(seeds)
     return [MEAN_FIELD] * len(given) if given.ndim == 2 else given.tolist()
-
-
-def sensor_positions(n_x: int, sensors: int) -> NDArray[np.int64]:
-    """Grid indices of equally spaced sensors, int((j + 0.5) n_x / sensors); all if there are 0."""
-    if sensors > n_x:
-        raise ValueError(f"sensors must be at most the {n_x} grid points, got {sensors}")
-    count = sensors or n_x
-    return (2 * np.arange(count) + 1) * n_x // (2 * count)

@@ -1,0 +1,211 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""What the numbers of a state are: a field on a grid of one or more axes, or a plain vector."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loop_interfaces.arrays import Array
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One direction of space.
+
+    Attributes
+    ----------
+    name : str
+        As figures show it.
+    length : float
+        L of the domain [0, L] in this direction.
+    size : int
+        Grid points.
+    periodic : bool
+        Whether the end is the beginning again. Then the points are i L / n.
+    walls : bool
+        Of an axis that is not periodic: whether its first and last points lie on the walls, at
+        i L / (n - 1), or the points are centres of cells, at (i + 1/2) L / n.
+    unit : str
+        Of the length.
+    """
+
+    name: str
+    length: float
+    size: int
+    periodic: bool = True
+    walls: bool = True
+    unit: str = "m"
+
+    def __post_init__(self) -> None:
+        if not (0 < self.length < math.inf and self.size >= 1):
+            raise ValueError(
+                f"the axis {self.name} must have a positive length and 1 or more points, got "
+                f"{self.length!r} and {self.size!r}"
+            )
+
+    @property
+    def spacing(self) -> float:
+        """Distance of two neighbouring points."""
+        on_walls = self.walls and not self.periodic and self.size > 1
+        return self.length / (self.size - 1 if on_walls else self.size)
+
+    @property
+    def points(self) -> Array:
+        """Where the grid points are, (n,)."""
+        i = np.arange(self.size, dtype=np.float64)
+        if self.periodic:
+            return self.length * i / self.size
+        return i * self.spacing if self.walls else (i + 0.5) * self.spacing
+
+    @property
+    def label(self) -> str:
+        """Of the axis of a figure."""
+        return f"{self.name} ({self.unit})" if self.unit else self.name
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The layout of a state: one component after the other, each in C order over the axes.
+
+    Attributes
+    ----------
+    axes : tuple of Axis
+        The slowest first, as in the array of `fields`; none: the state is a plain vector.
+    components : tuple of str
+        Names of the fields, or the one name of a plain vector's numbers.
+    unit : str
+        Of the values.
+    numbers : int
+        Size of a plain vector.
+
+    Examples
+    --------
+    >>> Grid((Axis("y", 1.0, 21, periodic=False), Axis("x", 2.0, 41, periodic=False)), ("u", "v")).size
+    1722
+    >>> Grid.vector(4).shape
+    (4,)
+    """
+
+    axes: tuple[Axis, ...] = ()
+    components: tuple[str, ...] = ("u",)
+    unit: str = ""
+    numbers: int = 0
+
+    def __post_init__(self) -> None:
+        if not self.components:
+            raise ValueError("a grid has one component or more, got none")
+        if bool(self.axes) == bool(self.numbers):
+            raise ValueError(
+                "a state has axes, or is a plain vector of a number of numbers: give one of both"
+            )
+
+    @classmethod
+    def vector(cls, numbers: int, name: str = "z", unit: str = "") -> Grid:
+        """Of a state that is no field."""
+        return cls((), (name,), unit, numbers)
+
+    @classmethod
+    def interval(
+        cls,
+        length: float,
+        size: int,
+        components: Sequence[str] = ("u",),
+        *,
+        periodic: bool = True,
+        walls: bool = True,
+    ) -> Grid:
+        """Of fields on [0, length], of `size` points each."""
+        return cls((Axis("x", length, size, periodic, walls),), tuple(components))
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Points along each axis, of one component; (n,) of a plain vector."""
+        return tuple(axis.size for axis in self.axes) or (self.numbers,)
+
+    @property
+    def points(self) -> int:
+        """Numbers of one component."""
+        return math.prod(self.shape)
+
+    @property
+    def size(self) -> int:
+        """Numbers of a state."""
+        return self.points * len(self.components)
+
+    @property
+    def volume(self) -> float:
+        """Product of the lengths; of a plain vector as many as it has numbers."""
+        return math.prod(axis.length for axis in self.axes) if self.axes else float(self.numbers)
+
+    @property
+    def is_circle(self) -> bool:
+        """Whether it is one periodic axis, on which a translation maps fields to fields."""
+        return len(self.axes) == 1 and self.axes[0].periodic
+
+    def fields(self, states: Array) -> Array:
+        """States (..., size) as their components on the grid, (..., components, *shape); a view."""
+        return states.reshape(*states.shape[:-1], len(self.components), *self.shape)
+
+    def part(self, component: int) -> slice:
+        """Where the numbers of a component are in a state."""
+        return slice(component * self.points, (component + 1) * self.points)
+
+    def equally_spaced(self, count: int) -> NDArray[np.int64]:
+        """Indices, within a component, of points that are equally spaced over the grid.
+
+        Along an axis of n points c of them are at int((j + 1/2) n / c). On several axes the counts
+        have `count` as their product and give distances that are as equal as can be.
+
+        Raises
+        ------
+        ValueError
+            There are fewer points, or no such counts.
+        """
+        counts = self._counts(count)
+        along = [
+            (2 * np.arange(own, dtype=np.int64) + 1) * size // (2 * own)
+            for own, size in zip(counts, self.shape, strict=True)
+        ]
+        places = np.meshgrid(*along, indexing="ij")
+        return np.ravel_multi_index([place.ravel() for place in places], self.shape).astype(
+            np.int64
+        )
+
+    def _counts(self, count: int) -> tuple[int, ...]:
+        """How many points along each axis."""
+        if count > self.points:
+            raise ValueError(f"sensors must be at most the {self.points} grid points, got {count}")
+        lengths = [axis.length for axis in self.axes] or [1.0]
+        found = [
+            own
+            for own in _factorisations(count, len(self.shape))
+            if all(c <= size for c, size in zip(own, self.shape, strict=True))
+        ]
+        if not found:
+            raise ValueError(
+                f"sensors must be a product of numbers of at most "
+                f"{' and '.join(map(str, self.shape))} points along the axes, got {count}"
+            )
+
+        def unequal(own: tuple[int, ...]) -> float:
+            distances = [length / c for length, c in zip(lengths, own, strict=True)]
+            return max(distances) / min(distances)
+
+        return min(found, key=unequal)
+
+
+def _factorisations(count: int, factors: int) -> list[tuple[int, ...]]:
+    """All ways to write a number as an ordered product."""
+    if factors == 1:
+        return [(count,)]
+    return [
+        (first, *rest)
+        for first in range(1, count + 1)
+        if count % first == 0
+        for rest in _factorisations(count // first, factors - 1)
+    ]

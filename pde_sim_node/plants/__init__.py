@@ -1,0 +1,4 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The plants that there are: a file each."""
+
+from pde_sim_node.plants.spectral import SpectralPlant as SpectralPlant

@@ -1,0 +1,215 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The plant of an equation on a periodic interval: pseudo-spectral in space, and compiled."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from loop_interfaces.arrays import Array
+from loop_interfaces.grid import Grid
+from pde_sim_node.actuators import actuator_supports
+from pde_sim_node.arguments import grid_points, internal_steps, positive, whole
+from pde_sim_node.compiled_step import compiled_step
+from pde_sim_node.definition import Definition, module_sources
+from pde_sim_node.equations import Equation, LinearEquation
+from pde_sim_node.equations.base import result_of
+from pde_sim_node.plant import MEAN_FIELD, Adjoint
+from pde_sim_node.plants.batch import BatchPlant
+from spectral_solver.workers import ParallelStep
+
+_NUMBERS = (
+    *("n_z", "n_a", "sample_time", "integration_time", "horizon"),
+    *("state_weight", "action_weight", "divergence_bound"),
+)
+
+
+class SpectralPlant(BatchPlant):
+    """M environments of one equation, advanced in lock-step.
+
+    u_t = F(u, u_x, ...) + sum_j Phi_j(x) a_j(t) on the grid x_i = i L / n_x, with the action held
+    over a sampling time: z_{k+1} = f(z_k, a_k), pseudo-spectral in space and ETDRK4 in time, or
+    exact in time for a `LinearEquation`. The result for an environment is the same to the last bit
+    whatever the number of environments, its place among them, the threads and the process.
+
+    Parameters
+    ----------
+    equation
+        The PDE.
+    n_z
+        Size of the state: the number of grid points, even, at least 8, times the number of the
+        equation's components, which stand one after the other in a state.
+    n_a
+        Number of actuators.
+    width
+        Width of one actuator as a fraction of the domain, see `Equation.supports`.
+    shape
+        "indicator", "gaussian" with ``width`` as standard deviation, or "equation", as
+        `Equation.supports` has it.
+    positions
+        Centres of the actuators as fractions of the domain; none: equally spaced, or as
+        `Equation.supports` has them.
+    sample_time
+        Sampling time, a whole multiple of ``integration_time``.
+    integration_time
+        Internal step of the integrator.
+    horizon, state_weight, action_weight, divergence_bound
+        See `pde_sim_node.plant.Plant`.
+
+    Attributes
+    ----------
+    x : (n_x,)
+        Grid points; n_x = n_z / components.
+    supports : (n_x, n_a)
+        Phi_j(x_i), on the component ``equation.actuated``.
+
+    Raises
+    ------
+    ValueError
+        A parameter has no usable value; the message names it and what would be right.
+    """
+
+    parallel: ParallelStep
+    supports: Array
+
+    def __init__(
+        self,
+        equation: Equation,
+        *,
+        n_z: int,
+        n_a: int,
+        width: float,
+        sample_time: float,
+        integration_time: float,
+        horizon: int,
+        state_weight: float,
+        action_weight: float,
+        divergence_bound: float = 1e3,
+        shape: str = "equation",
+        positions: Sequence[float] = (),
+    ) -> None:
+        if whole("n_z", n_z, 8) % 2:
+            raise ValueError(f"n_z must be even, got {n_z}: take {n_z + 1}")
+        self.equation = equation
+        self.integration_time = positive("integration_time", integration_time)
+        n_x = grid_points(equation, n_z)
+        self.x = equation.length * np.arange(n_x) / n_x
+        self.forced = slice(equation.actuated * n_x, (equation.actuated + 1) * n_x)
+        super().__init__(
+            grid=Grid.interval(equation.length, n_x, equation.components),
+            n_a=n_a,
+            horizon=horizon,
+            sample_time=sample_time,
+            state_weight=state_weight,
+            action_weight=action_weight,
+            divergence_bound=divergence_bound,
+            target=self._checked("target", result_of(equation.target, self.x)),
+        )
+        self.width, self.shape, self.positions = positive("width", width), shape, positions
+        self.supports = actuator_supports(equation, self.x, self.n_a, width, shape, positions)
+        self.parallel = self._make_step()
+        self._bind()
+
+    def _make_step(self) -> ParallelStep:
+        """The compiled step of this plant."""
+        modes = np.arange(len(self.x) // 2 + 1, dtype=np.float64)
+        return compiled_step(
+            self.equation,
+            2 * np.pi * modes / self.equation.length,
+            supports=self.supports,
+            target=self.field_target,
+            integration_time=self.integration_time,
+            steps=internal_steps(self.sample_time, self.integration_time),
+            state_weight=self.state_weight,
+            action_weight=self.action_weight,
+            bound=self.divergence_bound,
+        )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the compiled step, which holds addresses of this process: a copy makes its own."""
+        return {name: value for name, value in vars(self).items() if name != "parallel"}
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        """Continue where the plant was when it was pickled or copied, to the bit."""
+        vars(self).update(state)
+        self.parallel = self._make_step()
+        self._bind()
+
+    def __repr__(self) -> str:
+        return (
+            f"{type(self).__name__}({self.equation.name}: state of {self.state_size}, "
+            f"{self.n_a} actuators, {self.horizon} steps of {self.sample_time:g})"
+        )
+
+    @property
+    def definition(self) -> Definition:
+        """What it is made from, and the source of the equation; see `Definition`."""
+        values = {name: getattr(self, name) for name in _NUMBERS} | {"actuator_width": self.width}
+        # Defaults are omitted so that fingerprints from older versions stay valid.
+        if self.shape != "equation":
+            values["actuator_shape"] = self.shape
+        if len(self.positions):
+            values["actuator_positions"] = [float(position) for position in self.positions]
+        sources = module_sources(type(self.equation), Equation)
+        return Definition({**values, **asdict(self.equation)}, sources)
+
+    def adjoint(self) -> Adjoint:
+        """The transpose of the step's own derivative, or of the matrices of a linear step.
+
+        Raises
+        ------
+        ValueError
+            The equation's nonlinearity has no derivative that can be computed.
+        """
+        # Compiled code that only gradients need.
+        from spectral_solver import adjoint
+
+        if not isinstance(self.equation, LinearEquation):
+            return adjoint.Adjoint(self.parallel, self.equation.nonlinearity)
+        n_z, n_a = self.n_z, self.n_a
+        A_transposed, _ = self.evaluate(np.eye(n_z), np.zeros((n_z, n_a)))
+        B_transposed, _ = self.evaluate(np.zeros((n_a, n_z)), np.eye(n_a))
+        return adjoint.LinearAdjoint(A_transposed, B_transposed)
+
+    def refined(self) -> "SpectralPlant | None":
+        """With half the integration time; None where the step is exact."""
+        if isinstance(self.equation, LinearEquation):
+            return None
+        given = {name: getattr(self, name) for name in (*_NUMBERS, "width", "shape", "positions")}
+        given["integration_time"] /= 2
+        return SpectralPlant(self.equation, **given)
+
+    def _allocate(self, batch: int) -> None:
+        super()._allocate(batch)
+        if batch:
+            self._bind()
+
+    def _bind(self) -> None:
+        self.parallel.bind(self.states, self.actions, self.totals, self.diverged_step)
+
+    def _draw(self, seed: int) -> Array:
+        rng = None if seed == MEAN_FIELD else np.random.default_rng(seed)
+        return self._checked("initial_field", result_of(self.equation.initial_field, self.x, rng))
+
+    def _checked(self, what: str, values: Array) -> Array:
+        """A field of the equation as a state: one component after the other."""
+        components, n_x = len(self.equation.components), len(self.x)
+        shape = (n_x,) if components == 1 else (components, n_x)
+        values = np.asarray(values, dtype=np.float64)
+        if values.shape != shape or not np.isfinite(values).all():
+            raise ValueError(
+                f"{what} of the equation must return {' x '.join(map(str, shape))} finite numbers "
+                f"for x of shape ({n_x},), got shape {values.shape}"
+            )
+        return values.ravel()
+
+    def _advance(self) -> None:
+        self.parallel.step(self.step_index)
+
+    def _evaluate(self, states: Array, actions: Array) -> Array:
+        costs, diverged_step = np.zeros(len(states)), np.full(len(states), -1, dtype=np.int64)
+        self.parallel.bind(states, actions, costs, diverged_step)
+        self.parallel.step(0)
+        self._bind()
+        return costs

@@ -1,0 +1,59 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The layout of a state: points, components and equally spaced places on any number of axes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from loop_interfaces.grid import Axis, Grid
+
+
+def test_the_points_of_an_axis_are_on_a_circle_on_walls_or_in_cells() -> None:
+    def points(**how: bool) -> list[float]:
+        return Axis("x", 2.0, 4, **how).points.tolist()
+
+    assert points() == [0.0, 0.5, 1.0, 1.5]
+    assert points(periodic=False) == pytest.approx([0, 2 / 3, 4 / 3, 2])
+    assert points(periodic=False, walls=False) == [0.25, 0.75, 1.25, 1.75]
+
+
+def test_a_state_is_one_component_after_the_other_in_c_order() -> None:
+    grid = Grid((Axis("y", 1.0, 3, periodic=False), Axis("x", 2.0, 5)), ("u", "v"))
+    assert (grid.shape, grid.points, grid.size, grid.volume) == ((3, 5), 15, 30, 2.0)
+    states = np.arange(60.0).reshape(2, 30)
+    fields = grid.fields(states)
+    assert fields.shape == (2, 2, 3, 5)
+    assert fields[1, 1, 2, 4] == states[1, grid.part(1)][2 * 5 + 4]
+    assert not grid.is_circle and Grid.interval(1.0, 8).is_circle
+
+
+def test_a_plain_vector_has_no_axes() -> None:
+    grid = Grid.vector(5)
+    assert (grid.shape, grid.size, grid.axes, grid.is_circle) == ((5,), 5, (), False)
+    assert grid.equally_spaced(2).tolist() == [1, 3]
+
+
+def test_places_on_two_axes_are_as_far_apart_along_both() -> None:
+    grid = Grid((Axis("y", 1.0, 20), Axis("x", 4.0, 80)))
+    rows, columns = np.unravel_index(grid.equally_spaced(16), grid.shape)
+    assert sorted(set(rows.tolist())) == [5, 15]
+    assert sorted(set(columns.tolist())) == [5, 15, 25, 35, 45, 55, 65, 75]
+    assert grid.equally_spaced(1600).tolist() == list(range(1600))
+
+
+@pytest.mark.parametrize(
+    ("count", "words"), [(17, "at most the 16 grid points"), (11, "product of numbers of at most")]
+)
+def test_places_that_do_not_fit_are_refused(count: int, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        Grid((Axis("y", 1.0, 4), Axis("x", 1.0, 4))).equally_spaced(count)
+
+
+def test_what_is_no_grid_is_refused() -> None:
+    with pytest.raises(ValueError, match="1 or more points"):
+        Axis("x", 1.0, 0)
+    with pytest.raises(ValueError, match="give one of both"):
+        Grid()
+    with pytest.raises(ValueError, match="one component or more"):
+        Grid.interval(1.0, 4, ())
