@@ -120,41 +120,53 @@ def transposed(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> int:
     return forward(w, z, plan.z1 + plan.z2 - z, d, t, c, e)
 
 
-@jit
-def pull_back_internal(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> None:
-    """Turn the covector of the spectrum after an internal step into that before it."""
-    m, factors, modes, x = plan.fine.m, plan.fine.split, plan.modes, plan.x
-    on_v, on_b, on_c = plan.covector, plan.on_b, plan.on_c
-    for k in range(0, modes, 8):
-        put(w, x + k, d, conjugate_product(c, plan.f3m + k, e, get(w, on_v + k, d)))
-    z = transposed(w, d, plan, c, e, tape + 3 * m)
-    for k in range(0, modes, 8):
-        own = rfft_pack(w, z, d, m, factors, k, c, e)
-        put(w, on_c + k, d, own)
-        part = conjugate_product(c, plan.qm + k, e, own)
-        through = conjugate_product(c, plan.f2m + k, e, get(w, on_v + k, d))
-        put(w, x + k, d, plus(through, plus(part, part)))
-    z = transposed(w, d, plan, c, e, tape + 2 * m)
-    for k in range(0, modes, 8):
-        own = rfft_pack(w, z, d, m, factors, k, c, e)
-        put(w, on_b + k, d, own)
-        through = conjugate_product(c, plan.f2m + k, e, get(w, on_v + k, d))
-        put(w, x + k, d, plus(through, conjugate_product(c, plan.qm + k, e, own)))
-    z = transposed(w, d, plan, c, e, tape + m)
-    for k in range(0, modes, 8):
-        b, c_, v = get(w, on_b + k, d), get(w, on_c + k, d), get(w, on_v + k, d)
-        own = rfft_pack(w, z, d, m, factors, k, c, e)
-        a = plus(own, conjugate_product(c, plan.e2 + k, e, c_))
-        through = conjugate_product(c, plan.f1m + k, e, v)
-        put(w, x + k, d, plus(through, conjugate_product(c, plan.qm + k, e, minus(a, c_))))
-        held = conjugate_product(c, plan.q + k, e, plus(plus(a, b), c_))
-        held = plus(held, conjugate_product(c, plan.f + k, e, v))
-        put(w, plan.on_force + k, d, plus(get(w, plan.on_force + k, d), held))
-        linear = conjugate_product(c, plan.e2 + k, e, plus(a, b))
-        put(w, on_v + k, d, plus(linear, conjugate_product(c, plan.e + k, e, v)))
-    z = transposed(w, d, plan, c, e, tape)
-    for k in range(0, modes, 8):
-        put(w, on_v + k, d, plus(get(w, on_v + k, d), rfft_pack(w, z, d, m, factors, k, c, e)))
+def internal_pull_back(transposed: Callable[..., int]) -> Callable[..., None]:
+    """The transposed internal step, compiled: pull_back_internal(w, d, plan, c, e, tape).
+
+    transposed(w, d, plan, c, e, tape): the transform of what the nonlinear part's transposed derivative
+    at the stage on the tape makes of the spectrum x.
+    """
+
+    @jit
+    def pull_back_internal(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> None:
+        """Turn the covector of the spectrum after an internal step into that before it."""
+        m, factors, modes, x = plan.fine.m, plan.fine.split, plan.modes, plan.x
+        on_v, on_b, on_c = plan.covector, plan.on_b, plan.on_c
+        for k in range(0, modes, 8):
+            put(w, x + k, d, conjugate_product(c, plan.f3m + k, e, get(w, on_v + k, d)))
+        z = transposed(w, d, plan, c, e, tape + 3 * m)
+        for k in range(0, modes, 8):
+            own = rfft_pack(w, z, d, m, factors, k, c, e)
+            put(w, on_c + k, d, own)
+            part = conjugate_product(c, plan.qm + k, e, own)
+            through = conjugate_product(c, plan.f2m + k, e, get(w, on_v + k, d))
+            put(w, x + k, d, plus(through, plus(part, part)))
+        z = transposed(w, d, plan, c, e, tape + 2 * m)
+        for k in range(0, modes, 8):
+            own = rfft_pack(w, z, d, m, factors, k, c, e)
+            put(w, on_b + k, d, own)
+            through = conjugate_product(c, plan.f2m + k, e, get(w, on_v + k, d))
+            put(w, x + k, d, plus(through, conjugate_product(c, plan.qm + k, e, own)))
+        z = transposed(w, d, plan, c, e, tape + m)
+        for k in range(0, modes, 8):
+            b, c_, v = get(w, on_b + k, d), get(w, on_c + k, d), get(w, on_v + k, d)
+            own = rfft_pack(w, z, d, m, factors, k, c, e)
+            a = plus(own, conjugate_product(c, plan.e2 + k, e, c_))
+            through = conjugate_product(c, plan.f1m + k, e, v)
+            put(w, x + k, d, plus(through, conjugate_product(c, plan.qm + k, e, minus(a, c_))))
+            held = conjugate_product(c, plan.q + k, e, plus(plus(a, b), c_))
+            held = plus(held, conjugate_product(c, plan.f + k, e, v))
+            put(w, plan.on_force + k, d, plus(get(w, plan.on_force + k, d), held))
+            linear = conjugate_product(c, plan.e2 + k, e, plus(a, b))
+            put(w, on_v + k, d, plus(linear, conjugate_product(c, plan.e + k, e, v)))
+        z = transposed(w, d, plan, c, e, tape)
+        for k in range(0, modes, 8):
+            put(w, on_v + k, d, plus(get(w, on_v + k, d), rfft_pack(w, z, d, m, factors, k, c, e)))
+
+    return pull_back_internal
+
+
+pull_back_internal = internal_pull_back(transposed)
 
 
 @cached_njit(cache, native, simd, fft, spectra, kernel)

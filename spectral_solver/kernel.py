@@ -79,11 +79,14 @@ def nonlinear(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> int:
     return forward(w, z, plan.z1 + plan.z2 - z, d, t, c, e)
 
 
-def internal_step(nonlinear: Callable[..., int]) -> Callable[..., None]:
+def internal_step(
+    nonlinear: Callable[..., int], pack: Callable[..., Any] = rfft_pack
+) -> Callable[..., None]:
     """One internal step of the spectrum x, compiled: integrate(w, d, plan, c, e, tape).
 
     nonlinear(w, d, plan, c, e, tape): the transform of g(u) of a stage; may keep plan.fine.m numbers
-    of the stage at `tape`, of which the stages have consecutive ones.
+    of the stage at `tape`, of which the stages have consecutive ones. pack: eight modes of what it
+    returns, as `rfft_pack`.
     """
 
     @jit
@@ -95,7 +98,7 @@ def internal_step(nonlinear: Callable[..., int]) -> Callable[..., None]:
         f1m, f3m, qfs, ffs = plan.f1m, plan.f3m, plan.qf, plan.ff
         z = nonlinear(w, d, plan, c, e, tape)
         for k in range(0, modes, 8):
-            g, v, qf = rfft_pack(w, z, d, m, factors, k, c, e), get(w, x + k, d), get(w, qfs + k, d)
+            g, v, qf = pack(w, z, d, m, factors, k, c, e), get(w, x + k, d), get(w, qfs + k, d)
             half, qg = plus_product(qf, c, e2 + k, e, v), product(c, qm + k, e, g)
             a = plus(half, qg)
             put(w, x + k, d, a)
@@ -105,18 +108,18 @@ def internal_step(nonlinear: Callable[..., int]) -> Callable[..., None]:
             put(w, next_x + k, d, plus_product(whole, c, f1m + k, e, g))
         z = nonlinear(w, d, plan, c, e, tape + m)
         for k in range(0, modes, 8):
-            g = rfft_pack(w, z, d, m, factors, k, c, e)
+            g = pack(w, z, d, m, factors, k, c, e)
             put(w, x + k, d, plus_product(get(w, to_b + k, d), c, qm + k, e, g))
             put(w, next_x + k, d, plus_product(get(w, next_x + k, d), c, f2m + k, e, g))
         z = nonlinear(w, d, plan, c, e, tape + 2 * m)
         for k in range(0, modes, 8):
-            g = rfft_pack(w, z, d, m, factors, k, c, e)
+            g = pack(w, z, d, m, factors, k, c, e)
             qg = product(c, qm + k, e, g)
             put(w, x + k, d, plus(get(w, to_c + k, d), plus(qg, qg)))
             put(w, next_x + k, d, plus_product(get(w, next_x + k, d), c, f2m + k, e, g))
         z = nonlinear(w, d, plan, c, e, tape + 3 * m)
         for k in range(0, modes, 8):
-            g = rfft_pack(w, z, d, m, factors, k, c, e)
+            g = pack(w, z, d, m, factors, k, c, e)
             put(w, x + k, d, plus_product(get(w, next_x + k, d), c, f3m + k, e, g))
 
     return integrate

@@ -199,6 +199,31 @@ def minus_product(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
     return lanes(lanes, lanes, lanes), build
 
 
+@intrinsic
+def clamp(typing_context: Any, value: Any, bound: Any) -> Any:
+    """Each lane, but no further from 0 than a lane of `bound`; NaN stays."""
+
+    def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        value, bound = args
+        for limit, beyond in ((builder.fneg(bound), "<"), (bound, ">")):
+            outside = builder.fcmp_ordered(beyond, value, limit)
+            value = builder.select(outside, limit, value)
+        return value
+
+    return lanes(lanes, lanes), build
+
+
+@intrinsic
+def where_equal(typing_context: Any, a: Any, b: Any, value: Any) -> Any:
+    """The lanes of `value` where a and b are equal, 0 elsewhere."""
+
+    def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        a, b, value = args
+        return builder.select(builder.fcmp_ordered("==", a, b), value, ir.Constant(VECTOR, None))
+
+    return lanes(lanes, lanes, lanes), build
+
+
 def define(operation: Callable[[Any, Any], Any], instruction: str) -> None:
     """Let an operator on lanes be one instruction."""
 

@@ -35,6 +35,7 @@ from loop_method.models.base import Samples
 from loop_method.models.columns import least_squares, orthonormal
 from loop_method.models.settings import FieldModelSettings
 from loop_method.models.spectral import SpectralModel, Spectrum
+from spectral_solver.polynomial_step import phi_functions
 
 ORDERS = (4, 2, 2, 1, 1, 1, 1)
 """Of the highest derivative in the symbols of z, z^2, ..; (ik)^3 of z^2 lets the first pass explode."""
@@ -116,7 +117,7 @@ def fit_spectral(
             break
         left = regression.y - (new[0] - symbols[0]) * regression.W[0]
         left = left - np.einsum("pk,pnk->nk", new[1:], regression.W[1:])
-        inputs = irfft(least_squares(regression.common, left) / regression.phi, n_z)
+        inputs = n_z * irfft(least_squares(regression.common, left) / regression.phi, n_z)
         if not np.isfinite(inputs).all():
             break
         symbols, B, constant = new, inputs[:-1].T, inputs[-1]
@@ -134,15 +135,20 @@ def _model(
 
 
 def _regression(model: SpectralModel, samples: Samples) -> _Regression | None:
-    z, a, after = samples.before, samples.actions, samples.after
+    """The pass along the paths of a model; None where it overflows for half of the samples."""
+    L = model.linear
     with np.errstate(all="ignore"):
-        y, W, phi = _integrals(model, z, a, after)
+        try:
+            W = model.compiled.integrals(samples.before, samples.actions, samples.after)
+        except ValueError:  # it grows beyond all bounds within a substep
+            return None
+        before, after = (rfft(z) / model.n_z for z in (samples.before, samples.after))
+        y, phi = after - np.exp(L) * before, phi_functions(L)[0]
     ok = np.isfinite(y).all(axis=1) & np.isfinite(W).all(axis=(0, 2))
     if 2 * ok.sum() < len(samples) or not np.isfinite(phi).all():
         return None
     root = samples.weights()[:, None]
-    # Each input in its own unit, as else the smallest would be lost in rounding.
-    common = np.hstack([root * a, root])[ok]
+    common = np.hstack([root * samples.actions, root])[ok]
     return _Regression(
         y=(root * y)[ok],
         W=(root * W)[:, ok],
@@ -150,43 +156,6 @@ def _regression(model: SpectralModel, samples: Samples) -> _Regression | None:
         common=common,
         free_of_common=orthonormal(common),
     )
-
-
-def _integrals(
-    model: SpectralModel, z: Array, a: Array, after: Array
-) -> tuple[Spectrum, Spectrum, Spectrum]:
-    """y = F z_{k+1} - e^L F z_k, W_p and phi_1(L)."""
-    path, end = model.path(z, a), rfft(after)
-    miss, h = end - path[-1], 1.0 / model.substeps
-    step = h * model.linear
-    E, (p1, p2) = np.exp(step), _phis(step)
-    total = np.zeros((model.degree, *end.shape), complex)
-    before = np.zeros_like(total)
-    for i, v in enumerate(path):
-        now = _powers(model, v + i * h * miss)
-        if i:
-            total = E * total + h * ((p1 - p2) * before + p2 * now)
-        before = now
-    return end - np.exp(model.linear) * path[0], total, _phis(model.linear)[0]
-
-
-def _powers(model: SpectralModel, v: Spectrum) -> Spectrum:
-    """F[z^p], p = 1 .. P, of a spectrum."""
-    found, u = [v], np.clip(model.field(v), -model.clip, model.clip)
-    power = u
-    for _ in range(model.degree - 1):
-        power = power * u
-        found.append(rfft(power)[..., : v.shape[-1]] * (model.n_z / model.fine))
-    return np.stack(found)
-
-
-def _phis(x: Spectrum) -> tuple[Spectrum, Spectrum]:
-    """phi_1 = (e^x - 1)/x and phi_2 = (e^x - 1 - x)/x^2, as means on a circle around x."""
-    angles = 2 * np.pi * (np.arange(32) + 0.5) / 32
-    radius = np.where(np.abs(x) < 1, 2.0, 0.5)
-    r = x[:, None] + radius[:, None] * np.exp(1j * angles)
-    e = np.exp(r)
-    return np.mean((e - 1) / r, axis=1), np.mean((e - 1 - r) / r**2, axis=1)
 
 
 def _polynomial(

@@ -1,0 +1,185 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The step of an equation with polynomial nonlinear parts, made ready, with its adjoint."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loop_interfaces.arrays import Array
+from loop_interfaces.jit.simd import WIDTH, whole_lanes
+from spectral_solver.etdrk4 import Spectrum, etdrk4_coefficients
+from spectral_solver.fft import is_transform_length, plane_size
+from spectral_solver.memory import Constants, aligned, lay_out
+from spectral_solver.polynomial import (
+    PLAN,
+    advance,
+    analysed,
+    integrals,
+    pull_back,
+    synthesised,
+)
+
+
+class Polynomials(NamedTuple):
+    """The equation; see `PolynomialStep`."""
+
+    linear: Spectrum
+    multipliers: NDArray[np.complex128]
+    polynomials: Array
+    supports: Array
+    constant: Array
+    steps: int
+    clip: float
+
+
+class PolynomialStep:
+    """A sampling time, the unit of time, of d/dt F[u] = L F[u] + sum_q m_q F[g_q(u)] + F[Phi a + c].
+
+    One thread may use it at a time.
+
+    Parameters
+    ----------
+    equation
+        linear L (modes,), multipliers m_q (Q, modes), polynomials C_qp (Q, P - 1) for p = 2 .. P,
+        supports Phi (n_x, n_a), constant c (n_x,), steps: internal ones, clip: of u in g_q; modes =
+        n_x//2 + 1.
+
+    Raises
+    ------
+    ValueError
+        L grows beyond all bounds within an internal step.
+    """
+
+    def __init__(self, equation: Polynomials) -> None:
+        self._equation = equation
+        n_x, modes = len(equation.constant), len(equation.constant) // 2 + 1
+        degree = equation.polynomials.shape[1] + 1
+        fine, h = fine_length(n_x, degree), 1.0 / equation.steps
+        self._n_x, self._last, self._degree = n_x, modes - 1, degree
+        constants, self._plans = Constants(), np.zeros(1, PLAN)
+        plan, rows = self._plans[0], constants.add_spectra
+        plan["parts"], plan["degree"], plan["clip"] = (
+            len(equation.multipliers),
+            degree,
+            equation.clip,
+        )
+        plan["steps"], plan["n_x"] = equation.steps, n_x
+        supports = np.column_stack([equation.supports, equation.constant])
+        plan["n_a"], plan["modes"] = supports.shape[1], whole_lanes(modes)
+        self._whole = n_x % 2 == 0 and is_transform_length(n_x // 2)
+        if self._whole:
+            plan["coarse"] = constants.add_transform(n_x // 2, modes)
+        plan["fine"] = constants.add_transform(fine, modes)
+        c, m = etdrk4_coefficients(equation.linear, h), 1.0 / (4 * fine)
+        plan["e"], plan["e2"], plan["q"] = rows(c.e), rows(c.e2), rows(c.q)
+        plan["qm"], plan["f1m"] = rows(c.q * m), rows(c.f1 * m)
+        plan["f2m"], plan["f3m"] = rows(2 * c.f2 * m), rows(c.f3 * m)
+        plan["f"] = rows(c.f1 + 4 * c.f2 + c.f3)
+        plan["supports"] = rows(np.fft.rfft(supports, axis=0).T / n_x)
+        plan["multipliers"] = rows(equation.multipliers)
+        plan["polynomials"] = constants.add(equation.polynomials)
+        plan["slopes"] = constants.add(equation.polynomials * np.arange(2, degree + 1))
+        phi1, phi2 = phi_functions(equation.linear * h)
+        plan["weight_before"], plan["weight_now"] = rows(h * (phi1 - phi2)), rows(h * phi2)
+        own = int(plan["modes"])
+        size = lay_out(
+            plan,
+            {
+                **dict.fromkeys(("z1", "z2"), plane_size(max(fine, n_x // 2))),
+                **dict.fromkeys(("x", "part"), fine + WIDTH),
+                **dict.fromkeys(("next", "b", "c", "qf", "ff", "sum"), own),
+                **dict.fromkeys(("covector", "on_b", "on_c", "on_force"), own),
+                "power": fine,
+                **dict.fromkeys(("now", "before", "total"), degree * own),
+                "path": (equation.steps + 1) * own,
+                "tape": 4 * equation.steps * fine,
+            },
+        )
+        self._constants, self._scratch = constants.planes(), aligned(2 * size)
+        plan["constants"] = self._constants.ctypes.data
+        plan["constants_apart"] = self._constants.size // 2
+        plan["scratch"] = self._scratch.ctypes.data
+
+    def __reduce__(self) -> Any:
+        """Made anew from the equation: the plan has addresses."""
+        return PolynomialStep, (self._equation,)
+
+    def step(self, states: Array, actions: Array) -> Array:
+        """The states (M, n_x) a sampling time later under actions (M, n_a)."""
+        spectra = self.spectra(states)
+        advance(spectra, _with_constant(actions), self._plans)
+        return self.states(spectra)
+
+    def pull_back(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array]:
+        """(df/dz)^T y, (M, n_x), and (df/da)^T y, (M, n_a), of covectors y (M, n_x)."""
+        own, inputs = self.spectra(covectors), _with_constant(actions)
+        even, on_actions = self._n_x % 2 == 0, np.empty_like(inputs)
+        if even:  # the last mode has the weight 1 on the published grid, and 2 on the fine one
+            own[:, 0, self._last] *= 0.5
+            own[:, 1, self._last] = 0.0
+        pull_back(self.spectra(states), inputs, own, on_actions, self._plans)
+        if even:
+            own[:, 0, self._last] *= 2.0
+        return self.states(own), on_actions[:, :-1]
+
+    def integrals(self, states: Array, actions: Array, after: Array) -> NDArray[np.complex128]:
+        """int_0^1 exp(L (1 - s)) F[u(s)^p] ds, p = 1 .. P, (P, M, modes), F the mean of `spectra`.
+
+        u(s) is the path from the states under the actions, bent linearly in time so that it ends in
+        `after` (M, n_x).
+        """
+        begin, end = self.spectra(states), self.spectra(after)
+        found = np.empty((self._degree, *begin.shape))
+        integrals(begin, _with_constant(actions), end, found, self._plans)
+        return _complex(found)
+
+    def spectra(self, states: Array) -> Array:
+        """Spectra (M, 2, modes), real and imaginary parts: the real FFT over the number of points."""
+        z = np.ascontiguousarray(states, dtype=np.float64)
+        found = np.empty((len(z), 2, self._last + 1))
+        if self._whole:
+            analysed(z, found, self._plans)
+        else:  # row by row: in a batch, rounding depends on what stands beside
+            for i, row in enumerate(z):
+                spectrum = np.fft.rfft(row) / self._n_x
+                found[i] = spectrum.real, spectrum.imag
+        return found
+
+    def states(self, spectra: Array) -> Array:
+        """The states (M, n_x) of spectra."""
+        found = np.empty((len(spectra), self._n_x))
+        if self._whole:
+            synthesised(spectra, found, self._plans)
+        else:
+            for i, spectrum in enumerate(_complex(spectra)):
+                found[i] = np.fft.irfft(spectrum * self._n_x, self._n_x)
+        return found
+
+
+def _with_constant(actions: Array) -> Array:
+    inputs = np.ones((len(actions), actions.shape[1] + 1))
+    inputs[:, :-1] = actions
+    return inputs
+
+
+def _complex(planes: Array) -> NDArray[np.complex128]:
+    values: NDArray[np.complex128] = planes[..., 0, :] + 1j * planes[..., 1, :]
+    return values
+
+
+def fine_length(n_x: int, degree: int) -> int:
+    """Complex length, half the points, of the grid that is dealiased up to cubes."""
+    length = -(-(2 if degree == 1 else 3 if degree == 2 else 4) * n_x // 4)
+    while not is_transform_length(length):
+        length += 1
+    return length
+
+
+def phi_functions(x: Spectrum) -> tuple[Spectrum, Spectrum]:
+    """phi_1 = (e^x - 1)/x and phi_2 = (e^x - 1 - x)/x^2, as means on a circle around x."""
+    angles = 2 * np.pi * (np.arange(32) + 0.5) / 32
+    radius = np.where(np.abs(x) < 1, 2.0, 0.5)
+    r = x[:, None] + radius[:, None] * np.exp(1j * angles)
+    e = np.exp(r)
+    return np.mean((e - 1) / r, axis=1), np.mean((e - 1 - r) / r**2, axis=1)
