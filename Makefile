@@ -2,6 +2,8 @@
 PYTHON ?= python3
 BIN := .venv/bin
 SHELL := /bin/bash
+# Python is not to import what lies in this folder (loop_interfaces/module_path.py).
+export PYTHONSAFEPATH := 1
 
 .PHONY: setup run test coverage packages lint types docs check clean
 

@@ -6,16 +6,21 @@ docstring, and `text`, which shows the result to people. Keyword-only parameters
 are words without one.
 """
 
-from __future__ import annotations
+import os
+import sys
+
+if __name__ == "__main__" and sys.path[0] == os.getcwd() and not sys.flags.safe_path:  # noqa: PTH109
+    sys.path.append(sys.path.pop(0))  # as in pdeloop/__main__.py
 
 import argparse
 import importlib
 import inspect
-import sys
 from collections.abc import Callable, Sequence
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
+from loop_interfaces.module_path import PROJECT
+from loop_interfaces.start import begin
 from pdeloop.cli import run
 from pdeloop.output import print_json
 
@@ -137,4 +142,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    begin("benchmarks")
+    sys.path.append(str(PROJECT))  # where the workers of a program find it, too
     sys.exit(main())

@@ -14,12 +14,12 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.module_path import safe_environment
 from pde_sim_node.equations import EQUATIONS, Equation
 from pde_sim_node.supports import indicator_supports
 from spectral_solver.reference import ReferenceStep
@@ -156,14 +156,15 @@ def measure(method: str, batches: Sequence[int]) -> list[dict[str, Any]]:
 
 def measure_with(python: str, method: str, batches: Sequence[int]) -> list[dict[str, Any]]:
     """`measure` by another interpreter; CalledProcessError if it fails, its words on stderr."""
-    root = Path(__file__).resolve().parent.parent
+    from benchmarks.processes import program
+
     done = subprocess.run(
-        [python, "-m", "benchmarks.kernel", method, *map(str, batches)],
+        [python, *program("benchmarks.kernel", method, *map(str, batches))[1:]],
         check=True,
         stdout=subprocess.PIPE,
         text=True,
         timeout=600,
-        env={**os.environ, **KEEP_MEMORY, "PYTHONPATH": str(root)},
+        env={**safe_environment(os.environ), **KEEP_MEMORY},
     )
     rows: list[dict[str, Any]] = json.loads(done.stdout.splitlines()[-1])
     return rows

@@ -15,13 +15,11 @@ Both are measured on the fields of a training's closing evaluation, which the la
 from __future__ import annotations
 
 import json
-import os
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Executor
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -42,6 +40,7 @@ from pde_sim_node.build import build_plant
 from pdeloop.gradients import Gradients, features
 from pdeloop.in_process import LocalPair
 from pdeloop.reproduction import PAPER
+from pdeloop.study.executors import processes
 
 __all__ = ["run", "text"]
 
@@ -232,8 +231,7 @@ def run(
     evaluations = {draw: evaluation_seeds(draw, evaluation_fields) for draw in evaluation_seed}
     results = []
     # Processes, as L-BFGS and the loop over the steps hold the interpreter's lock.
-    cores = jobs or len(os.sched_getaffinity(0))
-    with ProcessPoolExecutor(cores, mp_context=get_context("spawn")) as pool:
+    with processes(jobs) as pool:
         for problem in problems or tuple(PAPER):
             values = load_parameters(problem, dict(given))
             work: partial[Any] = partial(
@@ -271,7 +269,7 @@ def run(
     return results
 
 
-def _all(pool: ProcessPoolExecutor, work: Any, given: Sequence[int], what: str) -> list[Any]:
+def _all(pool: Executor, work: Any, given: Sequence[int], what: str) -> list[Any]:
     """The results of `work` in order, with a line on stderr for each."""
     began = time.monotonic()
     results = []

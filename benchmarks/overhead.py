@@ -11,18 +11,17 @@ from __future__ import annotations
 import itertools
 import re
 import statistics
-import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from benchmarks.processes import Bench, BenchProcess, bench, progress
+from benchmarks.processes import Bench, BenchProcess, bench, program, progress
 from loop_interfaces.affinity import usable_cores
 from pdeloop.pairs import pair_cores, pair_nodes
 from pdeloop.supervisor import keep_on
 
-READER = (sys.executable, "-m", "benchmarks.reader")
+READER = "benchmarks.reader"
 
 
 def recorder(running: Bench, problem: str, others: Sequence[int]) -> list[BenchProcess]:
@@ -39,18 +38,17 @@ def viewer(running: Bench, problem: str, others: Sequence[int]) -> list[BenchPro
     """A viewer, and who looks at it."""
     node = running.start("viewer_node", problem=problem)
     keep_on(node.process.pid, others)
-    reader = running.run("reader", READER)
+    reader = running.run("reader", program(READER))
     reader.line()
     return [node, reader]
 
 
 def monitor(running: Bench, problem: str, others: Sequence[int]) -> list[BenchProcess]:
     """`pdeloop monitor`, and an open page."""
-    command = (sys.executable, "-u", "-m", "pdeloop.cli", "monitor", "--port", "0")
-    server = running.run("monitor", command)
+    server = running.run("monitor", program("pdeloop", "monitor", "--port", "0"))
     while not (address := re.search(r"http://[\d.:]+/", server.line())):
         pass
-    reader = running.run("reader", (*READER, address[0]))
+    reader = running.run("reader", program(READER, address[0]))
     reader.line()
     return [server, reader]
 

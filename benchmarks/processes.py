@@ -8,6 +8,7 @@ import json
 import os
 import platform
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,12 +17,29 @@ from pathlib import Path
 from typing import Any
 
 from loop_interfaces.isolation import loopback_environment
+from loop_interfaces.module_path import PROJECT, safe_environment
 from loop_interfaces.problem import find_problem
 from pdeloop.domain import own_domain
-from pdeloop.supervisor import die_with, node_command
+from pdeloop.supervisor import START, die_with, node_arguments
 
 ANSWER = 300.0
 """Longest silence of a process that was asked something, in s."""
+
+
+_RUN = """\
+import runpy, sys
+sys.path.append({folder!r})
+sys.argv[0] = {name!r}
+runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
+"""
+
+
+def program(name: str, *words: str) -> list[str]:
+    """The command that runs a module of this checkout, whose folder comes last on the module path.
+
+    Most of these are not installed, and whatever else lies in the checkout is not to be imported.
+    """
+    return [sys.executable, "-c", _RUN.format(folder=str(PROJECT), name=name), *words]
 
 
 class BenchError(RuntimeError):
@@ -82,10 +100,11 @@ class Bench:
     def __init__(self, folder: Path, domain: int) -> None:
         self.folder = folder
         self.environment = {
-            **os.environ,
+            **safe_environment(os.environ),
             **loopback_environment(),
             "ROS_DOMAIN_ID": str(domain),
             "ROS_LOG_DIR": str(folder),
+            "PYTHONUNBUFFERED": "1",
         }
         self._started: list[subprocess.Popen[str]] = []
 
@@ -107,7 +126,7 @@ class Bench:
         words += ["-r", f"__ns:=/{namespace}"] if namespace else []
         words += [word for parameter in parameters for word in ("-p", parameter)]
         words += [word for remap in remaps for word in ("-r", remap)]
-        command = [*prefix, *node_command(name, *words)]
+        command = [*prefix, *program(START, name, *node_arguments(*words))]
         return self.run(name, command, {**self.environment, **(environment or {})})
 
     def run(

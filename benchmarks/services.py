@@ -6,7 +6,6 @@ from __future__ import annotations
 import os
 import resource
 import signal
-import sys
 import threading
 import time
 from pathlib import Path
@@ -23,6 +22,7 @@ from benchmarks.processes import (
     bench,
     ended_well,
     machine,
+    program,
     progress,
     table,
 )
@@ -37,7 +37,7 @@ def run(*, problem: str = "burgers", calls: int = 20, queued: int = 20) -> dict[
     with bench() as running:
         os.environ |= running.environment
         out = running.folder / "run"
-        command = [sys.executable, "-m", "pdeloop", "train", problem, "--record", "--out", str(out)]
+        command = program("pdeloop", "train", problem, "--record", "--out", str(out))
         words = ["--optimizer", "two_point", "--iterations", "100000"]
         training = running.run("training", [*command, *words])
         limit = time.monotonic() + LIMIT

@@ -9,7 +9,6 @@ of all nodes, one exploratory episode.
 from __future__ import annotations
 
 import os
-import sys
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -25,9 +24,11 @@ from benchmarks.processes import (
     bench,
     ended_well,
     machine,
+    program,
     progress,
     table,
 )
+from pdeloop.supervisor import START
 
 LIMIT = 600.0
 """Seconds after which a training is given up."""
@@ -85,7 +86,7 @@ def _train(
     running: Bench, problem: str, iterations: int, out: Path, words: Sequence[str]
 ) -> dict[str, Any]:
     """Seconds, memory and policy of one training."""
-    command = [sys.executable, "-m", "pdeloop.cli", "train", problem, "--out", str(out), *words]
+    command = program("pdeloop", "train", problem, "--out", str(out), *words)
     # The optimiser that always has the same number of rollouts.
     options = ("--optimizer", "two_point", "--iterations", str(iterations))
     began = time.time()
@@ -118,9 +119,9 @@ def _memory(pid: int) -> dict[str, float]:
         for child in children:
             with suppress(OSError):
                 words = Path(f"/proc/{child}/cmdline").read_text().split("\0")
-                name = next((w.removesuffix(".node") for w in words if w.endswith(".node")), "")
                 pages = int(Path(f"/proc/{child}/statm").read_text().split()[1])
-                if name:
+                if START in words:
+                    name = words[words.index(START) + 1]
                     found[name] = pages * os.sysconf("SC_PAGE_SIZE") / 1e6
     return found
 

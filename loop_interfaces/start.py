@@ -12,6 +12,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+from loop_interfaces.module_path import leave_out_working_directory
+
 STOPPED_BY_SIGNAL = 130
 """Exit code."""
 _EXTRAS = {
@@ -37,6 +39,7 @@ def begin(program: str) -> None:
     Most of a start is imports, and an exception within those of compiled code is lost, or becomes
     another: so none is raised.
     """
+    leave_out_working_directory()
     _open_streams()
 
     def end(name: str) -> None:

@@ -14,11 +14,10 @@ Every name is imported when it is used first, so that `import pdeloop` costs not
 but `train(..., over_topics=True)`.
 """
 
-from __future__ import annotations
-
 import importlib
-from typing import TYPE_CHECKING, Any
 
+# Not from `typing`: `python -m pdeloop` is here before its working directory is off the module path.
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from loop_method.design.lqt import track as track
     from loop_method.reduce.order import study_orders as study_orders
@@ -62,7 +61,7 @@ __all__ = sorted(_MODULES)
 
 if not TYPE_CHECKING:  # a type checker knows the names above, and that there are no others
 
-    def __getattr__(name: str) -> Any:
+    def __getattr__(name: str) -> object:
         if name not in _MODULES:
             raise AttributeError(f"module 'pdeloop' has no attribute {name!r}")
         return getattr(importlib.import_module(_MODULES[name]), name)

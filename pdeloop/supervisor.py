@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 
 from loop_interfaces.files import open_own
+from loop_interfaces.module_path import safe_environment
 from loop_interfaces.protocol import NO_CONTROLLER, STOPPED
 
 STOP_GRACE = 2.0
@@ -29,6 +30,8 @@ STEADY = 30.0
 REFUSED, CRASHED = 1, 70
 """Exit codes of a node that was asked for something it cannot do, so that restarting would not help,
 and of one with a bug (loop_interfaces.ros.node_main)."""
+START = "loop_interfaces.start"
+"""The module that runs a node."""
 _KILLED = range(-64, 0)
 """Exit codes by signals."""
 
@@ -95,7 +98,7 @@ class Supervisor:
 
     def __post_init__(self) -> None:
         self._environment = {
-            **os.environ,
+            **safe_environment(os.environ),
             **self.isolation,
             "ROS_DOMAIN_ID": str(self.domain),
             "ROS_LOG_DIR": str(self.log_folder),
@@ -187,9 +190,13 @@ class Supervisor:
 
 def node_command(name: str, *ros_arguments: str) -> list[str]:
     """The command that runs a node with this interpreter."""
+    return [sys.executable, "-m", START, name, *node_arguments(*ros_arguments)]
+
+
+def node_arguments(*ros_arguments: str) -> list[str]:
+    """All arguments of a node that is started here."""
     # The log is the child's output: a second one by rcl's logging library would only repeat it.
-    own = ("--ros-args", "--disable-external-lib-logs")
-    return [sys.executable, "-m", "loop_interfaces.start", name, *own, *ros_arguments]
+    return ["--ros-args", "--disable-external-lib-logs", *ros_arguments]
 
 
 def keep_on(process: int, cores: Sequence[int]) -> None:

@@ -561,7 +561,7 @@ def test_a_real_shell_completes(shell: str, tmp_path: Path) -> None:
         shown.until("loaded")
         for typed, completed in (
             ("pdeloop tra", "pdeloop train "),
-            ("pdeloop train bur", "pdeloop train burgers "),
+            ("pdeloop train sch", "pdeloop train schrodinger "),
             # fish only sorts YAML files before others; bash and zsh leave the others out.
             ("pdeloop train zzz" + "-ow" * (shell == "fish"), "pdeloop train zzz-own.yaml "),
             ("pdeloop bag ver", "pdeloop bag verify "),

@@ -15,6 +15,7 @@ from importlib import metadata
 from typing import Any
 
 from loop_interfaces.affinity import usable_cores
+from loop_interfaces.module_path import SAFE_PATH, safe_children
 from pdeloop.study.description import StudyError
 from pdeloop.supervisor import die_with
 from spectral_solver.workers import use_cores
@@ -23,6 +24,8 @@ CONNECTING = 10.0
 """Seconds in which a scheduler has to answer."""
 RETRIES = 3
 """How often a cluster may begin a training again whose worker has gone."""
+WORKER = f"{SAFE_PATH}=1 dask worker {{address}} --nthreads 1"
+"""How a user starts a worker, which must not run modules of its working directory, either."""
 
 
 @contextlib.contextmanager
@@ -34,7 +37,7 @@ def processes(count: int | None = None) -> Iterator[Executor]:
     context = multiprocessing.get_context("spawn")
     others = {process.pid for process in multiprocessing.active_children()}
     workers = count or len(usable_cores())
-    with ProcessPoolExecutor(workers, context, _begin, (os.getpid(),)) as pool:
+    with safe_children(), ProcessPoolExecutor(workers, context, _begin, (os.getpid(),)) as pool:
         try:
             yield pool
         except BaseException:
@@ -75,7 +78,7 @@ def cluster(address: str) -> Iterator[Executor]:
         if not workers:
             raise StudyError(
                 f"the scheduler at {address} has no workers; start some with: "
-                f"dask worker {address} --nthreads 1"
+                + WORKER.format(address=address)
             )
         known = {f"worker at {at}": of["packages"]["distributed"] for at, of in workers.items()}
         _check_versions(known, own)
@@ -100,7 +103,7 @@ def no_worker(pool: Executor) -> str:
     client = getattr(pool, "client", None)
     with contextlib.suppress(OSError):  # no scheduler, either: the trainings fail
         if client is not None and not client.scheduler_info()["workers"]:
-            start = f"dask worker {client.scheduler.address} --nthreads 1"
+            start = WORKER.format(address=client.scheduler.address)
             return f"no worker is left, waiting for one: {start}"
     return ""
 

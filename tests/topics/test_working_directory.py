@@ -1,0 +1,141 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""No file of the working directory runs because it has the name of a module that is imported."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pdeloop.cli import COMMANDS
+from tests.interpreter import python
+from tests.loop_harness import Processes, until
+from tests.small import SMALL
+
+pytestmark = pytest.mark.topics
+LIMIT = 240.0
+"""Seconds for one command on a busy machine."""
+BIN = Path(sys.executable).parent
+OPTIONAL = {"IPython", "brotli", "colorama", "coverage", "tbb", "uvloop", "usercustomize"}
+"""Modules that libraries look for, installed or not."""
+TRAP = """
+with open({taken!r}, "a") as file:
+    print({name!r}, file=file)
+raise SystemExit("{name} of the working directory was imported")
+"""
+STUDY = f"""
+problems: [{SMALL}]
+seeds: 1
+settings: {{evaluation_fields: 1}}
+variants: {{one: {{iterations: 1}}}}
+"""
+TRAIN = ("train", str(SMALL), "--iterations", "1", "--evaluation-fields", "1")
+WORDS: dict[str, tuple[str, ...]] = {
+    "train": (*TRAIN, "--out", "run", "--record", "--view"),
+    "evaluate": ("evaluate", "run", "--fields", "1"),
+    "identify": ("identify", "--bag", "run"),
+    "bag": ("bag", "verify", "run"),
+    "monitor": ("monitor", "--port", "0"),
+    "reproduce": ("reproduce", str(SMALL), "--seeds", "1", "--iterations", "5", "--out", "paper"),
+    "report": ("report", "run"),
+    "study": ("study", "study.yaml", "--out", "study"),
+    "problems": ("problems",),
+    "new": ("new", "my-pde"),
+    "check": ("check", str(SMALL), "--picture", "check.png"),
+}
+"""What each command is called with, in an order in which it finds what it needs."""
+BENCHMARK = ("train", "--problem", str(SMALL), "--turns", "1", "--iterations", "1")
+NODES = ("pde_sim_node", "controller_node", "tuner_node", "recorder_node", "viewer_node")
+
+
+def third_party() -> set[str]:
+    """The top-level modules of everything that is installed here."""
+    files = [file for of in metadata.distributions() for file in of.files or []]
+    modules = [file for file in files if file.suffix in (".py", ".so")]
+    return {file.parts[0].split(".")[0] for file in modules} | OPTIONAL
+
+
+def set_traps(folder: Path, names: set[str]) -> Path:
+    """A file for each of these modules; the file that says which were imported."""
+    taken = folder / "imported.txt"
+    for name in filter(str.isidentifier, names):
+        (folder / f"{name}.py").write_text(TRAP.format(taken=str(taken), name=name))
+    return taken
+
+
+def finish(loop: Processes, process: Any) -> None:
+    """Wait for the end of a command; that of the page, once it serves it."""
+    if "monitor" in process.args:
+        until(lambda: "http://" in loop.output(process), LIMIT, "page")
+        os.kill(process.pid, signal.SIGINT)
+    loop.wait(process, LIMIT)
+
+
+def test_no_command_and_no_node_runs_a_file_of_the_working_directory(
+    loop: Processes, tmp_path: Path
+) -> None:
+    assert set(WORDS) == set(COMMANDS)
+    (tmp_path / "study.yaml").write_text(STUDY)
+    taken = set_traps(tmp_path, third_party() | set(sys.stdlib_module_names))
+    train, *others = WORDS.values()
+    loop.wait(loop.program(str(BIN / "pdeloop"), *train), LIMIT)
+    started = [loop.program(str(BIN / name), "--help") for name in NODES]
+    started += [loop.program(str(BIN / "pdeloop"), *words) for words in others]
+    for process in started:
+        finish(loop, process)
+    assert not taken.exists(), taken.read_text()
+
+
+def test_completion_runs_no_file_of_the_working_directory(tmp_path: Path) -> None:
+    taken = set_traps(tmp_path, third_party() | set(sys.stdlib_module_names))
+    line = "pdeloop train --optimizer two"
+    done = subprocess.run(
+        ["sh", "-c", '"$0" 8>&1 9>/dev/null', str(BIN / "pdeloop")],
+        cwd=tmp_path,
+        env={**os.environ, "_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line))},
+        capture_output=True,
+        text=True,
+        timeout=LIMIT,
+    )
+    assert done.stdout.strip() == "two_point", done.stderr
+    assert not taken.exists(), taken.read_text()
+
+
+@pytest.mark.parametrize("words", [("pdeloop", *TRAIN), ("benchmarks", *BENCHMARK)])
+def test_modules_that_python_starts_run_no_file_of_the_working_directory(
+    words: tuple[str, ...], loop: Processes, tmp_path: Path
+) -> None:
+    # What Python imports to find the module, before it can say anything, and the module itself.
+    loaded = python("-c", "import runpy, sys; print(*sys.modules)").stdout.split()
+    names = third_party() | set(sys.stdlib_module_names)
+    taken = set_traps(tmp_path, names - {name.split(".")[0] for name in loaded} - {words[0]})
+    loop.wait(loop.start("-m", *words), LIMIT)
+    assert not taken.exists(), taken.read_text()
+
+
+def test_an_empty_entry_of_the_module_path_is_not_the_working_directory(
+    loop: Processes, tmp_path: Path
+) -> None:
+    # As of `export PYTHONPATH=$PYTHONPATH:/some/folder` where it was not set.
+    loop.environment["PYTHONPATH"] = f":{loop.environment['PYTHONPATH']}"
+    taken = set_traps(tmp_path, {"numpy", "scipy", "numba", "yaml", "rich", "rclpy", "std_msgs"})
+    loop.wait(loop.program(str(BIN / "pdeloop"), *TRAIN), LIMIT)
+    assert not taken.exists(), taken.read_text()
+
+
+def test_code_that_the_user_names_runs_from_the_working_directory(
+    loop: Processes, tmp_path: Path
+) -> None:
+    own = "from pde_sim_node.equations import Burgers\nclass Own(Burgers):\n    name = 'own'\n"
+    (tmp_path / "numpy.py").write_text(own)
+    said = loop.wait(
+        loop.program(str(BIN / "pdeloop"), *TRAIN, "--equation", "numpy.py:Own"), LIMIT
+    )
+    assert re.search("mean stage cost after adaptation", said)
