@@ -17,6 +17,7 @@ from loop_interfaces.parameters import model_order
 from loop_method.design import lqt
 from loop_method.design.field_law import field_law
 from loop_method.reduce import dmdc, regression
+from loop_method.reduce.channels import NUMBERED, Channels
 from loop_method.reduce.order import study_orders
 from loop_method.reduce.reduced_model import ReducedModel
 
@@ -57,7 +58,12 @@ class DesignSettings:
 
 
 def identify(
-    trajectories: Sequence[tuple[ArrayLike, ArrayLike]], *, method: str, n_s: int, p: int = 0
+    trajectories: Sequence[tuple[ArrayLike, ArrayLike]],
+    *,
+    method: str,
+    n_s: int,
+    p: int = 0,
+    channels: Channels = NUMBERED,
 ) -> ReducedModel:
     """The reduced model of one plant.
 
@@ -71,27 +77,33 @@ def identify(
         Its order; 0: the suggested one (`order.study_orders`).
     p : int
         Rank of "dmdc"; 0: n_s + n_a.
+    channels : Channels
+        Names of states and inputs in what is refused.
 
     Raises
     ------
     ValueError
-        The data allow no such model, or there is no such method.
+        The data allow no such model, or do not determine it, or there is no such method.
     """
-    if not any(np.any(actions) for _, actions in trajectories):
-        raise ValueError("all actions are zero, which says nothing of B; excite the plant")
-    n_s = n_s or study_orders(trajectories).suggested
-    if method in ("field", "regression"):
-        return regression.exact_regression(trajectories, n_s=n_s)
-    if method == "dmdc":
-        n_a = np.shape(trajectories[0][1])[-1]
-        return dmdc.truncated_dmdc(trajectories, p=p or n_s + n_a, n_s=n_s)
-    raise ValueError(f"method is {method!r}; expected 'regression' or 'dmdc'")
+    if method not in ("regression", "dmdc"):
+        law = "; 'field' designs a law for a target: problem(..., identification='field')"
+        raise ValueError(
+            f"method is {method!r}; expected 'regression' or 'dmdc'{law if method == 'field' else ''}"
+        )
+    if p and method != "dmdc":
+        raise ValueError(f"p is the rank of 'dmdc', and method is {method!r}; leave it out")
+    n_s = n_s or study_orders(trajectories, channels=channels).suggested
+    if method == "regression":
+        return regression.exact_regression(trajectories, n_s=n_s, channels=channels)
+    n_a = np.shape(trajectories[0][1])[-1]
+    return dmdc.truncated_dmdc(trajectories, p=p or n_s + n_a, n_s=n_s, channels=channels)
 
 
 def design(
     trajectories: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]],
     target: NDArray[np.float64],
     settings: DesignSettings,
+    channels: Channels = NUMBERED,
 ) -> ModelRows:
     """Reduce and design: a model from the trajectories, then the LQ-tracking gains.
 
@@ -103,17 +115,21 @@ def design(
         z_r.
     settings : DesignSettings
         Method, order, which is lowered to the size of the state where that is smaller, and weights.
+    channels : Channels
+        Names of states and inputs in what is refused.
 
     Raises
     ------
     ValueError
-        The data allow no model of this order, or the model no stabilising gains.
+        The data allow or determine no model of this order, or the model no stabilising gains.
     """
+    truncated = settings.identification == "dmdc"
     model = identify(
         trajectories,
-        method=settings.identification,
+        method="dmdc" if truncated else "regression",
         n_s=min(model_order(asdict(settings)), target.size),
-        p=settings.dmdc_rank,
+        p=settings.dmdc_rank if truncated else 0,
+        channels=channels,
     )
     weights = {"state_weight": settings.state_weight, "action_weight": settings.action_weight}
     gains = lqt.track(model, **weights)

@@ -20,6 +20,8 @@ import importlib
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from loop_method.design.lqt import track as track
+    from loop_method.reduce.identifiability import IdentifiabilityWarning as IdentifiabilityWarning
+    from loop_method.reduce.identifiability import NotIdentifiableError as NotIdentifiableError
     from loop_method.reduce.order import study_orders as study_orders
     from loop_method.reduce.reduced_model import ReducedModel as ReducedModel
     from pde_sim_node.plant import Plant as Plant
@@ -41,6 +43,7 @@ if TYPE_CHECKING:
     from pdeloop.plots import plot_training as plot_training
 
 _NAMES = {
+    "loop_method.reduce.identifiability": ("IdentifiabilityWarning", "NotIdentifiableError"),
     "loop_method.design.lqt": ("track",),
     "loop_method.reduce.order": ("study_orders",),
     "loop_method.reduce.reduced_model": ("ReducedModel",),

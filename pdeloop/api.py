@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from io import StringIO
@@ -17,6 +18,7 @@ from numpy.typing import ArrayLike
 from controller_node import identification
 from loop_interfaces.arrays import Array
 from loop_interfaces.problem import load_parameters
+from loop_method.reduce.identifiability import IdentifiabilityWarning, examine
 from loop_method.reduce.reduced_model import ReducedModel
 from pde_sim_node.build import build_equation, build_plant
 from pde_sim_node.equations import allow
@@ -183,7 +185,13 @@ def identify(
     Raises
     ------
     ValueError
-        Shapes that do not fit, NaN or infinity, or data that allow no model of this order.
+        Shapes that do not fit, NaN or infinity, or data that allow or determine no model of this order:
+        inputs that never moved, always moved together, or always followed from the state are named.
+
+    Warns
+    -----
+    IdentifiabilityWarning
+        The data hardly determine the model, or hold a trajectory twice.
 
     Examples
     --------
@@ -197,7 +205,10 @@ def identify(
         raise ValueError("identify needs one trajectory or more, each a tuple (states, actions)")
     _check_count("n_s", n_s, 0)
     _check_count("p", p, 0)
-    return identification.identify(trajectories, method=method, n_s=n_s, p=p)
+    model = identification.identify(trajectories, method=method, n_s=n_s, p=p)
+    for remark in examine(trajectories, model.U).remarks:
+        warnings.warn(remark, IdentifiabilityWarning, stacklevel=2)
+    return model
 
 
 def train(

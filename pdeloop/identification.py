@@ -22,6 +22,8 @@ from loop_interfaces.model_rows import ModelRows, pack
 from loop_interfaces.parameters import as_recorded, model_order, recorded_values, table
 from loop_interfaces.spec import ParameterError
 from loop_interfaces.topics import COMPLETED, CostColumn
+from loop_method.reduce.channels import NUMBERED, Channels
+from loop_method.reduce.identifiability import Identifiability, NotIdentifiableError, examine
 from loop_method.reduce.order import OrderStudy, study_orders
 from pdeloop.data_file import read_measurements
 
@@ -36,18 +38,21 @@ class Identified:
     """A model from trajectories.
 
     sources: which trajectories, by episode and environment or by number; study: the orders on held-out
-    data, None where these are too few; sample_time in s, None where it is not known.
+    data, None where these are too few; determined: how well the data determine the model; sample_time
+    in s, None where it is not known.
     """
 
     model: ModelRows
     sources: list[dict[str, int]]
     steps: int
     study: OrderStudy | None
+    determined: Identifiability
     sample_time: float | None = None
 
     def summary(self) -> dict[str, Any]:
         """The result as data, without the arrays, which `save` writes."""
         A, B, U, study = self.model.A, self.model.B, self.model.U, self.study
+        determined = self.determined
         poles = np.linalg.eigvals(A)
         return {
             "reduced_order": len(A),
@@ -58,6 +63,11 @@ class Identified:
             "trajectories": self.sources,
             "poles": [[pole.real, pole.imag] for pole in poles],
             "spectral_radius": float(np.abs(poles).max()),
+            "rank": determined.rank,
+            "unknowns": determined.unknowns,
+            "smallest_singular_value": determined.smallest_singular_value,
+            "independence": determined.independence.tolist(),
+            "warnings": list(determined.remarks),
             "suggested_order": study and study.suggested,
             "singular_values": [] if study is None else study.singular_values.tolist(),
             "orders": [] if study is None else study.rows(),
@@ -80,6 +90,12 @@ class Identified:
         if self.sample_time is not None:
             rates = np.log(np.abs(np.linalg.eigvals(self.model.A))) / self.sample_time
             lines.append(f"  modes grow at rates of {rates.min():.3g} to {rates.max():.3g} 1/s")
+        own = self.determined.independence
+        lines.append(
+            f"  rank {known['rank']} of {known['unknowns']}, smallest singular value "
+            f"{known['smallest_singular_value']:.2g}; the inputs move by themselves to "
+            f"{100 * min(own.min(), 1.0):.0f} % or more"
+        )
         if self.study is None:
             lines.append("  too few steps to hold some out: no order is suggested")
         else:
@@ -149,6 +165,7 @@ def _identified(
     sources: list[dict[str, int]],
     recorded: Mapping[str, Any],
     given: Mapping[str, Any],
+    channels: Channels = NUMBERED,
 ) -> Identified:
     if given.get("reduced_order", 0) > target.size:
         raise ParameterError(
@@ -158,7 +175,9 @@ def _identified(
     values = {**recorded, **given}
     study, none = None, ""
     try:
-        study = study_orders(trajectories)
+        study = study_orders(trajectories, channels=channels)
+    except NotIdentifiableError:  # whatever the order
+        raise
     except ValueError as error:  # too few steps; the model itself may still be had
         none = str(error)
     defaults = {spec.name: spec.default for spec in table()} | {"reduced_order": 0}
@@ -172,9 +191,10 @@ def _identified(
             f"--rank is that of the identification dmdc, and this one is {settings.identification}: "
             "add --identification dmdc, or leave --rank out"
         )
-    model = design(trajectories, target, settings)
+    model = design(trajectories, target, settings, channels)
+    determined = examine(trajectories, model.U, channels)
     steps = sum(len(actions) for _, actions in trajectories)
-    return Identified(model, sources, steps, study, values.get("sample_time"))
+    return Identified(model, sources, steps, study, determined, values.get("sample_time"))
 
 
 def save(found: Identified, path: Path) -> None:

@@ -155,6 +155,6 @@ def test_the_command_line_says_it_in_one_line(
     capsys.readouterr()
     np.savez(tmp_path / "idle.npz", **arrays(actions=np.zeros((60, 2))))
     assert main(["identify", "--data", str(tmp_path / "idle.npz")]) == FAILED
-    assert "all actions are zero" in capsys.readouterr().err
+    assert "the inputs a1 and a2 never moved (constant at 0)" in capsys.readouterr().err
     assert main(["identify", "--data", str(EXAMPLE), "--episode", "1"]) == FAILED
     assert "choose from a bag" in capsys.readouterr().err

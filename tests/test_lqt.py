@@ -162,3 +162,24 @@ def test_it_returns_the_cost_to_go_and_the_closed_loops_poles() -> None:
         total += Q_WEIGHT * (s @ s) + R_WEIGHT * (a @ a)
         s = m.A @ s + m.B @ a
     np.testing.assert_allclose(total, cost_to_go, rtol=1e-9)
+
+
+@pytest.mark.parametrize("unit", [1e-13, 1e-6, 1e6, 1e13])
+def test_the_units_of_state_and_inputs_change_no_law(unit: float) -> None:
+    """Inputs or states in another unit, with the weight that makes them as dear as before."""
+    m = model(1.3)
+    same = track(m, state_weight=Q_WEIGHT, action_weight=R_WEIGHT)
+    other = track(
+        ReducedModel(A=m.A, B=m.B * unit, U=m.U),
+        state_weight=Q_WEIGHT,
+        action_weight=R_WEIGHT * unit**2,
+    )
+    state = track(
+        ReducedModel(A=m.A, B=m.B * unit, U=m.U),
+        state_weight=Q_WEIGHT / unit**2,
+        action_weight=R_WEIGHT,
+    )
+    for name in ("K_a", "K_b"):
+        expected = getattr(same, name)
+        np.testing.assert_allclose(getattr(other, name) * unit, expected, rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(getattr(state, name) * unit, expected, rtol=1e-6, atol=1e-9)

@@ -32,11 +32,16 @@ from threadpoolctl import threadpool_limits
 from loop_interfaces.arrays import Array
 from loop_method.reduce.reduced_model import ReducedModel
 
-# A direction that the inputs move by less than this, relative to the model's size, counts as out of
-# reach.
+# A direction that the inputs move by less than this, relative to what they move at most, counts as out
+# of reach.
 _REACH = 1e-12
 # I - (A + B K_a)^T with a smaller reciprocal condition number has no usable inverse.
 _RECIPROCAL_CONDITION = 1e-14
+
+
+# How many times as large inputs' effects may be as the model's own, or as small, before their unit is
+# changed for the computation.
+_ALIKE = 1e6
 
 
 class DesignError(ValueError):
@@ -118,12 +123,13 @@ def track(model: ReducedModel, *, state_weight: float, action_weight: float) -> 
     for name, weight in (("state_weight", state_weight), ("action_weight", action_weight)):
         if not (isinstance(weight, Real) and 0.0 < weight < np.inf):
             raise ValueError(f"{name} must be positive and finite, but it is {weight!r}.")
-    A, B = model.A, model.B
-    Q = state_weight * np.eye(model.n_s)
-    R = action_weight * np.eye(model.n_a)
     # One thread: a threaded LAPACK rounds differently for another number of threads.
     with threadpool_limits(limits=1):
-        _require_stabilisable(A, B)
+        _require_stabilisable(model.A, model.B)
+        unit, level = _units(model, state_weight)
+        A, B = model.A, model.B * unit
+        Q = state_weight / level * np.eye(model.n_s)
+        R = action_weight / level * unit**2 * np.eye(model.n_a)
         try:
             P = linalg.solve_discrete_are(A, B, Q, R)
         except (linalg.LinAlgError, ValueError) as error:
@@ -144,17 +150,30 @@ def track(model: ReducedModel, *, state_weight: float, action_weight: float) -> 
                 "so identify with another seed or another n_s."
             )
         K_b = linalg.solve(S, B.T @ _steady_state_map(closed_loop) @ Q, assume_a="pos")
-    return Gains(K_a=K_a, K_b=K_b, P=P, poles=poles)
+    return Gains(K_a=unit * K_a, K_b=unit * K_b, P=level * P, poles=poles)
+
+
+def _units(model: ReducedModel, state_weight: float) -> tuple[float, float]:
+    """Units of the inputs and of the cost in which the Riccati solver has numbers of one size.
+
+    1 each where they have that already, so that the bits are those of the model as it is.
+    """
+    ratio = float(linalg.norm(model.B, 2)) / max(float(linalg.norm(model.A, 2)), 1e-300)
+    if 1.0 / _ALIKE < ratio < _ALIKE or ratio == 0.0:
+        return 1.0, 1.0
+    return 1.0 / ratio, state_weight
 
 
 def _require_stabilisable(A: Array, B: Array) -> None:
     # Popov-Belevitch-Hautus: [lambda I - A, B] keeps full row rank at every eigenvalue with
     # |lambda| >= 1.
-    size = max(float(linalg.norm(A, 2)), float(linalg.norm(B, 2)))
+    size, largest = float(linalg.norm(A, 2)), float(linalg.norm(B, 2))
+    # As large as A: the unit of the inputs does not move a mode out of reach, or into it.
+    scaled = B * (size / largest) if largest > 0.0 else B
     for eigenvalue in linalg.eigvals(A):
         if abs(eigenvalue) < 1.0 - _REACH:
             continue
-        pencil = np.hstack([eigenvalue * np.eye(len(A)) - A, B])
+        pencil = np.hstack([eigenvalue * np.eye(len(A)) - A, scaled])
         reach = float(linalg.svdvals(pencil)[-1])
         if reach <= _REACH * size:
             raise DesignError(

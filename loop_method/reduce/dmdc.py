@@ -23,11 +23,17 @@ from numpy.typing import ArrayLike
 from scipy import linalg
 from threadpoolctl import threadpool_limits
 
+from loop_method.reduce.channels import NUMBERED, Channels
+from loop_method.reduce.identifiability import examine_steps
 from loop_method.reduce.reduced_model import ReducedModel, leading_modes, numerical_rank, steps_of
 
 
 def truncated_dmdc(
-    trajectories: Sequence[tuple[ArrayLike, ArrayLike]], *, p: int, n_s: int
+    trajectories: Sequence[tuple[ArrayLike, ArrayLike]],
+    *,
+    p: int,
+    n_s: int,
+    channels: Channels = NUMBERED,
 ) -> ReducedModel:
     """Identify a reduced model from trajectories of one plant, whose steps are pooled.
 
@@ -40,12 +46,14 @@ def truncated_dmdc(
         effect of the actuators; too large fits noise.
     n_s : int
         Modes of the reduced state.
+    channels : Channels
+        Names of states and inputs in what is refused.
 
     Raises
     ------
     ValueError
-        Shapes that do not fit, NaN or infinity, or more directions asked for than the trajectories
-        hold.
+        Shapes that do not fit, NaN or infinity, more directions asked for than the trajectories
+        hold, or inputs whose effects cannot be told apart.
     """
     data = steps_of(trajectories)
     steps, n_a = data.inputs.shape
@@ -66,6 +74,8 @@ def truncated_dmdc(
 
     # One thread: a threaded LAPACK rounds differently for another number of threads.
     with threadpool_limits(limits=1):
+        basis, _ = leading_modes(data.after, n_s, channels)
+        examine_steps(data, basis, channels).require()
         stacked = np.vstack([data.before.T, data.inputs.T])
         psi, xi, lam_t = linalg.svd(stacked, full_matrices=False)
         rank = numerical_rank(xi, n_z + n_a, steps)
@@ -74,7 +84,6 @@ def truncated_dmdc(
                 f"p must be at most the numerical rank of the data, {rank}, but p is {p}; lower p "
                 "or excite more."
             )
-        basis, _ = leading_modes(data.after, n_s)
         regression = (basis.T @ data.after.T) @ (lam_t[:p].T / xi[:p])
         return ReducedModel(
             A=regression @ (psi[:n_z, :p].T @ basis), B=regression @ psi[n_z:, :p].T, U=basis

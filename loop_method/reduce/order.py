@@ -27,11 +27,16 @@ from scipy import linalg
 from threadpoolctl import threadpool_limits
 
 from loop_interfaces.arrays import Array
+from loop_method.reduce.channels import NUMBERED, Channels, scaled
+from loop_method.reduce.identifiability import examine_steps
 from loop_method.reduce.reduced_model import (
     ReducedModel,
+    Steps,
     Trajectory,
+    leading_modes,
     numerical_rank,
     pieces,
+    repeated,
     steps_of,
 )
 from loop_method.reduce.regression import fit
@@ -107,7 +112,10 @@ class OrderStudy:
 
 
 def study_orders(
-    trajectories: Sequence[tuple[ArrayLike, ArrayLike]], orders: Iterable[int] = ORDERS
+    trajectories: Sequence[tuple[ArrayLike, ArrayLike]],
+    orders: Iterable[int] = ORDERS,
+    *,
+    channels: Channels = NUMBERED,
 ) -> OrderStudy:
     """Try orders of a reduced model on held-out parts of trajectories of one plant.
 
@@ -115,9 +123,12 @@ def study_orders(
     ----------
     trajectories : sequence of (states (N + 1, n_z), actions (N, n_a))
         z_0 .. z_N and a_0 .. a_{N-1}; a_k is held from z_k to z_{k+1}.
+        A trajectory that is there twice counts once.
     orders : iterable of int
-        Those to try, of which the ones remain that the data can determine: n_s + n_a steps must be
-        left without the held-out ones.
+        Those to try, of which the ones remain that the data determine without the held-out steps:
+        n_s + n_a of them must be left, for one.
+    channels : Channels
+        Names of states and inputs in what is refused.
 
     Returns
     -------
@@ -126,7 +137,8 @@ def study_orders(
     Raises
     ------
     ValueError
-        Shapes that do not fit, NaN or infinity, or too few steps for any of the orders.
+        Shapes that do not fit, NaN or infinity, inputs whose effects cannot be told apart, or too few
+        steps for any of the orders.
 
     Examples
     --------
@@ -142,7 +154,12 @@ def study_orders(
     (array([1, 2]), 2)
     """
     everything = steps_of(trajectories)
-    known = [(np.asarray(z, np.float64), np.asarray(a, np.float64)) for z, a in trajectories]
+    copies = repeated(trajectories)
+    known = [
+        (np.asarray(z, np.float64), np.asarray(a, np.float64))
+        for number, (z, a) in enumerate(trajectories)
+        if number not in copies
+    ]
     asked = list(orders)
     if wrong := [order for order in asked if not isinstance(order, Integral)]:
         raise ValueError(f"orders holds {wrong[0]!r}; expected whole numbers")
@@ -150,11 +167,14 @@ def study_orders(
     errors, scales = [], np.zeros(2)
     with threadpool_limits(limits=1):  # as in the identification itself
         singular_values: Array = linalg.svdvals(everything.after)
+        if len(everything.inputs) > 1 and singular_values[0] > 0.0:
+            examine_steps(everything, leading_modes(everything.after, 1)[0], channels).require()
         for fitted, held in _folds(known):
             data = steps_of(fitted)
             modes, values, _ = linalg.svd(data.after.T, full_matrices=False)
-            steps, n_a = data.inputs.shape
-            most = min(numerical_rank(values, *data.after.shape), steps - n_a)
+            most = min(numerical_rank(values, *data.after.shape), _determined(data, modes))
+            if most < 1:  # an input that moved in the held-out steps only, for one
+                continue
             tried = [n for n in tried if n <= most]
             models = [fit(data, modes[:, :n]) for n in tried]
             errors.append([_summed(_errors(model, *piece) for piece in held) for model in models])
@@ -171,6 +191,15 @@ def study_orders(
     enough = digits[0] + SHARE * (digits.max() - digits[0])
     suggested = tried[int(np.argmax(digits >= enough))]
     return OrderStudy(singular_values, np.array(tried), one_step, rollout, suggested)
+
+
+def _determined(data: Steps, modes: Array) -> int:
+    """The highest order whose regressors, on the leading modes (n_z, n), are independent here."""
+    steps, n_a = data.inputs.shape
+    columns, _ = scaled(np.hstack([data.inputs, data.before @ modes])[:, :steps])
+    heights = np.abs(np.diag(linalg.qr(columns, mode="r")[0]))
+    lost = heights <= steps * np.finfo(np.float64).eps
+    return int(np.argmax(lost) if lost.any() else len(heights)) - n_a
 
 
 def _folds(

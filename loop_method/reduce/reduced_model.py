@@ -9,6 +9,7 @@ Y = [a_0 .. a_{N-1}]; U holds the leading left singular vectors of Z'.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from itertools import pairwise
 
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import ArrayLike
 from scipy import linalg
 
 from loop_interfaces.arrays import Array, float_array
+from loop_method.reduce.channels import NUMBERED, Channels, state_faults
 
 Trajectory = tuple[Array, Array]
 """States (N + 1, n_z) and actions (N, n_a)."""
@@ -102,7 +104,8 @@ class Steps:
 def steps_of(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> Steps:
     """The steps of trajectories (states (N + 1, n_z), actions (N, n_a)) of one plant, pooled.
 
-    ValueError for shapes that do not fit, NaN and infinity.
+    A trajectory that is there twice counts once. ValueError for shapes that do not fit, NaN and
+    infinity.
     """
     befores, afters, inputs = [], [], []
     if (
@@ -111,8 +114,14 @@ def steps_of(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> Steps:
         or any(not isinstance(t, Sequence) or len(t) != 2 for t in trajectories)
     ):
         raise ValueError("expected a list of trajectories, each a tuple (states, actions)")
-    for trajectory in trajectories:
-        z, own = _matrix("states", trajectory[0]), _matrix("actions", trajectory[1])
+    checked = [(_matrix("states", z), _matrix("actions", a)) for z, a in trajectories]
+    if len(sizes := sorted({(z.shape[1], own.shape[1]) for z, own in checked})) > 1:
+        raise ValueError(
+            "expected trajectories of one plant, got states and actions of "
+            f"{' and of '.join(f'{n_z} and {n_a}' for n_z, n_a in sizes[:4])} numbers."
+        )
+    copies = repeated(checked)
+    for z, own in [pair for number, pair in enumerate(checked) if number not in copies]:
         if z.shape[0] != len(own) + 1:
             raise ValueError(
                 f"{len(own)} actions belong to {len(own) + 1} states, but {z.shape[0]} states were "
@@ -124,6 +133,21 @@ def steps_of(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> Steps:
     return Steps(*(np.concatenate(parts) for parts in (befores, afters, inputs)))
 
 
+def repeated(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> dict[int, int]:
+    """Which trajectories are copies of earlier ones, and of which, by number."""
+    first: dict[bytes, int] = {}
+    found = {}
+    for number, trajectory in enumerate(trajectories):
+        content = sha256()
+        for values in trajectory:
+            array = np.ascontiguousarray(values)
+            content.update(repr((array.shape, array.dtype)).encode())
+            content.update(array.data)
+        if (earlier := first.setdefault(content.digest(), number)) != number:
+            found[number] = earlier
+    return found
+
+
 def pieces(trajectories: Sequence[Trajectory], count: int) -> list[Trajectory]:
     """Every trajectory cut into so many pieces of about one length; neighbours share a state."""
     cut = []
@@ -133,20 +157,22 @@ def pieces(trajectories: Sequence[Trajectory], count: int) -> list[Trajectory]:
     return cut
 
 
-def leading_modes(after: Array, n_s: int) -> tuple[Array, Array]:
+def leading_modes(after: Array, n_s: int, channels: Channels = NUMBERED) -> tuple[Array, Array]:
     """The first n_s left singular vectors of Z', (n_z, n_s), and all its singular values.
 
     after : (N, n_z) array
         The transpose of Z'.
 
-    A ValueError says so where the states have fewer modes than that. Call it with one LAPACK thread.
+    A ValueError says so where the states have fewer modes than that, and which channels are the
+    reason. Call it with one LAPACK thread.
     """
     left, values, _ = linalg.svd(after.T, full_matrices=False)
     rank = numerical_rank(values, *after.shape)
     if n_s > rank:
+        reasons = state_faults(after, channels)
         raise ValueError(
-            f"n_s must be at most the numerical rank of the states, {rank}, but n_s is {n_s}; "
-            "lower n_s or excite more."
+            f"n_s must be at most the numerical rank of the states, {rank}, but n_s is {n_s}"
+            f"{': ' if reasons else ''}{', '.join(reasons)}; lower n_s or excite more."
         )
     return _unique_signs(left[:, :n_s]), values
 

@@ -4,12 +4,12 @@
 With U the first n_s left singular vectors of Z' = [z_1 .. z_N], Z = [z_0 .. z_{N-1}] and
 Y = [a_0 .. a_{N-1}] (one column per step),
 
-    [A B] = argmin || U^T Z' - A U^T Z - B Y ||_F^2,
+    [A B] = argmin || U^T Z' - A U^T Z - B Y ||_F^2.
 
-the solution of least norm where there are several. States are projected and inputs are kept whole, so
-that there is no second rank to choose and nothing depends on the unit of the inputs. The truncated
-regression of `loop_method.reduce.dmdc` is the same where the states have no more than n_s modes and p
-keeps everything; with p < n_s + n_a it cuts into the inputs.
+Data that do not determine it are refused (`loop_method.reduce.identifiability`). States are projected
+and inputs are kept whole, so that there is no second rank to choose and nothing depends on the unit of
+the inputs. The truncated regression of `loop_method.reduce.dmdc` is the same where the states have no
+more than n_s modes and p keeps everything; with p < n_s + n_a it cuts into the inputs.
 
 References
 ----------
@@ -27,11 +27,16 @@ from scipy import linalg
 from threadpoolctl import threadpool_limits
 
 from loop_interfaces.arrays import Array
+from loop_method.reduce.channels import NUMBERED, Channels, scaled
+from loop_method.reduce.identifiability import examine_steps
 from loop_method.reduce.reduced_model import ReducedModel, Steps, leading_modes, steps_of
 
 
 def exact_regression(
-    trajectories: Sequence[tuple[ArrayLike, ArrayLike]], *, n_s: int
+    trajectories: Sequence[tuple[ArrayLike, ArrayLike]],
+    *,
+    n_s: int,
+    channels: Channels = NUMBERED,
 ) -> ReducedModel:
     """Identify a reduced model from trajectories of one plant, whose steps are pooled.
 
@@ -42,6 +47,8 @@ def exact_regression(
     n_s : int
         Modes of the reduced state. All steps together must be at least n_s + n_a, as many as there are
         unknowns in a row of [A B].
+    channels : Channels
+        Names of states and inputs in what is refused.
 
     Returns
     -------
@@ -51,8 +58,8 @@ def exact_regression(
     Raises
     ------
     ValueError
-        Shapes that do not fit, NaN or infinity, fewer steps than unknowns, or more modes than the
-        states have.
+        Shapes that do not fit, NaN or infinity, fewer steps than unknowns, more modes than the
+        states have, or inputs whose effects cannot be told apart.
 
     Examples
     --------
@@ -78,21 +85,22 @@ def exact_regression(
         )
     # One thread: a threaded LAPACK rounds differently for another number of threads.
     with threadpool_limits(limits=1):
-        U, _ = leading_modes(data.after, n_s)
+        U, _ = leading_modes(data.after, n_s, channels)
+        examine_steps(data, U, channels).require()
         return fit(data, U)
 
 
 def fit(data: Steps, U: Array) -> ReducedModel:
-    """`exact_regression` on given modes U (n_z, n_s). Call with one LAPACK thread."""
+    """`exact_regression` on given modes U (n_z, n_s), unchecked. Call it with one LAPACK thread."""
     s, y = data.before @ U, data.inputs
     n_s = s.shape[1]
-    # In units in which both have the norm 1, so that what counts as zero does not depend on theirs.
-    scales = np.repeat([_norm(s), _norm(y)], [n_s, y.shape[1]])
-    coefficients: Array = linalg.lstsq(np.hstack([s, y]) / scales, data.after @ U)[0]
-    coefficients /= scales[:, None]
+    # The modes keep their proportions, in which small ones are small; inputs have none to each other.
+    units = np.concatenate([np.full(n_s, _norm(s)), scaled(y)[1]])
+    units[units == 0.0] = 1.0
+    coefficients: Array = linalg.lstsq(np.hstack([s, y]) / units, data.after @ U)[0]
+    coefficients /= units[:, None]
     return ReducedModel(A=coefficients[:n_s].T, B=coefficients[n_s:].T, U=U)
 
 
 def _norm(values: Array) -> float:
-    norm = float(linalg.norm(values))
-    return norm if norm > 0.0 else 1.0
+    return float(linalg.norm(values))

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 
 from loop_interfaces.parameters import IDENTIFICATION
 from loop_interfaces.spec import ParameterError
@@ -76,6 +77,8 @@ def _identify(options: argparse.Namespace) -> int:
         )
     if options.out is not None:
         save(found, options.out)
+    for remark in found.determined.remarks:
+        print(f"WARNING: {remark}", file=sys.stderr)
     if options.json:
         print_json(found.summary() | {"out": options.out and str(options.out)})
         return 0
