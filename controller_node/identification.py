@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from loop_method.design import lqt
 from loop_method.design.field_law import field_law
 from loop_method.reduce import dmdc, regression
 from loop_method.reduce.channels import NUMBERED, Channels
+from loop_method.reduce.identifiability import Identifiability, examine
 from loop_method.reduce.order import study_orders
 from loop_method.reduce.reduced_model import ReducedModel
 
@@ -97,6 +98,22 @@ def identify(
         return regression.exact_regression(trajectories, n_s=n_s, channels=channels)
     n_a = np.shape(trajectories[0][1])[-1]
     return dmdc.truncated_dmdc(trajectories, p=p or n_s + n_a, n_s=n_s, channels=channels)
+
+
+def examined(
+    trajectories: Sequence[tuple[ArrayLike, ArrayLike]],
+    model: ReducedModel | ModelRows,
+    *,
+    method: str,
+    p: int = 0,
+    channels: Channels = NUMBERED,
+) -> Identifiability:
+    """How well trajectories determine a model of `identify` or `design`; p as given there."""
+    found = examine(trajectories, model.U, channels)
+    if method != "dmdc":
+        return found
+    more = dmdc.truncation_remarks(trajectories, p or sum(np.shape(model.B)), channels)
+    return replace(found, remarks=(*found.remarks, *more))
 
 
 def design(

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from controller_node import identification
 from loop_interfaces.arrays import Array
 from loop_interfaces.problem import load_parameters
-from loop_method.reduce.identifiability import IdentifiabilityWarning, examine
+from loop_method.reduce.identifiability import IdentifiabilityWarning
 from loop_method.reduce.reduced_model import ReducedModel
 from pde_sim_node.build import build_equation, build_plant
 from pde_sim_node.equations import allow
@@ -206,7 +206,7 @@ def identify(
     _check_count("n_s", n_s, 0)
     _check_count("p", p, 0)
     model = identification.identify(trajectories, method=method, n_s=n_s, p=p)
-    for remark in examine(trajectories, model.U).remarks:
+    for remark in identification.examined(trajectories, model, method=method, p=p).remarks:
         warnings.warn(remark, IdentifiabilityWarning, stacklevel=2)
     return model
 

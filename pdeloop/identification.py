@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from controller_node.identification import DesignSettings, design
+from controller_node.identification import DesignSettings, design, examined
 from loop_interfaces.arrays import Array
 from loop_interfaces.episodes import episode_name
 from loop_interfaces.files import write_atomically
@@ -23,8 +23,9 @@ from loop_interfaces.parameters import as_recorded, model_order, recorded_values
 from loop_interfaces.spec import ParameterError
 from loop_interfaces.topics import COMPLETED, CostColumn
 from loop_method.reduce.channels import NUMBERED, Channels
-from loop_method.reduce.identifiability import Identifiability, NotIdentifiableError, examine
+from loop_method.reduce.identifiability import Identifiability, NotIdentifiableError
 from loop_method.reduce.order import OrderStudy, study_orders
+from loop_method.reduce.reduced_model import steps_of
 from pdeloop.data_file import read_measurements
 
 if TYPE_CHECKING:
@@ -192,8 +193,9 @@ def _identified(
             "add --identification dmdc, or leave --rank out"
         )
     model = design(trajectories, target, settings, channels)
-    determined = examine(trajectories, model.U, channels)
-    steps = sum(len(actions) for _, actions in trajectories)
+    method, p = settings.identification, settings.dmdc_rank
+    determined = examined(trajectories, model, method=method, p=p, channels=channels)
+    steps = len(steps_of(trajectories).inputs)
     return Identified(model, sources, steps, study, determined, values.get("sample_time"))
 
 

@@ -17,6 +17,7 @@ from loop_method.adapt.sensitivity import (
     expand,
     predict_difference,
 )
+from loop_method.reduce.identifiability import NotIdentifiableError
 
 R, N_A, N_S, STEPS = 4, 2, 3, 12
 
@@ -65,6 +66,34 @@ def test_fit_recovers_a_planted_quadratic_system() -> None:
     np.testing.assert_allclose(fitted.jacobians(x), model.jacobians(x), atol=2e-4)
     np.testing.assert_allclose(fitted.B, model.B, atol=2e-4)
     np.testing.assert_allclose(fitted.quadratic, model.quadratic, atol=2e-4)
+
+
+@pytest.mark.parametrize("units", [(1e-9, 1e9), (1e9, 1e-9), (1e-9, 1e-9), (1e9, 1e9)])
+def test_fit_does_not_depend_on_the_units_of_the_inputs(units: tuple[float, float]) -> None:
+    model, rng = planted(), np.random.default_rng(1)
+    x, a = rng.standard_normal((300, R)), rng.standard_normal((300, N_A))
+    change = model.step(x, a) - x
+    for one, other in zip(
+        fit(x, a, change, np.ones(300), [1e-6]),
+        fit(x, a * units, change, np.ones(300), [1e-6]),
+        strict=True,
+    ):
+        np.testing.assert_allclose(other.B * units, one.B, rtol=1e-9)
+        np.testing.assert_allclose(other.linear, one.linear, atol=1e-9)
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+def test_fit_refuses_inputs_that_it_cannot_tell_apart(unit: float) -> None:
+    model, rng = planted(), np.random.default_rng(1)
+    x, a = rng.standard_normal((300, R)), rng.standard_normal((300, N_A))
+    for own, words in (
+        (a * [1.0, 0.0], "the input a2 never moved"),
+        (np.c_[a[:, 0], 3.0 * a[:, 0]], "a1 and a2"),
+        (np.c_[a[:, 0], 0.1 * x[:, 2] + 0.5], "the input a2 always followed from the state"),
+    ):
+        with pytest.raises(NotIdentifiableError, match=words):
+            fit(x, unit * own, model.step(x, own) - x, np.ones(300), [1e-6])
+        fit(x, unit * (own + 1e-3 * a), model.step(x, own) - x, np.ones(300), [1e-6])
 
 
 def test_fit_recovers_a_planted_cubic_system_in_the_leading_modes() -> None:

@@ -67,8 +67,12 @@ def test_truncated_dmdc_is_the_same_at_full_rank() -> None:
     for name in ("A", "B", "U"):
         np.testing.assert_allclose(getattr(truncated, name), getattr(model, name), atol=1e-12)
     # With fewer directions than n_s + n_a it loses the inputs first when they are small.
-    cut = dmdc.truncated_dmdc([(states, 1e-3 * actions)], p=8, n_s=8)
-    assert np.linalg.norm(1e-3 * cut.B) < 1e-3 * np.linalg.norm(model.B)
+    with pytest.raises(ValueError, match=r"p = 8 keeps 0\.\d+ %, 0\.\d+ % of a move of a1 and a2"):
+        dmdc.truncated_dmdc([(states, 1e-3 * actions)], p=8, n_s=8)
+    cut = dmdc.truncated_dmdc([(states, 0.05 * actions)], p=8, n_s=8)
+    assert np.linalg.norm(0.05 * cut.B) < 0.05 * np.linalg.norm(model.B)
+    (remark,) = dmdc.truncation_remarks([(states, 0.05 * actions)], 8)
+    assert "of a move of a1 and a2" in remark
 
 
 def test_same_bits_whatever_the_threads() -> None:

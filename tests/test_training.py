@@ -17,6 +17,7 @@ from tuner_node import checkpoint, training_state
 from tuner_node.batch import BatchResult
 from tuner_node.build import build_training
 from tuner_node.errors import ContradictionError
+from tuner_node.narration import Narration
 
 
 def test_a_seed_has_one_policy_alone_and_beside_others_and_however_episodes_are_cut():
@@ -287,3 +288,27 @@ def test_all_episodes_of_a_run_have_as_many_steps_also_after_a_restart(optimizer
             training.finish(replace(result, steps=frozenset(steps)))
     training.finish(result)
     assert training.phase != "identify"
+
+
+def test_an_exploration_whose_inputs_cannot_be_told_apart_is_refused_whoever_drew_them():
+    """As of a controller of somebody's own, which proposes a law and explores by itself."""
+    values = parameters(optimizer="gauss_newton", rollouts=20)
+    training, pair = build_training(values), LocalPair(values)
+    result = pair.run(training.next_batch())
+    (explored,) = result.trajectories
+
+    def with_actions(actions):
+        own = [replace(explored, actions=actions)]
+        return replace(result, trajectories=own)
+
+    dead, coupled, close = (explored.actions.copy() for _ in range(3))
+    dead[:, 1] = 0.0
+    coupled[:, 1] = -2.0 * coupled[:, 0]
+    close[:, 1] = close[:, 0] + 1e-3 * close[:, 1]
+    for actions, words in ((dead, "a2 never moved"), (coupled, "a1 and a2 always moved together")):
+        with pytest.raises(ValueError, match=words):
+            training.finish(with_actions(actions))
+    remark, *rows = training.finish(with_actions(close))
+    assert remark["event"] == "excitation" and "a1 and a2" in remark["remark"]
+    assert rows[0]["event"] == "designed"
+    assert Narration(0, 1).lines(remark) == [f"  seed 0: {remark['remark']}"]

@@ -63,6 +63,8 @@ class Narration:
             seed = row["seed"] - self._seed
             self._rollouts[seed] = row["rollouts"]
             self._costs[seed] = row.get("cost")
+        elif event == "excitation":
+            lines.append(f"  seed {row['seed']}: {row['remark']}")
         elif event == "repeated":
             lines.append(f"  {row['reason']}")
         return lines

@@ -28,6 +28,7 @@ from loop_interfaces import model_rows
 from loop_interfaces.arrays import Array
 from loop_interfaces.topics import COMPLETED, CostColumn
 from loop_method.adapt import Context, Optimizer, Record, Rollout, Trajectory
+from loop_method.reduce.identifiability import examine_excitation
 from tuner_node import rollouts
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, TrainingSettings, batch_of
 from tuner_node.budget import Budget
@@ -117,13 +118,15 @@ class Training:
         self.plant, self.steps = result.plant, self._same_steps(result)
         if self.phase == "identify":
             assert result.models is not None
+            remarks: list[dict[str, Any]] = []
             if result.trajectories is not None:
                 for m, trajectory in zip(self.pending, result.trajectories, strict=True):
+                    remarks += self._excitation(m, trajectory)
                     self.explorations[m] = trajectory
                 self.target = result.target
             if self.settings.model is not None:  # explored for the optimiser's sake
-                return self._given(result.models)
-            return self._identified(result.models)
+                return remarks + self._given(result.models)
+            return remarks + self._identified(result.models)
         if self.phase == "check":
             return self._checked(result)
         if self.phase == "adapt":
@@ -208,6 +211,17 @@ class Training:
         if self.settings.identification_attempts == 1:
             self._start_adapting()
         return rows
+
+    def _excitation(self, m: int, explored: Trajectory) -> list[dict[str, Any]]:
+        """Rows of what is hardly determined by an exploration, whoever's controller drew its actions.
+
+        NotIdentifiableError if the effects of its inputs cannot be told apart.
+        """
+        steps = len(explored.states) - 1
+        found = examine_excitation((explored.states, explored.actions[:steps]))
+        found.require()
+        seed = self.settings.all_seeds[m]
+        return [{"event": "excitation", "seed": seed, "remark": remark} for remark in found.remarks]
 
     def _given(self, identified: Array) -> list[dict[str, Any]]:
         """The given model instead of the identified ones, if it is one of this plant's size."""

@@ -30,6 +30,8 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from loop_interfaces.arrays import Array
+from loop_method.reduce.channels import NUMBERED, followed_the_state, never_moved
+from loop_method.reduce.identifiability import NotIdentifiableError
 
 __all__ = ["LocalModel", "extended_basis", "fit"]
 
@@ -39,6 +41,8 @@ IndexArray = NDArray[np.int64]
 # move.
 _LINEAR_RIDGE = 1e-5
 _ACTION_RIDGE = 1e-8
+# What is left of the mean square of an input, or of a combination of inputs, beside the state.
+_DETERMINED = 1e-13
 # Samples whose features are in memory at a time.
 _BLOCK = 1024
 
@@ -122,12 +126,17 @@ def fit(
     x (N, r), a (N, n_a), change (N, r): x_k, a_k and x_{k+1} - x_k of any number of trajectories,
     with weights (N,), not negative; ridges: of the quadratic and cubic part per unit weight,
     `numpy.inf` for an affine model; leading: l, coordinates that the cubic part acts on.
+
+    NotIdentifiableError where the effects of some inputs cannot be told apart: a ridge would share them
+    out.
     """
     r, n_a = x.shape[1], a.shape[1]
     share = weights / weights.sum()
     centre: Array = share @ x
     spread = _spread(share, x - centre)
-    action_spread = _spread(share, a)
+    # Inputs have units of their own, so that each is scaled by itself.
+    action_spread = np.sqrt(share @ (a * a))
+    action_spread[action_spread == 0.0] = 1.0
     pairs, triples = _products(r, 2), _products(leading, 3)
     affine = 1 + r + n_a
     bent = affine + len(pairs)
@@ -141,6 +150,7 @@ def fit(
         gram += features @ features.T
         moment += features @ (change[block] * root[block, None])
 
+    _require_determined(gram[:affine, :affine], n_a)
     models = []
     for most in (bent, len(gram)) if len(triples) else (bent,):
         for ridge in ridges:
@@ -166,6 +176,24 @@ def fit(
                 )
             )
     return models
+
+
+def _require_determined(gram: Array, n_a: int) -> None:
+    """NotIdentifiableError where some inputs are an affine function of the state and of each other.
+
+    gram: that of 1, the state and the inputs, which come last and are scaled.
+    """
+    state, mixed, inputs = gram[:-n_a, :-n_a], gram[:-n_a, -n_a:], gram[-n_a:, -n_a:]
+    own = inputs - mixed.T @ linalg.lstsq(state, mixed)[0]
+    squares, directions = linalg.eigh(0.5 * (own + own.T))
+    if squares[0] > _DETERMINED:
+        return
+    lost = np.abs(directions[:, squares <= _DETERMINED]).max(axis=1) > 0.01
+    names = [NUMBERED.input(j) for j in np.flatnonzero(lost).tolist()]
+    still = [
+        name for name, moved in zip(names, np.diag(inputs)[lost] > 0.0, strict=True) if not moved
+    ]
+    raise NotIdentifiableError(never_moved(still, [0.0]) if still else followed_the_state(names))
 
 
 def _features(e: Array, a: Array, root: Array, pairs: IndexArray, triples: IndexArray) -> Array:

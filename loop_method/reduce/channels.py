@@ -112,6 +112,15 @@ def hardly_independent(names: Sequence[str], shares: Sequence[float]) -> str:
     )
 
 
+def cut_off(names: Sequence[str], shares: Sequence[float], p: int) -> str:
+    """Of inputs that a truncation to p directions leaves out; shares: what it keeps of their moves."""
+    kept = ", ".join(f"{100 * share:.2g} %" for share in shares[:SHOWN])
+    return (
+        f"the rank p = {p} keeps {kept} of a move of {listed(names)}, and as little of the effect: "
+        "raise p, or choose units in which the inputs are as large as the states"
+    )
+
+
 def state_faults(states: Array, channels: Channels = NUMBERED) -> list[str]:
     """Which numbers of the state never moved, are multiples of others, or are lost beside them.
 
@@ -145,7 +154,7 @@ def _copies(states: Array, names: Sequence[str]) -> list[str]:
     cosines = unit.T @ unit
     first = np.argmax(np.abs(cosines) > 1.0 - 1e-12, axis=1)
     found = []
-    for i in np.flatnonzero(first != np.arange(len(first))):
+    for i in np.flatnonzero(first != np.arange(len(first))).tolist():
         one = int(first[i])
         largest = int(np.argmax(np.abs(states[:, one])))
         factor = float(states[largest, i] / states[largest, one])

@@ -23,9 +23,14 @@ from numpy.typing import ArrayLike
 from scipy import linalg
 from threadpoolctl import threadpool_limits
 
-from loop_method.reduce.channels import NUMBERED, Channels
-from loop_method.reduce.identifiability import examine_steps
+from loop_interfaces.arrays import Array
+from loop_method.reduce.channels import NUMBERED, Channels, cut_off
+from loop_method.reduce.identifiability import NotIdentifiableError, examine_steps
 from loop_method.reduce.reduced_model import ReducedModel, leading_modes, numerical_rank, steps_of
+
+LOST, SHRUNK = 0.01, 0.1
+"""Shares of a move of an input alone that p directions keep: with less it is refused, or remarked
+upon."""
 
 
 def truncated_dmdc(
@@ -84,7 +89,30 @@ def truncated_dmdc(
                 f"p must be at most the numerical rank of the data, {rank}, but p is {p}; lower p "
                 "or excite more."
             )
+        kept = _kept(psi, data.inputs.shape[1], p)
+        if (lost := np.flatnonzero(kept < LOST)).size:
+            names = [channels.input(j) for j in lost.tolist()]
+            raise NotIdentifiableError(cut_off(names, kept[lost].tolist(), p))
         regression = (basis.T @ data.after.T) @ (lam_t[:p].T / xi[:p])
         return ReducedModel(
             A=regression @ (psi[:n_z, :p].T @ basis), B=regression @ psi[n_z:, :p].T, U=basis
         )
+
+
+def truncation_remarks(
+    trajectories: Sequence[tuple[ArrayLike, ArrayLike]], p: int, channels: Channels = NUMBERED
+) -> list[str]:
+    """Which inputs p directions of [Z; Y] hardly keep, in words."""
+    data = steps_of(trajectories)
+    with threadpool_limits(limits=1):
+        stacked = np.vstack([data.before.T, data.inputs.T])
+        psi, _, _ = linalg.svd(stacked, full_matrices=False)
+    kept = _kept(psi, data.inputs.shape[1], p)
+    shrunk = np.flatnonzero(kept < SHRUNK)
+    names = [channels.input(j) for j in shrunk.tolist()]
+    return [cut_off(names, kept[shrunk].tolist(), p)] if names else []
+
+
+def _kept(psi: Array, n_a: int, p: int) -> Array:
+    """The share of a move of each input alone, in [Z; Y], that the p directions have; in the norm."""
+    return np.asarray(linalg.norm(psi[-n_a:, :p], axis=1))

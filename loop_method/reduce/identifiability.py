@@ -34,7 +34,13 @@ from threadpoolctl import threadpool_limits
 from loop_interfaces.arrays import Array
 from loop_method.reduce import channels as words
 from loop_method.reduce.channels import NUMBERED, Channels, constant, scaled
-from loop_method.reduce.reduced_model import Steps, numerical_rank, repeated, steps_of
+from loop_method.reduce.reduced_model import (
+    Steps,
+    Trajectory,
+    numerical_rank,
+    repeated,
+    steps_of,
+)
 
 DEPENDENT = 1e-5
 """An input of less independence cannot be told apart: a log of six digits holds no more."""
@@ -120,6 +126,17 @@ def examine(
     if suspicious := words.state_faults(data.after, channels):
         remarks.append(f"of the state, {'; '.join(suspicious)}: leave out what is not measured")
     return replace(found, remarks=tuple(remarks))
+
+
+def examine_excitation(trajectory: Trajectory, channels: Channels = NUMBERED) -> Identifiability:
+    """Whether an exploration tells the effects of its inputs apart, whatever the order of the model.
+
+    trajectory : (states (N + 1, n_z), actions (N, n_a))
+    """
+    data = steps_of([trajectory])
+    with threadpool_limits(limits=1):
+        U = linalg.svd(data.after, full_matrices=False)[2][:1].T
+        return examine_steps(data, U, channels)
 
 
 def examine_steps(data: Steps, U: Array, channels: Channels = NUMBERED) -> Identifiability:

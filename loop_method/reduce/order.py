@@ -198,8 +198,9 @@ def _determined(data: Steps, modes: Array) -> int:
     steps, n_a = data.inputs.shape
     columns, _ = scaled(np.hstack([data.inputs, data.before @ modes])[:, :steps])
     heights = np.abs(np.diag(linalg.qr(columns, mode="r")[0]))
-    lost = heights <= steps * np.finfo(np.float64).eps
-    return int(np.argmax(lost) if lost.any() else len(heights)) - n_a
+    lost = np.flatnonzero(heights <= steps * np.finfo(np.float64).eps)
+    most: int = (lost[0] if lost.size else heights.size) - n_a
+    return most
 
 
 def _folds(
