@@ -5,12 +5,13 @@ No symbolic link is followed.
 """
 
 import errno
-import json
 import os
 import stat
 from io import BufferedReader
 from pathlib import Path
 from typing import Any, BinaryIO
+
+from loop_interfaces.documents import parse_json
 
 MAX_JSON_BYTES = 2**27
 """Of a file in JSON; a training's history takes some 200 bytes a rollout."""
@@ -160,18 +161,3 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise FileError(f"{path} holds no JSON object")
     return content
-
-
-def parse_json(text: str | bytes) -> Any:
-    """What a text in JSON says. ValueError if it is none, or has a number of more than 64 bits."""
-    try:
-        return json.loads(text, parse_int=_whole)
-    except RecursionError as error:
-        raise ValueError("it is nested too deeply") from error
-
-
-def _whole(digits: str) -> int:
-    """A whole number that NumPy can hold, and a floating-point number, too."""
-    if len(digits) > 20 or not -(2**63) <= (number := int(digits)) < 2**63:
-        raise ValueError(f"expected whole numbers of at most 64 bits, got {digits[:20]}...")
-    return number

@@ -8,6 +8,7 @@ from typing import Any
 
 from loop_interfaces.parameters import table, with_budget, with_identification
 from loop_interfaces.spec import ParameterError, check, check_names, exponent_hint, read_yaml
+from loop_interfaces.text import shown
 
 
 def config_folder() -> Path:
@@ -63,7 +64,7 @@ def _physical(given: Mapping[str, Any]) -> dict[str, float]:
             value = value.tolist() if hasattr(value, "tolist") else value  # NumPy's
             if isinstance(value, bool) or not isinstance(value, (int, float)):
                 raise ParameterError(
-                    f"parameter '{name}' is {value!r}; expected a number{exponent_hint(value)}"
+                    f"parameter '{name}' is {shown(value)}; expected a number{exponent_hint(value)}"
                 )
             physical[name] = math.inf if abs(value) >= 2**1000 else float(value)
     return physical

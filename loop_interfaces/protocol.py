@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 
+from loop_interfaces.documents import parse_json
 from loop_interfaces.frames import Frame
 from loop_interfaces.text import printable
 from loop_interfaces.topics import Topic
@@ -54,14 +55,14 @@ class ModelFailure:
     def from_json(text: str) -> ModelFailure:
         """Raises ValueError when `text` is not the JSON of a failure."""
         try:
-            fields = json.loads(text[:10_000])
+            fields = parse_json(text[:10_000])
             return ModelFailure(
                 run=int(fields["run"]),
                 episode=int(fields["episode"]),
                 retry=bool(fields["retry"]),
                 reason=_one_line(str(fields["reason"])),
             )
-        except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise ValueError(f"expected the JSON of a model failure, got {text[:80]!r}") from error
 
 

@@ -17,13 +17,13 @@ from typing import Any
 
 import yaml
 
+from loop_interfaces.documents import parse_yaml
 from loop_interfaces.files import FileError, read_bounded
+from loop_interfaces.text import shown
 
 Value = bool | int | float | str | list[str] | list[float]
 MAX_YAML_BYTES = 1_000_000
-MAX_PARAMETERS = 10_000
-_SHOWN = 200
-"""Characters of a wrong value in an error."""
+MAX_PARAMETERS, MAX_NAME = 10_000, 500
 _FILE_NAME = re.compile(r"[^\W_][\w.-]{,99}")
 _EXPONENT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)[eE][+-]?\d+")
 
@@ -111,7 +111,7 @@ class Spec:
         if good is None:
             called = called or f"parameter '{self.name}'"
             raise ParameterError(
-                f"{called} is {_shown(value)}; expected {self.range}"
+                f"{called} is {shown(value)}; expected {self.range}"
                 + (f" ({self.unit})" if self.unit else "")
                 + (exponent_hint(value) if self.type is float else "")
             )
@@ -141,6 +141,8 @@ class Spec:
             return self._coerce_numbers(value)
         if not isinstance(value, self.type) or (self.type is int and isinstance(value, bool)):
             return None
+        if isinstance(value, str) and "\0" in value:  # no name of a file or a class
+            return None
         if isinstance(value, list):
             return value if all(isinstance(item, str) for item in value) else None
         if self.choices:
@@ -168,14 +170,6 @@ class Spec:
         return None if None in found else [float(item) for item in found]
 
 
-def _shown(value: object) -> str:
-    """A value as Python writes it, its beginning if that is long."""
-    if isinstance(value, int) and abs(value) >= 2**1000:  # Python writes no more than 4300 digits
-        return "a number of more than 300 digits"
-    text = repr(value)
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
-
-
 def _plain(number: float) -> str:
     """A bound as people write it: 1000000, not 1e+06."""
     whole = float(number).is_integer() and abs(number) < 1e17
@@ -184,7 +178,7 @@ def _plain(number: float) -> str:
 
 def exponent_hint(value: object) -> str:
     """What to do with a text like '1e12', which YAML 1.1 does not read as a number; else empty."""
-    if isinstance(value, str) and _EXPONENT.fullmatch(value):
+    if isinstance(value, str) and len(value) < 100 and _EXPONENT.fullmatch(value):
         return "; YAML reads a number with an exponent only with point and sign, like 1.0e+12"
     return ""
 
@@ -196,7 +190,7 @@ def check_names(names: Iterable[str], known: Iterable[str]) -> None:
         if name not in known and not name.startswith("physical."):
             close = difflib.get_close_matches(name, known, n=1)
             hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known)}"
-            raise ParameterError(f"unknown parameter '{name}'; {hint}")
+            raise ParameterError(f"unknown parameter {shown(name)}; {hint}")
 
 
 def check(specs: Iterable[Spec], given: Mapping[str, Any]) -> dict[str, Any]:
@@ -229,21 +223,23 @@ def read_document(path: Path) -> Any:
     except FileError as error:
         raise ParameterError(str(error)) from error
     try:
-        return yaml.safe_load(raw)
-    except (yaml.YAMLError, UnicodeDecodeError, ValueError, RecursionError) as error:
-        first = str(error).splitlines()[0]
-        if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
-            first = f"{error.problem or first}, in line {error.problem_mark.line + 1}"
-        raise ParameterError(f"{path} is not valid YAML: {first}") from error
+        return parse_yaml(raw)
+    except ValueError as error:
+        raise ParameterError(f"{path} is not valid YAML: {error}") from error
 
 
 def _flatten(body: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for key, value in body.items():
+        name = f"{prefix}{key}"
+        if len(name) > MAX_NAME:
+            raise ParameterError(
+                f"the name of a parameter has more than {MAX_NAME} characters: {shown(name)}"
+            )
         if isinstance(value, dict):
-            flat.update(_flatten(value, f"{prefix}{key}."))
+            flat.update(_flatten(value, f"{name}."))
         else:
-            flat[f"{prefix}{key}"] = value
+            flat[name] = value
         if len(flat) > MAX_PARAMETERS:
             raise ParameterError(f"more than {MAX_PARAMETERS} parameters in one file")
     return flat

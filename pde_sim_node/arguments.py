@@ -6,6 +6,9 @@ import operator
 
 from pde_sim_node.equations import Equation, LinearEquation
 
+MAX_INTERNAL_STEPS = 10**7
+"""Of one sampling time; more are a mistake in a unit, and would be waited for for ever."""
+
 
 def grid_points(equation: Equation, n_z: int) -> int:
     """Grid points of each component of a state of size n_z."""
@@ -44,6 +47,11 @@ def positive(name: str, value: float) -> float:
 def internal_steps(sample_time: float, integration_time: float) -> int:
     """Internal steps of a sampling time; by rounding, as 0.01 // 0.00001 is 999."""
     ratio = sample_time / integration_time
+    if not ratio <= MAX_INTERNAL_STEPS:
+        raise ValueError(
+            f"sample_time must be at most {MAX_INTERNAL_STEPS} times integration_time, got "
+            f"{sample_time!r} and {integration_time!r}"
+        )
     steps = round(ratio)
     if steps < 1 or abs(ratio - steps) > 1e-9 * ratio:
         near = max(steps, 1)

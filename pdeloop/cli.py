@@ -64,7 +64,7 @@ def _run(
     except (ValueError, RuntimeError) as error:
         # RunFolderError, FileError, ParameterError, DomainError, NodeError and the plant's
         # and controller's refusals.
-        return _failed(str(error))
+        return _failed(_sentence(error))
     except ModuleNotFoundError as error:
         needed = what_to_install(error)
         return _crashed() if needed is None else _failed(needed)
@@ -83,6 +83,17 @@ def _run(
         return _failed(f"{error.strerror or error}{where}")
     except Exception:
         return _crashed()
+
+
+def _sentence(error: Exception) -> str:
+    """The text of an error; one of linear algebra names a routine's argument, and not the cause."""
+    if type(error).__name__ != "LinAlgError":  # of NumPy, which not every command imports
+        return str(error)
+    return (
+        "the numbers given determine no result, as a matrix that is made of them is singular: check "
+        "the data for states or actions that are constant, equal or out of all proportion, and the "
+        "weights for extreme ones"
+    )
 
 
 def _failed(text: str) -> int:

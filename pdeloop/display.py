@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any, TextIO
 
 from rich.console import Console
 
+from loop_interfaces.documents import parse_json
 from pdeloop.output import complain, drop_unwritable
 from pdeloop.progress import Progress
 from tuner_node.narration import Narration
@@ -101,6 +101,6 @@ class ProgressFile:
         found = []
         for line in lines:
             with contextlib.suppress(ValueError):  # torn by a disk that was full
-                row = json.loads(line)
+                row = parse_json(line)
                 found += [row] if isinstance(row, dict) else []
         return found

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
+from loop_interfaces.documents import parse_json
 from loop_interfaces.files import FileError, is_private, open_new, open_ordinary, private_folder
 from pdeloop.domain import DOMAINS_FOLDER
 
@@ -90,6 +91,6 @@ def _read(path: Path) -> list[Live]:
         if not is_locked(file):
             path.unlink(missing_ok=True)  # of a process that was killed
             return []
-        content = json.loads(file.read(_MAX_TEXT))
+        content = parse_json(file.read(_MAX_TEXT))
     folder, started = Path(content["folder"]), float(content["started"])
     return [Live(int(content["domain"]), folder, started, bool(content["network"]))]

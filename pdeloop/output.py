@@ -13,6 +13,9 @@ from typing import Any
 
 from loop_interfaces.text import printable
 
+LONGEST = 4000
+"""Characters of a complaint; a longer one repeats what a file says."""
+
 
 def print_json(value: Any) -> None:
     """One line of JSON. A number that JSON has no word for is null."""
@@ -21,8 +24,9 @@ def print_json(value: Any) -> None:
 
 def complain(text: str) -> None:
     """One line on stderr, where it can be written; a terminal does not obey what a file says."""
+    told = text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
     with contextlib.suppress(OSError):
-        print(f"pdeloop: {printable(text)}", file=sys.stderr)
+        print(f"pdeloop: {printable(told)}", file=sys.stderr)
 
 
 def drop_unwritable() -> None:

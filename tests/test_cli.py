@@ -274,7 +274,10 @@ def test_a_file_that_expands_without_end_is_refused(tmp_path, capsys):
     ]
     text = "/**:\n  ros__parameters:\n" + "".join(f"    {line}\n" for line in levels)
     (tmp_path / "bomb.yaml").write_text(text)
-    assert "more than 10000 parameters" in error_of(capsys, "train", str(tmp_path / "bomb.yaml"))
+    assert "repeats 'a0' by an alias" in error_of(capsys, "train", str(tmp_path / "bomb.yaml"))
+    text = "/**:\n  ros__parameters:\n" + "".join(f"    a{i}: 1\n" for i in range(10_001))
+    (tmp_path / "many.yaml").write_text(text)
+    assert "more than 10000 parameters" in error_of(capsys, "train", str(tmp_path / "many.yaml"))
 
 
 @pytest.mark.parametrize(

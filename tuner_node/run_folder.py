@@ -42,6 +42,7 @@ from loop_interfaces.parameters import (
     table,
 )
 from loop_interfaces.spec import ParameterError, read_yaml, yaml_text
+from loop_interfaces.text import shown
 from tuner_node.results import check_result, policy_arrays, summarise, versions
 from tuner_node.training import Training
 
@@ -59,6 +60,9 @@ TRANSIENT = (
     *(spec.name for spec in (*PLANT, *EXECUTION, *RECORDER, *VIEWER)),
 )
 """Parameters that change how a training is carried out, not what comes out of it."""
+
+SHOWN = 20
+"""Parameters that differ and are named; the others are only counted."""
 
 
 class RunFolderError(ValueError):
@@ -186,13 +190,15 @@ class RunFolder:
         known = as_recorded(known)
         there = {name: known.get(name, defaults.get(name)) for name in {*known, *now}}
         changes = [
-            f"{name}: {there[name]!r} there, {now.get(name)!r} now"
+            f"{shown(name)[1:-1]}: {shown(there[name])} there, {shown(now.get(name))} now"
             for name in sorted(set(there) - set(TRANSIENT))
             if there[name] != now.get(name)
         ]
         if changes:
+            more = f"; and {len(changes) - SHOWN} more" if len(changes) > SHOWN else ""
             raise RunFolderError(
-                f"the run in {self.path} has other parameters ({'; '.join(changes)}); "
+                f"the run in {self.path} has other parameters "
+                f"({'; '.join(changes[:SHOWN])}{more}); "
                 "continue it with its own, or start a new run in another folder"
             )
 

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from loop_interfaces import model_rows
 from loop_interfaces.array_files import taken
-from loop_interfaces.files import parse_json
+from loop_interfaces.documents import parse_json
+from loop_interfaces.text import shown
 from loop_method.adapt.trajectories import (
     record_arrays,
     taken_record,
@@ -103,7 +104,7 @@ def _check(training: Training) -> None:
     """A ValueError unless this is a state that a training can be in."""
     phase, pending, settings = training.phase, training.pending, training.settings
     if phase not in PHASES:
-        raise ValueError(f"its phase is {phase!r}; expected one of {', '.join(PHASES)}")
+        raise ValueError(f"its phase is {shown(phase)}; expected one of {', '.join(PHASES)}")
     if not set(pending) <= set(range(settings.seeds)) or min(training.attempts) < 0:
         raise ValueError("its seeds or attempts are out of range")
     check_history(training.history, settings.seed, settings.seeds)

@@ -22,6 +22,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.text import shown
 from pde_sim_node.supports import indicator_supports
 
 Field = NDArray[np.float64]
@@ -102,17 +103,19 @@ class Equation(ABC):
             low = item.metadata.get("minimum", -math.inf)
             high = item.metadata.get("maximum", math.inf)
             if isinstance(value, bool) or not isinstance(value, int | float | np.number):
-                raise ValueError(f"{item.name} of {self.name} must be a number, got {value!r}")
+                raise ValueError(f"{item.name} of {self.name} must be a number, got {shown(value)}")
             if not (low <= value <= high and math.isfinite(value)):
                 raise ValueError(
-                    f"{item.name} of {self.name} must lie between {low:g} and {high:g}, got {value!r}"
+                    f"{item.name} of {self.name} must lie between {low:g} and {high:g}, "
+                    f"got {shown(value)}"
                 )
             values[item.name] = float(value)
         for lower, value in values.items():
             upper = lower.removesuffix("_min") + "_max"
             if lower.endswith("_min") and upper in values and value > values[upper]:
                 raise ValueError(
-                    f"{lower} of {self.name} must not exceed {upper}, got {value!r} > {values[upper]!r}"
+                    f"{lower} of {self.name} must not exceed {upper}, got {shown(value)} > "
+                    f"{values[upper]!r}"
                 )
 
     @abstractmethod

@@ -19,6 +19,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from loop_interfaces.text import shown
 from pde_sim_node.equations.base import Equation
 from pde_sim_node.equations.registry import EQUATIONS
 
@@ -43,9 +44,9 @@ def configured_equation(name: str, environment: Mapping[str, str] = os.environ) 
     if ":" in name and identity(name) not in allowed:
         quoted = shlex.quote(name)
         raise ValueError(
-            f"the equation {name!r} is code, which is not run because a file names it; if you trust "
-            f"it, name it yourself: --equation {quoted}, or for nodes and workers {ALLOWED}={quoted} "
-            "in the environment"
+            f"the equation {shown(name)} is code, which is not run because a file names it; if you "
+            f"trust it, name it yourself: --equation {quoted}, or for nodes and workers "
+            f"{ALLOWED}={quoted} in the environment"
         )
     return load_equation(name)
 
@@ -87,7 +88,7 @@ def load_equation(name: str) -> type[Equation]:
     module = load_file(Path(source)) if source.endswith(".py") else load_module(source)
     found = getattr(module, class_name, None)
     if found is None:
-        raise ValueError(f"equation {name!r}: there is no {class_name!r} in {source}")
+        raise ValueError(f"equation {shown(name)}: there is no {shown(class_name)} in {source}")
     return complete(name, class_name, found)
 
 
@@ -100,30 +101,35 @@ def load_entry_point(name: str) -> Any:
     if not found:
         known = ", ".join([*EQUATIONS, *sorted(set(offered) - set(EQUATIONS))])
         raise ValueError(
-            f"unknown equation {name!r}: give one of {known}, "
+            f"unknown equation {shown(name)}: give one of {known}, "
             "or 'package.module:ClassName', or 'path/to/file.py:ClassName'"
         )
     if len(found) > 1:
         raise ValueError(
-            f"equation {name!r} is offered by several installed packages ({', '.join(found)}): "
+            f"equation {shown(name)} is offered by several installed packages ({', '.join(found)}): "
             "remove one, or give 'package.module:ClassName'"
         )
     (entry,) = found.values()
     try:
         return entry.load()
     except Exception as error:
-        raise ValueError(f"equation {name!r}: {entry.value} cannot be loaded: {error}") from error
+        raise ValueError(
+            f"equation {shown(name)}: {entry.value} cannot be loaded: {error}"
+        ) from error
 
 
 def complete(name: str, class_name: str, found: Any) -> type[Equation]:
     """What was found, if it is a whole equation."""
     if not (isinstance(found, type) and issubclass(found, Equation)):
-        raise ValueError(f"equation {name!r}: {class_name} must be a subclass of Equation")
+        raise ValueError(f"equation {shown(name)}: {class_name} must be a subclass of Equation")
     if missing := sorted(found.__abstractmethods__):
-        raise ValueError(f"equation {name!r}: {class_name} does not define {', '.join(missing)}")
+        raise ValueError(
+            f"equation {shown(name)}: {class_name} does not define {', '.join(missing)}"
+        )
     if missing := [item for item in ("name", "order") if not hasattr(found, item)]:
         raise ValueError(
-            f"equation {name!r}: {class_name} does not set the class attribute {', '.join(missing)}"
+            f"equation {shown(name)}: {class_name} does not set the class attribute "
+            f"{', '.join(missing)}"
         )
     return found
 
@@ -133,13 +139,15 @@ def load_module(dotted: str) -> ModuleType:
     try:
         return importlib.import_module(dotted)
     except Exception as error:
-        raise ValueError(f"the equation module {dotted!r} cannot be imported: {error}") from error
+        raise ValueError(
+            f"the equation module {shown(dotted)} cannot be imported: {error}"
+        ) from error
 
 
 def load_file(path: Path) -> ModuleType:
     """Execute a file as a module, once for each content: an edited file is a new module."""
     if not path.is_file():
-        raise ValueError(f"the equation file {str(path)!r} does not exist")
+        raise ValueError(f"the equation file {shown(str(path))} does not exist")
     path, source = path.resolve(), path.read_bytes()
     # Numba keys its cache by the module's name: a name made of path and content is the same in the
     # next process, and another one after an edit.
@@ -153,7 +161,9 @@ def load_file(path: Path) -> ModuleType:
         exec(compile(source, path, "exec"), vars(module))
     except Exception as error:
         del sys.modules[module.__name__]
-        raise ValueError(f"the equation file {str(path)!r} cannot be executed: {error}") from error
+        raise ValueError(
+            f"the equation file {shown(str(path))} cannot be executed: {error}"
+        ) from error
     for kind in vars(module).values():
         own = isinstance(kind, type) and issubclass(kind, Equation)
         if own and kind.__module__ == module.__name__:

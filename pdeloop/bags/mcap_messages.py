@@ -30,6 +30,7 @@ from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from loop_interfaces.files import FileError, open_ordinary, read_bounded
+from loop_interfaces.text import shown
 from recorder_node.bag import METADATA, BagError
 
 RATIO, SLACK = 100, 64 * 2**20
@@ -163,7 +164,7 @@ def _decompressed(chunk: Chunk) -> Chunk:
             data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
         elif chunk.compression:
             raise ValueError(
-                f"chunks compressed by {chunk.compression!r}; expected zstd, lz4 or none"
+                f"chunks compressed by {shown(chunk.compression)}; expected zstd, lz4 or none"
             )
     except (zstandard.ZstdError, RuntimeError, EOFError) as error:
         raise ValueError(str(error)) from error

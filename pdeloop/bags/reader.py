@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from loop_interfaces.arrays import Array
-from loop_interfaces.files import parse_json
+from loop_interfaces.documents import parse_json
 from loop_interfaces.topics import TARGET
 from pdeloop.bags.episodes import EpisodeIndex, RecordedEpisode
 from pdeloop.bags.mcap_messages import Message, files, finished, read, text_of

@@ -11,11 +11,14 @@ from typing import Any
 
 from loop_interfaces.problem import find_problem
 from loop_interfaces.spec import read_yaml
+from loop_interfaces.text import shown
 from pdeloop.training_run import resolve
 from tuner_node.build import build_training
 
 MAX_SEEDS = 1_000_000
 """Of a study that gives their number."""
+MAX_PATH = 1000
+"""Characters of a problem's name or file."""
 _NAME = re.compile(r"[\w.+-]{1,60}")
 
 
@@ -46,7 +49,7 @@ class Study:
         (0, 1)
         """
         if not isinstance(content, dict):
-            raise StudyError(f"the study is {content!r}; expected a table with 'problems'")
+            raise StudyError(f"the study is {shown(content)}; expected a table with 'problems'")
         if "/**" in content:
             raise StudyError(
                 "this is a problem's file; expected a study's, which lists it in 'problems'"
@@ -54,32 +57,43 @@ class Study:
         entries = ("problems", "seeds", "variants", "settings", "curves")
         unknown = sorted(set(map(str, content)) - {*entries})
         if unknown:
-            raise StudyError(
-                f"unknown entries: {', '.join(unknown)}; expected {', '.join(entries)}"
-            )
+            some = ", ".join(name[:60] for name in unknown[:10])
+            raise StudyError(f"unknown entries: {some}; expected {', '.join(entries)}")
         problems, seeds = content.get("problems"), content.get("seeds", 1)
         if not isinstance(problems, list) or not problems:
-            raise StudyError(f"'problems' is {problems!r}; expected a list of names or YAML files")
+            raise StudyError(
+                f"'problems' is {shown(problems)}; expected a list of names or YAML files"
+            )
+        for word in problems:
+            if not isinstance(word, str) or not 0 < len(word) <= MAX_PATH:
+                raise StudyError(
+                    f"'problems' holds {shown(word)}; expected names or YAML files, texts of at most "
+                    f"{MAX_PATH} characters"
+                )
         if type(seeds) is int and 0 < seeds <= MAX_SEEDS:
             seeds = range(seeds)
         elif not isinstance(seeds, list) or not seeds or any(type(s) is not int for s in seeds):
             raise StudyError(
-                f"'seeds' is {seeds!r}; expected how many, at most {MAX_SEEDS}, or a list of them"
+                f"'seeds' is {shown(seeds)}; expected how many, at most {MAX_SEEDS}, or a list of them"
             )
         variants, settings = content.get("variants", {"default": {}}), content.get("settings", {})
         curves = content.get("curves", False)
         if type(curves) is not bool:
-            raise StudyError(f"'curves' is {curves!r}; expected true or false")
+            raise StudyError(f"'curves' is {shown(curves)}; expected true or false")
         for name, table in (("variants", variants), ("settings", settings)):
             if not isinstance(table, dict):
-                raise StudyError(f"'{name}' is {table!r}; expected a table")
+                raise StudyError(f"'{name}' is {shown(table)}; expected a table")
         if not variants:
             raise StudyError("'variants' is empty; expected one or more, such as: default: {}")
         for name, table in variants.items():
             if not isinstance(name, str) or not _NAME.fullmatch(name):
-                raise StudyError(f"variant {name!r}; expected a name of letters, digits, . + - _")
+                raise StudyError(
+                    f"variant {shown(name)}; expected a name of letters, digits, . + - _"
+                )
             if not isinstance(table, dict):
-                raise StudyError(f"variant '{name}' is {table!r}; expected a table of parameters")
+                raise StudyError(
+                    f"variant '{name}' is {shown(table)}; expected a table of parameters"
+                )
         if any(
             own in table for table in (settings, *variants.values()) for own in ("seed", "seeds")
         ):
@@ -89,8 +103,8 @@ class Study:
             )
         files = {}
         for word in problems:
-            beside = folder / str(word)
-            file = str(beside.resolve()) if beside.is_file() else str(word)
+            beside = folder / word
+            file = str(beside.resolve()) if beside.is_file() else word
             name = str(read_yaml(find_problem(file)).get("problem", Path(file).stem))
             if not _NAME.fullmatch(name) or name in files:
                 raise StudyError(f"problem '{name}' of {file}; expected names that differ")

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import socket
 import threading
 import time
@@ -26,6 +25,7 @@ from pathlib import Path
 from aiohttp import WSMsgType, web
 
 from loop_interfaces.controllers import CONTROLLERS
+from loop_interfaces.documents import parse_json
 from viewer_node.operation import VERBS
 from viewer_node.web.page import Page
 
@@ -175,8 +175,8 @@ class Server:
     def take(self, text: str) -> str:
         """Do what a page asks for; why not, if it cannot be done."""
         try:
-            wanted = json.loads(text)
-        except (ValueError, RecursionError):
+            wanted = parse_json(text)
+        except ValueError:
             wanted = None
         match wanted:
             case {"node": node, "verb": verb}:
