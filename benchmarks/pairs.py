@@ -124,7 +124,7 @@ def _pair(
         return running.start(
             package,
             *parameters,
-            problem=None if package == "tests.relay" else str(problem),
+            problem=None if package == "tests.support.relay" else str(problem),
             namespace=namespace,
             prefix=on(host),
             environment=environment(),
@@ -137,7 +137,7 @@ def _pair(
         start("controller_node", "action:=action_sent"),
     ]
     if faults:
-        start("tests.relay", "", *faults, f"seed:={seed}")
+        start("tests.support.relay", "", *faults, f"seed:={seed}")
     return nodes
 
 

@@ -26,7 +26,7 @@ no message stays in the mailbox.
 
 The lock is a POSIX mutex: locking acquires, unlocking releases, on every architecture. What both
 threads touch is touched under it, but for the store with which `disarm` begins: it orders nothing,
-and sees to it that the node's thread waits for one answer only. `tests/test_channel_model.py`
+and sees to it that the node's thread waits for one answer only. `tests/fast_path/test_channel_model.py`
 explores all interleavings.
 
 The mailbox is bounded. What it cannot hold is dropped and counted; lock-step sends it again.

@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 from pdeloop.training_run import resolve
-from tests.colcon_workspace import Workspace, build
-from tests.loop_harness import Processes, processes
-from tests.made_once import made_once
-from tests.small import RECORDED, REPRODUCED, SMALL
+from tests.support.colcon_workspace import Workspace, build
+from tests.support.loop_harness import Processes, processes
+from tests.support.made_once import made_once
+from tests.support.small import RECORDED, REPRODUCED, SMALL
 
 # Hundreds of processes import the same modules; each would compile them again.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)

@@ -28,7 +28,7 @@ import numpy as np
 
 from pdeloop.in_process import LocalPair, train
 from pdeloop.training_run import resolve
-from tests.relay.train import FAULTS
+from tests.support.relay.train import FAULTS
 from tuner_node.build import build_training
 
 NODES = ("pde_sim_node", "controller_node", "tuner_node", "relay")
@@ -157,7 +157,7 @@ class _Training:
         return same and costs.transpose(1, 0, 2).tobytes() == quiet.evaluation.tobytes()
 
     def _start(self, *arguments: str) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", "tests.relay.train", *arguments]
+        command = [sys.executable, "-m", "tests.support.relay.train", *arguments]
         with self._log.open("ab") as log:
             return subprocess.Popen(
                 command,

@@ -12,7 +12,7 @@ from functools import cache
 from tests.simulation.history import History
 from tests.simulation.plan import Plan, draw
 from tests.simulation.processes import remembering, values
-from tests.small import same_bits, train_here
+from tests.support.small import same_bits, train_here
 from tuner_node.errors import DispatchError
 from tuner_node.training import Training
 

@@ -37,7 +37,7 @@ from pde_sim_node import build as plant_build
 from pde_sim_node.lockstep import Lockstep, Timing
 from pde_sim_node.plant import Plant
 from tests.simulation.disk import Disk
-from tests.small import parameters
+from tests.support.small import parameters
 from tuner_node import training_state
 from tuner_node.build import build_dispatcher, build_training
 from tuner_node.run_folder import RunIdentity

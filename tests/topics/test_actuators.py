@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from pdeloop.bags.verify import verify
-from tests.loop_harness import Processes
-from tests.small import SMALL, parameters, train_here
-from tests.small_loop import LIMIT, assert_same_training, start_tuner
+from tests.support.loop_harness import Processes
+from tests.support.small import SMALL, parameters, train_here
+from tests.support.small_loop import LIMIT, assert_same_training, start_tuner
 
 pytestmark = pytest.mark.topics
 POSITIONS = [0.05, 0.2, 0.45, 0.9]

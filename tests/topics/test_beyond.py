@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from pdeloop.bags.verify import verify
-from tests.loop_harness import Processes, until
-from tests.small import SMALL, parameters, train_here
-from tests.small_loop import LIMIT, PARAMETERS, adapted, assert_same_training, start_tuner
+from tests.support.loop_harness import Processes, until
+from tests.support.small import SMALL, parameters, train_here
+from tests.support.small_loop import LIMIT, PARAMETERS, adapted, assert_same_training, start_tuner
 
 pytestmark = pytest.mark.topics
 INSTRUMENTS: dict[str, Any] = {
@@ -30,7 +30,7 @@ def test_a_faulty_line_and_killed_nodes_change_no_noise(loop: Processes, tmp_pat
     lines = {"pde_sim_node": "state:=state_sent", "controller_node": "action:=action_sent"}
     running = {name: loop.node(name, *start, "-r", line) for name, line in lines.items()}
     line = ("-p", "loss:=0.002", "-p", "duplicate:=0.2", "-p", "delay:=0.002")
-    loop.start("-m", "tests.relay.node", "--ros-args", *line, name="relay")
+    loop.start("-m", "tests.support.relay.node", "--ros-args", *line, name="relay")
     options = {"rollouts": 27, "optimizer": "gauss_newton"}
     tuner = start_tuner(loop, out, *WORDS, **options, max_attempts=50)
     for count, victim in ((3, "controller_node"), (6, "pde_sim_node")):

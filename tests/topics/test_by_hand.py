@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.loop_harness import ROOT, Processes
+from tests.support.loop_harness import ROOT, Processes
 
 pytestmark = pytest.mark.topics
 LIMIT = 180.0

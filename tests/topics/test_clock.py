@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.loop_harness import Processes, until
-from tests.operator_harness import SLOW, full_speed, operator
-from tests.small_loop import (
+from tests.support.loop_harness import Processes, until
+from tests.support.operator_harness import SLOW, full_speed, operator
+from tests.support.small_loop import (
     LIMIT,
     adapted,
     assert_same_training,
@@ -28,7 +28,7 @@ STUCK = """
 import rclpy
 from loop_interfaces.ros import node_loop
 from loop_interfaces.topics import ACTION, STATE
-from tests.test_fast_path import Controller
+from tests.fast_path.test_fast_path import Controller
 node_loop.HOUSEKEEPING = node_loop.WAIT = 600.0  # as long as a wait until a moment that was set back
 rclpy.init()
 loop = node_loop.NodeLoop(rclpy.create_node("stuck"))

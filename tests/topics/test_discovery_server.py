@@ -11,8 +11,8 @@ import pytest
 from benchmarks.participants import server_command
 from benchmarks.processes import BenchError
 from pdeloop.pairs import PAIR, namespaces
-from tests.loop_harness import Processes, udp_sockets, until
-from tests.small_loop import (
+from tests.support.loop_harness import Processes, udp_sockets, until
+from tests.support.small_loop import (
     LIMIT,
     PARAMETERS,
     adapted,

@@ -22,8 +22,8 @@ from loop_method.seeds import Purpose, derive
 from pde_sim_node.build import build_plant
 from pde_sim_node.equations import ALLOWED, Equation, load_equation
 from pdeloop.cli import main
-from tests.loop_harness import ROOT, Processes, until
-from tests.small_loop import LIMIT
+from tests.support.loop_harness import ROOT, Processes, until
+from tests.support.small_loop import LIMIT
 from tests.topics.test_foreign import INTERFACES, code_block, documented_command
 
 pytestmark = pytest.mark.topics
@@ -120,7 +120,7 @@ def test_a_pde_of_ones_own_trains_from_its_file(
 
 
 def test_a_pde_of_ones_own_is_offered_by_its_package() -> None:
-    """As the page says; what an entry point leads to is in tests/test_equations.py."""
+    """As the page says; what an entry point leads to is in tests/plant/test_equations.py."""
     project = tomllib.loads((EXAMPLES / "swift_hohenberg" / "pyproject.toml").read_text())
     ((name, value),) = project["project"]["entry-points"]["pdeloop.equations"].items()
     assert f'[project.entry-points."pdeloop.equations"]\n{name} = "{value}"' in PAGE

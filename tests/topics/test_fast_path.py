@@ -10,14 +10,20 @@ from pathlib import Path
 
 import pytest
 
-from tests.loop_harness import Processes
-from tests.small_loop import LIMIT, PARAMETERS, assert_same_training, in_process, start_tuner
+from tests.support.loop_harness import Processes
+from tests.support.small_loop import (
+    LIMIT,
+    PARAMETERS,
+    assert_same_training,
+    in_process,
+    start_tuner,
+)
 
 pytestmark = pytest.mark.topics
 
 
 def test_plant_and_controller_answer_with_the_bytes_of_the_ordinary_path(loop: Processes) -> None:
-    text = loop.wait(loop.start("-m", "tests.fast_path_program", name="fast_path"), LIMIT)
+    text = loop.wait(loop.start("-m", "tests.support.fast_path_program", name="fast_path"), LIMIT)
     assert text.splitlines()[-1] == "done"  # the first to compile says so before
 
 

@@ -18,11 +18,11 @@ import pytest
 from pde_sim_node.build import fingerprint
 from pdeloop.cli import main
 from pdeloop.in_process import LocalPair
-from tests.loop_harness import until
-from tests.operator_harness import SLOW, full_speed, held_training, operator
-from tests.small import SMALL, parameters
-from tests.small_disk import small_disk
-from tests.small_loop import (
+from tests.support.loop_harness import until
+from tests.support.operator_harness import SLOW, full_speed, held_training, operator
+from tests.support.small import SMALL, parameters
+from tests.support.small_disk import small_disk
+from tests.support.small_loop import (
     LIMIT,
     PARAMETERS,
     adapted,
@@ -41,7 +41,7 @@ def test_lost_repeated_delayed_and_reordered_messages_change_nothing(loop, tmp_p
     loop.node("pde_sim_node", *PARAMETERS, "-r", "state:=state_sent", "-p", "action_timeout:=0.02")
     loop.node("controller_node", *PARAMETERS, "-r", "action:=action_sent")
     arguments = [word for name, value in faults.items() for word in ("-p", f"{name}:={value}")]
-    relay = loop.start("-m", "tests.relay.node", "--ros-args", *arguments, name="relay")
+    relay = loop.start("-m", "tests.support.relay.node", "--ros-args", *arguments, name="relay")
     tuner = start_tuner(loop, tmp_path / "run", iterations=8)
     loop.wait(tuner, LIMIT)
     assert_same_training(tmp_path / "run", in_process(iterations=8))

@@ -13,8 +13,8 @@ from scipy.linalg import solve_discrete_are
 
 from loop_interfaces.model_rows import unpack
 from loop_method.seeds import Purpose, derive
-from tests.loop_harness import ROOT, Processes
-from tests.small_loop import LIMIT
+from tests.support.loop_harness import ROOT, Processes
+from tests.support.small_loop import LIMIT
 
 pytestmark = pytest.mark.topics
 INTERFACES = (ROOT / "docs" / "interfaces.md").read_text()

@@ -8,9 +8,9 @@ import time
 
 import pytest
 
-from tests.loop_harness import Processes, until
-from tests.operator_harness import operator
-from tests.small_loop import (
+from tests.support.loop_harness import Processes, until
+from tests.support.operator_harness import operator
+from tests.support.small_loop import (
     LIMIT,
     PARAMETERS,
     adapted,

@@ -20,8 +20,8 @@ from loop_interfaces.isolation import (
 )
 from loop_interfaces.problem import config_folder
 from pdeloop.domain import DomainError, own_domain
-from tests.loop_harness import ROOT, Processes, udp_sockets, until
-from tests.small_loop import LIMIT
+from tests.support.loop_harness import ROOT, Processes, udp_sockets, until
+from tests.support.small_loop import LIMIT
 
 pytestmark = pytest.mark.topics
 

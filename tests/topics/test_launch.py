@@ -2,7 +2,7 @@
 """The package as colcon installs it, started by its launch files, over real topics.
 
 ROS's own `launch` and `launch_ros` read them where an installation of ROS is. They are not on PyPI:
-elsewhere a stand-in does (tests/launch_stand_in).
+elsewhere a stand-in does (tests/support/launch_stand_in).
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from pathlib import Path
 
 import pytest
 
-from tests.colcon_workspace import ROOT, Workspace
-from tests.loop_harness import Processes, until
-from tests.small import SMALL
-from tests.small_loop import adapted, assert_same_training, in_process
+from tests.support.colcon_workspace import ROOT, Workspace
+from tests.support.loop_harness import Processes, until
+from tests.support.small import SMALL
+from tests.support.small_loop import adapted, assert_same_training, in_process
 
 LIMIT = 240.0
 """Seconds: a launch is seven processes that start at once, on a machine that has other things to do."""
 LAUNCH = importlib.util.find_spec("launch_ros") is not None
-STAND_IN = ROOT / "tests" / "launch_stand_in"
+STAND_IN = ROOT / "tests" / "support" / "launch_stand_in"
 pytestmark = pytest.mark.topics
 
 RUN = """

@@ -16,9 +16,9 @@ import pytest
 
 from loop_interfaces.protocol import NO_CONTROLLER
 from loop_interfaces.topics import MAX_GAIN
-from tests.loop_harness import Processes, until
-from tests.small import SMALL, parameters, train_here
-from tests.small_loop import (
+from tests.support.loop_harness import Processes, until
+from tests.support.small import SMALL, parameters, train_here
+from tests.support.small_loop import (
     LIMIT,
     PARAMETERS,
     adapted,

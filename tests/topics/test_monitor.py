@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 
-from tests.browser import Browser, browser
-from tests.loop_harness import Processes, until, without_domain
-from tests.small import SMALL, paced
+from tests.support.browser import Browser, browser
+from tests.support.loop_harness import Processes, until, without_domain
+from tests.support.small import SMALL, paced
 
 pytestmark = pytest.mark.topics
 LIMIT = 180.0

@@ -8,10 +8,10 @@ import signal
 import pytest
 
 from loop_interfaces.protocol import STOPPED
-from tests.loop_harness import Processes, until
-from tests.operator_harness import SLOW, full_speed, operator
-from tests.small import SMALL
-from tests.small_loop import (
+from tests.support.loop_harness import Processes, until
+from tests.support.operator_harness import SLOW, full_speed, operator
+from tests.support.small import SMALL
+from tests.support.small_loop import (
     LIMIT,
     PARAMETERS,
     adapted,

@@ -15,10 +15,10 @@ from benchmarks.hosts import can_make_hosts, hosts
 from benchmarks.processes import bench
 from pdeloop.in_process import LocalPair, train
 from pdeloop.training_run import resolve
-from tests.interpreter import helps_solver
-from tests.loop_harness import Processes, until
-from tests.small import SMALL, parameters, train_here
-from tests.small_loop import LIMIT, adapted, assert_same_training
+from tests.support.interpreter import helps_solver
+from tests.support.loop_harness import Processes, until
+from tests.support.small import SMALL, parameters, train_here
+from tests.support.small_loop import LIMIT, adapted, assert_same_training
 from tuner_node.build import build_training
 
 pytestmark = pytest.mark.topics

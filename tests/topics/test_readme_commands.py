@@ -9,7 +9,7 @@ import re
 import numpy as np
 import pytest
 
-from tests.loop_harness import Processes
+from tests.support.loop_harness import Processes
 
 pytestmark = pytest.mark.topics
 LIMIT = 240.0

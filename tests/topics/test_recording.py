@@ -22,11 +22,11 @@ from pdeloop.bags.reader import Bag
 from pdeloop.bags.verify import verify
 from pdeloop.identification import identify_bag
 from recorder_node.bag import BagWriter, Channel
-from tests.loop_harness import Processes, until
-from tests.operator_harness import operator
-from tests.small import RECORDED, SMALL, paced, same_bits
-from tests.small_disk import read_only_folder, small_disk
-from tests.small_loop import (
+from tests.support.loop_harness import Processes, until
+from tests.support.operator_harness import operator
+from tests.support.small import RECORDED, SMALL, paced, same_bits
+from tests.support.small_disk import read_only_folder, small_disk
+from tests.support.small_loop import (
     LIMIT,
     adapted,
     assert_same_training,

@@ -9,8 +9,8 @@ import xml.etree.ElementTree as ET
 import pytest
 
 from loop_interfaces.problem import config_folder
-from tests.loop_harness import Processes
-from tests.small_loop import LIMIT
+from tests.support.loop_harness import Processes
+from tests.support.small_loop import LIMIT
 
 pytestmark = pytest.mark.topics
 

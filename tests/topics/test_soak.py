@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.small import SMALL
 from tests.soak import soak, text
+from tests.support.small import SMALL
 
 pytestmark = pytest.mark.topics
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import pytest
 
-from tests.loop_harness import Processes, until
-from tests.small import parameters, train_here
-from tests.small_loop import LIMIT, assert_same_training, start_pair, start_tuner
+from tests.support.loop_harness import Processes, until
+from tests.support.small import parameters, train_here
+from tests.support.small_loop import LIMIT, assert_same_training, start_pair, start_tuner
 
 pytestmark = pytest.mark.topics
 ROLLOUTS = 27

@@ -10,10 +10,10 @@ import signal
 import pytest
 
 from loop_interfaces.topics import VIEW_NUMBERS
-from tests.loop_harness import Processes, until
-from tests.operator_harness import operator
-from tests.small import paced
-from tests.small_loop import (
+from tests.support.loop_harness import Processes, until
+from tests.support.operator_harness import operator
+from tests.support.small import paced
+from tests.support.small_loop import (
     LIMIT,
     PARAMETERS,
     adapted,
@@ -22,7 +22,7 @@ from tests.small_loop import (
     start_pair,
     start_tuner,
 )
-from tests.test_layouts import named_topics
+from tests.viewer.test_layouts import named_topics
 
 pytestmark = pytest.mark.topics
 ITERATIONS = 300

@@ -15,9 +15,9 @@ from typing import Any
 import pytest
 
 from pdeloop.cli import COMMANDS
-from tests.interpreter import python
-from tests.loop_harness import Processes, until
-from tests.small import SMALL
+from tests.support.interpreter import python
+from tests.support.loop_harness import Processes, until
+from tests.support.small import SMALL
 
 pytestmark = pytest.mark.topics
 LIMIT = 240.0

@@ -1,0 +1,164 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The limits of `python -m benchmarks optimum`: against known optima; for whom they hold."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import optimum
+from benchmarks.__main__ import parser
+from benchmarks.descent import descend
+from benchmarks.limits import FOLDER, find
+from loop_interfaces.problem import load_parameters
+from pde_sim_node.build import build_plant
+from pdeloop.cli import run
+from pdeloop.gradients import Gradients
+from tests.support.plants import Advection, plant_of
+from tests.support.small import SMALL
+
+FIELDS = 3
+GIVEN = {"fields": 4, "tolerance": 1e-6, "jobs": 1}
+
+
+def test_open_inputs_of_a_linear_plant_are_those_of_the_least_squares_problem():
+    grid = {"n_z": 16, "n_a": 2, "width": 0.3, "horizon": 8}
+    plant = plant_of(Advection(), **grid, sample_time=0.1, integration_time=0.05, action_weight=0.1)
+    T, n_a, n_z = plant.horizon, plant.n_a, plant.n_z
+    A = plant.evaluate(np.eye(n_z), np.zeros((n_z, n_a)))[0].T
+    B = plant.evaluate(np.zeros((n_a, n_z)), np.eye(n_a))[0].T
+    # z_k = A^k z_0 + sum_{j<k} A^{k-1-j} B a_j; weighted residuals of all stages below each other.
+    z0 = plant.reset([4])[0].copy()
+    rows, right = [], []
+    for k in range(T):
+        row = np.zeros((n_z, T * n_a))
+        for j in range(k):
+            row[:, j * n_a : (j + 1) * n_a] = np.linalg.matrix_power(A, k - 1 - j) @ B
+        rows.append(row)
+        right.append(plant.target - np.linalg.matrix_power(A, k) @ z0)
+    rows.append(np.sqrt(0.1) * np.eye(T * n_a))
+    right.append(np.zeros(T * n_a))
+    matrix, vector = np.concatenate(rows), np.concatenate(right)
+    exact = np.linalg.lstsq(matrix, vector, rcond=None)[0]
+    least = float(np.sum((matrix @ exact - vector) ** 2)) / T
+    gradients = Gradients(plant)
+    found = descend(
+        lambda a: gradients.of_actions(a, [4])[:2],
+        np.zeros((T, 1, n_a)),
+        tolerance=1e-12,
+        iterations=200,
+    )
+    assert found.converged and found.cost == pytest.approx(least, rel=1e-9)
+    np.testing.assert_allclose(found.x.ravel(), exact, atol=1e-5 * np.abs(exact).max())
+
+
+def test_a_descent_goes_round_where_rollouts_diverge_and_says_when_it_was_cut_off():
+    def valley(x):
+        """Rosenbrock's function plus 1, infinite beyond x_0 = 0.9 times x_1 + 1."""
+        a, b = x
+        if a > 0.9 * b + 1:
+            return np.inf, np.zeros(2)
+        value = 1 + (1 - a) ** 2 + 100 * (b - a * a) ** 2
+        return value, np.array([-2 * (1 - a) - 400 * a * (b - a * a), 200 * (b - a * a)])
+
+    found = descend(valley, np.array([-1.2, 1.0]), tolerance=1e-10, iterations=500)
+    assert found.converged and found.cost == pytest.approx(1.0, abs=1e-8)
+    np.testing.assert_allclose(found.x, 1.0, atol=1e-3)
+    assert found.gradient_norm < 1e-3
+    cut = descend(valley, np.array([-1.2, 1.0]), tolerance=1e-10, iterations=5)
+    assert cut.iterations == 5 and cut.cost > found.cost
+    with pytest.raises(ValueError, match="must begin where the cost is finite"):
+        descend(valley, np.array([5.0, 0.0]), tolerance=1e-4, iterations=5)
+
+
+@pytest.fixture(scope="module")
+def limits(tmp_path_factory) -> tuple[Path, dict]:
+    """The limits of the small problem with two seeds, as the command line saves them."""
+    folder = tmp_path_factory.mktemp("limits")
+    (result,) = optimum.run([str(SMALL)], **GIVEN, seeds=2, evaluation_fields=FIELDS, save=folder)
+    return folder, result
+
+
+def values_of(**changes):
+    return {**load_parameters(str(SMALL), {}), "evaluation_fields": FIELDS, **changes}
+
+
+def test_the_limits_are_optima(limits):
+    """No neighbouring law is better on its fields; better than LQT, and open inputs than both."""
+    _, result = limits
+    assert all(result["converged"])
+    gradients = Gradients(build_plant(values_of()))
+    fields = optimum.evaluation_seeds(optimum.TRAINING_SEED, 4)
+    for seed, costs in enumerate(result["costs"]):
+        given = {"fields": 4, "evaluations": {}, "tolerance": 1e-6}
+        found, (U, theta), _ = optimum.optimise_law(str(SMALL), seed, **given)
+        assert found.gradient_norm < 1e-2
+        rng = np.random.default_rng(seed)
+        for _ in range(10):
+            step = 0.02 * rng.standard_normal(theta.shape) * np.abs(theta).max()
+            assert gradients.of_law(U, theta + step, fields)[0] > found.cost
+        assert np.mean(costs["optimum"][0]) < np.mean(costs["lqt"][0])
+        assert (np.array(result["open_loop"]["0"]) < np.array(costs["optimum"][0])).all()
+
+
+def test_the_limits_from_zero_are_the_same(limits):
+    (again,) = optimum.run([str(SMALL)], **GIVEN, seeds=1, evaluation_fields=FIELDS, from_zero=True)
+    _, result = limits
+    law, other = (np.mean(found["costs"][0]["optimum"][0]) for found in (result, again))
+    assert other == pytest.approx(law, rel=5e-3)
+    assert again["open_loop"]["0"] == pytest.approx(result["open_loop"]["0"], rel=1e-3)
+
+
+def test_limits_hold_for_their_plant_only(limits):
+    folder, result = limits
+    found = find(values_of(), folder)
+    assert found is not None and found.tolist() == result["open_loop"]["0"]
+    for change in ({"learning_rate": 1.0}, {"seed": 5}, {"reduced_order": 3}):
+        assert find(values_of(**change), folder) is not None
+    for change in (
+        {"action_weight": 0.5},
+        {"physical.viscosity": 2e-2},
+        {"evaluation_seed": 9},
+        {"evaluation_fields": 10},
+        {"problem": "unknown"},
+    ):
+        assert find(values_of(**change), folder) is None, change
+    # The same parameters, and a plant that does something else.
+    known = json.loads((folder / "small.json").read_text())
+    known["no_control_cost"] *= 1.01
+    (folder / "other.json").write_text(json.dumps(known))
+    assert find(values_of(problem="other"), folder) is None
+
+
+def test_the_kept_limits_hold_for_the_shipped_problems():
+    names = sorted(path.stem for path in FOLDER.glob("*.json"))
+    assert names == ["allen-cahn", "burgers", "kdv"]
+    for name in names:
+        assert find(load_parameters(name, {})) is not None, (
+            f"python -m benchmarks optimum {name} --save {FOLDER}"
+        )
+
+
+def test_a_law_has_the_order_that_is_asked_for():
+    given = {"fields": 2, "evaluations": {}, "tolerance": 1e-2}
+    for order in (2, 3):
+        _, (U, theta), _ = optimum.optimise_law(
+            str(SMALL), 0, **given, given={"reduced_order": order, "dmdc_order": order}
+        )
+        assert U.shape[1] == order and theta.shape[1] == order + 1
+
+
+def test_the_command_line_prints_the_limits_and_refuses_nonsense(capsys, tmp_path):
+    options = ["--seeds", "1", "--fields", "2", "--evaluation-fields", "1"]
+    given = ["optimum", str(SMALL), *options, "--tolerance", "0.01", "--jobs", "1"]
+    assert run(parser, [*given, "--save", str(tmp_path / "x")]) == 0
+    shown = capsys.readouterr()
+    assert "small" in shown.out and "optimum of class" in shown.out
+    assert "law of seed 0" in shown.err
+    assert (tmp_path / "x" / "small.json").is_file()
+    for words in (["--seeds", "0"], ["--tolerance", "2"], ["--fields", "0"]):
+        assert run(parser, ["optimum", str(SMALL), *words]) == 1
+        assert words[0].lstrip("-") in capsys.readouterr().err
+    assert run(parser, ["optimum", str(SMALL), "--settings", "n_zz=3"]) == 1
+    assert "unknown parameter 'n_zz'" in capsys.readouterr().err

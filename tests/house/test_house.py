@@ -1,0 +1,100 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The rules of the house: layers point downwards, and pure modules never see ROS."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+from tests.support.interpreter import ROOT, python
+
+KNOWS = {
+    "loop_interfaces": set(),
+    "fast_path": {"loop_interfaces"},
+    "spectral_solver": {"loop_interfaces"},
+    "loop_method": {"loop_interfaces", "spectral_solver"},
+    "pde_sim_node": {"loop_interfaces", "fast_path", "spectral_solver"},
+    "controller_node": {"loop_interfaces", "fast_path", "loop_method"},
+    "tuner_node": {"loop_interfaces", "loop_method"},
+    "recorder_node": {"loop_interfaces"},
+    "viewer_node": {"loop_interfaces"},
+}
+"""Each package below `pdeloop`, and those that it may import: no node imports another."""
+WITH_ROS = {
+    "node.py",
+    "node_loop.py",
+    "sample_subscription.py",
+    "observer.py",
+    "loop_reader.py",
+    "service_call.py",
+    "peers.py",
+    "node_main.py",
+    "endpoints.py",
+    "introspection.py",
+    "parameters.py",
+}
+"""Files that may import rclpy or messages."""
+ROS = (
+    "rclpy",
+    "std_msgs",
+    "std_srvs",
+    "rosgraph_msgs",
+    "rcl_interfaces",
+    "diagnostic_msgs",
+    "sensor_msgs",
+    "visualization_msgs",
+    "geometry_msgs",
+    "launch",
+    "launch_ros",
+)
+LARGE = ("matplotlib", "scipy.signal", "scipy.stats")
+"""Half a second of a core to import: for who uses them, not for each node that starts."""
+
+
+def sources(*packages: str) -> list[Path]:
+    return [path for package in packages for path in sorted((ROOT / package).rglob("*.py"))]
+
+
+def imports(path: Path) -> set[str]:
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            found.add(node.module)
+    return found
+
+
+def tops(path: Path) -> set[str]:
+    return {name.split(".")[0] for name in imports(path)}
+
+
+@pytest.mark.parametrize("package", KNOWS)
+def test_a_package_imports_only_what_is_below_it(package):
+    others = {"pdeloop", *KNOWS} - {package} - KNOWS[package]
+    for path in sources(package):
+        assert not tops(path) & others, path
+
+
+def test_only_the_named_files_import_ros():
+    for path in sources(*KNOWS, "pdeloop"):
+        if path.name not in WITH_ROS:
+            assert not tops(path) & set(ROS), path
+
+
+def test_nothing_installed_imports_benchmarks_or_tests():
+    for path in sources(*KNOWS, "pdeloop"):
+        assert not tops(path) & {"benchmarks", "tests"}, path
+
+
+def test_the_loop_runs_in_one_process_without_ros_and_large_imports():
+    program = (
+        "import sys\n"
+        f"for name in {ROS + LARGE!r}: sys.modules[name] = None\n"
+        "from tests.support.small import parameters, train_here\n"
+        "print(train_here(parameters(iterations=1)).policies().shape)\n"
+    )
+    done = python("-c", program)
+    assert done.stdout.strip() == "(1, 4, 8)"

@@ -1,0 +1,179 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Parameters: every refusal names the parameter, the value and the range."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loop_interfaces.parameters import NODES, table, taken_by
+from loop_interfaces.problem import load_parameters, shipped_problems
+from loop_interfaces.spec import ParameterError as Refused
+from loop_interfaces.spec import Spec, check_names
+from pde_sim_node.build import build_plant, fingerprint
+from pde_sim_node.equations import EQUATIONS
+from tests.support.small import parameters
+
+SPECS = {spec.name: spec for spec in table()}
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("n_z", 7, "'n_z' is 7; expected an even whole number from 8 to 65536"),
+        ("n_z", 64.0, "'n_z' is 64.0; expected an even whole number"),
+        ("n_a", True, "'n_a' is True; expected a whole number from 1 to 1024"),
+        ("length", 0.0, "'length' is 0.0; expected a number above 0"),
+        ("length", float("nan"), "'length' is nan; expected a number above 0"),
+        ("sample_time", "fast", "'sample_time' is 'fast'; expected a number above 0"),
+        (
+            "length",
+            "1.0e12",
+            "(m); YAML reads a number with an exponent only",
+        ),
+        ("actuator_width", 1.5, "'actuator_width' is 1.5; expected a number above 0, at most 1"),
+        ("start", "lqg", "'start' is 'lqg'; expected one of lqt, zero"),
+        ("seed", -1, "'seed' is -1; expected a whole number from 0"),
+        ("pairs", "a", "'pairs' is 'a'; expected a list of texts"),
+        ("actuator_positions", [0.1, 1.2], "is [0.1, 1.2]; expected a list of numbers from 0 to 1"),
+        ("actuator_positions", [0.1, "a"], "is [0.1, 'a']; expected a list of numbers from 0 to 1"),
+        ("actuator_positions", 0.1, "is 0.1; expected a list of numbers from 0 to 1"),
+    ],
+)
+def test_a_bad_value_is_refused_with_name_value_and_range(name, value, words):
+    with pytest.raises(Refused) as refusal:
+        SPECS[name].check(value)
+    assert words in str(refusal.value)
+
+
+def test_a_value_of_any_length_is_refused_in_a_short_sentence():
+    for name, value in (("seed", 10**5000), ("length", 10**5000), ("start", "x" * 10**6)):
+        with pytest.raises(Refused, match=f"^parameter '{name}' is .*; expected") as refusal:
+            SPECS[name].check(value)
+        assert len(str(refusal.value)) < 400
+
+
+def test_defaults_are_within_their_own_ranges():
+    for spec in table():
+        assert spec.check(spec.default) == spec.default
+        assert spec.description
+        assert spec.range
+
+
+def test_a_whole_number_serves_where_a_number_is_expected():
+    value = Spec("x", 1.0).check(2)
+    assert value == 2.0
+    assert isinstance(value, float)
+
+
+@pytest.mark.parametrize("positions", [[0, 0.5], (0.0, 0.5), np.array([0.0, 0.5])])
+def test_numbers_in_a_list_a_tuple_or_an_array_become_a_list_that_a_file_can_hold(positions):
+    value = SPECS["actuator_positions"].check(positions)
+    assert value == [0.0, 0.5]
+    assert [type(number) for number in value] == [float, float]
+
+
+def test_an_unknown_name_is_refused_with_the_nearest_known_one():
+    with pytest.raises(Refused, match="'learning_rat'; did you mean 'learning_rate'"):
+        check_names(["learning_rat"], SPECS)
+
+
+def test_a_plant_with_other_actuators_has_another_fingerprint():
+    options = [{}, {"actuator_positions": [0.1, 0.2, 0.5, 0.8]}, {"actuator_shape": "gaussian"}]
+    assert len({fingerprint(parameters(**given)) for given in options}) == len(options)
+
+
+@pytest.mark.parametrize("name", shipped_problems())
+def test_shipped_problems_load_and_build(name):
+    values = load_parameters(name, {})
+    plant = build_plant(values)
+    assert plant.n_z == values["n_z"]
+    assert plant.supports.shape == (len(plant.x), values["n_a"])
+    assert set(EQUATIONS) <= set(shipped_problems())
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("n_z: 3", "not a ROS parameter file"),
+        ("/**: {ros__parameters: [1]}", "not a ROS parameter file"),
+        ("a: [", "not valid YAML"),
+        ("a: 1\nb: 2: 3\n", "not valid YAML: mapping values are not allowed here, in line 2"),
+        ("", "not a ROS parameter file"),
+        ("/**: {ros__parameters: {n_zz: 3}}", "unknown parameter 'n_zz'; did you mean 'n_z'"),
+        ("/**: {ros__parameters: {n_z: odd}}", "'n_z' is 'odd'"),
+        ("/**: {ros__parameters: {physical: {viscosity: thick}}}", "'physical.viscosity'"),
+        ("/**: {ros__parameters: {physical: {viscosity: 1e-3}}}", "point and sign, like 1.0e+12"),
+        ("x: !!python/object/apply:os.system ['true']", "not valid YAML"),
+    ],
+)
+def test_a_bad_problem_file_is_one_clear_sentence(tmp_path, text, words):
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    with pytest.raises(Refused) as refusal:
+        load_parameters(str(path), {})
+    assert words in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+def test_an_unknown_problem_lists_the_known_ones():
+    with pytest.raises(
+        Refused, match="'burger'; expected one of allen-cahn, allen-cahn-modes, burgers, burgers-m"
+    ):
+        load_parameters("burger", {})
+
+
+def test_an_equation_file_is_found_beside_its_yaml(tmp_path):
+    (tmp_path / "mine.yaml").write_text("/**: {ros__parameters: {equation: 'heat.py:Heat'}}")
+    assert (
+        load_parameters(str(tmp_path / "mine.yaml"), {})["equation"] == f"{tmp_path}/heat.py:Heat"
+    )
+
+
+def test_the_documents_table_is_that_of_the_specs():
+    """docs/interfaces.md: name, default, unit, nodes and meaning of every parameter, in any order."""
+    text = (Path(__file__).parents[2] / "docs" / "interfaces.md").read_text()
+    rows = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in text.splitlines()]
+    rows = [row for row in rows if len(row) == 6 and row[0][:1] == "`" and "physical" not in row[1]]
+    documented = {row[0].strip("`"): row for row in rows}
+    for spec in table():
+        default = str(spec.default).lower() if spec.type is bool else str(spec.default)
+        _, shown, _, unit, nodes, meaning = documented.pop(spec.name, [""] * 6)
+        if spec.name != "pairs":
+            assert shown == (f"`{default}`" if default else "empty"), spec.name
+        assert (unit, nodes) == (spec.unit, " ".join(spec.nodes)), spec.name
+        assert re.sub(r"\[(.*?)\]\(.*?\)", r"\1", meaning) == spec.description, spec.name
+    assert documented == {}
+
+
+def test_the_documents_code_prints_the_table(capsys):
+    text = (Path(__file__).parents[2] / "docs" / "interfaces.md").read_text()
+    (block,) = re.findall(
+        r"^```python\n(from loop_interfaces.*?)^```", text, re.MULTILINE | re.DOTALL
+    )
+    exec(block, {})
+    rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()]
+    assert [row[0] for row in rows] == [spec.name for spec in table()]
+
+
+def test_a_text_is_parsed_as_its_parameter_asks():
+    assert SPECS["horizon"].parse("20") == 20
+    assert SPECS["sample_time"].parse("1e-3") == 1e-3
+    assert SPECS["publish_clock"].parse("false") is False
+    assert SPECS["problem"].parse("5") == "5"
+    assert SPECS["actuator_positions"].parse("[0, 0.25]") == [0.0, 0.25]
+    refused = {"horizon": "2.5", "sample_time": "fast", "publish_clock": "no"}
+    for name, text in {**refused, "actuator_positions": "0.1 0.2"}.items():
+        with pytest.raises(Refused, match=f"'{name}' is '{text}'; expected"):
+            SPECS[name].parse(text)
+
+
+def test_every_parameter_says_which_nodes_take_it():
+    for node in ("pde_sim_node", "controller_node", "tuner_node", "recorder_node", "viewer_node"):
+        assert taken_by(node)
+    assert {spec.name for spec in table()} == {
+        spec.name for node in NODES.values() for spec in taken_by(node)
+    }

@@ -1,0 +1,107 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""DMDc recovers linear systems, is unique, and refuses what it cannot identify."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from loop_method.reduce.dmdc import truncated_dmdc
+from loop_method.reduce.reduced_model import ReducedModel
+from tests.support.linear_system import assert_recovered, lift, linear_system, trajectory
+
+N_S, N_A, STEPS = 3, 2, 40
+
+
+@pytest.mark.parametrize("n_z", [N_S, 20, 60])
+def test_recovers_a_linear_system_to_machine_precision(n_z: int) -> None:
+    A, B = linear_system(N_S)
+    onto = lift(n_z, N_S)
+    states, actions = trajectory(A, B, steps=STEPS)
+    model = truncated_dmdc([(states @ onto.T, actions)], p=N_S + N_A, n_s=N_S)
+    assert_recovered(model, A, B, onto, atol=1e-12)
+    np.testing.assert_allclose(model.U.T @ model.U, np.eye(N_S), atol=1e-13)
+    assert (model.n_z, model.n_s, model.n_a) == (n_z, N_S, N_A)
+
+
+def test_is_the_formula_of_the_paper() -> None:
+    rng = np.random.default_rng(3)
+    states, actions = rng.standard_normal((STEPS + 1, 12)), rng.standard_normal((STEPS, N_A))
+    p, n_s = 7, 4
+    model = truncated_dmdc([(states, actions)], p=p, n_s=n_s)
+    psi, xi, lam_t = np.linalg.svd(np.vstack([states[:-1].T, actions.T]), full_matrices=False)
+    truncated = lam_t[:p].T @ np.diag(1.0 / xi[:p])
+    left = model.U.T @ states[1:].T @ truncated
+    np.testing.assert_allclose(model.A, left @ psi[:12, :p].T @ model.U, atol=1e-12)
+    np.testing.assert_allclose(model.B, left @ psi[12:, :p].T, atol=1e-12)
+
+
+def test_basis_is_unique_and_repeatable() -> None:
+    states, actions = trajectory(*linear_system(N_S), steps=STEPS)
+    first = truncated_dmdc([(states, actions)], p=5, n_s=N_S)
+    again = truncated_dmdc([(states.copy(), actions.copy())], p=5, n_s=N_S)
+    for name in ("A", "B", "U"):
+        assert np.array_equal(getattr(first, name), getattr(again, name))
+    # The opposite trajectory has opposite singular vectors; the sign rule gives the same basis.
+    opposite = truncated_dmdc([(-states, -actions)], p=5, n_s=N_S)
+    np.testing.assert_allclose(opposite.U, first.U, atol=1e-13)
+    largest = np.abs(first.U).argmax(axis=0)
+    assert (first.U[largest, np.arange(N_S)] > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("p", "n_s", "message"),
+    [
+        (0, 1, "at least 1"),
+        (3, 0, "at least 1"),
+        (23, 3, r"at most min\(n_z \+ n_a, N\) = 22"),
+        (6, 3, "numerical rank of the data, 5"),
+        (5, 4, "numerical rank of the states, 3"),
+        (3, 4, "at most p = 3"),
+    ],
+)
+def test_refuses_more_than_the_trajectory_holds(p: int, n_s: int, message: str) -> None:
+    states, actions = trajectory(*linear_system(N_S), steps=STEPS)
+    with pytest.raises(ValueError, match=message):
+        truncated_dmdc([(states @ lift(20, N_S).T, actions)], p=p, n_s=n_s)
+
+
+def test_refuses_a_trajectory_shorter_than_p() -> None:
+    states, actions = trajectory(*linear_system(N_S), steps=STEPS)
+    with pytest.raises(ValueError, match="= 4, but p is 5"):
+        truncated_dmdc([(states[:5], actions[:4])], p=5, n_s=3)
+
+
+def test_refuses_malformed_trajectories() -> None:
+    states, actions = trajectory(*linear_system(N_S), steps=STEPS)
+    with pytest.raises(ValueError, match="40 actions belong to 41 states, but 40"):
+        truncated_dmdc([(states[:-1], actions)], p=5, n_s=3)
+    with pytest.raises(ValueError, match="non-empty matrix"):
+        truncated_dmdc([(states[0], actions)], p=5, n_s=3)
+    with pytest.raises(ValueError, match="non-empty matrix"):
+        truncated_dmdc([(states[:1], actions[:0])], p=5, n_s=3)
+    broken = states.copy()
+    broken[7, 1] = np.nan
+    with pytest.raises(ValueError, match="row 7"):
+        truncated_dmdc([(broken, actions)], p=5, n_s=3)
+    broken = actions.copy()
+    broken[3, 0] = np.inf
+    with pytest.raises(ValueError, match="actions must be finite, but row 3"):
+        truncated_dmdc([(states, broken)], p=5, n_s=3)
+
+
+def test_reduced_model_checks_itself_and_is_read_only() -> None:
+    A, B, U = np.eye(2), np.ones((2, 1)), np.eye(5)[:, :2]
+    model = ReducedModel(A=A, B=B, U=U)
+    A[0, 0] = 7.0
+    assert model.A[0, 0] == 1.0
+    with pytest.raises(ValueError, match="read-only"):
+        model.A[0, 0] = 2.0
+    with pytest.raises(ValueError, match=r"needs A of shape \(2, 2\)"):
+        ReducedModel(A=np.eye(3), B=B, U=U)
+    with pytest.raises(ValueError, match="B with 2 rows"):
+        ReducedModel(A=np.eye(2), B=np.ones((3, 1)), U=U)
+    with pytest.raises(ValueError, match="B of a reduced model must be finite"):
+        ReducedModel(A=np.eye(2), B=B * np.nan, U=U)
+    with pytest.raises(ValueError, match="U of a reduced model must be a non-empty matrix"):
+        ReducedModel(A=np.eye(2), B=B, U=np.ones(5))

@@ -1,0 +1,419 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Gauss-Newton on measured trajectories: a known optimum, its safeguards, its checkpoints."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from loop_method.adapt import Context, GaussNewton, Rollout, RolloutResult, Trajectory
+from loop_method.adapt.proposals import Proposer, chaotic
+from loop_method.adapt.simulation import mismatch, mismatch_of_pieces
+from loop_method.adapt.trajectories import Records
+from loop_method.design.lqt import track
+from loop_method.field_models.convolution import ConvolutionModel, fit_convolutions
+from loop_method.reduce.reduced_model import ReducedModel
+from tests.support.small import parameters, same_bits, train_here
+
+N_Z, N_S, N_A, T = 7, 4, 2, 80
+Q, R = 1.0, 0.2
+
+
+class Plant:
+    """s' = A s + B a, lifted to N_Z dimensions; `bend` adds a quadratic term."""
+
+    def __init__(self, bend: float = 0.0) -> None:
+        rng = np.random.default_rng(0)
+        A = rng.standard_normal((N_S, N_S))
+        self.A = 1.02 * A / np.abs(np.linalg.eigvals(A)).max()
+        self.B = rng.standard_normal((N_S, N_A))
+        self.U = np.linalg.qr(rng.standard_normal((N_Z, N_S)))[0]
+        self.target = self.U @ np.array([0.5, -0.2, 0.3, 0.1])
+        self.bend = bend
+        self.model = ReducedModel(A=self.A, B=self.B, U=self.U)
+        self.best = track(self.model, state_weight=Q, action_weight=R).policy
+
+    def run(self, policy: np.ndarray, seed: int, noise: np.ndarray | None = None) -> RolloutResult:
+        s = np.random.default_rng(seed).standard_normal(N_S)
+        b = policy[:, N_S:] @ self.U.T @ self.target
+        states, actions, cost = [self.U @ s], [], 0.0
+        for k in range(T):
+            a = policy[:, :N_S] @ s + b if noise is None else noise[k]
+            cost += Q * float(np.sum((states[-1] - self.target) ** 2)) + R * float(a @ a)
+            s = self.A @ s + self.B @ a + self.bend * np.tanh(s) * s[::-1]
+            actions.append(a)
+            if np.abs(s).max() > 1e3:
+                done = Trajectory(np.array(states), np.array(actions)[:-1])
+                return RolloutResult(1e9, True, done)
+            states.append(self.U @ s)
+        return RolloutResult(cost / T, False, Trajectory(np.array(states), np.array(actions)))
+
+    def context(self) -> Context:
+        noise = 0.3 * np.random.default_rng(1).standard_normal((T, N_A))
+        exploration = self.run(np.zeros((N_A, 2 * N_S)), 77, noise).trajectory
+        assert exploration is not None
+        return Context(self.U, self.target, Q, R, T, exploration)
+
+
+def make(plant: Plant, policy: np.ndarray | None = None, **changes: Any) -> GaussNewton:
+    settings: dict[str, Any] = {"seed": 5, "rollouts": 24, "context": plant.context()}
+    return GaussNewton(0.6 * plant.best if policy is None else policy, **(settings | changes))
+
+
+def measure(plant: Plant, asked: list[Rollout]) -> list[RolloutResult]:
+    return [plant.run(rollout.policy, rollout.field_seed) for rollout in asked]
+
+
+def mean_cost(plant: Plant, policy: np.ndarray) -> float:
+    return float(np.mean([plant.run(policy, 10**6 + i).cost for i in range(40)]))
+
+
+def same_state(a: GaussNewton, b: GaussNewton) -> bool:
+    one, other = a.state(), b.state()
+    return one.keys() == other.keys() and all(same_bits(one[k], other[k]) for k in one)
+
+
+def test_converges_to_the_known_optimum_of_a_linear_quadratic_plant() -> None:
+    """Large steps first, on three fields; small ones, near the optimum, are judged on more."""
+    plant = Plant()
+    optimizer = make(plant, rollouts=36)
+    start, best = mean_cost(plant, optimizer.policy), mean_cost(plant, plant.best)
+    used, counts = 0, []
+    while not optimizer.done:
+        asked = optimizer.ask()
+        used += len(asked)
+        optimizer.tell(measure(plant, asked))
+        counts.append(optimizer.state()["fields"].size)
+        again = make(plant, rollouts=36)
+        again.restore(optimizer.state())
+        assert same_state(again, optimizer)
+    final = mean_cost(plant, optimizer.policy)
+    assert start > 1.05 * best
+    # The infinite-horizon law is optimal up to the end of the episode.
+    assert final == pytest.approx(best, rel=0.01)
+    assert used <= 36
+    assert counts[0] == 3 and counts == sorted(counts) and 3 < counts[-1] <= 6
+
+
+def test_improves_a_plant_that_is_not_linear() -> None:
+    plant = Plant(bend=0.1)
+    optimizer = make(plant)
+    start = mean_cost(plant, optimizer.policy)
+    while not optimizer.done:
+        optimizer.tell(measure(plant, optimizer.ask()))
+    assert mean_cost(plant, optimizer.policy) < 0.95 * start
+
+
+@pytest.mark.parametrize(
+    ("law", "rollouts", "better"),
+    [((50.0, 50.0, 120.0), 3, True), ((50.0, 90.0, 120.0), 3, False), ((50.0, 210.0), 2, False)],
+)
+def test_with_sensors_the_first_law_has_to_beat_no_control_on_all_fields(
+    law: tuple[float, ...], rollouts: int, better: bool
+) -> None:
+    """One field of three is dear without control; the law is given up when it cannot win any more."""
+    plant = Plant()
+    optimizer = make(plant, context=replace(plant.context(), sensors=N_S))
+    none, first = optimizer.ask(), plant.best
+    assert len(none) == 3 and not any(asked.policy.any() for asked in none)
+    results = measure(plant, none)
+    optimizer.tell(
+        [
+            replace(result, cost=cost)
+            for result, cost in zip(results, (34.0, 34.0, 185.0), strict=True)
+        ]
+    )
+    for cost in law:
+        (asked,) = optimizer.ask()
+        assert same_bits(asked.policy, 0.6 * first)
+        row = optimizer.tell([replace(plant.run(asked.policy, asked.field_seed), cost=cost)])
+    assert row["accepted"] is better and row["rollouts"] == 3 + rollouts
+    assert same_bits(optimizer.policy, 0.6 * first if better else np.zeros_like(first))
+
+
+def test_asks_are_pure_rows_are_json_and_the_budget_is_kept() -> None:
+    plant = Plant()
+    optimizer = make(plant, rollouts=24)
+    total, costs = 0, []
+    while not optimizer.done:
+        first, second = optimizer.ask(), optimizer.ask()
+        for a, b in zip(first, second, strict=True):
+            assert np.array_equal(a.policy, b.policy)
+            assert a.field_seed == b.field_seed
+            a.policy[:] = np.nan
+        assert np.isfinite(optimizer.ask()[0].policy).all()
+        total += len(second)
+        row = optimizer.tell(measure(plant, second))
+        assert json.loads(json.dumps(row, allow_nan=False)) == row
+        assert row["rollouts"] == total
+        costs.append(row["cost"])
+    assert 24 - 3 < total <= 24
+    assert optimizer.ask() == []
+    with pytest.raises(ValueError, match="done"):
+        optimizer.tell([])
+
+
+def test_candidates_are_judged_on_the_fields_of_the_incumbent() -> None:
+    plant = Plant()
+    optimizer = make(plant)
+    fields = [rollout.field_seed for rollout in optimizer.ask()]
+    assert len(set(fields)) == 3
+    optimizer.tell(measure(plant, optimizer.ask()))
+    seen = []
+    for _ in range(3):
+        asked = optimizer.ask()
+        assert len(asked) == 1
+        seen.append(asked[0].field_seed)
+        row = optimizer.tell(measure(plant, asked))
+    assert seen == fields
+    assert row["accepted"] is True
+    # After an acceptance the oldest field is replaced by a fresh one.
+    fresh = optimizer.ask()
+    assert [rollout.field_seed for rollout in fresh] != fields[:1]
+    assert fresh[0].field_seed not in fields
+    assert np.array_equal(fresh[0].policy, optimizer.policy)
+
+
+def test_a_clearly_worse_candidate_is_given_up_after_one_rollout() -> None:
+    plant = Plant()
+    optimizer = make(plant)
+    optimizer.tell(measure(plant, optimizer.ask()))
+    before = optimizer.policy
+    damping = float(optimizer.state()["damping"].item())
+    worse = plant.run(np.zeros_like(before), optimizer.ask()[0].field_seed)
+    row = optimizer.tell([RolloutResult(1e4, False, worse.trajectory)])
+    assert row["accepted"] is False
+    assert row["damping"] == 4 * damping
+    assert np.array_equal(optimizer.policy, before)
+
+
+def diverged(plant: Plant, rollout: Rollout, tail: str) -> RolloutResult:
+    result = plant.run(rollout.policy, rollout.field_seed)
+    assert result.trajectory is not None
+    states, actions = result.trajectory.states.copy(), result.trajectory.actions.copy()
+    if tail == "nan":
+        states[9:], actions[9:] = np.nan, np.nan
+    elif tail == "frozen":
+        states[9:] = states[9]
+    elif tail == "huge":
+        states[9:] *= 1e30
+    elif tail == "empty":
+        states, actions = states[:1], actions[:0]
+    return RolloutResult(1e9 if tail != "nan" else np.nan, True, Trajectory(states, actions))
+
+
+@pytest.mark.parametrize("tail", ["nan", "frozen", "huge", "empty"])
+def test_a_diverged_candidate_stays_out_of_the_policy_and_of_the_model(tail: str) -> None:
+    plant = Plant()
+    optimizer = make(plant, rollouts=16)
+    optimizer.tell(measure(plant, optimizer.ask()))
+    before = optimizer.policy
+    for _ in range(3):
+        row = optimizer.tell([diverged(plant, optimizer.ask()[0], tail)])
+        assert row["diverged"] == 1
+        assert row["accepted"] is False
+        assert json.dumps(row, allow_nan=False)
+    assert np.array_equal(optimizer.policy, before)
+    kept = [a for name, a in optimizer.state().items() if name.endswith(".states")]
+    assert sum(map(len, kept)) < 4 * (T + 1)
+    start = mean_cost(plant, before)
+    while not optimizer.done:
+        optimizer.tell(measure(plant, optimizer.ask()))
+    assert mean_cost(plant, optimizer.policy) < start
+
+
+def test_a_warm_start_that_diverges_is_halved_until_it_does_not() -> None:
+    plant = Plant()
+    wild = 8.0 * plant.best
+    optimizer = make(plant, wild)
+    results = measure(plant, optimizer.ask())
+    assert all(result.diverged for result in results)
+    row = optimizer.tell(results)
+    assert "cost" not in row
+    assert np.array_equal(optimizer.ask()[0].policy, 0.5 * wild)
+    while not optimizer.done:
+        row = optimizer.tell(measure(plant, optimizer.ask()))
+        assert json.dumps(row, allow_nan=False)
+    assert mean_cost(plant, optimizer.policy) < 1.1 * mean_cost(plant, plant.best)
+
+
+def test_only_divergence_never_moves_the_policy() -> None:
+    plant = Plant()
+    optimizer = make(plant, rollouts=12)
+    before = optimizer.policy
+    while not optimizer.done:
+        optimizer.tell([diverged(plant, rollout, "nan") for rollout in optimizer.ask()])
+    assert np.array_equal(optimizer.policy, before)
+
+
+def test_a_restored_training_ends_with_the_same_bits() -> None:
+    plant = Plant(bend=0.1)
+
+    def step(optimizer: GaussNewton) -> dict[str, Any]:
+        asked = optimizer.ask()
+        results = measure(plant, asked)
+        if optimizer.tells == 4:
+            results[0] = diverged(plant, asked[0], "nan")
+        return optimizer.tell(results)
+
+    # What a step leaves follows from what is kept before it, so restoring may come anywhere.
+    whole = make(plant, rollouts=17)
+    while not whole.done:
+        stored = io.BytesIO()
+        np.savez(stored, **whole.state())
+        stored.seek(0)
+        again = make(plant, rollouts=17)
+        with np.load(stored, allow_pickle=False) as arrays:
+            again.restore(dict(arrays))
+        assert step(again) == step(whole)
+        assert same_state(again, whole)
+    assert whole.tells > 8
+
+
+def test_refuses_foreign_checkpoints() -> None:
+    plant = Plant()
+    optimizer = make(plant)
+    optimizer.tell(measure(plant, optimizer.ask()))
+    good = optimizer.state()
+    with pytest.raises(ValueError, match="no array 'candidate'"):
+        make(plant).restore({"policy": optimizer.policy})
+    with pytest.raises(ValueError, match=r"no array 'record1\.states'"):
+        make(plant).restore({k: v for k, v in good.items() if k != "record1.states"})
+    with pytest.raises(ValueError, match=r"expected 'record1\.states'"):
+        make(plant).restore(good | {"record1.states": good["record1.states"][:, :0]})
+    with pytest.raises(ValueError, match="states and"):
+        make(plant).restore(good | {"record1.states": good["record1.states"][:1]})
+    with pytest.raises(ValueError, match=r"lacks: \[1\]"):
+        make(plant).restore(good | {"stamps": np.array([0, 2])})
+
+
+def test_needs_sound_trajectories_and_stays_as_it_was_without() -> None:
+    plant = Plant()
+    optimizer = make(plant)
+    good = measure(plant, optimizer.ask())
+    trajectory = good[0].trajectory
+    assert trajectory is not None
+    broken = Trajectory(trajectory.states * np.nan, trajectory.actions)
+    short = Trajectory(trajectory.states[:-4], trajectory.actions)
+    for bad, message in (
+        (RolloutResult(1.0), "learns from trajectories"),
+        (RolloutResult(1.0, False, broken), "finite trajectory"),
+        (RolloutResult(1.0, False, short), "T or T"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            optimizer.tell([*good[:2], bad])
+    assert optimizer.tells == 0
+    assert len(optimizer.ask()) == 3
+    optimizer.tell(good)
+    with pytest.raises(ValueError, match="one result per rollout, 1, but got 3"):
+        optimizer.tell(good)
+
+
+def test_a_step_moves_the_gains_and_the_constant_part_by_what_it_says() -> None:
+    plant = Plant()
+    proposer = Proposer(plant.context(), plant.best)
+    step = np.random.default_rng(8).standard_normal((N_A, N_S + 1))
+    moved = proposer.loop.moved(plant.best, step)
+    s_r = plant.U.T @ plant.target
+    constant = (moved - plant.best)[:, N_S:] @ s_r
+    np.testing.assert_allclose((moved - plant.best)[:, :N_S], step[:, :N_S], atol=1e-12)
+    np.testing.assert_allclose(constant, step[:, N_S], atol=1e-12)
+    np.testing.assert_allclose(
+        proposer.loop.theta(moved) - proposer.loop.theta(plant.best), step, atol=1e-12
+    )
+
+
+def test_a_target_outside_of_the_basis_leaves_the_constant_part_alone() -> None:
+    plant = Plant()
+    outside = np.linalg.qr(np.column_stack([plant.U, np.ones(N_Z)]))[0][:, N_S]
+    plant.target = outside
+    policy = 0.6 * plant.best
+    optimizer = make(plant, policy)
+    while not optimizer.done:
+        optimizer.tell(measure(plant, optimizer.ask()))
+    assert np.array_equal(optimizer.policy[:, N_S:], policy[:, N_S:])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"fields": 0}, "fields must be positive"),
+        ({"rollouts": 0}, "rollouts must be positive"),
+        ({"policy": np.zeros((2, 6))}, "does not fit a basis"),
+        ({"policy": np.zeros((3, 8))}, "exploratory trajectory must have"),
+    ],
+)
+def test_refuses_bad_parameters(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make(Plant(), **changes)
+
+
+def test_a_reduced_model_larger_than_the_default_number_of_modes_is_adapted() -> None:
+    size = {"n_z": 64, "n_a": 2, "reduced_order": 34, "horizon": 80}
+    training = train_here(parameters(optimizer="gauss_newton", rollouts=14, **size))
+    assert training.policies().shape == (1, 2, 68)
+    _, lqt, adapted = training.evaluation.mean(axis=2)[0]
+    assert adapted < lqt
+
+
+def test_a_plant_that_forgets_is_improved_from_many_states_until_it_gains_nothing() -> None:
+    """And not from the few initial fields, whose costs say nothing about others."""
+    plant = Plant()
+    proposer = Proposer(plant.context(), plant.best)
+    policy, seeds = 0.6 * plant.best, range(4)
+    records = Records(40, 1e9)
+    for seed in seeds:
+        records.add(policy, plant.run(policy, seed), set())
+    data = records.all()
+    states = [record.states for record in data]
+    z, then = (np.concatenate([s[i : T + i] for s in states]) for i in (0, 1))
+    a = np.concatenate([record.actions for record in data])
+    (model,) = fit_convolutions(z, a, then, np.ones(len(z)), degrees=(1,), ridges=(1e-9,))
+    falls = []
+    for _ in range(20):
+        proposal = chaotic.propose(proposer.loop, model, 0.01, data, policy, 1e-3)
+        if proposal is None:
+            break
+        falls.append(proposal.fall)
+        policy = proposal.policy
+    assert proposal is None
+    assert falls
+    other = plant.run(data[0].policy, 99).trajectory
+    assert other is not None
+    before, after = (
+        proposer.loop.simulate(model, proposer.loop.theta(p), other.states).cost
+        for p in (data[0].policy, policy)
+    )
+    assert after < 0.95 * before
+
+
+def test_chaos_is_told_from_disturbances() -> None:
+    """A map at every point: the chaotic logistic one, nearly known, or a random walk."""
+    plant = Plant()
+    proposer, rng = Proposer(plant.context(), plant.best), np.random.default_rng(3)
+
+    def forgets(true: tuple[float, float], known: tuple[float, float], disturbance: float) -> bool:
+        """z+ = true_1 z + true_2 z^2 + disturbance, and a model of it with other coefficients."""
+        symbols = np.array(known)[:, None, None, None] * np.ones(N_Z // 2 + 1)
+        model = ConvolutionModel(symbols.astype(complex), np.zeros((N_Z, N_A)), np.zeros(N_Z))
+        records = Records(10, 1e9)
+        for policy in (0.0 * plant.best, plant.best):
+            states = [rng.uniform(0.2, 0.8, N_Z)]
+            for _ in range(T):
+                after = true[0] * states[-1] + true[1] * states[-1] ** 2
+                states.append(after + disturbance * rng.standard_normal(N_Z))
+            done = Trajectory(np.array(states), np.zeros((T, N_A)))
+            records.add(policy, RolloutResult(1.0, False, done), set())
+        measured = [proposer.loop.measured(record) for record in records.all()]
+        error = mismatch_of_pieces(proposer.loop, model, measured, T // 8)
+        assert 0.0 < error < 0.05
+        assert all(mismatch(proposer.loop, model, [own], 9.0) > 0.05 for own in measured)
+        return chaotic.forgets(proposer.loop, model, error, records.all(), 0.05)
+
+    assert forgets((3.9, -3.9), (3.9001, -3.9001), 0.0)
+    assert not forgets((1.0, 0.0), (1.0, 0.0), 0.03)

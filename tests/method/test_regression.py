@@ -1,0 +1,128 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Least squares in reduced coordinates: recovers systems, needs no unit, and its error is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_limits
+
+from loop_method.reduce import dmdc
+from loop_method.reduce.regression import exact_regression
+from tests.support.linear_system import assert_recovered, lift, linear_system, trajectory
+from tuner_node.exploration import least_variance
+
+N_S, N_A, STEPS = 4, 2, 60
+
+
+@pytest.mark.parametrize("n_z", [N_S, 30])
+def test_recovers_a_linear_system_from_pooled_trajectories(n_z: int) -> None:
+    A, B = linear_system(N_S)
+    # None of them alone has enough steps for n_s + n_a unknowns.
+    parts = [trajectory(A, B, seed, steps=N_S + N_A - 1) for seed in (1, 2, 3)]
+    onto = lift(n_z, N_S)
+    model = exact_regression([(z @ onto.T, a) for z, a in parts], n_s=N_S)
+    assert_recovered(model, A, B, onto, atol=1e-11)
+
+
+def test_is_the_projected_least_squares_solution() -> None:
+    rng = np.random.default_rng(3)
+    states, actions = rng.standard_normal((STEPS + 1, 12)), rng.standard_normal((STEPS, N_A))
+    model = exact_regression([(states, actions)], n_s=N_S)
+    s = states @ model.U
+    residual = s[1:] - s[:-1] @ model.A.T - actions @ model.B.T
+    # The residual of least squares is orthogonal to all regressors.
+    np.testing.assert_allclose(residual.T @ np.hstack([s[:-1], actions]), 0.0, atol=1e-11)
+    left = np.linalg.svd(states[1:].T)[0][:, :N_S]
+    np.testing.assert_allclose(model.U @ model.U.T, left @ left.T, atol=1e-12)
+
+
+@pytest.mark.parametrize("scale", [1e-9, 3.0, 1e9])
+def test_does_not_depend_on_the_unit_of_the_inputs(scale: float) -> None:
+    rng = np.random.default_rng(4)
+    states, actions = rng.standard_normal((STEPS + 1, 20)), rng.standard_normal((STEPS, N_A))
+    model, other = (
+        exact_regression([(states, actions)], n_s=6),
+        exact_regression([(states, scale * actions)], n_s=6),
+    )
+    np.testing.assert_allclose(other.A, model.A, atol=1e-12)
+    np.testing.assert_allclose(scale * other.B, model.B, atol=1e-12)
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1e9])
+def test_does_not_depend_on_the_unit_of_one_input(scale: float) -> None:
+    rng = np.random.default_rng(4)
+    states, actions = rng.standard_normal((STEPS + 1, 20)), rng.standard_normal((STEPS, N_A))
+    units = np.array([1.0, scale])
+    model, other = (exact_regression([(states, c * actions)], n_s=6) for c in (1.0, units))
+    np.testing.assert_allclose(other.A, model.A, atol=1e-12)
+    np.testing.assert_allclose(units * other.B, model.B, atol=1e-12)
+
+
+def test_truncated_dmdc_is_the_same_at_full_rank() -> None:
+    rng = np.random.default_rng(5)
+    states, actions = rng.standard_normal((STEPS + 1, 8)), rng.standard_normal((STEPS, N_A))
+    model = exact_regression([(states, actions)], n_s=8)
+    truncated = dmdc.truncated_dmdc([(states, actions)], p=8 + N_A, n_s=8)
+    for name in ("A", "B", "U"):
+        np.testing.assert_allclose(getattr(truncated, name), getattr(model, name), atol=1e-12)
+    # With fewer directions than n_s + n_a it loses the inputs first when they are small.
+    with pytest.raises(ValueError, match=r"p = 8 keeps 0\.\d+ %, 0\.\d+ % of a move of a1 and a2"):
+        dmdc.truncated_dmdc([(states, 1e-3 * actions)], p=8, n_s=8)
+    cut = dmdc.truncated_dmdc([(states, 0.05 * actions)], p=8, n_s=8)
+    assert np.linalg.norm(0.05 * cut.B) < 0.05 * np.linalg.norm(model.B)
+    (remark,) = dmdc.truncation_remarks([(states, 0.05 * actions)], 8)
+    assert "of a move of a1 and a2" in remark
+
+
+def test_same_bits_whatever_the_threads() -> None:
+    rng = np.random.default_rng(6)
+    states, actions = rng.standard_normal((301, 256)), rng.standard_normal((300, 12))
+    with threadpool_limits(limits=1):
+        one = exact_regression([(states, actions)], n_s=24)
+    with threadpool_limits(limits=4):
+        four = exact_regression([(states, actions)], n_s=24)
+    for name in ("A", "B", "U"):
+        assert np.array_equal(getattr(one, name), getattr(four, name))
+
+
+def test_refuses_what_it_cannot_identify() -> None:
+    states, actions = trajectory(*linear_system(N_S), steps=STEPS)
+    with pytest.raises(ValueError, match="needs at least 6 steps, but there are 5"):
+        exact_regression([(states[:6], actions[:5])], n_s=N_S)
+    with pytest.raises(ValueError, match="numerical rank of the states, 4, but n_s is 5"):
+        exact_regression([(states @ lift(20, N_S).T, actions)], n_s=5)
+    with pytest.raises(ValueError, match="at least 1"):
+        exact_regression([(states, actions)], n_s=0)
+    with pytest.raises(ValueError, match="40 actions belong to 41 states"):
+        exact_regression([(states, actions), (states[:40], actions[:40])], n_s=N_S)
+
+
+def test_the_variance_for_noise_gives_the_error_of_the_inputs_that_it_promises() -> None:
+    """Of every entry of B, relative to its column: sqrt(2 / c), against many noisy experiments."""
+    noise, steps, sample_time, width, n_z = 0.05, 200, 0.01, 0.125, 32
+    accuracy = 0.05
+    variance = least_variance(
+        noise=noise,
+        steps=steps,
+        sample_time=sample_time,
+        width=width,
+        n_z=n_z,
+        accuracy=accuracy,
+    )
+    # An actuator of that width acts for one step on its share of the grid; the field keeps nearly all.
+    support = np.zeros((n_z, 1))
+    support[: int(width * n_z)] = 1.0
+    A, B = 0.995 * np.eye(n_z), sample_time * support
+    rng = np.random.default_rng(7)
+    errors = []
+    for _ in range(200):
+        actions = np.sqrt(variance) * rng.standard_normal((steps, 1))
+        states = [np.sin(2.0 * np.pi * np.arange(n_z) / n_z)]
+        for a in actions:
+            states.append(A @ states[-1] + B @ a)
+        measured = np.array(states) + noise * rng.standard_normal((steps + 1, n_z))
+        model = exact_regression([(measured, actions)], n_s=2)
+        errors.append(model.B[:, 0] - model.U.T @ B[:, 0])
+    found = np.sqrt(np.mean(np.square(errors))) / np.linalg.norm(B)
+    assert found == pytest.approx(accuracy, rel=0.15)

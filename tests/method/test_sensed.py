@@ -1,0 +1,208 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A differential equation, its actuators and the fields are found from a few point sensors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_limits
+
+import pdeloop
+from loop_method.adapt import Context, GaussNewton, Rollout, RolloutResult, Trajectory
+from loop_method.adapt.base import Record
+from loop_method.adapt.proposals.sensed import SensedProposals
+from loop_method.adapt.simulation import Loop
+from loop_method.field_models.sensed import SensedModel, fit_sensed, grid_points, interpolated
+from pdeloop.episode import rollout
+from tests.support.small import same_bits
+
+Array = np.ndarray
+SENSORS = 8
+FIELD = 11
+
+
+def _fitted(problem: pdeloop.Problem, seed: int) -> tuple[SensedModel, Array, float]:
+    """From an exploration and a rollout without control."""
+    plant = problem.plant()
+    explored, actions = problem.explore(seed)
+    uncontrolled = rollout(plant, lambda k, y: np.zeros((1, plant.n_a)), [FIELD])
+    readings = np.stack([explored[:-1], uncontrolled.states[:-1, 0]])
+    positions = problem.values["actuator_positions"] or _equally_spaced(plant.n_a)
+    with threadpool_limits(1):
+        return fit_sensed(
+            readings,
+            [actions, uncontrolled.actions[:, 0]],
+            np.array(positions),
+            problem.values["measurement_noise"] * _scale(problem),
+        )
+
+
+def test_the_cost_of_a_rollout_tells_of_the_field_between_the_sensors() -> None:
+    problem = pdeloop.problem("allen-cahn", sensors=SENSORS, horizon=40)
+    plant = problem.plant()
+    explored, excited = problem.explore(1000)
+    uncontrolled = rollout(plant, lambda k, y: np.zeros((1, plant.n_a)), [FIELD])
+    readings = np.stack([explored[:-1], uncontrolled.states[:-1, 0]])
+    actions = [excited, uncontrolled.actions[:, 0]]
+    distance = float(uncontrolled.costs.mean[0]) / (plant.state_weight * SENSORS)
+
+    def off(*known: Array) -> float:
+        """The relative error of the simulated distance from the target."""
+        with threadpool_limits(1):
+            model, fields, error = fit_sensed(
+                readings, actions, _equally_spaced(plant.n_a), 0.0, None, *known
+            )
+        assert error < 1e-5
+        z, target, squares = fields[1], interpolated(plant.target), []
+        for action in actions[1]:
+            squares.append(np.mean((z - target) ** 2))
+            z = model.step(z, action)
+        return abs(float(np.mean(squares)) / distance - 1.0)
+
+    assert off() > 0.02
+    assert off(plant.target, np.array([np.nan, distance])) < 1e-3
+
+
+def _scale(problem: pdeloop.Problem) -> float:
+    """What the published readings are multiplied by."""
+    return float(np.sqrt(problem.values["n_z"] / SENSORS))
+
+
+def _equally_spaced(n_a: int) -> Array:
+    return (np.arange(n_a) + 0.5) / n_a
+
+
+def test_the_kdv_equation_is_found_from_eight_sensors() -> None:
+    """u_t = -u_xxx + 3 (u^2)_x on a domain of length 20; the soliton is not seen in the beginning."""
+    problem = pdeloop.problem("kdv", sensors=SENSORS)
+    plant = problem.plant()
+    model, fields, error = _fitted(problem, 1000)
+    assert error < 1e-5
+    transport, diffusion, dispersion, quadratic = _coefficients(model)
+    assert dispersion == pytest.approx(-1 / 20**3, rel=0.02)
+    assert quadratic * _scale(problem) == pytest.approx(3 / 20, rel=0.02)
+    assert abs(transport) < 1e-3 and abs(diffusion) < 5e-5
+    plant.reset([FIELD])
+    true = _scale(problem) * plant.states[0, :: plant.x.size // fields.shape[1]]
+    assert np.linalg.norm(fields[1] - true) < 0.01 * np.linalg.norm(true)
+
+
+def test_noise_does_not_hide_the_allen_cahn_equation() -> None:
+    """u_t = 0.0025 u_xx + 5 u - 5 u^3 on a domain of length 2."""
+    problem = pdeloop.problem("allen-cahn", sensors=SENSORS, measurement_noise=0.03)
+    model, _, error = _fitted(problem, 1000)
+    assert error < 1e-4
+    small, none = 1e-3, np.zeros(model.B.shape[1])
+    still = model.step(np.zeros(len(model.B)), none)
+    growth = (model.step(np.full(len(model.B), small), none) - still) / small
+    assert np.mean(growth) == pytest.approx(np.exp(0.05), rel=0.015)
+
+
+def test_actuators_need_not_be_equally_spaced() -> None:
+    positions = [0.1, 0.22, 0.55]
+    strong = {"actuator_positions": positions, "n_a": 3, "exploration_variance": 4.0}
+    problem = pdeloop.problem("allen-cahn", sensors=SENSORS, horizon=50, **strong)
+    model, _, error = _fitted(problem, 1000)
+    assert error < 1e-4
+    x = np.arange(len(model.B)) / len(model.B)
+    effect = np.abs(model.B)
+    np.testing.assert_allclose(x @ effect / effect.sum(axis=0), positions, atol=0.02)
+
+
+def _coefficients(model: SensedModel) -> Array:
+    """c_11, c_12, c_13, c_21 per second, of a sampling time of 0.01 s."""
+    small, n = 1e-4, len(model.B)
+    x = np.arange(n) / n
+    none = np.zeros(model.B.shape[1])
+    still = model.step(np.zeros(n), none)
+
+    def effect(z: Array) -> Array:
+        """dz/dt in Fourier space."""
+        return np.fft.rfft(model.step(z, none) - still - z) / (0.01 * n / 2)
+
+    one, two = (effect(small * np.cos(2 * np.pi * k * x))[k] / small for k in (1, 2))
+    k = 2 * np.pi
+    # i k c_1 - k^2 c_2 - i k^3 c_3 at the first two wavenumbers.
+    transport, dispersion = np.linalg.solve(
+        [[k, -(k**3)], [2 * k, -8 * k**3]], [one.imag, two.imag]
+    )
+    (diffusion,) = np.linalg.lstsq(np.array([[3 * k**2]]), np.array([one.real - two.real]))[0]
+    bent = effect(0.01 * np.cos(k * x))
+    quadratic = bent[2].imag / (2 * k * 0.5 * 0.01**2)
+    return np.array([transport, diffusion, dispersion, quadratic])
+
+
+@pytest.fixture
+def model() -> SensedModel:
+    shared = np.array([2.0, 1.0, 1.5, -3.0, 0.2, 0.5, -0.1, 0.1, 5.0, -1.0, 0.5, 2.0])
+    return SensedModel.of(shared, SENSORS, _equally_spaced(5))
+
+
+def test_jacobians_are_the_derivatives_of_a_step(model: SensedModel) -> None:
+    n = len(model.B)
+    z = np.cos(2 * np.pi * np.arange(n) / n) + np.linspace(0.0, 0.5, 3)[:, None]
+    V = np.linalg.qr(np.random.default_rng(0).standard_normal((n, 6)))[0]
+    change, none = V @ np.arange(1.0, 7.0), np.zeros(5)
+    moved = (model.step(z + 1e-3 * change, none) - model.step(z - 1e-3 * change, none)) / 2e-3
+    expected = np.einsum("tij,j->ti", model.jacobians(z, V), np.arange(1.0, 7.0))
+    np.testing.assert_allclose(moved @ V, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_an_action_moves_the_field_as_the_input_matrix_says(model: SensedModel) -> None:
+    z, action = np.zeros(len(model.B)), np.array([0.0, 1.0, 0.0, 0.0, -0.5])
+    moved = model.step(z, action) - model.step(z, 0.0 * action)
+    effect = model.B @ action
+    assert np.linalg.norm(moved - effect) < 0.05 * np.linalg.norm(effect)
+
+
+def test_readings_are_interpolated_by_the_lowest_wavenumbers() -> None:
+    n = grid_points(SENSORS)
+    sensors = (np.arange(SENSORS) + 0.5) / SENSORS
+    field = interpolated(np.cos(2 * np.pi * sensors) + 0.5)
+    np.testing.assert_allclose(field, np.cos(2 * np.pi * np.arange(n) / n) + 0.5, atol=1e-12)
+
+
+def test_readings_that_no_equation_explains_make_no_proposal_and_no_start_of_the_next() -> None:
+    rng = np.random.default_rng(0)
+    states, actions = rng.standard_normal((2, 25, 4)), rng.standard_normal((2, 24, 2))
+    records = [Record(np.zeros((2, 8)), 1.0, *pair) for pair in zip(states, actions, strict=True)]
+    loop = Loop(np.eye(4), np.zeros(4), 1.0, 1.0, horizon=24, action_limit=0.0)
+    proposals = SensedProposals(loop, _equally_spaced(2), noise=0.0, largest_cost=np.inf)
+    with threadpool_limits(1):
+        assert proposals.propose(records, records[0].policy, damping=1.0) is None
+    assert not proposals.equation.any()
+
+
+def test_gauss_newton_controls_with_few_sensors_and_continues_with_the_same_bits() -> None:
+    problem = pdeloop.problem("allen-cahn", sensors=SENSORS, horizon=16)
+    plant = problem.plant()
+    explored, actions = problem.explore(0)
+    U = np.eye(SENSORS)
+    context = Context(
+        *(U, plant.target, plant.state_weight, plant.action_weight, plant.horizon),
+        Trajectory(explored[:-1], actions),
+        sensors=SENSORS,
+    )
+
+    def make() -> GaussNewton:
+        start = np.zeros((plant.n_a, 2 * SENSORS))
+        return GaussNewton(start, seed=0, rollouts=10, context=context)
+
+    def measure(asked: Rollout) -> RolloutResult:
+        K = asked.policy[:, :SENSORS]
+        b = asked.policy[:, SENSORS:] @ plant.target
+        episode = rollout(plant, lambda k, y: y @ K.T + b, [asked.field_seed])
+        seen = Trajectory(episode.states[:, 0], episode.actions[:, 0])
+        return RolloutResult(float(episode.costs.mean[0]), trajectory=seen)
+
+    first, later = make(), make()
+    row = first.tell([measure(asked) for asked in first.ask()])
+    assert row["model"] == "sensed"
+    for _ in range(2):
+        first.tell([measure(first.ask()[0])])
+    later.restore(first.state())
+    rows = [optimizer.tell([measure(optimizer.ask()[0])]) for optimizer in (first, later)]
+    assert rows[0] == rows[1] and rows[0]["accepted"] and rows[0]["relative_cost"] < 0.8
+    for optimizer in (first, later):
+        optimizer.tell([measure(asked) for asked in optimizer.ask()])
+    assert same_bits(first.ask()[0].policy, later.ask()[0].policy)

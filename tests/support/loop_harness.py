@@ -1,0 +1,267 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Real nodes in real processes on a ROS domain of their own, with a limit on every wait.
+
+Most of what it takes to start a node is imports and the loading of compiled code, a second of a
+core. So what a test starts itself, nodes, commands and pieces of Python, is forked from a process
+that has done that (`preloaded`). The nodes that a training starts are programs of their own, as
+always.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from loop_interfaces.isolation import loopback_environment
+from pdeloop.domain import DOMAINS, DOMAINS_FOLDER, own_domain
+
+ROOT = Path(__file__).resolve().parents[2]
+FORKING = multiprocessing.get_context("forkserver")
+FORKING.set_forkserver_preload(["tests.support.preloaded"])
+
+
+def until(condition: Callable[[], object], limit: float, what: str) -> None:
+    """Wait until `condition()`; AssertionError naming `what` after `limit` seconds."""
+    deadline = time.monotonic() + limit
+    while not condition():
+        assert time.monotonic() < deadline, f"no {what} within {limit} s"
+        time.sleep(0.02)
+
+
+def udp_sockets(pid: int) -> list[tuple[str, int]]:
+    """Local address (hexadecimal) and port of the UDP sockets of a process."""
+    inodes = set()
+    for entry in Path(f"/proc/{pid}/fd").iterdir():
+        target = str(entry.readlink())
+        if target.startswith("socket:["):
+            inodes.add(target[8:-1])
+    lines = Path(f"/proc/{pid}/net/udp").read_text().splitlines()[1:]
+    own = [line.split()[1].split(":") for line in lines if line.split()[9] in inodes]
+    return [(address, int(port, 16)) for address, port in own]
+
+
+class Forked:
+    """A node or a program in a process that was forked, not executed; used like a Popen.
+
+    name: one of tests.support.preloaded.MAINS, or "-c" and the first argument is Python, as for an
+    interpreter. Its output goes into the file `log`.
+    """
+
+    def __init__(
+        self, name: str, arguments: Sequence[str], log: Path, environment: Mapping[str, str]
+    ) -> None:
+        self.name, self.args, self.log = name, [name, *arguments], log
+        log.touch()
+        given = (name, list(arguments), log, dict(environment))
+        self._process = FORKING.Process(target=run_main, args=given)
+        self._process.start()
+        assert self._process.pid is not None
+        self.pid = self._process.pid
+
+    def poll(self) -> int | None:
+        return self._process.exitcode
+
+    def wait(self, timeout: float | None = None) -> int:
+        self._process.join(timeout)
+        code = self._process.exitcode
+        if code is None:
+            raise subprocess.TimeoutExpired(self.args, timeout or 0.0)
+        return code
+
+    def send_signal(self, number: int) -> None:
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        self.send_signal(signal.SIGKILL)
+
+
+def become(log: Path, environment: Mapping[str, str]) -> None:
+    """Make a forked process one of a test's own: its session, output, environment and folder."""
+    os.setsid()
+    with log.open("wb") as output, Path(os.devnull).open("rb") as nothing:
+        for file, number in ((nothing, 0), (output, 1), (output, 2)):
+            os.dup2(file.fileno(), number)
+    os.environ.clear()
+    os.environ.update(environment)
+    os.chdir(log.parent)
+
+
+def run_main(name: str, arguments: list[str], log: Path, environment: dict[str, str]) -> None:
+    """What `Forked` runs, in the forked process."""
+    become(log, environment)
+    if name == "-c":
+        code, *arguments = arguments
+        sys.argv = [name, *arguments]
+        exec(code, {"__name__": "__main__"})
+        return
+    from tests.support.preloaded import MAINS
+
+    sys.argv = [name, *arguments]
+    sys.exit(MAINS[name]())
+
+
+class Processes:
+    """The processes of one test. All are gone when it is over.
+
+    forks: whether what it starts is forked; set it to False where that needs an interpreter that
+    was started in this test's environment.
+    """
+
+    forks = True
+
+    def __init__(self, folder: Path, domain: int) -> None:
+        self.folder = folder
+        self.environment = {
+            **os.environ,
+            **loopback_environment(),
+            "ROS_DOMAIN_ID": str(domain),
+            "ROS_LOG_DIR": str(folder / "ros_logs"),
+            "PYTHONPATH": str(ROOT),
+        }
+        self._alive: list[subprocess.Popen[bytes] | Forked] = []
+        self._count = 0
+
+    def start(self, *command: str, name: str = "") -> Any:
+        """Run `python COMMAND...` with its output in a file (see `output`)."""
+        if self.forks and command[0] == "-c":
+            return self._fork(self._new_log(name or Path(command[-1]).name), *command)
+        return self.program(sys.executable, *command, name=name)
+
+    def program(self, *command: str, name: str = "") -> Any:
+        """Run any program in the same way."""
+        path = self._new_log(name or Path(command[-1]).name)
+        with path.open("wb") as log:
+            process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=self.environment,
+                cwd=self.folder,
+                start_new_session=True,
+            )
+        process.log = path  # type: ignore[attr-defined]
+        self._alive.append(process)
+        return process
+
+    def _new_log(self, name: str) -> Path:
+        self._count += 1
+        return self.folder / f"{self._count:02d}-{name}.log"
+
+    def _fork(self, log: Path, name: str, *arguments: str) -> Forked:
+        forked = Forked(name, arguments, log, self.environment)
+        self._alive.append(forked)
+        return forked
+
+    def node(self, name: str, *ros_arguments: str) -> Any:
+        """Start one of our nodes."""
+        if self.forks:
+            return self._fork(self._new_log(name), name, "--ros-args", *ros_arguments)
+        return self.start("-m", f"{name}.node", "--ros-args", *ros_arguments, name=name)
+
+    def pdeloop(self, *arguments: str) -> Any:
+        """Start the command line."""
+        if self.forks and arguments[0] not in ("reproduce", "study"):  # they have their own workers
+            return self._fork(self._new_log("pdeloop"), "pdeloop", *arguments)
+        return self.start("-m", "pdeloop.cli", *arguments, name="pdeloop")
+
+    def output(self, process: subprocess.Popen[bytes]) -> str:
+        text: str = process.log.read_text(errors="replace")  # type: ignore[attr-defined]
+        return text
+
+    def wait(self, process: subprocess.Popen[bytes], limit: float, code: int = 0) -> str:
+        """Wait for the end of `process`, which must come with exit code `code`; its output."""
+        try:
+            got = process.wait(limit)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(f"still running after {limit} s:\n{self.everything()}") from None
+        assert got == code, f"exit code {got}, expected {code}:\n{self.everything()}"
+        return self.output(process)
+
+    def everything(self) -> str:
+        """What every process printed."""
+        return "\n".join(f"== {p.args}\n{self.output(p)[-3000:]}" for p in self._alive)
+
+    def left_behind(self) -> list[int]:
+        """Processes of this test that still run, also those its children started."""
+        inside = f"ROS_LOG_DIR={self.folder}".encode()
+        found = [forked.pid for forked in self._forked()]
+        for entry in Path("/proc").glob("[0-9]*"):
+            with contextlib.suppress(OSError):
+                environment = (entry / "environ").read_bytes()
+                zombie = (entry / "stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
+                if inside in environment and not zombie:
+                    found.append(int(entry.name))
+        return found
+
+    def _forked(self) -> list[Forked]:
+        """The forked ones that still run."""
+        return [p for p in self._alive if isinstance(p, Forked) and p.poll() is None]
+
+    def pids(self, node: str) -> list[int]:
+        """Processes of this test that run the module `node`.node, whoever started them."""
+        found = [forked.pid for forked in self._forked() if forked.name == node]
+        for pid in self.left_behind():
+            with contextlib.suppress(OSError):
+                words = Path(f"/proc/{pid}/cmdline").read_bytes().decode().split("\0")
+                if node in words:
+                    found.append(pid)
+        return found
+
+    def stop(self) -> None:
+        """SIGINT, then SIGKILL, to all and to whatever they started."""
+        for number, patience in ((signal.SIGINT, 3.0), (signal.SIGKILL, 3.0)):
+            for process in self._alive:
+                if process.poll() is None:
+                    with contextlib.suppress(ProcessLookupError):
+                        os.killpg(process.pid, number)
+                        os.killpg(process.pid, signal.SIGCONT)
+            deadline = time.monotonic() + patience
+            for process in self._alive:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(max(0.0, deadline - time.monotonic()))
+        for pid in self.left_behind():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        deadline = time.monotonic() + 60.0  # a killed process takes a moment to end
+        while self.left_behind() and time.monotonic() < deadline:
+            time.sleep(0.01)
+
+
+@contextlib.contextmanager
+def processes(folder: Path) -> Iterator[Processes]:
+    """The processes of one test in a domain that nobody else uses."""
+    with own_domain() as domain:
+        running = Processes(folder, domain)
+        try:
+            yield running
+        finally:
+            running.stop()
+
+
+@contextlib.contextmanager
+def without_domain(loop: Processes) -> Iterator[None]:
+    """As a person uses it: no domain is given, commands take one, and find each other's loops.
+
+    They find those of this test only, and take one of two domains that this test holds: with a
+    temporary folder of their own they would not see which ones the tests beside them hold.
+    """
+    own = loop.environment.pop("ROS_DOMAIN_ID")
+    folder = loop.folder / DOMAINS_FOLDER.name
+    folder.mkdir()
+    loop.environment["TMPDIR"] = str(loop.folder)
+    loop.forks = False  # a program looks for its temporary folder when it starts
+    with own_domain() as another, contextlib.ExitStack() as held:
+        for domain in set(map(str, DOMAINS)) - {own, str(another)}:
+            fcntl.flock(held.enter_context((folder / domain).open("w")), fcntl.LOCK_EX)
+        yield

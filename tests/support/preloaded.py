@@ -1,0 +1,27 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""What nodes and commands import and load, done once by the process that they are forked from.
+
+`tests.support.loop_harness` starts that process with this module.
+"""
+
+import controller_node.node
+import pde_sim_node.node
+import recorder_node.node
+import tests.support.operator_program  # noqa: F401
+import tuner_node.node
+import viewer_node.node
+from pdeloop import cli
+from pdeloop.training_run import resolve
+from tests.support.small import SMALL
+
+MAINS = {
+    "controller_node": controller_node.node.main,
+    "pdeloop": cli.main,
+    "pde_sim_node": pde_sim_node.node.main,
+    "recorder_node": recorder_node.node.main,
+    "tuner_node": tuner_node.node.main,
+    "viewer_node": viewer_node.node.main,
+}
+
+cli.parser()  # imports what the commands need
+resolve(str(SMALL), {})  # loads what is compiled

@@ -1,0 +1,160 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Own measurements in files: read as they are documented, refused in one sentence if they are not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from loop_method.reduce.regression import exact_regression
+from pdeloop import data_file
+from pdeloop.cli import FAILED, main
+from pdeloop.data_file import read_measurements
+from tests.support.linear_system import linear_system, trajectory
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "measurements.csv"
+Array = np.ndarray
+
+
+def arrays(**changes: Any) -> dict[str, Any]:
+    states, actions = trajectory(*linear_system(4), steps=60)
+    good = {"states": states, "actions": actions, "target": states[0], "sample_time": 0.1}
+    return {name: value for name, value in {**good, **changes}.items() if value is not None}
+
+
+def test_the_example_is_read_and_gives_the_order_of_the_plant_that_made_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = read_measurements(EXAMPLE)
+    assert [(z.shape, a.shape) for z, a in found.trajectories] == [((61, 5), (60, 2))] * 2
+    assert found.sample_time == 0.5 and found.target.tolist() == [1.0, 0.8, 0.5, 0.2, 0.0]
+    out = tmp_path / "model.npz"
+    assert main(["identify", "--data", str(EXAMPLE), "--out", str(out)]) == 0
+    text = capsys.readouterr().out
+    assert "order 5 from 120 steps of 2 trajectories" in text and "suggested" in text
+    with np.load(out) as saved:
+        assert np.array_equal(saved["A"], exact_regression(found.trajectories, n_s=5).A)
+    assert main(["identify", "--data", str(EXAMPLE), "--order", "2"]) == 0
+    assert "order 2 from" in capsys.readouterr().out
+
+
+def test_an_npz_of_one_or_several_trajectories_is_what_was_saved(tmp_path: Path) -> None:
+    one = arrays()
+    np.savez(tmp_path / "one.npz", **one)
+    ((states, actions),) = read_measurements(tmp_path / "one.npz").trajectories
+    assert np.array_equal(states, one["states"]) and np.array_equal(actions, one["actions"])
+    np.savez(
+        tmp_path / "two.npz", **arrays(states=[one["states"]] * 2, actions=[one["actions"]] * 2)
+    )
+    assert len(read_measurements(tmp_path / "two.npz").trajectories) == 2
+
+
+NAN = np.full((61, 4), np.nan)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"target": None}, "target is missing"),
+        ({"states": NAN}, "finite numbers, got NaN"),
+        ({"actions": np.zeros((61, 2))}, r"got shapes \(61, 4\) and \(61, 2\)"),
+        ({"actions": np.zeros((60, 0))}, "same n_z numbers"),
+        ({"target": np.zeros(3)}, "same n_z numbers"),
+        ({"target": np.full(4, np.inf)}, "target of finite numbers"),
+        (
+            {"states": np.zeros((2, 61, 4))},
+            r"K trajectories, got shapes \(2, 61, 4\) and \(60, 2\)",
+        ),
+        (
+            {"states": np.zeros((2, 61, 4)), "actions": np.zeros((1, 60, 2))},
+            r"K trajectories, got shapes \(2, 61, 4\) and \(1, 60, 2\)",
+        ),
+        ({"actions": np.full((60, 2), 1e200)}, r"magnitude 1e\+100 at most, got 1e\+200"),
+        ({"states": np.array(["x"])}, "real numbers in states"),
+        ({"states": np.array([object()])}, "holds no arrays"),
+        ({"sample_time": 0.0}, "sample_time above 0"),
+        ({"sample_time": np.array([1.0, 2.0])}, "one number as sample_time"),
+    ],
+)
+def test_a_flawed_npz_is_refused(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
+    path = tmp_path / "own.npz"
+    np.savez(path, **arrays(**changes))
+    refused(path, words)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "expected the names t, z"),
+        (b"\xff\xfe\x00garbage", "expected the names t, z"),
+        (b"x,y\n1,2\n", "expected the names t, z"),
+        (b"t,z1,a1\n", "whose t is the word target"),
+        (b"t,z1,a1\ntarget,0,\n0,1,1\n", "no trajectory of two states"),
+        (b"t,z1,a1\ntarget,0,\n0,1,1\n1,1\n", "expected 3 values in row 4, got 2"),
+        (b"t,z1,a1\ntarget,0,\n0,one,1\n", "expected numbers in row 3"),
+        (b"t,z1,a1\ntarget,0,\n0,1,1\n1,1,1\n3,1,1\n", "expected equal steps of t, got 1 to 2"),
+        (b"t,z1,a1\ntarget,0,\n0,1,1\nnan,1,1\n", "expected a time t in row 4"),
+        (b"t,z1,a1\ntarget,0,\n0,1,\n1,1,1\n", "finite numbers, got NaN"),
+        (b"t,z1,a1\ntarget,0,\n0,1,1\ntarget,0,\n1,1,1\n", "one row .* got another, 4"),
+        (b'"' + b"t," * 10**6, "no table of commas|expected the names"),
+    ],
+)
+def test_a_flawed_csv_is_refused(tmp_path: Path, content: bytes, words: str) -> None:
+    path = tmp_path / "own.csv"
+    path.write_bytes(content)
+    refused(path, words)
+
+
+def test_other_files_and_larger_ones_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refused(tmp_path / "own.xlsx", r"must be a .npz or a .csv file")
+    refused(tmp_path / "none.csv", "cannot be read: No such file")
+    monkeypatch.setattr(data_file, "MAX_TEXT_BYTES", 100)
+    refused(EXAMPLE, "larger than 100 bytes; give the same as .npz")
+
+
+def test_more_trajectories_or_numbers_than_memory_may_take_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "own.npz"
+    monkeypatch.setattr(data_file, "MAX_TRAJECTORIES", 2)
+    np.savez(path, **arrays(states=np.zeros((3, 2, 0)), actions=np.zeros((3, 1, 0))))
+    refused(path, "at most 2 trajectories, got 3")
+    path = tmp_path / "own.csv"
+    path.write_text("t,z1,a1\ntarget,0,\n" + "0,1,1\n" * 4)
+    refused(path, "at most 2 trajectories, got 3")
+    monkeypatch.setattr(data_file, "MAX_ARRAY_BYTES", 8 * 100)
+    path = tmp_path / "own.npz"
+    np.savez(path, **arrays(states=np.zeros((61, 4), dtype=np.int8)))
+    refused(path, "at most 100 numbers, got 369")
+
+
+def refused(path: Path, words: str) -> None:
+    with pytest.raises(ValueError, match=words) as failed:
+        read_measurements(path)
+    assert "\n" not in str(failed.value) and path.name in str(failed.value)
+
+
+def test_the_command_line_says_it_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "own.csv").write_text("t,z1,a1\ntarget,0,\n0,1,1\n1,2,1\n")
+    assert main(["identify", "--data", str(tmp_path / "own.csv")]) == FAILED
+    assert "too few, or vary too little, to hold some of them out" in capsys.readouterr().err
+    assert main(["identify", "--data", str(EXAMPLE), "--order", "9"]) == FAILED
+    assert capsys.readouterr().err.count("\n") == 1
+    assert main(["identify", "--data", str(EXAMPLE), "--rank", "4"]) == FAILED
+    assert "add --identification dmdc, or leave --rank out" in capsys.readouterr().err
+    assert (
+        main(["identify", "--data", str(EXAMPLE), "--rank", "7", "--identification", "dmdc"]) == 0
+    )
+    capsys.readouterr()
+    np.savez(tmp_path / "idle.npz", **arrays(actions=np.zeros((60, 2))))
+    assert main(["identify", "--data", str(tmp_path / "idle.npz")]) == FAILED
+    assert "the inputs a1 and a2 never moved (constant at 0)" in capsys.readouterr().err
+    assert main(["identify", "--data", str(EXAMPLE), "--episode", "1"]) == FAILED
+    assert "choose from a bag" in capsys.readouterr().err

@@ -1,0 +1,224 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The server of the live page: what it serves, to whom, and what a page may ask of the nodes."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import aiohttp
+import numpy as np
+import pytest
+
+from tests.support.browser import browser
+from viewer_node.loop_nodes import Endpoint
+from viewer_node.operation import Call
+from viewer_node.web.page import Page, ShowLoop
+from viewer_node.web.server import FILES, STATIC, Server
+
+
+@contextlib.contextmanager
+def served() -> Iterator[tuple[Server, Page]]:
+    page = Page()
+    page.controls = [{"role": "plant", "node": "/p", "verbs": ["pause"]}]
+    server = Server(page, 0)
+    server.start()
+    try:
+        yield server, page
+    finally:
+        server.stop()
+
+
+async def ask(server: Server, path: str, **headers: str) -> tuple[int, str]:
+    url = f"http://127.0.0.1:{server.port}{path}"
+    async with (
+        aiohttp.ClientSession() as session,
+        session.get(url, headers=headers) as answer,
+    ):
+        return answer.status, await answer.text()
+
+
+async def refusal(server: Server, said: Any, **headers: str) -> str:
+    """Why a page is refused what it says over its WebSocket."""
+    async with aiohttp.ClientSession() as session:
+        url = f"http://127.0.0.1:{server.port}/ws"
+        async with session.ws_connect(url, headers=headers) as page:
+            assert (await page.receive_json(timeout=600))["part"] == "hello"
+            await page.send_json(said)
+            while (answer := await page.receive_json(timeout=600))["part"] != "refusal":
+                pass
+            return str(answer["text"])
+
+
+def test_every_file_of_the_page_is_served_and_nothing_else():
+    with served() as (server, _):
+        assert {"index.html", "main.js", "uPlot.iife.min.js"} <= set(FILES)
+        for name, path in {"": STATIC / "index.html", **FILES}.items():
+            status, text = asyncio.run(ask(server, f"/{name}"))
+            assert status == 200 and text == path.read_text()
+        for name in (
+            "node.py",
+            "%2e%2e%2fserver.py",
+            "server.py",
+            "page",
+            "style.css/x",
+            "README.md",
+        ):
+            status, _ = asyncio.run(ask(server, f"/{name}"))
+            assert status in (403, 404), name
+
+
+def test_a_foreign_host_name_or_page_is_refused():
+    with served() as (server, page):
+        pause = {"node": "/p", "verb": "pause"}
+        own = f"http://127.0.0.1:{server.port}"
+        for wrong in (
+            {"Host": f"evil.example:{server.port}"},
+            {"Host": "127.0.0.1"},
+            {"Origin": "http://evil.example"},
+            {"Origin": "null"},
+            {"Origin": f"https://127.0.0.1:{server.port}"},
+        ):
+            assert asyncio.run(ask(server, "/", **wrong))[0] == 403, wrong
+            with pytest.raises(aiohttp.WSServerHandshakeError):
+                asyncio.run(refusal(server, pause, **{"Origin": own, **wrong}))
+        with pytest.raises(aiohttp.WSServerHandshakeError):
+            asyncio.run(refusal(server, pause))  # from no page
+        assert page.requests.empty()
+
+
+def test_a_page_of_ours_reaches_the_nodes_and_nothing_but_what_they_offer():
+    with served() as (server, page):
+        own = f"http://localhost:{server.port}"
+        text = asyncio.run(refusal(server, {"node": "/p", "verb": "stop"}, Origin=own))
+        assert "no node of this loop offers" in text
+        page.place["namespaces"] = ["/", "/lab"]
+        for said, done in (
+            ({"node": "/p", "verb": "pause"}, True),
+            ({"node": "/q", "verb": "pause"}, False),
+            ({"node": ["/p"], "verb": "pause"}, False),
+            ([], False),
+            (None, False),
+            ({"namespace": "/lab"}, True),
+            ({"namespace": "/other"}, False),
+            ({"component": 1}, True),
+            ({"component": -1}, False),
+            ({"component": "u"}, False),
+            ({"environment": 1}, False),
+        ):
+            assert (server.take(json.dumps(said)) == "") == done, said
+        assert "expected a component" in server.take("[" * 100_000)
+        # Confirmed at once, whatever the node is doing.
+        assert page.requests.get(timeout=600) == Call("/p", "pause")
+        assert page.requests.get(timeout=600) == ShowLoop("/lab") and page.requests.empty()
+
+
+def test_the_headers_allow_nothing_from_elsewhere_and_no_inline_script():
+    async def headers(server: Server) -> Any:
+        async with (
+            aiohttp.ClientSession() as session,
+            session.get(server.url) as answer,
+        ):
+            return answer.headers
+
+    with served() as (server, _):
+        found = asyncio.run(headers(server))
+    policy = found["Content-Security-Policy"]
+    assert "default-src 'none'" in policy and "script-src 'self'" in policy
+    assert "unsafe" not in policy and "http" not in policy
+    assert found["X-Content-Type-Options"] == "nosniff"
+    for name, path in FILES.items():
+        text = path.read_text().replace("http://www.w3.org/", "")  # names of XML vocabularies
+        text = text.removeprefix("/*! https://github.com/leeoniya/uPlot")  # the mark of its licence
+        assert "https://" not in text and "http://" not in text and "eval(" not in text, name
+
+
+def test_the_colour_map_is_that_of_the_report():
+    from matplotlib import colormaps
+
+    from pdeloop.report.style import FIELD_MAP
+
+    hexadecimal = (STATIC / "cividis.js").read_text().split("const COLOURS")[0]
+    text = "".join(hexadecimal.split('"')[1::2])
+    ours = np.frombuffer(bytes.fromhex(text), np.uint8).reshape(-1, 3)
+    theirs = (colormaps[FIELD_MAP](np.arange(256))[:, :3] * 255).round()
+    np.testing.assert_array_equal(ours, theirs)
+
+
+def test_the_page_tells_what_a_node_computes_and_what_became_of_a_request(tmp_path):
+    """In a real browser, with a tuner that is only told of."""
+    with served() as (server, page), browser(tmp_path) as tab:
+        page.show(page.view, domain=1, namespace="/")
+        page.controls = [{"role": "tuner", "node": "/t", "verbs": ["pause", "resume", "stop"]}]
+        view, now = page.view, time.monotonic()
+        view.nodes.update({"tuner": [Endpoint("/t", b"t")]})
+        busy = [("activity", "fitting models"), ("activity for", "7.0")]
+
+        def shows(state: str, notice: str) -> None:
+            with page.lock:
+                page.refresh(now)
+            tab.until(f"document.querySelector('#state').textContent === {state!r}", 30.0)
+            tab.until(f"document.querySelector('#notice').textContent === {notice!r}", 30.0)
+
+        view.nodes.diagnosis("t: training", 0, "", busy, now)
+        tab.go(server.url)
+        shows("fitting models, 7 s", "")
+        tab.click("#tuner-pause")
+        asked = page.requests.get(timeout=600)
+        assert asked == Call("/t", "pause")
+        view.operation.asked(asked, now)
+        shows("fitting models, 7 s", "Pause training: asked for; takes effect after fitting models")
+        button = "document.querySelector('#tuner-%s')"
+        assert tab.ask(f"{button % 'pause'}.disabled")
+        assert tab.ask(f"{button % 'pause'}.textContent.trim()") == "Pausing…"
+        view.operation.answered(asked, now, None)
+        view.nodes.diagnosis("t: training", 1, "", [("paused", "yes")], now)
+        shows("training paused", "")
+        tab.click("#tuner-stop")
+        assert tab.ask(f"{button % 'stop'}.textContent.trim()") == "Really stop?"
+        assert page.requests.empty()
+        tab.click("#tuner-stop")
+        stop = page.requests.get(timeout=600)
+        view.operation.answered(stop, now, "no plant")
+        shows("training paused", "Stop training: no plant")
+        view.operation.answered(stop, now, None)
+        shows("training paused", "The training ends after the rollouts under way.")
+        assert tab.ask(f"{button % 'stop'}.disabled")
+        assert tab.console == []
+
+
+async def closed(connections: list[tuple[asyncio.StreamReader, asyncio.StreamWriter]]) -> None:
+    """Wait until the server has closed all of these."""
+    for reader, writer in connections:
+        with contextlib.suppress(ConnectionError):
+            assert await asyncio.wait_for(reader.read(), 10.0) in (b"",)
+        writer.close()
+
+
+def test_connections_that_ask_nothing_are_closed_and_a_page_stays(monkeypatch):
+    monkeypatch.setattr("viewer_node.web.server.LINGER", 1.0)
+    monkeypatch.setattr("viewer_node.web.server.MOST_CONNECTIONS", 50)
+
+    async def scenario(server: Server, content: Page) -> None:
+        url = f"http://127.0.0.1:{server.port}/ws"
+        own = f"http://127.0.0.1:{server.port}"
+        async with (
+            aiohttp.ClientSession() as session,
+            session.ws_connect(url, headers={"Origin": own}) as page,
+        ):
+            await page.receive_json(timeout=600)
+            half = [await asyncio.open_connection("127.0.0.1", server.port) for _ in range(49 + 20)]
+            for _, writer in half[:10]:
+                writer.write(b"GET / HTTP/1.1\r\nHost: ")  # and never the rest
+            await closed(half[49:])  # beyond the limit: at once
+            await closed(half[:49])
+            assert (await ask(server, "/"))[0] == 200
+            assert not page.closed and content.open
+            await page.ping()
+
+    with served() as (server, page):
+        asyncio.run(scenario(server, page))

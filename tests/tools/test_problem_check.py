@@ -1,0 +1,144 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""`pdeloop check`: modes and steps against theory, and what it refuses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+
+from loop_interfaces.problem import load_parameters
+from pde_sim_node.build import build_plant
+from pde_sim_node.equations import LinearEquation
+from pde_sim_node.plants import SpectralPlant
+from pdeloop.cli import FAILED, main
+from pdeloop.problem_check import check, reach
+from tests.support.plants import plant_of
+from tests.support.small import parameters
+
+
+@dataclass(frozen=True, kw_only=True)
+class Growing(LinearEquation):
+    """u_t = u + 0.2 u_xx on [0, 2 pi): the waves 0, 1 and 2 grow."""
+
+    name: ClassVar[str] = "growing"
+    order: ClassVar[float] = 2.0
+    length: float = 2 * np.pi
+
+    def linear_operator(self, k: Any) -> Any:
+        return 1.0 - 0.2 * k**2
+
+    def initial_field(self, x: Any, rng: Any) -> Any:
+        return np.cos(x)
+
+    def target(self, x: Any) -> Any:
+        return np.zeros_like(x)
+
+
+def plant(n_a: int, width: float) -> SpectralPlant:
+    return plant_of(Growing(), n_z=32, n_a=n_a, width=width, sample_time=0.1, horizon=5)
+
+
+def test_the_unstable_modes_are_those_of_the_operator_and_enough_actuators_reach_them() -> None:
+    found = reach(plant(5, 0.1))
+    assert found.waves.tolist() == [0, 1, 1, 2, 2]
+    np.testing.assert_allclose(found.growth, [1.0, 0.8, 0.8, 0.2, 0.2], atol=1e-7)
+    assert found.margins.min() > 0.1
+
+
+@pytest.mark.parametrize(("n_a", "lost"), [(1, [1, 2]), (2, [1, 2]), (4, [2])])
+def test_waves_on_which_equally_spaced_actuators_have_one_phase_are_not_reached(
+    n_a: int, lost: list[int]
+) -> None:
+    """A pair cos, sin of one growth rate needs two columns of B, and they see wave n_a / 2 as one."""
+    found = reach(plant(n_a, 0.1))
+    assert sorted(set(found.waves[found.margins < 1e-6])) == lost
+
+
+@pytest.mark.parametrize(
+    ("equilibrium", "growth"),
+    [(1, [0.1308, 0.1308, 0.0824, 0.0824]), (2, [0.139] * 2), (3, [0.0933] * 2)],
+)
+def test_four_actuators_reach_the_unstable_modes_of_the_equilibria(
+    equilibrium: int, growth: list[float]
+) -> None:
+    """Rates of Cvitanovic, Davidchack, Siminos (2010); a shift of the field keeps its size."""
+    values = load_parameters("kuramoto-sivashinsky-22", {"physical.equilibrium": equilibrium})
+    found = reach(build_plant(values))
+    grows = found.growth > 1e-3
+    np.testing.assert_allclose(np.sort(found.growth[grows])[::-1], growth, atol=2e-4)
+    assert found.margins[grows].min() > 0.2
+
+
+def named(**changes: Any) -> dict[str, tuple[bool, str]]:
+    return {found.name: (found.good, found.text) for found in check(parameters(**changes))}
+
+
+def test_the_small_problem_is_good_and_a_coarse_step_is_not() -> None:
+    fine, coarse = named(), named(integration_time=0.05)
+    assert all(good for good, _ in fine.values()), fine
+    assert set(fine) == {"integration step", "modes", "exploration", "order", "first law"}
+    assert coarse["integration step"][0] is False
+    assert "take 0.025 s or less" in coarse["integration step"][1]
+
+
+def test_an_exploration_that_diverges_is_told() -> None:
+    found = named(divergence_bound=0.5)
+    assert found["exploration"][0] is False and "diverges at step" in found["exploration"][1]
+    assert "order" not in found
+
+
+@pytest.mark.parametrize(
+    ("words", "wrong"),
+    [
+        (["burgers", "--n-a", "2"], "--n-a: only for the check of a node"),
+        (["burgers", "--patience", "10"], "--patience: only for the check of a node"),
+        (["burgers", "--network"], "--network: only for the check of a node"),
+        (["plant", "--n-z", "8"], "--n-z: only for the check of a node (controller)"),
+        (["tuner", "--equation", "burgers"], "--equation: only for the check of a problem's FILE"),
+        (["plant", "--picture", "x.png"], "--picture: only for the check of a problem's FILE"),
+    ],
+)
+def test_an_option_of_the_other_check_is_refused(
+    words: list[str], wrong: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["check", *words])
+    assert ended.value.code == 2
+    assert (
+        capsys.readouterr()
+        .err.splitlines()[-1]
+        .startswith(f"pdeloop check: error: leave out {wrong}")
+    )
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--n-a", "-3"],
+        ["--n-a", "1000000000000"],
+        ["--n-a", "2.5"],
+        ["--patience", "inf"],
+        ["--patience", "nan"],
+        ["--limit", "0"],
+    ],
+)
+def test_a_number_out_of_its_range_is_refused(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["check", "plant", *words])
+    assert ended.value.code == 2
+    told = capsys.readouterr().err
+    assert f"{words[0]}: expected a " in told and told.endswith(f", got {words[1]}\n")
+
+
+def test_a_picture_that_cannot_be_written_is_refused_before_the_check(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["check", "burgers", "--picture", str(tmp_path / "none" / "x.png")]) == FAILED
+    told = capsys.readouterr()
+    assert not told.out and "No such file" in told.err

@@ -1,0 +1,403 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Studies: the same results wherever the trainings run, whatever ends them meanwhile."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pdeloop.cli import main
+from pdeloop.study import Failure, Study, StudyError, rows, run
+from pdeloop.study.executors import cluster
+from pdeloop.study.table import text
+from pdeloop.study.training import FILES, train_one
+from tests.support.small import SMALL, same_bits, train_here
+
+LIMIT = 300.0
+CONTENT: dict[str, Any] = {
+    "problems": [str(SMALL)],
+    "seeds": 3,
+    "settings": {"rollouts": 9},
+    "variants": {"gauss-newton": {"optimizer": "gauss_newton"}, "two-point": {}},
+}
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """All files of the finished trainings."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name != "study.json"
+    }
+
+
+@contextmanager
+def here() -> Iterator[Executor]:
+    with ThreadPoolExecutor(1) as pool:
+        yield pool
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("study")
+    assert run(Study.of(CONTENT), folder, here) == []
+    return folder
+
+
+def test_every_training_of_a_study_is_an_ordinary_run_with_the_bits_of_train(reference: Path):
+    study = Study.of(CONTENT)
+    trainings = study.trainings()
+    assert len(trainings) == 6 and set(contents(reference)) == {
+        f"{name}/{file}" for name in trainings for file in FILES
+    }
+    name = "small/gauss-newton/2"
+    alone = train_here(trainings[name])
+    with np.load(reference / name / "policy.npz") as kept:
+        assert same_bits(kept["policy"], alone.policies())
+
+
+def test_the_table_is_that_of_the_runs(reference: Path):
+    table = rows(Study.of(CONTENT), reference)
+    assert [(row["variant"], row["seeds"], row["rollouts"]) for row in table] == [
+        ("gauss-newton", 3, 9.0),
+        ("two-point", 3, 9.0),
+    ]
+    found = [
+        json.loads((reference / f"small/two-point/{seed}/result.json").read_text())
+        for seed in range(3)
+    ]
+    costs = [result["mean_cost"]["adapted"] for result in found]
+    assert np.isclose(table[1]["cost"], np.mean(costs), rtol=1e-12)
+    low, high = table[1]["interval"]
+    assert min(costs) <= low <= np.mean(costs) <= high <= max(costs)
+    assert table[1]["worst"] == max(table[1]["cost_by_seed"])
+    assert sum("two-point" in line for line in text(table).splitlines()) == 2
+
+
+def test_the_result_is_a_function_of_the_parameters_alone():
+    values = Study.of(CONTENT).trainings()["small/two-point/0"]
+    assert train_one(values) == train_one(values)
+
+
+def test_an_interrupted_study_trains_only_what_is_missing(reference: Path, tmp_path: Path):
+    study, seen = Study.of(CONTENT), []
+
+    def stop_after_two(done: int, total: int, status: str) -> None:
+        seen.append((done, total))
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(study, tmp_path, here, tell=stop_after_two)
+    kept = contents(tmp_path)
+    assert 2 * len(FILES) <= len(kept) < 6 * len(FILES)
+    damaged = tmp_path / "small/two-point/2"  # as a crash between its files would leave it
+    damaged.mkdir(parents=True, exist_ok=True)
+    (damaged / "result.json").unlink(missing_ok=True)
+    (damaged / "policy.npz").write_bytes(b"half")
+    seen.clear()
+    assert (
+        run(study, tmp_path, here, tell=lambda done, total, status: seen.append((done, total)))
+        == []
+    )
+    assert seen[0][0] >= 2 and seen[-1] == (6, 6)
+    assert contents(tmp_path) == contents(reference)
+
+
+def test_a_training_that_fails_is_named_and_the_others_are_kept(tmp_path: Path):
+    wild = {"exploration_variance": 1e12}  # the plant diverges under exploration
+    study = Study.of({**CONTENT, "seeds": 1, "variants": {"wild": wild, "tame": {}}})
+    (failure,) = run(study, tmp_path, here)
+    assert isinstance(failure, Failure) and failure.training == "small/wild/0"
+    assert "lower exploration_variance" in failure.reason
+    assert [row["variant"] for row in rows(study, tmp_path)] == ["tame"]
+
+
+class Breaking(Executor):
+    """Loses its workers after `successes` trainings, as a pool whose process is killed."""
+
+    def __init__(self, successes: int) -> None:
+        self._left = successes
+
+    def submit(self, function: Any, /, *arguments: Any, **options: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        if self._left:
+            future.set_result(function(*arguments, **options))
+        else:
+            future.set_exception(BrokenProcessPool("a process ended"))
+        self._left = max(0, self._left - 1)
+        return future
+
+
+def test_workers_that_end_are_replaced_and_those_that_always_end_are_reported(
+    reference: Path, tmp_path: Path
+):
+    study, made = Study.of(CONTENT), []
+
+    def breaking(successes: int) -> Executor:
+        made.append(successes)
+        return Breaking(successes)
+
+    # Of two that were finished at the same moment the broken one may be looked at first.
+    with pytest.raises(StudyError, match="the workers ended 3 times"):
+        run(study, tmp_path / "never", lambda: breaking(0))
+    assert made == [0, 0, 0] and contents(tmp_path / "never") == {}
+    counts = iter((1, 6))
+    assert run(study, tmp_path / "once", lambda: breaking(next(counts))) == []
+    assert contents(tmp_path / "once") == contents(reference)
+
+
+def test_a_worker_with_other_versions_is_refused_or_accepted_on_request(
+    reference: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    from pdeloop.study import training
+
+    study, true = Study.of({**CONTENT, "seeds": 1}), training.environment()
+    monkeypatch.setattr(training, "environment", lambda: {**true, "numpy": "1.0"})
+    with pytest.raises(StudyError, match=r"a worker has numpy 1\.0 instead of .*any-environment"):
+        run(study, tmp_path, here)
+    assert contents(tmp_path) == {}
+    assert run(study, tmp_path, here, any_environment=True) == []
+    result = json.loads((tmp_path / "small/two-point/0/result.json").read_text())
+    assert result["environment"]["numpy"] == "1.0"
+    monkeypatch.undo()
+    table = text(rows(study, tmp_path))
+    assert "two-point*" in table and "*: some trainings had numpy 1.0 instead of " in table
+    monkeypatch.setattr(training, "environment", lambda: {**true, "numpy": "2.0"})
+    with pytest.raises(StudyError, match="trained with other versions"):
+        run(study, tmp_path, here)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"problems": []}, "'problems' is"),
+        ({"problems": ["kdv", "kdv"]}, "names that differ"),
+        ({"seeds": 0}, "'seeds' is 0"),
+        ({"seeds": 10**12}, "at most 1000000, or a list"),
+        ({"seeds": [1, "2"]}, "'seeds' is"),
+        ({"variants": ["a"]}, "'variants' is"),
+        ({"variants": {"../a": {}}}, "expected a name of letters"),
+        ({"variants": {"a": 1}}, "variant 'a' is 1"),
+        ({"variants": {}}, "'variants' is empty"),
+        ({"variants": {"a": {"seed": 4}}}, "leave them out, and give 'seeds' beside"),
+        ({"settings": 3}, "'settings' is 3"),
+        ({"settings": {"seeds": 4}}, "leave them out, and give 'seeds' beside"),
+        ({"seed": 3}, "unknown entries: seed"),
+        ({"/**": {}}, "this is a problem's file; expected a study's"),
+    ],
+)
+def test_a_study_that_cannot_be_is_refused_in_one_sentence(change: dict[str, Any], sentence: str):
+    with pytest.raises(StudyError, match=sentence):
+        Study.of({**CONTENT, **change})
+    with pytest.raises(
+        StudyError, match=r"small, variant 'gauss-newton': parameter 'rollouts' is -1"
+    ):
+        Study.of({**CONTENT, "settings": {"rollouts": -1}}).trainings()
+
+
+def test_the_command_runs_continues_and_refuses_another_study(
+    reference: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    file, out = tmp_path / "study.yaml", tmp_path / "out"
+    file.write_text(json.dumps({**CONTENT, "seeds": 1}))  # JSON is YAML
+    assert main(["study", str(file), "--out", str(out), "--processes", "1"]) == 0
+    assert "results in" in capsys.readouterr().out and (out / "costs.png").stat().st_size > 1000
+    assert main(["study", "--out", str(out), "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["rows"]) == 2
+    for name in ("table.json", "costs.png"):
+        (tmp_path / name).write_text("of somebody else")
+        (out / name).unlink()
+        (out / name).symlink_to(tmp_path / name)
+    assert main(["study", "--out", str(out)]) == 0
+    assert len(json.loads((out / "table.json").read_text())["rows"]) == 2
+    assert {(tmp_path / name).read_text() for name in ("table.json", "costs.png")} == {
+        "of somebody else"
+    }
+    capsys.readouterr()
+    file.write_text(json.dumps(CONTENT))
+    assert main(["study", str(file), "--out", str(out)]) == 1
+    assert "holds another study" in capsys.readouterr().err
+    a_training = next(out.rglob("parameters.yaml")).parent
+    assert main(["study", str(file), "--out", str(a_training)]) == 1
+    assert f"{a_training} holds a run" in capsys.readouterr().err
+    assert main(["study", "--out", str(tmp_path / "none")]) == 1
+    assert "no study in" in capsys.readouterr().err
+    words = (str(file), "--out", str(tmp_path / "new"), "--scheduler")
+    assert main(["study", *words, "127.0.0.1"]) == 1
+    assert "expected one like tcp://localhost:8786" in capsys.readouterr().err
+    assert main(["study", *words, ""]) == 1
+    assert "address is ''; expected one like" in capsys.readouterr().err
+    assert main(["study", *words, "tls://127.0.0.1:1"]) == 1
+    assert "needs certificates" in capsys.readouterr().err
+    assert main(["study", *words, "tcp://127.0.0.1:1"]) == 1
+    assert "no Dask scheduler answers" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_the_command_takes_an_own_equation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("PDELOOP_EQUATIONS", "")  # to be as it was after the test
+    monkeypatch.chdir(tmp_path)
+    assert main(["new", "own"]) == 0
+    settings = {"rollouts": 9, "horizon": 40, "evaluation_fields": 2}
+    (tmp_path / "study.yaml").write_text(
+        json.dumps({"problems": ["own/own.yaml"], "settings": settings})
+    )
+    words = ["study", "study.yaml", "--out", "out", "--processes", "1"]
+    assert main(words) == 1 and not Path("out").exists()
+    assert main([*words, "--equation", "own/own.py:Own"]) == 0
+    assert Path("out/own/default/0/result.json").exists()
+
+
+def test_an_interrupted_command_ends_its_processes_in_the_middle(tmp_path: Path):
+    file, out = tmp_path / "study.yaml", tmp_path / "out"
+    endless = {"rollouts": 2_000_000, "optimizer": "two_point"}
+    file.write_text(json.dumps({"problems": [str(SMALL)], "seeds": 9, "settings": endless}))
+    words = [sys.executable, "-m", "pdeloop.cli", "study", str(file), "--out", str(out)]
+    process = subprocess.Popen(
+        [*words, "--processes", "2"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    assert process.stdout is not None
+    try:
+        # A busy machine may say first that it compiles.
+        assert any("0 of 9 trainings" in line for line in process.stdout)
+        process.send_signal(signal.SIGINT)
+        told, _ = process.communicate(timeout=LIMIT)
+    finally:
+        process.kill()
+    assert process.returncode == 130 and f"continue with: pdeloop study --out {out}" in told
+    assert "Traceback" not in told, told
+    assert not list(out.rglob("result.json"))
+
+
+def dask(command: str, *options: str, packages: str = "") -> subprocess.Popen[bytes]:
+    """A Dask process on loopback, in a session of its own, with packages of another folder first."""
+    words = [sys.executable, "-m", "distributed.cli." + command, "--host", "127.0.0.1", *options]
+    quiet, first = subprocess.DEVNULL, {**os.environ, "PYTHONPATH": packages}
+    return subprocess.Popen(words, stdout=quiet, stderr=quiet, start_new_session=True, env=first)
+
+
+def installed_before(name: str, folder: Path, *others: str) -> str:
+    """A folder with the newest versions of packages before those installed here."""
+    older = [f"{each}<{metadata.version(each)}" for each in (name, *others)]
+    options = ("--quiet", "--no-deps", "--no-compile", "--only-binary=:all:", "--retries=0")
+    words = [sys.executable, "-m", "pip", "install", *options, "--target", str(folder), *older]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=LIMIT)
+    if done.returncode:
+        pytest.skip(f"another {name} cannot be had: {done.stderr.strip().splitlines()[-1]}")
+    return str(folder)
+
+
+@contextmanager
+def dask_cluster(
+    folder: Path, workers: int, *, scheduler: str = "", worker: str = ""
+) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+    """Address of a real scheduler, and its real workers, one thread each.
+
+    scheduler, worker: folders of packages that these processes have instead of those here.
+    """
+    folder.mkdir(exist_ok=True)
+    file = folder / "scheduler.json"
+    with ExitStack() as stack:
+
+        def started(command: str, *options: str, packages: str) -> subprocess.Popen[bytes]:
+            shared = ("--scheduler-file", str(file), "--no-dashboard")
+            process = dask(command, *shared, *options, packages=packages)
+            stack.callback(process.wait, LIMIT)
+            stack.callback(lambda: process.poll() is None and os.kill(process.pid, signal.SIGKILL))
+            return process
+
+        started("dask_scheduler", "--port", "0", packages=scheduler)
+        deadline = time.monotonic() + LIMIT
+        while not file.exists():
+            assert time.monotonic() < deadline, "no scheduler"
+            time.sleep(0.05)
+        known = [
+            started(
+                *("dask_worker", "--no-nanny", "--nthreads", "1", "--local-directory", str(folder)),
+                packages=worker,
+            )
+            for _ in range(workers)
+        ]
+        address = json.loads(file.read_text())["address"]
+        if workers:
+            from distributed import Client
+
+            with Client(address, set_as_default=False) as client:
+                client.wait_for_workers(workers, timeout=LIMIT)
+        yield address, known
+
+
+@pytest.mark.filterwarnings("default")  # of the libraries below Dask, in threads of its own
+def test_a_dask_cluster_that_loses_a_worker_gives_the_same_bits(reference: Path, tmp_path: Path):
+    out = tmp_path / "out"
+    with dask_cluster(tmp_path, 2) as (address, workers):
+
+        def kill_one(done: int, total: int, status: str) -> None:
+            if done and workers[0].poll() is None:
+                os.kill(workers[0].pid, signal.SIGKILL)
+
+        assert run(Study.of(CONTENT), out, partial(cluster, address), tell=kill_one) == []
+        assert workers[0].wait(LIMIT) == -signal.SIGKILL and workers[1].poll() is None
+
+        def kill_the_other(done: int, total: int, status: str) -> None:
+            if workers[1].poll() is None:
+                os.kill(workers[1].pid, signal.SIGKILL)
+            if "no worker is left, waiting for one: PYTHONSAFEPATH=1 dask worker tcp" in status:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            run(Study.of(CONTENT), tmp_path / "no", partial(cluster, address), tell=kill_the_other)
+    assert contents(out) == contents(reference)
+
+
+@pytest.mark.filterwarnings("default")  # of the libraries below Dask, in threads of its own
+def test_a_dask_worker_with_another_numpy_is_refused_or_accepted_and_marked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    older = installed_before("numpy", tmp_path / "packages")
+    file, out = tmp_path / "study.yaml", str(tmp_path / "out")
+    file.write_text(json.dumps({**CONTENT, "seeds": 1}))
+    with dask_cluster(tmp_path / "dask", 1, worker=older) as (address, _):
+        words = ["study", str(file), "--out", out, "--scheduler", address]
+        assert main(words) == 1
+        said = capsys.readouterr().err.strip().splitlines()[-1]
+        assert re.fullmatch(
+            rf"pdeloop: a worker has numpy \S+ instead of {np.__version__}: .* --any-environment",
+            said,
+        )
+        assert main([*words, "--any-environment"]) == 0
+    result = json.loads((tmp_path / "out/small/two-point/0/result.json").read_text())
+    numpy = result["environment"]["numpy"]
+    assert numpy != np.__version__
+    told = capsys.readouterr().out
+    assert "two-point*" in told and f"*: some trainings had numpy {numpy} instead of" in told
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_scheduler_and_a_worker_with_another_dask_are_refused(tmp_path: Path):
+    older = installed_before("distributed", tmp_path / "packages", "dask")
+    words = f"has Dask .*, and this machine has {metadata.version('distributed')}; install the same"
+    study = Study.of(CONTENT)
+    one = dask_cluster(tmp_path / "one", 0, scheduler=older)
+    with one as (address, _), pytest.raises(StudyError, match=f"the scheduler {words}"):
+        run(study, tmp_path / "out", partial(cluster, address))
+    other = dask_cluster(tmp_path / "other", 1, worker=older)
+    with other as (address, _), pytest.raises(StudyError, match=f"the worker at tcp://.* {words}"):
+        run(study, tmp_path / "out", partial(cluster, address))

@@ -1,0 +1,204 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""What a person is told of a training."""
+
+from __future__ import annotations
+
+import io
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pdeloop.cli import main
+from pdeloop.display import Display
+from pdeloop.in_process import LocalPair
+from tests.support.small import SMALL, parameters
+from tuner_node.build import build_training
+from tuner_node.narration import Narration, closing_lines, failed, warnings
+from tuner_node.rollouts import CHECK
+
+
+def phase(name: str, rollouts: list[int], budget: int = 20) -> dict[str, Any]:
+    seeds = len(rollouts)
+    return {"event": "phase", "phase": name, "rollouts": rollouts, "budget": [budget] * seeds}
+
+
+def adapted(seed: int, rollouts: int, cost: float | None) -> dict[str, Any]:
+    row = {"event": "adapted", "seed": seed, "rollouts": rollouts, "diverged": int(cost is None)}
+    return row if cost is None else row | {"cost": cost}
+
+
+def checked(seed: int, lqt: float, lost: int = 0, again: bool = False) -> dict[str, Any]:
+    accepted = not lost and lqt < 5.0
+    row = {"event": "checked", "seed": seed, "none": 5.0, "lqt": lqt, "accepted": accepted}
+    return row | {"again": again, "diverged": {"none": 0, "lqt": lost}}
+
+
+def told(rows: list[dict[str, Any]], seed: int = 0, seeds: int = 1) -> list[str]:
+    narration = Narration(seed, seeds)
+    return [line for row in rows for line in narration.lines(row)]
+
+
+def test_one_seed_is_told_event_by_event():
+    rows = [
+        phase("check", [1]),
+        checked(3, 2.5e8, lost=1, again=True),
+        checked(3, 9.0),
+        phase("adapt", [18]),
+        adapted(3, 20, 1.25),
+        phase("evaluate", [20]),
+    ]
+    assert told(rows, seed=3) == [
+        "check",
+        "  seed 3: a rollout costs 5 without control, diverged with LQT; no better, exploring again",
+        "  seed 3: a rollout costs 5 without control, 9 with LQT; "
+        "no better, and no other exploration is left: a poor warm start",
+        "adapt",
+        "  20 rollouts: cost 1.25",
+        "evaluate",
+    ]
+
+
+def test_of_several_seeds_mean_and_range_are_told_in_one_line():
+    rows = [phase("check", [1] * 3), checked(0, 2.0), checked(1, 9.0, again=True)]
+    rows += [checked(2, 2.5e8, lost=1, again=True), phase("identify", [9] * 3)]
+    assert told(rows, seeds=3)[1] == (
+        "  3 seeds: a rollout costs 5 without control, 5.5 (2 to 9) and 1 diverged with LQT; "
+        "no better for 2 of them, exploring again"
+    )
+
+
+def test_the_status_is_of_all_seeds_and_a_diverged_law_says_so():
+    narration = Narration(4, 3)
+    narration.lines(phase("adapt", [9, 9, 18]))
+    assert (narration.done, narration.budget) == (36, 60)
+    narration.lines(adapted(4, 11, None))
+    assert (narration.done, narration.status) == (38, "diverged")
+    narration.lines(adapted(5, 11, 1.0))
+    narration.lines(adapted(6, 20, 3.0))
+    assert (narration.done, narration.status) == (42, "cost 2 (1 to 3) and 1 diverged")
+
+
+def test_a_real_training_with_a_law_that_diverges_never_says_a_billion(capsys):
+    values = parameters(seeds=2, rollouts=13, evaluation_fields=2)
+    training, pair = build_training(values), LocalPair(values)
+    stream = io.StringIO()
+    display = Display(0, 2, stream)
+    while (batch := training.next_batch()) is not None:
+        if training.phase == "check":
+            batch.policies[CHECK - 1] = 1e6  # the first law of the first seed
+        for row in training.finish(pair.run(batch)):
+            display.row(row)
+        pair.follow(training)
+        display.row(phase(training.phase, [9, 9]))
+    shown = stream.getvalue()
+    assert "and 1 diverged with LQT; no better for 1 of them" in shown
+    assert "e+0" not in shown
+
+
+def summary(**changes: Any) -> dict[str, Any]:
+    spent = {"exploration": 1, "check": 8, "adaptation": 11, "evaluation": 6, "total": 20}
+    return {
+        "seed": 0,
+        "seeds": 2,
+        "costs": {"none": [4.0, 4.0], "lqt": [2.0, 3.0], "adapted": [1.0, 2.0]},
+        "reduction": {"ratio_of_means": 0.4, "mean_of_ratios": 0.4167},
+        "diverged": {"none": 0, "lqt": 0, "adapted": 0},
+        "evaluation_rollouts": 4,
+        "changed": [True, True],
+        "improved": True,
+        "rollouts": [spent, {**spent, "exploration": 2, "check": 16, "total": 29}],
+        "seconds": 1.0,
+        **changes,
+    }
+
+
+def test_the_closing_words_have_the_ranges_the_budget_and_the_folder():
+    lines = closing_lines("kdv", summary(), "runs/a")
+    assert lines == [
+        "kdv, seeds 0 to 1: 20 to 29 rollouts a seed (exploration 1 to 2, check 8 to 16, "
+        "adaptation 11) in 1.0 s",
+        "  mean stage cost without control  4",
+        "  mean stage cost with LQT         2.5 (2 to 3)",
+        "  mean stage cost after adaptation 1.5 (1 to 2)   "
+        "(40.0 % below LQT; mean of the seeds' ratios 41.7 %)",
+        "  results in runs/a",
+    ]
+    assert warnings(summary()) == [] and not failed(summary())
+
+
+def test_a_gain_on_a_law_that_is_worse_than_no_control_is_told_against_no_control():
+    costs = {"none": [4.0, 4.0], "lqt": [2.0, 30.0], "adapted": [1.0, 2.0]}
+    words = "no less than no control; the adapted one costs 62.5 % less than no control"
+    assert any(line.endswith(words) for line in closing_lines("kdv", summary(costs=costs), ""))
+    assert not any("no less" in line for line in closing_lines("kdv", summary(), ""))
+
+
+def test_a_plant_that_costs_nothing_without_control_has_no_share_of_that():
+    costs = {"none": [0.0, 0.0], "lqt": [2.0, 3.0], "adapted": [1.0, 2.0]}
+    assert "adaptation 1.5" in closing_lines("kdv", summary(costs=costs), "")[3]
+
+
+def test_what_adapted_nothing_is_no_gain():
+    lines = closing_lines("kdv", summary(changed=[False, False]), "")
+    assert not any("LQT;" in line or "% below" in line for line in lines)
+    assert "  nothing was adapted: the policies are those that the adaptation began with" in lines
+
+
+def test_a_law_that_became_worse_is_no_improvement():
+    for seeds, words in ((1, "did not improve on the LQT law"), (2, "the LQT law for every seed")):
+        lines = closing_lines("kdv", summary(seeds=seeds, improved=False), "")
+        assert lines[-1].endswith(words)
+
+
+def test_several_publishers_of_a_topic_are_a_warning():
+    found = summary(several_publishers={"/action": ["/controller_node", "/stranger"]})
+    assert warnings(found) == [
+        "several nodes published /action: /controller_node, /stranger; expected one"
+    ]
+
+
+def test_a_cost_above_no_control_is_a_warning_that_names_the_seeds():
+    worse = summary(costs={"none": [4.0, 4.0], "lqt": [2.0, 5.0], "adapted": [1.0, 4.5]})
+    assert warnings(worse) == [
+        "after adaptation the cost is not below that without control for seed 1"
+    ]
+    assert not failed(worse)
+
+
+@pytest.mark.parametrize(
+    ("diverged", "adapted", "fails", "count"),
+    [
+        ({"none": 0, "lqt": 4, "adapted": 4}, [1e9, 1e9], True, 2),
+        ({"none": 0, "lqt": 4, "adapted": 0}, [5.0, 5.0], True, 2),
+        ({"none": 0, "lqt": 4, "adapted": 0}, [1.0, 1.0], False, 1),
+        ({"none": 0, "lqt": 0, "adapted": 4}, [1e9, 1e9], True, 1),
+        ({"none": 0, "lqt": 0, "adapted": 1}, [1e8, 1.0], False, 1),
+    ],
+)
+def test_laws_that_diverge_are_told_with_likely_causes(diverged, adapted, fails, count):
+    lqt = [1e9, 1e9] if diverged["lqt"] else [2.0, 3.0]
+    costs = {"none": [4.0, 4.0], "lqt": lqt, "adapted": adapted}
+    found = summary(costs=costs, diverged=diverged)
+    assert failed(found) == fails
+    assert len(warnings(found)) == count
+    if diverged["lqt"]:
+        assert "every rollout of the first laws diverged; likely causes: " in warnings(found)[0]
+    assert not any("e+0" in line for line in closing_lines("p", found, ""))
+
+
+def test_a_training_whose_laws_all_diverge_ends_with_a_warning_and_a_code(tmp_path, capsys):
+    values = parameters(rollouts=11)
+    training, pair = build_training(values), LocalPair(values)
+    training.finish(pair.run(training.next_batch()))
+    wild = training.models.copy()
+    wild[:, -2 * values["n_a"] - 1 : -1] *= -1e6  # the gains
+    np.savez(tmp_path / "model.npz", model=wild)
+    words = ["--rollouts", "2", "--in-process", "--model", str(tmp_path / "model.npz")]
+    assert main(["train", str(SMALL), *words, "--out", str(tmp_path / "run")]) == 1
+    shown = capsys.readouterr().out
+    assert "WARNING: every rollout of the first laws diverged; likely causes" in shown
+    assert "e+0" not in shown
+    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    assert result["diverged"]["lqt"] == result["evaluation_rollouts"]
