@@ -116,6 +116,17 @@ def examined(
     return replace(found, remarks=(*found.remarks, *more))
 
 
+def check_sizes(settings: DesignSettings, state_size: int, steps: int) -> None:
+    """ValueError if one episode of so many steps is too short for the model that is asked for."""
+    n_s, n_a = min(model_order(asdict(settings)), state_size), settings.n_a
+    if not n_s:
+        return  # as the data suggest
+    if settings.identification == "dmdc":
+        dmdc.check_sizes(settings.dmdc_rank or n_s + n_a, n_s, n_z=state_size, n_a=n_a, steps=steps)
+    else:
+        regression.check_sizes(n_s, n_a, steps)
+
+
 def design(
     trajectories: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]],
     target: NDArray[np.float64],

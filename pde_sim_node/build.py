@@ -29,19 +29,22 @@ def build_equation(values: Mapping[str, Any]) -> Equation:
     return kind(length=values["length"], **physical)
 
 
-def build_plant(values: Mapping[str, Any]) -> Plant:
-    """The plant of a problem. ValueError, one sentence, if the parameters do not fit together."""
+def build_plant(values: Mapping[str, Any], *, compiled: bool = True) -> Plant:
+    """The plant of a problem. ValueError, one sentence, if the parameters do not fit together.
+
+    compiled: its step is compiled now, which can take long; otherwise with the first step.
+    """
     equation = build_equation(values)
     grid = {name: values[name] for name in _GRID}
     grid |= {name: values[f"actuator_{name}"] for name in ("width", "shape", "positions")}
-    plant = SpectralPlant(equation, **grid)
+    plant = SpectralPlant(equation, **grid, compiled=compiled)
     instruments = Instruments(**{spec.name: values[spec.name] for spec in INSTRUMENTS})
     return plant if instruments.ideal else InstrumentedPlant(plant, instruments)
 
 
 def fingerprint(values: Mapping[str, Any]) -> int:
     """The fingerprint of a problem's plant; see `definition.Definition`."""
-    return build_plant(values).definition.fingerprint
+    return build_plant(values, compiled=False).definition.fingerprint
 
 
 _GRID = (

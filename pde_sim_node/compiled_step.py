@@ -23,7 +23,7 @@ def compiled_step(equation: Equation, k: Field, **settings: Any) -> ParallelStep
     """The step z_{k+1} = f(z_k, a_k) of an equation: exact in time if it is linear, else ETDRK4.
 
     k: wavenumbers 2 pi j / L, (n_x//2 + 1,); settings: the other fields of `StepSettings`. ValueError
-    for operators of the wrong shape or that are not finite, and a nonlinearity that does not compile.
+    for operators of the wrong shape or that are not finite. It is compiled by `load`.
     """
     linear = isinstance(equation, LinearEquation)
     step = StepSettings(
@@ -33,8 +33,13 @@ def compiled_step(equation: Equation, k: Field, **settings: Any) -> ParallelStep
         actuated=equation.actuated,
         **settings,
     )
+    return exact_step(step) if linear else etdrk4_step(step)
+
+
+def load(step: ParallelStep, equation: Equation) -> None:
+    """Load the machine code of an equation's step; ValueError where its nonlinearity has none."""
     try:
-        return exact_step(step) if linear else etdrk4_step(step)
+        step.load()
     except NotCompiledError as error:
         function = equation.nonlinearity
         why = reason(function)

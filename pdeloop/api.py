@@ -261,6 +261,8 @@ def train(
         raise ValueError(f"problem is {problem!r}; expected a Problem or its name")
     if over_topics and out is None:
         raise ValueError("a training over topics needs a folder for its results and logs: give out")
+    transport = Transport(not over_topics)
+    transport.require()
     with TemporaryDirectory() as temporary:
         source, given = (
             (problem.source, problem.given) if isinstance(problem, Problem) else (problem, {})
@@ -269,7 +271,7 @@ def train(
         folder, values = begin(source, {**given, **parameters}, where)
         display = Display(values["seed"], values["seeds"], progress or StringIO())
         try:
-            carry_out(folder, values, Transport(not over_topics), display, lambda: None)
+            carry_out(folder, values, transport, display, lambda: None)
         except Interruption as reason:
             raise RuntimeError(f"stopped by {reason}; continue with: {resuming(folder)}") from None
         finally:

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -16,6 +17,8 @@ from loop_interfaces.affinity import least_busy_cores, usable_cores
 from loop_interfaces.isolation import PROFILE
 from loop_interfaces.spec import ParameterError, Spec
 from pde_sim_node.build import fingerprint
+from pdeloop.domain import given_domain
+from pdeloop.supervisor import NodeError
 from tuner_node.run_folder import RunFolder
 
 MAX_PAIRS = 64
@@ -125,6 +128,17 @@ class Transport:
         if self.in_process and (self.pairs > 1 or self.view):
             raise ParameterError("--pairs and --view are about nodes; leave out --in-process")
         PAIRS.check(self.pairs)
+
+    def require(self) -> None:
+        """Refuse what the nodes would end with: no ROS, a wrong ROS domain."""
+        if self.in_process:
+            return
+        if importlib.util.find_spec("rclpy") is None:
+            raise NodeError(
+                "needs rclpy: source an installed ROS 2 Jazzy, or pip install 'pdeloop[ros]', or train "
+                "without ROS: --in-process"
+            )
+        given_domain()
 
     @property
     def recorded(self) -> bool:

@@ -71,9 +71,10 @@ def check(values: Mapping[str, Any]) -> Iterator[Finding]:
     yield from _identification(values)
 
 
-def _field_plant(values: Mapping[str, Any]) -> Plant:
+def _field_plant(values: Mapping[str, Any], *, compiled: bool = True) -> Plant:
     """The plant without noise, limits and sensors."""
-    return build_plant({**values, **{spec.name: spec.default for spec in INSTRUMENTS}})
+    ideal = {spec.name: spec.default for spec in INSTRUMENTS}
+    return build_plant({**values, **ideal}, compiled=compiled)
 
 
 def _variance(values: Mapping[str, Any]) -> float:
@@ -222,7 +223,7 @@ def draw(values: Mapping[str, Any], path: Path) -> None:
     """A picture of the initial fields, the target and the actuators' supports."""
     from matplotlib.figure import Figure
 
-    plant = _field_plant(values)
+    plant = _field_plant(values, compiled=False)
     fields = plant.reset([MEAN_FIELD, *range(DRAWN)]).copy()
     grid = plant.grid
     names, axis = grid.components, grid.axes[0]

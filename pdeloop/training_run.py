@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import controller_node.law
+from controller_node.identification import DesignSettings, check_sizes
 from loop_interfaces.files import FileError, make_own_folder
 from loop_interfaces.isolation import NETWORK, loopback_environment
 from loop_interfaces.problem import load_parameters
@@ -41,9 +42,24 @@ POLL = 0.05
 
 
 def resolve(problem: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """The parameters of a new run; ValueError if the problem's plant cannot be built from them."""
+    """The parameters of a new run; ValueError if the problem's plant cannot be built from them.
+
+    Nothing is compiled.
+    """
     values = load_parameters(problem, options)
-    # Compiled code is kept on disk, so that this is slow once only, and not for the nodes.
+    plant = build_plant(values, compiled=False)
+    if not values["model"]:
+        check_sizes(DesignSettings.of(values), plant.state_size, plant.horizon)
+    physical = asdict(build_equation(values))
+    del physical["length"]
+    return {**values, **{f"physical.{name}": value for name, value in physical.items()}}
+
+
+def load_compiled(values: Mapping[str, Any]) -> None:
+    """Load or compile what a run with these parameters needs; ValueError where that is impossible.
+
+    Compiled code is kept on disk, so that this is slow once only, and not for the nodes.
+    """
     notice = threading.Timer(4.0, print, ["compiling, once ..."], {"file": sys.stderr})
     notice.daemon = True
     notice.start()
@@ -55,18 +71,20 @@ def resolve(problem: str, options: Mapping[str, Any]) -> dict[str, Any]:
                 importlib.import_module(f"{node}.fast_path").load_compiled()
     finally:
         notice.cancel()
-    physical = asdict(build_equation(values))
-    del physical["length"]
-    return {**values, **{f"physical.{name}": value for name, value in physical.items()}}
 
 
 def begin(
     problem: str, options: Mapping[str, Any], out: Path | None
 ) -> tuple[Path, dict[str, Any]]:
-    """Folder and parameters of a new training, of which nothing has been done yet."""
+    """Folder and parameters of a new training, of which nothing has been done yet.
+
+    What can be refused without a compiler is refused before anything is compiled.
+    """
     values = resolve(problem, options)
-    build_training(values)  # refuses before there is a folder
+    build_training(values)
     folder = out or Path("runs") / f"{values['problem']}-{timestamp()}"
+    RunFolder(folder).refuse_another()
+    load_compiled(values)
     RunFolder(folder).create(values)
     return folder, values
 
@@ -161,11 +179,6 @@ def _train_here(
 def _train_over_topics(
     folder: Path, display: Display, transport: Transport, check: Callable[[], None]
 ) -> None:
-    if importlib.util.find_spec("rclpy") is None:
-        raise NodeError(
-            "needs rclpy: source an installed ROS 2 Jazzy, or pip install 'pdeloop[ros]', or train "
-            f"without ROS: {resuming(folder)} --in-process"
-        )
     logs = folder / "logs"
     make_own_folder(logs)
     bags: list[Path] = []

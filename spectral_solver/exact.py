@@ -136,4 +136,4 @@ def exact_step(settings: StepSettings) -> ParallelStep:
             "state": whole_lanes(n_z),
         },
     )
-    return ParallelStep(propagate(), plan, constants, size, points_per_step=2 * n_z)
+    return ParallelStep(propagate, plan, constants, size, points_per_step=2 * n_z)

@@ -13,6 +13,7 @@ the multiplier m is contained in the coefficients (names with an m).
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -159,7 +160,7 @@ def etdrk4_step(settings: StepSettings) -> ParallelStep:
 
     The nonlinearity is dealiased on a grid of at least 3/2 n_z points; exactly that where 3/2 n_z
     is 16 * 2^i * 3^j, else the next such number. ValueError where L grows beyond all bounds within
-    an internal step, and for a nonlinearity that does not compile.
+    an internal step; NotCompiledError, when it is loaded, for a nonlinearity that does not compile.
     """
     n_z, steps = settings.n_x, settings.steps
     fine = fine_length(n_z)
@@ -177,7 +178,6 @@ def etdrk4_step(settings: StepSettings) -> ParallelStep:
     plan["f2m"], plan["f3m"] = spectra(2 * c.f2 * m), spectra(c.f3 * m)
     plan["f"] = spectra(c.f1 + 4 * c.f2 + c.f3)
     plan["supports"] = spectra(np.fft.rfft(settings.supports, axis=0).T / n_z)
-    plan["pointwise"] = pointwise_loop(settings.nonlinearity)
     plane, modes = plane_size(max(fine, n_z // 2)), int(plan["modes"])
     size = lay_out(
         plan,
@@ -189,7 +189,14 @@ def etdrk4_step(settings: StepSettings) -> ParallelStep:
             "state": whole_lanes(n_z),
         },
     )
-    return ParallelStep(environments(), plan, constants, size, points_per_step=8 * steps * fine)
+    return ParallelStep(
+        environments,
+        plan,
+        constants,
+        size,
+        points_per_step=8 * steps * fine,
+        called={"pointwise": partial(pointwise_loop, settings.nonlinearity)},
+    )
 
 
 def fine_length(n_z: int) -> int:

@@ -3,9 +3,10 @@
 
 import ctypes
 import os
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -28,14 +29,23 @@ ENVIRONMENTS = ctypes.CFUNCTYPE(None, *[ctypes.c_ssize_t] * 8)
 class ParallelStep:
     """Machine code that advances environments, with its constants and a scratch for each thread.
 
-    code: its address, see `batch_step.environments_of`; plan: its plan, where the addresses of
-    constants and scratch are filled in; scratch: size of a plane of it; points_per_step: how much
-    work an environment is. The memory of `constants` is what `plans`, one for each thread, have the
-    address of.
+    code: gives its address, see `batch_step.environments_of`; plan: its plan, where the addresses
+    of constants and scratch are filled in; scratch: size of a plane of it; points_per_step: how much
+    work an environment is; called: gives the addresses of what `code` calls, by their entry in the
+    plan. The memory of `constants` is what `plans`, one for each thread, have the address of.
+
+    Nothing is compiled before `load`, or the first step.
     """
 
     def __init__(
-        self, code: int, plan: Any, constants: Constants, scratch: int, *, points_per_step: int
+        self,
+        code: Callable[[], int],
+        plan: Any,
+        constants: Constants,
+        scratch: int,
+        *,
+        points_per_step: int,
+        called: Mapping[str, Callable[[], int]] = MappingProxyType({}),
     ) -> None:
         self.constants = constants.planes()
         plan["constants"] = self.constants.ctypes.data
@@ -45,7 +55,24 @@ class ParallelStep:
         self.plans = np.repeat(plan, threads)
         self.plans["scratch"] = [area.ctypes.data for area in self._scratch]
         self._points_per_step = points_per_step
-        self.code, self._environments = code, ENVIRONMENTS(code)
+        self._address_of, self._called = code, called
+        self._code = 0
+        self._environments = ENVIRONMENTS(self._code)
+
+    @property
+    def code(self) -> int:
+        """Address of the machine code."""
+        self.load()
+        return self._code
+
+    def load(self) -> None:
+        """Load the machine code from disk, or compile it."""
+        if self._code:
+            return
+        for name, address in self._called.items():
+            self.plans[name] = address()
+        self._code = self._address_of()
+        self._environments = ENVIRONMENTS(self._code)
 
     def bind(
         self,
@@ -72,6 +99,8 @@ class ParallelStep:
 
     def step(self, k: int) -> None:
         """Advance all environments in place; k: step of the states."""
+        if not self._code:
+            self.load()
         own, *others = self._parts
         begun = [solver_threads.pool().submit(self._environments, *it, k) for it in others]
         self._environments(*own, k)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from pdeloop.training_run import resolve
+from pdeloop.training_run import load_compiled, resolve
 from tests.support.colcon_workspace import Workspace, build
 from tests.support.loop_harness import Processes, processes
 from tests.support.made_once import made_once
@@ -28,7 +28,7 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)
 def _compiled(tmp_path_factory: pytest.TempPathFactory) -> None:
     """What nearly all tests use is compiled by one of several workers, not by each of them."""
     if "PYTEST_XDIST_WORKER" in os.environ:
-        made_once(tmp_path_factory, "compiled", lambda folder: len(resolve(str(SMALL), {})))
+        made_once(tmp_path_factory, "compiled", lambda _: load_compiled(resolve(str(SMALL), {})))
 
 
 @pytest.fixture(autouse=True)

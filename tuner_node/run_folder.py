@@ -13,6 +13,7 @@ logs/              one file a node, when the command line started them
 """
 
 import contextlib
+import errno
 import fcntl
 import json
 import os
@@ -93,14 +94,23 @@ class RunFolder:
         self.path = path
         self.checkpoint = path / "checkpoint"
 
-    def create(self, parameters: Mapping[str, Any]) -> None:
-        """Begin a new training here. RunFolderError if the folder holds one or cannot be written."""
+    def refuse_another(self) -> None:
+        """RunFolderError where no new training can begin: the folder holds one, or is none."""
         if (self.path / "parameters.yaml").exists():
             raise RunFolderError(
                 f"{self.path} already holds a run; choose another folder, delete this one, "
                 f"or continue it with: {resuming(self.path)} "
                 "(a tuner_node with -p resume:=true)"
             )
+        there = next(path for path in (self.path, *self.path.absolute().parents) if path.exists())
+        if not there.is_dir():
+            raise RunFolderError(f"cannot write to {self.path}: {there} is not a folder")
+        if not os.access(there, os.W_OK | os.X_OK):
+            raise RunFolderError(f"cannot write to {self.path}: {os.strerror(errno.EACCES)}")
+
+    def create(self, parameters: Mapping[str, Any]) -> None:
+        """Begin a new training here. RunFolderError if the folder holds one or cannot be written."""
+        self.refuse_another()
         try:
             make_folder(self.path)
             kept = {k: v for k, v in parameters.items() if k not in ("out", "resume")}

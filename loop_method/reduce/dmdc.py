@@ -63,19 +63,7 @@ def truncated_dmdc(
     data = steps_of(trajectories)
     steps, n_a = data.inputs.shape
     n_z = data.before.shape[1]
-    if n_s < 1 or p < 1:
-        raise ValueError(f"p and n_s must be at least 1, but p is {p} and n_s is {n_s}.")
-    largest = min(n_z + n_a, steps)
-    if p > largest:
-        raise ValueError(
-            f"p must be at most min(n_z + n_a, N) = {largest}, but p is {p}; lower p or record a "
-            "longer trajectory."
-        )
-    if n_s > p:
-        raise ValueError(
-            f"n_s must be at most p = {p}, but n_s is {n_s}; {p} directions of the data cannot "
-            "carry more modes, so lower n_s or raise p."
-        )
+    check_sizes(p, n_s, n_z=n_z, n_a=n_a, steps=steps)
 
     # One thread: a threaded LAPACK rounds differently for another number of threads.
     with threadpool_limits(limits=1):
@@ -116,3 +104,20 @@ def truncation_remarks(
 def _kept(psi: Array, n_a: int, p: int) -> Array:
     """The share of a move of each input alone, in [Z; Y], that the p directions have; in the norm."""
     return np.asarray(linalg.norm(psi[-n_a:, :p], axis=1))
+
+
+def check_sizes(p: int, n_s: int, *, n_z: int, n_a: int, steps: int) -> None:
+    """ValueError if trajectories of so many steps cannot hold p directions, or those no n_s modes."""
+    if n_s < 1 or p < 1:
+        raise ValueError(f"p and n_s must be at least 1, but p is {p} and n_s is {n_s}.")
+    largest = min(n_z + n_a, steps)
+    if p > largest:
+        raise ValueError(
+            f"p must be at most min(n_z + n_a, N) = {largest}, but p is {p}; lower p or record a "
+            "longer trajectory."
+        )
+    if n_s > p:
+        raise ValueError(
+            f"n_s must be at most p = {p}, but n_s is {n_s}; {p} directions of the data cannot "
+            "carry more modes, so lower n_s or raise p."
+        )

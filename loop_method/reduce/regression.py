@@ -75,6 +75,16 @@ def exact_regression(
     """
     data = steps_of(trajectories)
     steps, n_a = data.inputs.shape
+    check_sizes(n_s, n_a, steps)
+    # One thread: a threaded LAPACK rounds differently for another number of threads.
+    with threadpool_limits(limits=1):
+        U, _ = leading_modes(data.after, n_s, channels)
+        examine_steps(data, U, channels).require()
+        return fit(data, U)
+
+
+def check_sizes(n_s: int, n_a: int, steps: int) -> None:
+    """ValueError if so many steps determine no model of this order."""
     if n_s < 1:
         raise ValueError(f"n_s must be at least 1, but it is {n_s}.")
     if steps < n_s + n_a:
@@ -83,11 +93,6 @@ def exact_regression(
             f"but there are {steps}; take more steps (a longer horizon), or a lower n_s where that is "
             "enough."
         )
-    # One thread: a threaded LAPACK rounds differently for another number of threads.
-    with threadpool_limits(limits=1):
-        U, _ = leading_modes(data.after, n_s, channels)
-        examine_steps(data, U, channels).require()
-        return fit(data, U)
 
 
 def fit(data: Steps, U: Array) -> ReducedModel:

@@ -11,7 +11,7 @@ from loop_interfaces.arrays import Array
 from loop_interfaces.grid import Grid
 from pde_sim_node.actuators import actuator_supports
 from pde_sim_node.arguments import grid_points, internal_steps, positive, whole
-from pde_sim_node.compiled_step import compiled_step
+from pde_sim_node.compiled_step import compiled_step, load
 from pde_sim_node.definition import Definition, module_sources
 from pde_sim_node.equations import Equation, LinearEquation
 from pde_sim_node.equations.base import result_of
@@ -56,6 +56,8 @@ class SpectralPlant(BatchPlant):
         Internal step of the integrator.
     horizon, state_weight, action_weight, divergence_bound
         See `pde_sim_node.plant.Plant`.
+    compiled
+        Whether the step is compiled now; otherwise by `load`, or with the first step.
 
     Attributes
     ----------
@@ -88,6 +90,7 @@ class SpectralPlant(BatchPlant):
         divergence_bound: float = 1e3,
         shape: str = "equation",
         positions: Sequence[float] = (),
+        compiled: bool = True,
     ) -> None:
         if whole("n_z", n_z, 8) % 2:
             raise ValueError(f"n_z must be even, got {n_z}: take {n_z + 1}")
@@ -110,6 +113,12 @@ class SpectralPlant(BatchPlant):
         self.supports = actuator_supports(equation, self.x, self.n_a, width, shape, positions)
         self.parallel = self._make_step()
         self._bind()
+        if compiled:
+            self.load()
+
+    def load(self) -> None:
+        """Load the compiled step, or compile it; ValueError where the equation cannot be compiled."""
+        load(self.parallel, self.equation)
 
     def _make_step(self) -> ParallelStep:
         """The compiled step of this plant."""
@@ -165,6 +174,7 @@ class SpectralPlant(BatchPlant):
         # Compiled code that only gradients need.
         from spectral_solver import adjoint
 
+        self.load()
         if not isinstance(self.equation, LinearEquation):
             return adjoint.Adjoint(self.parallel, self.equation.nonlinearity)
         n_z, n_a = self.n_z, self.n_a

@@ -84,11 +84,12 @@ def _check(options: argparse.Namespace) -> int:
         found = check_node(options.problem, **given)
     else:
         from pdeloop.problem_check import check, draw
-        from pdeloop.training_run import resolve
+        from pdeloop.training_run import load_compiled, resolve
 
         values = resolve(options.problem, allow_equation(options))
         if options.picture is not None:
             draw(values, options.picture)  # before the check, which takes longer
+        load_compiled(values)
         found = check(values)
     findings = []
     for finding in found:

@@ -92,6 +92,7 @@ def _train(options: argparse.Namespace) -> int:
         pairs=options.pairs,
         view=options.view,
     )
+    transport.require()
     given = given_flags(options)
     for name in ("rollouts", "iterations"):
         if given.get(name) == 0:

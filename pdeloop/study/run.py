@@ -18,6 +18,7 @@ from concurrent.futures import (
     CancelledError,
     Executor,
     Future,
+    ProcessPoolExecutor,
     wait,
 )
 from contextlib import AbstractContextManager
@@ -29,6 +30,7 @@ from loop_interfaces.files import make_folder, read_json, write_atomically
 from pdeloop.study.description import Study, StudyError
 from pdeloop.study.executors import no_worker
 from pdeloop.study.training import EnvironmentMismatchError, environment, train_one
+from pdeloop.training_run import load_compiled
 
 ASKED = "study.json"
 ATTEMPTS = 3
@@ -125,8 +127,11 @@ def run(
     for _ in range(ATTEMPTS):
         try:
             with executor() as pool:
-                keep(folder, study)  # not before there is somebody to train
                 todo = {n: v for n, v in trainings.items() if n not in finished}
+                if isinstance(pool, ProcessPoolExecutor):  # of this machine: once for all of them
+                    for values in {v["equation"]: v for v in todo.values()}.values():
+                        load_compiled(values)
+                keep(folder, study)  # not before there is somebody to train
                 waiting = {
                     pool.submit(tasks.get(n.split("/")[1], train), v, expected): n
                     for n, v in todo.items()

@@ -10,7 +10,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from pdeloop.training_run import resolve
+from pdeloop.training_run import load_compiled, resolve
 from tests.support.small import SMALL
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -41,7 +41,7 @@ class Workspace:
 
         Compiling it again would be most of what the tests of an installation do.
         """
-        resolve(str(SMALL), {})  # compiles what is not
+        load_compiled(resolve(str(SMALL), {}))
         (library,) = self.prefix.glob("lib/python*/site-packages")
         for installed in library.iterdir():
             for path in (ROOT / installed.name).rglob("*.nb[ic]"):

@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import Any
 
 from pdeloop.cli import DONE, FAILED, main, parser
-from pdeloop.training_run import resolve
+from pdeloop.training_run import load_compiled, resolve
 from tests.support.small import SMALL
 from tuner_node import run_store
 
@@ -159,7 +159,7 @@ def run(folder: Path, kinds: tuple[str, ...]) -> dict[str, Any]:
     """Every failure, one after the other."""
     parser()  # imports what each training needs
     out = folder / "run"
-    resolve(str(problem(out)), {})  # loads what is compiled
+    load_compiled(resolve(str(problem(out)), {}))
     gc.freeze()  # what a fork touches is copied
     assert forked(folder / "log", training(out)) == 0, (folder / "log").read_text()
     policy = (out / "policy.npz").read_bytes()

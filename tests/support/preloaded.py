@@ -11,7 +11,7 @@ import tests.support.operator_program  # noqa: F401
 import tuner_node.node
 import viewer_node.node
 from pdeloop import cli
-from pdeloop.training_run import resolve
+from pdeloop.training_run import load_compiled, resolve
 from tests.support.small import SMALL
 
 MAINS = {
@@ -24,4 +24,4 @@ MAINS = {
 }
 
 cli.parser()  # imports what the commands need
-resolve(str(SMALL), {})  # loads what is compiled
+load_compiled(resolve(str(SMALL), {}))  # loads what is compiled

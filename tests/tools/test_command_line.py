@@ -6,7 +6,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import fcntl
-import importlib.util
 import io
 import json
 import os
@@ -174,15 +173,6 @@ def test_a_bug_is_a_traceback_and_a_code_of_its_own(monkeypatch, capsys) -> None
     monkeypatch.setattr(problems, "shipped_problems", broken)
     assert main(["problems"]) == 70
     assert "Traceback" in capsys.readouterr().err
-
-
-def test_a_machine_without_ros_is_told_what_to_do(monkeypatch, capsys, tmp_path: Path) -> None:
-    find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda n: None if n == "rclpy" else find(n))
-    out = str(tmp_path / "run")
-    assert main(["train", str(SMALL), "--iterations", "2", "--out", out]) == 1
-    assert "pdeloop[ros]" in capsys.readouterr().err
-    assert main(["train", "--resume", out, "--in-process"]) == 0
 
 
 def test_a_reader_that_leaves_is_no_error_to_talk_about() -> None:
