@@ -1,21 +1,20 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Own measurements in a file, .npz or .csv (docs/identification.md), as trajectories."""
+"""Own measurements in files, .npz or .csv (docs/identification.md), as trajectories."""
 
 from __future__ import annotations
 
-import csv
-import io
-from array import array
-from collections.abc import Iterator
-from dataclasses import dataclass
-from math import isfinite, nan
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from loop_interfaces.array_files import MAX_ARRAY_BYTES, read_arrays
-from loop_interfaces.arrays import Array
+from loop_interfaces.arrays import Array, float_array
 from loop_interfaces.files import FileError, read_bounded
+from loop_method.reduce.channels import NUMBERED, Channels, listed
+from pdeloop.data_table import Columns, read_table
 
 __all__ = ["Measurements", "read_measurements"]
 
@@ -24,7 +23,9 @@ MAX_TEXT_BYTES = 2**28
 MAX_TRAJECTORIES = 100_000
 LARGEST = 1e100
 """Magnitude of a number, so that squares and their sums stay finite."""
-NAMES = ("states", "actions", "target", "sample_time")
+SAME_STEP = 1e-3
+"""By which the sampling times of several files may differ, relatively."""
+TABLES = (".csv", ".tsv", ".txt", ".dat")
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,32 +36,57 @@ class Measurements:
     ----------
     trajectories : list of (states (N + 1, n_z), actions (N, n_a))
         a_k was held from z_k to z_{k+1}.
-    target : (n_z,) array
-        z_r, the state that is to be reached.
+    target : (n_z,) array or None
+        z_r, the state that is to be reached; None if no file has one.
     sample_time : float
         Seconds between two states.
+    channels : Channels
+        Names of the numbers of the state and of the inputs; empty if they have none.
+    sources : list of dict
+        Of each trajectory its number in its file, and the file where there are several.
+    remarks : tuple of str
+        What was left out.
     """
 
     trajectories: list[tuple[Array, Array]]
-    target: Array
+    target: Array | None
     sample_time: float
+    channels: Channels = NUMBERED
+    sources: Sequence[dict[str, int | str]] = ()
+    remarks: tuple[str, ...] = ()
 
 
-def read_measurements(path: str | Path) -> Measurements:
-    """The measurements in a file.
+def read_measurements(
+    *paths: str | Path,
+    time: str = "",
+    states: str = "",
+    inputs: str = "",
+    sample_time: float | None = None,
+    target: ArrayLike | None = None,
+) -> Measurements:
+    """The measurements in one file or several, of one plant.
 
-    In a .npz file are the arrays `states` (N + 1, n_z), `actions` (N, n_a), `target` (n_z,) and
-    `sample_time` (s), with one axis more in front of states and actions where there are several
-    trajectories.
+    In a .npz file are the arrays `states` (N + 1, n_z), `actions` (N, n_a), `target` (n_z,), which may
+    be missing, and `sample_time` (s), with one axis more in front of states and actions where there
+    are several trajectories.
 
-    A .csv file has a line of names, t, z..., a..., then a line for each instant, t in s. A time that
-    does not grow begins another trajectory, and the actions of a trajectory's last line are not used.
-    The line whose t is the word target has z_r.
+    A .csv file has a line of names, t, z..., a..., then a line for each instant, t in s or an instant
+    like 2026-01-31 12:00:00.5. A time that does not grow begins another trajectory, and the actions of
+    a trajectory's last line are not used. The line whose t is the word target has z_r. Columns are
+    separated by commas, semicolons, tabs or spaces, and with anything but commas the decimal mark may
+    be a comma.
 
     Parameters
     ----------
-    path
-        Of the file, which ends in .npz or .csv.
+    paths
+        Of the files, which end in .npz, or in .csv, .tsv, .txt or .dat.
+    time, states, inputs
+        Names of columns, or of arrays, separated by commas; patterns such as "T*" for columns. If one
+        is given, other columns are left out.
+    sample_time
+        Seconds between two states, where the files do not have it.
+    target : (n_z,)
+        z_r, instead of that in the files.
 
     Returns
     -------
@@ -69,20 +95,82 @@ def read_measurements(path: str | Path) -> Measurements:
     Raises
     ------
     FileError
-        It cannot be read, is too large, or is not that; one sentence.
+        One cannot be read, is too large, or is not that; one sentence.
     """
-    path = Path(path)
-    read = {".npz": _npz, ".csv": _csv}.get(path.suffix.lower())
-    if read is None:
+    if not paths:
+        raise FileError("no file given; expected a .npz or a .csv file")
+    columns = Columns(time, states, inputs)
+    found = []
+    for path in map(Path, paths):
+        try:
+            found.append(_read(path, columns, sample_time))
+        except FileError:
+            raise
+        except ValueError as error:
+            raise FileError(f"{path}: {error}") from error
+    whole = _together(found, [str(path) for path in paths])
+    if target is None:
+        return whole
+    wanted, n_z = float_array("target", target), whole.trajectories[0][0].shape[1]
+    if wanted.shape != (n_z,) or not np.isfinite(wanted).all():
+        raise FileError(
+            f"expected a target of {n_z} finite numbers, one for each of the state, got "
+            f"{wanted.size if wanted.ndim == 1 else f'shape {wanted.shape}'}"
+        )
+    return replace(whole, target=wanted)
+
+
+def _read(path: Path, columns: Columns, sample_time: float | None) -> Measurements:
+    """One file; ValueError, one sentence, without its name."""
+    kind = path.suffix.lower()
+    if kind == ".npz":
+        found = _npz(path, columns, sample_time)
+    elif kind in TABLES:
+        found = _csv(path, columns, sample_time)
+    else:
         raise FileError(f"{path} must be a .npz or a .csv file (docs/identification.md)")
-    try:
-        found = read(path)
-        _check(found)
-    except FileError:
-        raise
-    except ValueError as error:
-        raise FileError(f"{path}: {error}") from error
+    _check(found)
     return found
+
+
+def _together(found: Sequence[Measurements], names: Sequence[str]) -> Measurements:
+    """The measurements of several files. FileError if they are not of one plant."""
+    first = found[0]
+    if len(found) == 1:
+        return first
+    sources: list[dict[str, int | str]] = []
+    for one, name in zip(found, names, strict=True):
+        for what, own, other in (
+            ("the states", one.channels.states, first.channels.states),
+            ("the inputs", one.channels.inputs, first.channels.inputs),
+            ("the sizes", *([len(a[0]) for a in m.trajectories[0]] for m in (one, first))),
+        ):
+            if list(own) != list(other):
+                raise FileError(
+                    f"{name}: expected the same channels as in {names[0]}, got {what} "
+                    f"{listed([str(x) for x in own] or ['without names'])} after "
+                    f"{listed([str(x) for x in other] or ['without names'])}"
+                )
+        if abs(one.sample_time - first.sample_time) > SAME_STEP * first.sample_time:
+            raise FileError(
+                f"{name}: expected the sampling time of {names[0]}, {first.sample_time:g} s, got "
+                f"{one.sample_time:g} s"
+            )
+        sources += [{"file": name, **source} for source in one.sources]
+    targets = [
+        (name, m.target) for name, m in zip(names, found, strict=True) if m.target is not None
+    ]
+    for name, target in targets[1:]:
+        if not np.array_equal(target, targets[0][1]):
+            raise FileError(f"{name}: expected the target of {targets[0][0]}, or none, got another")
+    return Measurements(
+        [trajectory for one in found for trajectory in one.trajectories],
+        targets[0][1] if targets else None,
+        first.sample_time,
+        first.channels,
+        sources,
+        tuple(f"{n}: {text}" for n, m in zip(names, found, strict=True) for text in m.remarks),
+    )
 
 
 def _check(found: Measurements) -> None:
@@ -94,13 +182,23 @@ def _check(found: Measurements) -> None:
                 "expected states (N + 1, n_z) and actions (N, n_a), got shapes "
                 f"{states.shape} and {actions.shape} in trajectory {number}"
             )
-        if states.shape[1:] != target.shape or not (actions.size and target.size):
+        if not (actions.size and states.size):
+            raise ValueError(
+                f"expected states and actions of one number or more, got shapes {states.shape} and "
+                f"{actions.shape} in trajectory {number}"
+            )
+        if target is not None and states.shape[1:] != target.shape:
             raise ValueError(
                 f"expected states and a target of the same n_z numbers, got shapes {states.shape} and "
                 f"{target.shape} in trajectory {number}"
             )
-        if not (np.isfinite(states).all() and np.isfinite(actions).all()):
-            raise ValueError(f"expected finite numbers, got NaN or infinity in trajectory {number}")
+        for name, values in (("states", states), ("actions", actions)):
+            if not np.isfinite(values).all():
+                row = int(np.argmin(np.isfinite(values).all(axis=1)))
+                raise ValueError(
+                    f"expected finite numbers, got NaN or infinity in row {row} of {name} in "
+                    f"trajectory {number}: fill the gap, or cut the trajectory in two there"
+                )
         largest = max(np.abs(states).max(), np.abs(actions).max())
         if largest > LARGEST:
             raise ValueError(
@@ -109,26 +207,45 @@ def _check(found: Measurements) -> None:
             )
     if not found.trajectories:
         raise ValueError("it holds no trajectory of two states or more")
-    if not np.isfinite(target).all():
+    if target is not None and not np.isfinite(target).all():
         raise ValueError("expected a target of finite numbers, got NaN or infinity")
     if not 0 < found.sample_time < np.inf:
         raise ValueError(f"expected a sample_time above 0, got {found.sample_time:g}")
 
 
-def _npz(path: Path) -> Measurements:
+def _npz(path: Path, columns: Columns, sample_time: float | None) -> Measurements:
     arrays = read_arrays(path)
-    if missing := [name for name in NAMES if name not in arrays]:
+    names = {
+        "states": columns.states or "states",
+        "actions": columns.inputs or "actions",
+        "sample_time": columns.time or "sample_time",
+        "target": "target",
+    }
+    needed = [names["states"], names["actions"], names["sample_time"]]
+    if sample_time is not None:
+        needed.pop()
+        if names["sample_time"] in arrays:
+            raise ValueError(f"leave out --sample-time: it has the array {names['sample_time']}")
+    if missing := [name for name in needed if name not in arrays]:
         raise ValueError(
-            f"expected the arrays {', '.join(NAMES)}, but {', '.join(missing)} is missing"
+            f"expected the arrays {', '.join(needed)}, but {', '.join(missing)} is missing; there are "
+            f"{', '.join(arrays) or 'none'}"
         )
-    for name in NAMES:
-        if arrays[name].dtype.kind not in "fiu":
-            raise ValueError(f"expected real numbers in {name}, got {arrays[name].dtype}")
-    if (size := 8 * sum(arrays[name].size for name in NAMES)) > MAX_ARRAY_BYTES:
+    own = {what: arrays[name] for what, name in names.items() if name in arrays}
+    for what, array in own.items():
+        if array.dtype.kind not in "fiu":
+            raise ValueError(f"expected real numbers in {names[what]}, got {array.dtype}")
+    if (size := 8 * sum(array.size for array in own.values())) > MAX_ARRAY_BYTES:
         raise ValueError(f"expected at most {MAX_ARRAY_BYTES // 8} numbers, got {size // 8}")
-    states, actions, target, times = (arrays[name].astype(np.float64) for name in NAMES)
-    if times.size != 1:
-        raise ValueError(f"expected one number as sample_time, got shape {times.shape}")
+    own = {what: array.astype(np.float64) for what, array in own.items()}
+    states, actions, target = own["states"], own["actions"], own.get("target")
+    if sample_time is None:
+        times = own["sample_time"]
+        if times.size != 1:
+            raise ValueError(
+                f"expected one number as {names['sample_time']}, got shape {times.shape}"
+            )
+        sample_time = float(times.reshape(()))
     several = states.ndim == 3
     if several and (actions.ndim != 3 or len(actions) != len(states)):
         raise ValueError(
@@ -137,67 +254,31 @@ def _npz(path: Path) -> Measurements:
         )
     if several:
         _check_count(len(states))
-    pairs = zip(states, actions, strict=True) if several else [(states, actions)]
-    return Measurements(list(pairs), target, float(times.reshape(())))
+    pairs = list(zip(states, actions, strict=True) if several else [(states, actions)])
+    return Measurements(pairs, target, sample_time, sources=_numbered(len(pairs)))
 
 
-def _csv(path: Path) -> Measurements:
+def _csv(path: Path, columns: Columns, sample_time: float | None) -> Measurements:
     raw = read_bounded(path, MAX_TEXT_BYTES, "give the same as .npz (docs/identification.md)")
-    text = io.TextIOWrapper(io.BytesIO(raw), "utf-8-sig", errors="replace", newline="")
-    lines = csv.reader(text)
-    try:
-        return _table(line for line in lines if line)
-    except csv.Error as error:
-        raise ValueError(f"it is no table of commas: {error}") from error
-
-
-def _table(lines: Iterator[list[str]]) -> Measurements:
-    head = [name.strip() for name in next(lines, [])]
-    kinds = "".join(name[:1] for name in head)
-    n_z, n_a = kinds.count("z"), kinds.count("a")
-    if head[:1] != ["t"] or not (n_z and n_a) or kinds != "t" + "z" * n_z + "a" * n_a:
-        raise ValueError(
-            f"expected the names t, z..., a... in the first line, got '{','.join(head)[:60]}'"
-        )
-    numbers, target = array("d"), None
-    for number, line in enumerate(lines, 2):
-        if len(line) != len(head):
-            raise ValueError(f"expected {len(head)} values in row {number}, got {len(line)}")
-        if line[0].strip() == "target":
-            if target is not None:
-                raise ValueError(
-                    f"expected one row whose t is the word target, got another, {number}"
-                )
-            target = np.array(_numbers(line[1 : 1 + n_z], number))
-            continue
-        row = _numbers(line, number)
-        if not isfinite(row[0]):
-            raise ValueError(f"expected a time t in row {number}, got '{line[0]}'")
-        numbers.extend(row)
-    if target is None:
-        raise ValueError("expected a row whose t is the word target")
-    table = np.array(numbers).reshape(-1, len(head))
-    starts = 1 + np.flatnonzero(~(np.diff(table[:, 0]) > 0))
-    _check_count(len(starts))
-    parts = [part for part in np.split(table, starts) if len(part) > 1]
-    steps = np.concatenate([np.diff(part[:, 0]) for part in parts] or [np.ones(1)])
-    if not np.allclose(steps, steps[0], rtol=1e-3):
-        raise ValueError(f"expected equal steps of t, got {steps.min():g} to {steps.max():g}")
-    states = slice(1, 1 + n_z)
+    found = read_table(raw, columns, timed=sample_time is None, most=MAX_TRAJECTORIES)
+    if sample_time is not None and found.sample_time is not None:
+        raise ValueError("leave out --sample-time: it has a column of times")
+    step = sample_time if found.sample_time is None else found.sample_time
     return Measurements(
-        [(part[:, states], part[:-1, 1 + n_z :]) for part in parts], target, float(np.median(steps))
+        found.trajectories,
+        found.target,
+        1.0 if step is None else step,  # without a trajectory, which is refused
+        found.channels,
+        _numbered(len(found.trajectories)),
+        tuple(found.remarks),
     )
+
+
+def _numbered(count: int) -> list[dict[str, int | str]]:
+    return [{"trajectory": number} for number in range(count)]
 
 
 def _check_count(trajectories: int) -> None:
     """ValueError for so many that each takes more memory than its numbers."""
     if trajectories > MAX_TRAJECTORIES:
         raise ValueError(f"expected at most {MAX_TRAJECTORIES} trajectories, got {trajectories}")
-
-
-def _numbers(texts: list[str], row: int) -> list[float]:
-    """The numbers of a row; an empty place is NaN."""
-    try:
-        return [float(text) if text.strip() else nan for text in texts]
-    except ValueError as error:
-        raise ValueError(f"expected numbers in row {row}: {error}") from None

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from controller_node.identification import DesignSettings, design, examined
+from controller_node.identification import DesignSettings, design, examined, identify
 from loop_interfaces.arrays import Array
 from loop_interfaces.episodes import episode_name
 from loop_interfaces.files import write_atomically
@@ -22,56 +23,78 @@ from loop_interfaces.model_rows import ModelRows, pack
 from loop_interfaces.parameters import as_recorded, model_order, recorded_values, table
 from loop_interfaces.spec import ParameterError
 from loop_interfaces.topics import COMPLETED, CostColumn
-from loop_method.reduce.channels import NUMBERED, Channels
+from loop_method.reduce.channels import NUMBERED, SHOWN, Channels
 from loop_method.reduce.identifiability import Identifiability, NotIdentifiableError
 from loop_method.reduce.order import OrderStudy, study_orders
-from loop_method.reduce.reduced_model import steps_of
-from pdeloop.data_file import read_measurements
+from loop_method.reduce.reduced_model import ReducedModel, steps_of
+from pdeloop.data_file import Measurements
+from pdeloop.identified_law import ClosedLoop, closed_loop
 
 if TYPE_CHECKING:
     from pdeloop.bags.episodes import RecordedEpisode
 
 Trajectories = Sequence[tuple[Array, Array]]
+Source = Mapping[str, int | str]
+"""Which trajectory it was."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Identified:
-    """A model from trajectories.
+    """A model from trajectories, and its law where there is a target.
 
-    sources: which trajectories, by episode and environment or by number; study: the orders on held-out
-    data, None where these are too few; determined: how well the data determine the model; sample_time
-    in s, None where it is not known.
+    sources: which trajectories, by episode and environment or by file and number; study: the orders on
+    held-out data, None where these are too few; determined: how well the data determine the model;
+    trajectory: the longest one; sample_time in s, None where it is not known; remarks: on the data.
     """
 
-    model: ModelRows
-    sources: list[dict[str, int]]
+    model: ModelRows | ReducedModel
+    sources: Sequence[Source]
     steps: int
     study: OrderStudy | None
     determined: Identifiability
+    trajectory: tuple[Array, Array]
+    target: Array | None = None
     sample_time: float | None = None
+    channels: Channels = NUMBERED
+    remarks: tuple[str, ...] = ()
+
+    @cached_property
+    def closed_loop(self) -> ClosedLoop | None:
+        """The law on the model; None without a target."""
+        if self.target is None or not isinstance(self.model, ModelRows):
+            return None
+        return closed_loop(self.model, self.target, *self.trajectory)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is to be known before the model is used."""
+        return [*self.remarks, *self.determined.remarks]
 
     def summary(self) -> dict[str, Any]:
         """The result as data, without the arrays, which `save` writes."""
         A, B, U, study = self.model.A, self.model.B, self.model.U, self.study
-        determined = self.determined
+        determined, loop = self.determined, self.closed_loop
         poles = np.linalg.eigvals(A)
         return {
             "reduced_order": len(A),
             "n_z": U.shape[0],
             "n_a": B.shape[1],
+            "states": list(self.channels.states),
+            "inputs": list(self.channels.inputs),
             "steps": self.steps,
             "sample_time": self.sample_time,
-            "trajectories": self.sources,
+            "trajectories": list(self.sources),
             "poles": [[pole.real, pole.imag] for pole in poles],
             "spectral_radius": float(np.abs(poles).max()),
             "rank": determined.rank,
             "unknowns": determined.unknowns,
             "smallest_singular_value": determined.smallest_singular_value,
             "independence": determined.independence.tolist(),
-            "warnings": list(determined.remarks),
+            "warnings": self.warnings,
             "suggested_order": study and study.suggested,
             "singular_values": [] if study is None else study.singular_values.tolist(),
             "orders": [] if study is None else study.rows(),
+            "closed_loop": loop and loop.summary(),
         }
 
     def text(self) -> str:
@@ -101,23 +124,52 @@ class Identified:
             lines.append("  too few steps to hold some out: no order is suggested")
         else:
             lines += ["", self.study.text()]
-        return "\n".join(lines)
+        return "\n".join([*lines, "", *self._law_lines()])
+
+    def _law_lines(self) -> list[str]:
+        """What the law does and how it is applied, or why there is none."""
+        loop = self.closed_loop
+        if loop is None:
+            return [
+                "no target, so no gains: give --target X,X,..., or a row whose t is the word target"
+            ]
+        every = "" if self.sample_time is None else f" every {self.sample_time:g} s"
+        names = ""
+        if self.channels.states and self.channels.inputs:
+            states, inputs = (_row(own) for own in (self.channels.states, self.channels.inputs))
+            names = f", with z = {states} and a = {inputs}"
+        return [
+            *loop.text(self.sample_time),
+            f"to apply the law elsewhere: a = K_a U^T z + K_b s_r{every}{names}",
+        ]
 
 
-def _source_text(source: Mapping[str, int]) -> str:
+def _row(names: Sequence[str]) -> str:
+    """(a1, a2), with the middle left out where there are many."""
+    shown = list(names) if len(names) <= 2 * SHOWN else [*names[:2], "...", names[-1]]
+    return f"({', '.join(shown)})"
+
+
+def _source_text(source: Source) -> str:
     names = {
-        what: episode_name(number) if what == "episode" else number
+        what: episode_name(int(number)) if what == "episode" else number
         for what, number in source.items()
     }
     return ", ".join(f"{what} {name}" for what, name in names.items())
 
 
-def identify_file(path: Path, given: Mapping[str, Any]) -> Identified:
-    """The model from measurements in a file; see `pdeloop.data_file`, and `given` as below."""
-    found = read_measurements(path)
-    sources = [{"trajectory": number} for number in range(len(found.trajectories))]
+def identify_data(found: Measurements, given: Mapping[str, Any]) -> Identified:
+    """The model from measurements; see `pdeloop.data_file`, and `given` as below."""
     known = {"sample_time": found.sample_time}
-    return _identified(found.trajectories, found.target, sources, known, given)
+    return _identified(
+        found.trajectories,
+        found.target,
+        found.sources,
+        known,
+        given,
+        channels=found.channels,
+        remarks=found.remarks,
+    )
 
 
 def identify_bag(
@@ -126,12 +178,13 @@ def identify_bag(
     *,
     episode: int | None = None,
     environment: int | None = None,
+    target: Array | None = None,
 ) -> Identified:
     """The model from the complete episodes of the bag at `path`.
 
     given: parameters (reduced_order, identification, dmdc_rank, state_weight, action_weight) that
     replace those of the recorded run, which replace the defaults; episode, environment: only this
-    one; otherwise the exploratory episodes, or all if there are none.
+    one; otherwise the exploratory episodes, or all if there are none; target: instead of the bag's.
     """
     from pdeloop.bags.reader import Bag  # here, as it needs the extra `record`
     from recorder_node.bag import BagError
@@ -143,10 +196,8 @@ def identify_bag(
     if not chosen:
         which = "complete episode" + (f" {episode_name(episode)}" if episode is not None else "")
         raise BagError(f"{bag.path} holds no {which} to identify from (see pdeloop bag info)")
-    target = bag.target()
-    if target is None:
-        raise BagError(f"{bag.path} holds no target, without which no gains can be designed")
-    trajectories, sources = [], []
+    target = bag.target() if target is None else target
+    trajectories, sources = [], list[Source]()
     for one in chosen:
         states, actions = one.trajectory()
         for env in range(states.shape[1]):
@@ -162,16 +213,27 @@ def identify_bag(
 
 def _identified(
     trajectories: Trajectories,
-    target: Array,
-    sources: list[dict[str, int]],
+    target: Array | None,
+    sources: Sequence[Source],
     recorded: Mapping[str, Any],
     given: Mapping[str, Any],
+    *,
     channels: Channels = NUMBERED,
+    remarks: tuple[str, ...] = (),
 ) -> Identified:
-    if given.get("reduced_order", 0) > target.size:
+    n_z = trajectories[0][0].shape[1]
+    if given.get("reduced_order", 0) > n_z:
         raise ParameterError(
-            f"expected an order of at most {target.size}, the numbers of a state, got "
-            f"{given['reduced_order']}"
+            f"expected an order of at most {n_z}, the numbers of a state, got {given['reduced_order']}"
+        )
+    if target is not None and target.shape != (n_z,):
+        raise ParameterError(
+            f"expected a target of {n_z} numbers, those of a state, got {target.size}"
+        )
+    if target is None and (unused := sorted({"state_weight", "action_weight"} & {*given})):
+        flags = " and ".join(f"--{name.replace('_', '-')}" for name in unused)
+        raise ParameterError(
+            f"{flags} weigh a law, for which there is no target: give --target too"
         )
     values = {**recorded, **given}
     study, none = None, ""
@@ -187,24 +249,57 @@ def _identified(
         raise ParameterError(f"no order can be suggested: {none}; or give one with --order")
     own = {"n_a": trajectories[0][1].shape[1], "reduced_order": order, "dmdc_order": order}
     settings = DesignSettings.of({**defaults, **values, **own})
-    if given.get("dmdc_rank") and settings.identification != "dmdc":
+    method, p = settings.identification, settings.dmdc_rank
+    if given.get("dmdc_rank") and method != "dmdc":
         raise ParameterError(
-            f"--rank is that of the identification dmdc, and this one is {settings.identification}: "
+            f"--rank is that of the identification dmdc, and this one is {method}: "
             "add --identification dmdc, or leave --rank out"
         )
-    model = design(trajectories, target, settings, channels)
-    method, p = settings.identification, settings.dmdc_rank
-    determined = examined(trajectories, model, method=method, p=p, channels=channels)
-    steps = len(steps_of(trajectories).inputs)
-    return Identified(model, sources, steps, study, determined, values.get("sample_time"))
+    if target is None and given.get("identification") == "field":
+        raise ParameterError("--identification field designs a law for a target: give --target too")
+    model: ModelRows | ReducedModel
+    if target is not None:
+        model = design(trajectories, target, settings, channels)
+    else:
+        truncated = method == "dmdc"
+        model = identify(
+            trajectories,
+            method="dmdc" if truncated else "regression",
+            n_s=min(order, n_z),
+            p=p if truncated else 0,
+            channels=channels,
+        )
+    return Identified(
+        model,
+        sources,
+        len(steps_of(trajectories).inputs),
+        study,
+        examined(trajectories, model, method=method, p=p, channels=channels),
+        max(trajectories, key=lambda trajectory: len(trajectory[1])),
+        target,
+        values.get("sample_time"),
+        channels,
+        remarks,
+    )
 
 
 def save(found: Identified, path: Path) -> None:
-    """Write the model as an .npz archive: A, B, U, K_a, K_b, s_r and `model`, the rows of the topic."""
+    """Write the model as an .npz archive.
+
+    A, B, U, with a target also K_a, K_b, s_r and `model`, the rows of the topic; sample_time and the
+    names of the channels where they are known.
+    """
     model = found.model
     arrays: dict[str, Any] = {name: getattr(model, name) for name in model.__dataclass_fields__}
+    if isinstance(model, ModelRows):
+        arrays["model"] = pack(model)[np.newaxis]
+    if found.sample_time is not None:
+        arrays["sample_time"] = np.array(found.sample_time)
+    for name in ("states", "inputs"):
+        if names := getattr(found.channels, name):
+            arrays[name] = np.array(names)
     content = BytesIO()
-    np.savez(content, model=pack(model)[np.newaxis], **arrays)
+    np.savez(content, **arrays)
     try:
         write_atomically(path, content.getvalue())
     except OSError as error:

@@ -29,6 +29,8 @@ def read_model(path: Path, n_a: int) -> NDArray[np.float64]:
     """The rows of the model that `pdeloop identify --out` wrote. ValueError if there is none."""
     try:
         arrays = read_arrays(path)
+        if "model" not in arrays and "A" in arrays:
+            raise ValueError("it has a model without gains; identify with a target")
         rows = arrays["model"].astype(np.float64)
         actuators = len(arrays["B"].T) if "B" in arrays else n_a
     except (KeyError, ValueError, TypeError) as error:

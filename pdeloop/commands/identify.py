@@ -5,11 +5,15 @@ from __future__ import annotations
 
 import argparse
 import sys
+from math import isfinite
 
 from loop_interfaces.parameters import IDENTIFICATION
 from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import Commands, a_path, add_json, command
 from pdeloop.output import print_json
+
+OF_DATA = ("time", "states", "inputs", "sample_time")
+"""The options that only --data has."""
 
 
 def add(commands: Commands) -> None:
@@ -31,9 +35,28 @@ def add(commands: Commands) -> None:
         "--data",
         type=a_path,
         metavar="FILE",
-        help="states, actions, target and sampling time as .npz or .csv (docs/identification.md)",
+        nargs="+",
+        help="states, actions, target and sampling time as .npz or .csv, one file or several of one "
+        "plant (docs/identification.md)",
     )
+    add = identify.add_argument_group("of --data").add_argument
+    add("--time", metavar="NAME", help="the column of times in s, or the array sample_time [t]")
+    add(
+        "--states",
+        metavar="NAME,...",
+        help="the columns of the state: names or patterns like 'T*'; columns of no kind are left out "
+        "[those that begin with z]",
+    )
+    add("--inputs", metavar="NAME,...", help="the columns of the inputs [those that begin with a]")
+    add("--sample-time", type=float, metavar="S", help="where no column has times")
     add = identify.add_argument
+    add(
+        "--target",
+        type=_numbers,
+        metavar="X,X,...",
+        help="the state to be reached, a number for each of the state [that of the data; without any "
+        "only a model is identified]",
+    )
     add(
         "--order",
         type=int,
@@ -52,11 +75,19 @@ def add(commands: Commands) -> None:
     add("--state-weight", type=float, metavar="Q", help="q of Q = q I [that of the run, or 1]")
     add("--action-weight", type=float, metavar="R", help="r of R = r I [that of the run, or 1]")
     add("--out", type=a_path, metavar="FILE", help="write A, B, U, K_a, K_b, s_r to this .npz")
+    add(
+        "--plot",
+        type=a_path,
+        metavar="FILE",
+        help="draw the orders, the model beside the data, and the law on the model to this .png, .svg "
+        "or .pdf",
+    )
     add_json(identify)
 
 
 def _identify(options: argparse.Namespace) -> int:
-    from pdeloop.identification import identify_bag, identify_file, save
+    from pdeloop.data_file import read_measurements
+    from pdeloop.identification import identify_bag, identify_data, save
 
     given = {
         "reduced_order": options.order,
@@ -70,22 +101,56 @@ def _identify(options: argparse.Namespace) -> int:
     if options.data is not None:
         if options.episode is not None or options.environment is not None:
             raise ParameterError("--episode and --environment choose from a bag; leave them out")
-        found = identify_file(options.data, given)
+        table = {name: getattr(options, name) or "" for name in ("time", "states", "inputs")}
+        measured = read_measurements(
+            *options.data, **table, sample_time=options.sample_time, target=options.target
+        )
+        found = identify_data(measured, given)
     else:
+        for name in OF_DATA:
+            if getattr(options, name) is not None:
+                flag = f"--{name.replace('_', '-')}"
+                raise ParameterError(
+                    f"{flag} is of --data; a bag has names and times: leave it out"
+                )
         found = identify_bag(
-            options.bag, given, episode=_episode(options.episode), environment=options.environment
+            options.bag,
+            given,
+            episode=_episode(options.episode),
+            environment=options.environment,
+            target=options.target,
         )
     if options.out is not None:
         save(found, options.out)
-    for remark in found.determined.remarks:
+    if options.plot is not None:
+        from pdeloop.identification_plot import draw
+
+        draw(found, options.plot)
+    for remark in found.warnings:
         print(f"WARNING: {remark}", file=sys.stderr)
     if options.json:
-        print_json(found.summary() | {"out": options.out and str(options.out)})
+        files = {"out": options.out, "plot": options.plot}
+        print_json(found.summary() | {name: path and str(path) for name, path in files.items()})
         return 0
     print(found.text())
     if options.out is not None:
-        print(f"  written to {options.out}")
+        print(f"written to {options.out}")
+    if options.plot is not None:
+        print(f"picture in {options.plot}")
     return 0
+
+
+def _numbers(text: str) -> list[float]:
+    """A list of numbers, for argparse."""
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if not numbers or not all(map(isfinite, numbers)):
+        raise argparse.ArgumentTypeError(
+            f"expected finite numbers with commas between, got '{text}'"
+        )
+    return numbers
 
 
 def _episode(name: str | None) -> int | None:

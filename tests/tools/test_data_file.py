@@ -58,10 +58,10 @@ NAN = np.full((61, 4), np.nan)
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"target": None}, "target is missing"),
+        ({"states": None}, "states is missing; there are actions"),
         ({"states": NAN}, "finite numbers, got NaN"),
         ({"actions": np.zeros((61, 2))}, r"got shapes \(61, 4\) and \(61, 2\)"),
-        ({"actions": np.zeros((60, 0))}, "same n_z numbers"),
+        ({"actions": np.zeros((60, 0))}, "of one number or more"),
         ({"target": np.zeros(3)}, "same n_z numbers"),
         ({"target": np.full(4, np.inf)}, "target of finite numbers"),
         (
@@ -91,15 +91,18 @@ def test_a_flawed_npz_is_refused(tmp_path: Path, changes: dict[str, Any], words:
         (b"", "expected the names t, z"),
         (b"\xff\xfe\x00garbage", "expected the names t, z"),
         (b"x,y\n1,2\n", "expected the names t, z"),
-        (b"t,z1,a1\n", "whose t is the word target"),
+        (b"t,z1,a1\n", "no trajectory of two states"),
         (b"t,z1,a1\ntarget,0,\n0,1,1\n", "no trajectory of two states"),
-        (b"t,z1,a1\ntarget,0,\n0,1,1\n1,1\n", "expected 3 values in row 4, got 2"),
-        (b"t,z1,a1\ntarget,0,\n0,one,1\n", "expected numbers in row 3"),
-        (b"t,z1,a1\ntarget,0,\n0,1,1\n1,1,1\n3,1,1\n", "expected equal steps of t, got 1 to 2"),
+        (b"t,z1,a1\ntarget,0,\n0,1,1\n1,1\n", "expected 3 values in row 4, .*, got 2"),
+        (b"t,z1,a1\ntarget,0,\n0,one,1\n", "expected a number, got 'one' in row 3, column z1"),
+        (
+            b"t,z1,a1\ntarget,0,\n0,1,1\n1,1,1\n3,1,1\n",
+            "got 2 s before row 5 where the others are 1 s",
+        ),
         (b"t,z1,a1\ntarget,0,\n0,1,1\nnan,1,1\n", "expected a time t in row 4"),
-        (b"t,z1,a1\ntarget,0,\n0,1,\n1,1,1\n", "finite numbers, got NaN"),
-        (b"t,z1,a1\ntarget,0,\n0,1,1\ntarget,0,\n1,1,1\n", "one row .* got another, 4"),
-        (b'"' + b"t," * 10**6, "no table of commas|expected the names"),
+        (b"t,z1,a1\ntarget,0,\n0,1,\n1,1,1\n", "a1 is missing in row 3: fill the gap"),
+        (b"t,z1,a1\ntarget,0,\n0,1,1\ntarget,0,\n1,1,1\n", "one row .* got another, row 4"),
+        (b'"' + b"t," * 10**6, "it is not a table: field larger than"),
     ],
 )
 def test_a_flawed_csv_is_refused(tmp_path: Path, content: bytes, words: str) -> None:
@@ -126,7 +129,7 @@ def test_more_trajectories_or_numbers_than_memory_may_take_are_refused(
     refused(path, "at most 2 trajectories, got 3")
     path = tmp_path / "own.csv"
     path.write_text("t,z1,a1\ntarget,0,\n" + "0,1,1\n" * 4)
-    refused(path, "at most 2 trajectories, got 3")
+    refused(path, "at most 2 trajectories, got 4")
     monkeypatch.setattr(data_file, "MAX_ARRAY_BYTES", 8 * 100)
     path = tmp_path / "own.npz"
     np.savez(path, **arrays(states=np.zeros((61, 4), dtype=np.int8)))

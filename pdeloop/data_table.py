@@ -1,0 +1,376 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Measurements in a text table, as loggers and spreadsheets write them.
+
+The separator, the decimal mark and the encoding are those of the file; what could mean two things is
+refused with its row and column.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from array import array
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from difflib import get_close_matches
+from fnmatch import fnmatchcase
+from itertools import pairwise
+from math import isfinite, nan
+from typing import NamedTuple
+
+import numpy as np
+
+from loop_interfaces.arrays import Array
+from loop_method.reduce.channels import Channels, listed
+
+__all__ = ["Columns", "Table", "read_table"]
+
+SEPARATORS = (",", ";", "\t", "|")
+"""Tried in this order; without any of them columns are separated by spaces."""
+MISSING = ("", "nan", "na", "n/a", "null", "none", "-")
+"""What stands, in small letters, where a value is missing."""
+JITTER = 1e-3
+"""By which a step of t may differ from the median one, relative to that."""
+TARGET = "target"
+"""The word in the column of t whose row has z_r."""
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Which columns are what: names, or patterns such as T*, separated by commas.
+
+    Without any, `t`, those that begin with z, and those that begin with a, and no others.
+    """
+
+    time: str = ""
+    states: str = ""
+    inputs: str = ""
+
+    @property
+    def chosen(self) -> bool:
+        """Whether any is given, so that columns of no kind are left out."""
+        return bool(self.time or self.states or self.inputs)
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """What a table holds.
+
+    Attributes
+    ----------
+    channels : Channels
+        Names of the columns.
+    trajectories : list of (states (N + 1, n_z), actions (N, n_a))
+        a_k was held from z_k to z_{k+1}.
+    target : (n_z,) array or None
+        Of the row whose t is the word target.
+    sample_time : float or None
+        Of t, in s; None without such a column.
+    remarks : list of str
+        What was left out.
+    """
+
+    channels: Channels
+    trajectories: list[tuple[Array, Array]]
+    target: Array | None
+    sample_time: float | None
+    remarks: list[str] = field(default_factory=list)
+
+
+class _Places(NamedTuple):
+    """Where the columns are: time is -1 if there is none."""
+
+    time: int
+    states: list[int]
+    inputs: list[int]
+
+
+def read_table(raw: bytes, columns: Columns, *, timed: bool = True, most: int) -> Table:
+    """The measurements in the bytes of a file. ValueError, one sentence, if it is not such a table.
+
+    timed: whether there has to be a column of times; without one all rows are one trajectory. most:
+    trajectories that are taken.
+    """
+    separator, numbered = _lines(_text(raw))
+    _, first = next(numbered, (1, []))
+    if separator == " " and first[:1] == ["#"]:
+        first = first[1:]
+    head = [name.strip().lstrip("#").strip() for name in first]
+    width = max((i for i, name in enumerate(head) if name), default=-1) + 1
+    head = head[:width]
+    places = _places(head, columns, timed)
+    channels = Channels([head[i] for i in places.states], [head[i] for i in places.inputs])
+    target: Array | None = None
+    values, rows, numbers = array("d"), array("q"), _Numbers(head, separator)
+    for row, line in numbered:
+        if any(cell.strip() for cell in line[width:]) or len(line) < width:
+            raise ValueError(
+                f"expected {width} values in row {row}, as in the line of names, got {len(line)}"
+            )
+        stamp = line[places.time].strip() if places.time >= 0 else ""
+        if stamp.lower() == TARGET:
+            if target is not None:
+                raise ValueError(
+                    f"expected one row whose t is the word target, got another, row {row}"
+                )
+            target = np.array([numbers.read(line, i, row) for i in places.states])
+            if not np.isfinite(target).all():
+                lost = head[places.states[int(np.argmin(np.isfinite(target)))]]
+                raise ValueError(f"the target of {lost} is missing, in row {row}")
+            continue
+        rows.append(row)
+        if places.time >= 0:
+            values.append(numbers.time(stamp, row))
+        values.extend(numbers.read(line, i, row) for i in (*places.states, *places.inputs))
+    count = (places.time >= 0) + len(places.states) + len(places.inputs)
+    table = np.array(values).reshape(-1, count)
+    times = table[:, 0] if places.time >= 0 else np.arange(len(table), dtype=np.float64)
+    own = table[:, places.time >= 0 :]
+    return _cut(own, times, np.array(rows), channels, target, timed=places.time >= 0, most=most)
+
+
+def _cut(
+    values: Array,
+    times: Array,
+    rows: Array,
+    channels: Channels,
+    target: Array | None,
+    *,
+    timed: bool,
+    most: int,
+) -> Table:
+    """The rows as trajectories: each ends where t does not grow."""
+    n_z = len(channels.states)
+    starts = 1 + np.flatnonzero(~(np.diff(times) > 0.0))
+    bounds = [0, *starts.tolist(), len(times)]
+    if len(bounds) - 1 > most:
+        raise ValueError(f"expected at most {most} trajectories, got {len(bounds) - 1}")
+    parts = [slice(a, b) for a, b in pairwise(bounds)]
+    single = [int(rows[part.start]) for part in parts if part.stop - part.start == 1]
+    parts = [part for part in parts if part.stop - part.start > 1]
+    ends = np.array([part.stop - 1 for part in parts], dtype=np.int64)
+    known = np.isfinite(values)
+    known[ends, n_z:] = True  # nothing follows the last actions
+    if not known.all():
+        k, i = (int(place) for place in np.argwhere(~known)[0])
+        name = [*channels.states, *channels.inputs][i]
+        more = int((~known).any(axis=1).sum()) - 1
+        others = f" (and {more} more with gaps)" if more else ""
+        raise ValueError(
+            f"{name} is missing in row {rows[k]}{others}: fill the gap, or cut the file in two there, "
+            "as several files can be given"
+        )
+    step = None
+    if timed and parts:
+        step = _sample_time(times, rows, parts)
+    remarks = []
+    if single:
+        remarks.append(
+            f"left out row {listed([str(row) for row in single])}: t grows neither before nor after it"
+        )
+    trajectories = [(values[p, :n_z], values[p.start : p.stop - 1, n_z:]) for p in parts]
+    return Table(channels, trajectories, target, step, remarks)
+
+
+def _sample_time(times: Array, rows: Array, parts: Sequence[slice]) -> float:
+    """The step of t, which has to be the same throughout."""
+    steps = [np.diff(times[part]) for part in parts]
+    every = np.sort(np.concatenate(steps))
+    median = float(
+        every[(len(every) - 1) // 2]
+    )  # one that is there, of two different ones the shorter
+    # A clock that counts since 1970 has steps that are rounded themselves.
+    rounding = 4 * np.finfo(np.float64).eps * float(np.abs(times).max())
+    for part, own in zip(parts, steps, strict=True):
+        if (wrong := np.flatnonzero(np.abs(own - median) > JITTER * median + rounding)).size:
+            k = part.start + 1 + int(wrong[0])
+            raise ValueError(
+                f"expected equal steps of t, got {own[wrong[0]]:g} s before row {rows[k]} where the "
+                f"others are {median:g} s: fill the gap or sample the log anew, or cut the file in two "
+                "there, as several files can be given"
+            )
+    return median
+
+
+def _text(raw: bytes) -> str:
+    """The file's text, in the encodings that spreadsheets write."""
+    if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return raw.decode("utf-16", errors="replace")
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return raw.decode("cp1252", errors="replace")
+
+
+def _lines(text: str) -> tuple[str, Iterator[tuple[int, list[str]]]]:
+    """The separator that the line of names has, and from there on the rows with their numbers."""
+    skipped, head, separator = _head(text)
+    try:
+        fields = {s: len(next(csv.reader([head], delimiter=s), [])) for s in SEPARATORS}
+    except csv.Error as error:
+        raise ValueError(f"it is not a table: {error} in row {skipped + 1}") from error
+    if not separator:
+        separator = max(SEPARATORS, key=lambda s: fields[s])
+        separator = separator if fields[separator] > 1 else " "
+    source = io.StringIO(text, newline="")
+    for _ in range(skipped):
+        source.readline()
+    return separator, _rows(source, skipped, separator)
+
+
+def _head(text: str) -> tuple[int, str, str]:
+    """How many lines precede the line of names, that line, and the separator that a line before names.
+
+    Lines that begin with # are remarks; the last of them is the line of names if numbers follow it.
+    """
+    separator, remark = "", (0, "")
+    for skipped, line in enumerate(io.StringIO(text, newline=None)):
+        words = line.strip()
+        if words.lower().startswith("sep=") and len(words) == 5:  # as spreadsheets ask for
+            separator = words[4]
+        elif words.startswith("#"):
+            remark = skipped, words
+        elif words:
+            bare = words.lstrip("\"'+-.").lower()
+            numeric = bare[:1].isdigit() or bare.startswith(TARGET)
+            return (*remark, separator) if numeric and remark[1] else (skipped, line, separator)
+    return (*remark, separator)
+
+
+def _rows(source: io.StringIO, skipped: int, separator: str) -> Iterator[tuple[int, list[str]]]:
+    """The rows that are not empty, with their numbers from 1 on; remarks are left out."""
+    if separator == " ":
+        numbered = ((number, line.split()) for number, line in enumerate(source, skipped + 1))
+    else:
+        reader = csv.reader(source, delimiter=separator, skipinitialspace=True)
+        numbered = ((skipped + reader.line_num, cells) for cells in reader)
+    first = True
+    try:
+        for number, cells in numbered:
+            if any(cell.strip() for cell in cells) and (first or not cells[0].startswith("#")):
+                first = False
+                yield number, cells
+    except csv.Error as error:
+        raise ValueError(
+            f"it is not a table: {error} in row {skipped + reader.line_num}"
+        ) from error
+
+
+def _places(head: Sequence[str], columns: Columns, timed: bool) -> _Places:
+    """Where time, states and inputs are. ValueError if a name is missing, or means two things."""
+    shown = ", ".join(head)[:200]
+    if twice := sorted({name for name in head if head.count(name) > 1 and name}):
+        raise ValueError(f"expected a name for each column, got several named {listed(twice)}")
+    if not columns.chosen:
+        kinds = {"t": [], "z": [], "a": [], "": []}  # type: dict[str, list[int]]
+        for i, name in enumerate(head):
+            kind = "t" if name == "t" else name[:1] if name[:1] in ("z", "a") else ""
+            kinds[kind].append(i)
+        if kinds[""] or not (kinds["z"] and kinds["a"] and (kinds["t"] or not timed)):
+            raise ValueError(
+                "expected the names t, z..., a... in the first line, separated by commas, semicolons "
+                f"or tabs, got '{shown}'; or choose columns with --time, --states and --inputs"
+            )
+        return _Places(kinds["t"][0] if kinds["t"] else -1, kinds["z"], kinds["a"])
+    found = {
+        "--time": _matching(
+            head, columns.time or "t", "--time", needed=bool(columns.time) or timed
+        ),
+        "--states": _matching(head, columns.states or "z*", "--states"),
+        "--inputs": _matching(head, columns.inputs or "a*", "--inputs"),
+    }
+    if len(found["--time"]) > 1:
+        names = listed([head[i] for i in found["--time"]])
+        raise ValueError(f"expected one column for --time, got {names}")
+    for one, other in (
+        ("--time", "--states"),
+        ("--time", "--inputs"),
+        ("--states", "--inputs"),
+    ):
+        if both := sorted({*found[one]} & {*found[other]}):
+            names = listed([head[i] for i in both])
+            raise ValueError(
+                f"{names} cannot be of both {one} and {other}; name columns one by one"
+            )
+    time = found["--time"]
+    return _Places(time[0] if time else -1, found["--states"], found["--inputs"])
+
+
+def _matching(head: Sequence[str], patterns: str, flag: str, *, needed: bool = True) -> list[int]:
+    """The columns that the patterns name, in their order and each once."""
+    found: dict[int, None] = {}
+    for pattern in (part.strip() for part in patterns.split(",")):
+        # A name may hold what is special in a pattern, like T [K].
+        own = [i for i, name in enumerate(head) if name == pattern] or [
+            i for i, name in enumerate(head) if name and fnmatchcase(name, pattern)
+        ]
+        if not own and needed:
+            close = get_close_matches(pattern, head, n=1, cutoff=0.4)
+            meant = f"; did you mean {close[0]}?" if close else ""
+            raise ValueError(
+                f"{flag}: no column is named '{pattern}'; there are {', '.join(head)[:200]}{meant}"
+            )
+        found |= dict.fromkeys(own)
+    return list(found)
+
+
+class _Numbers:
+    """Reads the cells of a table, whose decimal mark is found on the way."""
+
+    def __init__(self, head: Sequence[str], separator: str) -> None:
+        self._head = head
+        self._separator = separator
+        self._mark = ""
+        self._since: datetime | None = None
+
+    def read(self, line: Sequence[str], i: int, row: int) -> float:
+        """The number in a cell; NaN where it is missing."""
+        return self._number(line[i].strip(), self._head[i], row)
+
+    def time(self, text: str, row: int) -> float:
+        """Seconds: a number, or an instant like 2026-01-31 12:00:00.5 since the first one."""
+        instant = self._instant(text)
+        if instant is None:
+            value = nan if self._since else self._number(text, "t", row)
+            if not isfinite(value):
+                raise ValueError(f"expected a time t in row {row}, got '{text[:40]}'")
+            return value
+        self._since = self._since or instant
+        if bool(instant.tzinfo) != bool(self._since.tzinfo):
+            raise ValueError(
+                f"expected a time zone in all rows or in none, got '{text[:40]}' in {row}"
+            )
+        return (instant - self._since).total_seconds()
+
+    @staticmethod
+    def _instant(text: str) -> datetime | None:
+        if "-" not in text[1:] and ":" not in text:  # a number
+            return None
+        try:
+            return datetime.fromisoformat(text)
+        except ValueError:
+            return None
+
+    def _number(self, text: str, name: str, row: int) -> float:
+        """The number in a text; NaN where it is missing."""
+        if text.lower() in MISSING:
+            return nan
+        where = f"'{text[:40]}' in row {row}, column {name}"
+        mark = "," if "," in text else "." if "." in text else ""
+        if mark == self._separator:
+            raise ValueError(
+                f"expected a decimal point where commas separate the columns, got {where}; separate "
+                "them by semicolons, or write points"
+            )
+        if text.count(",") + text.count(".") > 1 or (mark and self._mark not in ("", mark)):
+            after = f", after '{self._mark}' before" if self._mark else ""
+            raise ValueError(
+                f"expected one decimal mark and no mark of thousands, got {where}{after}"
+            )
+        try:
+            value = float(text.replace(",", "."))
+        except ValueError:
+            raise ValueError(f"expected a number, got {where}") from None
+        self._mark = self._mark or mark
+        return value

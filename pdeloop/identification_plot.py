@@ -1,0 +1,112 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A picture of what was identified: orders, the model beside the data, and the law on the model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from loop_interfaces.arrays import Array
+from loop_interfaces.model_rows import ModelRows
+from loop_method.reduce.order import OrderStudy
+from loop_method.reduce.reduced_model import ReducedModel
+from pdeloop.identification import Identified
+from pdeloop.report.style import STYLE
+
+CHANNELS = 5
+"""Numbers of the state, and inputs, that are drawn."""
+
+
+def draw(found: Identified, path: Path) -> None:
+    """Write the picture; its suffix says in which format."""
+    with matplotlib.rc_context(STYLE):
+        figure = plot(found)
+        # Without a format a folder would become the name of a file beside it.
+        figure.savefig(path, dpi=150, format=path.suffix[1:] or "png")
+
+
+def plot(found: Identified) -> Figure:
+    """The figure; the lower half only where there is a law."""
+    rows = 1 if found.closed_loop is None else 2
+    figure = Figure(figsize=(8.0, 3.0 * rows), layout="constrained")
+    axes = figure.subplots(rows, 2, squeeze=False)
+    _orders(axes[0, 0], found.study, len(found.model.A))
+    step = found.sample_time or 1.0
+    unit = "t (s)" if found.sample_time else "step"
+    states, actions = found.trajectory
+    shown = _spread(states.shape[1])
+    _lines(axes[0, 1], states, shown, None, step, linewidth=3.0, alpha=0.35)
+    _lines(axes[0, 1], predicted(found.model, states, actions), shown, found.channels.state, step)
+    axes[0, 1].set(title="recorded (thick), predicted from $z_0$ (thin)", xlabel=unit)
+    axes[0, 1].legend(frameon=False, fontsize="small")
+    loop = found.closed_loop
+    if loop is not None:
+        _lines(axes[1, 0], loop.states, shown, found.channels.state, step)
+        for place, i in enumerate(shown):
+            axes[1, 0].axhline(loop.target[i], color=f"C{place}", linestyle=":", linewidth=0.9)
+        axes[1, 0].set(title="law on the model, and target (dotted)", xlabel=unit)
+        chosen = _spread(loop.actions.shape[1])
+        times = step * np.arange(len(loop.actions))
+        for place, j in enumerate(chosen):
+            axes[1, 1].step(
+                times,
+                loop.actions[:, j],
+                where="post",
+                color=f"C{place}",
+                linewidth=0.9,
+                label=found.channels.input(j),
+            )
+        axes[1, 1].set(title="its actions", xlabel=unit)
+        axes[1, 1].legend(frameon=False, fontsize="small")
+    return figure
+
+
+def predicted(model: ReducedModel | ModelRows, states: Array, actions: Array) -> Array:
+    """U s_k of the model under the recorded actions, from s_0 = U^T z_0, (N + 1, n_z)."""
+    s = model.U.T @ states[0]
+    reduced = [s]
+    with np.errstate(over="ignore", invalid="ignore"):
+        for a in actions:
+            s = model.A @ s + model.B @ a
+            reduced.append(s)
+    return np.asarray(np.array(reduced) @ model.U.T)
+
+
+def _orders(ax: Axes, study: OrderStudy | None, order: int) -> None:
+    ax.set(title="errors on held-out steps", xlabel="order $n_s$")
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    if study is None:
+        ax.text(0.5, 0.5, "too few steps to hold some out", ha="center", transform=ax.transAxes)
+        return
+    ax.semilogy(study.orders, study.one_step, "o-", markersize=3, label="one step")
+    ax.semilogy(study.orders, study.rollout, "s-", markersize=3, label="rollout")
+    ax.axvline(order, color="0.5", linestyle=":", label=f"this model, {order}")
+    ax.legend(frameon=False, fontsize="small")
+
+
+def _lines(
+    ax: Axes,
+    values: Array,
+    shown: Sequence[int],
+    name: Callable[[int], str] | None,
+    step: float,
+    **style: Any,
+) -> None:
+    times = step * np.arange(len(values))
+    for place, i in enumerate(shown):
+        label = name(i) if name else None
+        drawn = {"linewidth": 0.9, **style}
+        ax.plot(times, values[:, i], color=f"C{place}", label=label, **drawn)
+
+
+def _spread(count: int) -> list[int]:
+    """A few of so many, equally spaced."""
+    few = np.linspace(0, count - 1, min(count, CHANNELS))
+    return [int(i) for i in few.round()]

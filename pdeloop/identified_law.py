@@ -1,0 +1,96 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The law of an identified model, on that model: what it would do, and how it is applied elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from loop_interfaces.arrays import Array
+from loop_interfaces.model_rows import ModelRows
+
+SETTLED = 0.05
+"""Share of the way from the first to the last state within which the loop counts as settled."""
+DECAYED = 1e-3
+"""What is left of the slowest mode of the closed loop at the end of the simulation, if that is long
+enough."""
+LONGEST = 10
+"""Times as many steps as the recorded trajectory that are simulated at most."""
+_OVERFLOW = 1e100
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedLoop:
+    """The law on the model, from the first recorded state.
+
+    states (N + 1, n_z): U s_k; actions (N, n_a); target (n_z,); radius: spectral radius of A + B K_a;
+    recorded: largest magnitude of each recorded action, (n_a,).
+    """
+
+    states: Array
+    actions: Array
+    target: Array
+    radius: float
+    recorded: Array
+
+    @property
+    def settled(self) -> int:
+        """The step from which on the state is close to the last one."""
+        distances = np.linalg.norm(self.states - self.states[-1], axis=1)
+        far = np.flatnonzero(distances > SETTLED * distances[0])
+        return int(far[-1]) + 1 if far.size else 0
+
+    @property
+    def left(self) -> float:
+        """|U s_N - z_r|, relative to |U s_0 - z_r|; infinity if s_0 is there already."""
+        first, last = (float(np.linalg.norm(self.states[k] - self.target)) for k in (0, -1))
+        return last / first if first > 0.0 else float("inf") if last > 0.0 else 0.0
+
+    def summary(self) -> dict[str, Any]:
+        """As data."""
+        return {
+            "spectral_radius": self.radius,
+            "steps": len(self.actions),
+            "settled_step": self.settled,
+            "distance_left": self.left if np.isfinite(self.left) else None,
+            "largest_actions": np.abs(self.actions).max(axis=0).tolist(),
+            "largest_recorded_actions": self.recorded.tolist(),
+        }
+
+    def text(self, sample_time: float | None) -> list[str]:
+        """Lines for people."""
+        unit, step = (" steps", 1.0) if sample_time is None else (" s", sample_time)
+        largest = np.abs(self.actions).max(axis=0)
+        beyond = ": beyond what the model was identified from"
+        return [
+            "closed loop on the model, from the first recorded state",
+            f"  spectral radius {self.radius:.4f}; settled after {self.settled * step:.3g}{unit}, with "
+            f"{100 * self.left:.3g} % of the distance to the target left",
+            f"  actions up to {largest.max():.3g}, recorded {self.recorded.max():.3g}"
+            f"{beyond if (largest > 1.01 * self.recorded).any() else ''}",
+        ]
+
+
+def closed_loop(law: ModelRows, target: Array, states: Array, actions: Array) -> ClosedLoop:
+    """Simulate s_{k+1} = A s_k + B a_k under a_k = K_a s_k + K_b s_r, from s_0 = U^T z_0.
+
+    states (N + 1, n_z) and actions (N, n_a): the recorded trajectory whose first state it begins with.
+    It runs for its length, or longer, until the slowest mode has decayed.
+    """
+    radius = float(np.abs(np.linalg.eigvals(law.A + law.B @ law.K_a)).max())
+    needed = np.log(DECAYED) / np.log(min(max(radius, 0.01), 1.0 - 1e-9))
+    steps = int(np.clip(np.ceil(needed), len(actions), LONGEST * len(actions)))
+    s, forced = law.U.T @ states[0], law.K_b @ law.s_r
+    reduced, applied = [s], list[Array]()
+    for _ in range(steps):
+        a = law.K_a @ s + forced
+        after = law.A @ s + law.B @ a
+        if applied and not np.abs(after).max() < _OVERFLOW:
+            break
+        s = after
+        reduced.append(s)
+        applied.append(a)
+    recorded = np.abs(actions).max(axis=0)
+    return ClosedLoop(np.array(reduced) @ law.U.T, np.array(applied), target, radius, recorded)
