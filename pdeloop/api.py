@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from difflib import get_close_matches
 from io import StringIO
 from numbers import Integral
 from pathlib import Path
@@ -17,11 +18,12 @@ from numpy.typing import ArrayLike
 
 from controller_node import identification
 from loop_interfaces.arrays import Array
+from loop_interfaces.parameters import table
 from loop_interfaces.problem import load_parameters
 from loop_method.reduce.identifiability import IdentifiabilityWarning
 from loop_method.reduce.reduced_model import ReducedModel
 from pde_sim_node.build import build_equation, build_plant
-from pde_sim_node.equations import allow
+from pde_sim_node.equations import allow, configured_equation
 from pde_sim_node.plant import Plant
 from pdeloop.display import Display
 from pdeloop.finished_run import FinishedRun, load_run
@@ -150,14 +152,37 @@ def problem(
     >>> states.shape, actions.shape
     ((101, 64), (100, 6))
     """
-    if physical is not None and not isinstance(physical, Mapping):
-        raise ValueError(f"physical is {physical!r}; expected a dict of names and numbers")
-    given = parameters | {f"physical.{name}": value for name, value in (physical or {}).items()}
-    if "equation" in given:
-        given["equation"] = allow(given["equation"])
+    given = named(str(source), {**parameters, "physical": physical})
     values = load_parameters(str(source), given)
     build_equation(values)  # refuses physical parameters that it does not have
     return Problem(str(source), given, values)
+
+
+def named(source: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters by their names, those of `physical` among them; code that is named is allowed.
+
+    ValueError, with what was meant, where a parameter of the equation is given as one of the problem.
+    """
+    given = dict(parameters)
+    physical = given.pop("physical", None) or {}
+    if not isinstance(physical, Mapping):
+        raise ValueError(f"physical is {physical!r}; expected a dict of names and numbers")
+    if "equation" in given:
+        given["equation"] = allow(given["equation"])
+    known = [spec.name for spec in table()]
+    for name, value in given.items():
+        if name in known or name.startswith("physical."):
+            continue
+        equation = {"equation": given["equation"]} if "equation" in given else {}
+        kind = configured_equation(load_parameters(source, equation)["equation"])
+        own = [item.name for item in fields(kind) if item.name != "length"]
+        for meant in get_close_matches(name, [*own, *known], n=1):
+            if meant in own:
+                raise ValueError(
+                    f"{name!r} is not a parameter of the problem; did you mean the equation's own, "
+                    f"physical={{{meant!r}: {value!r}}}?"
+                )
+    return given | {f"physical.{name}": value for name, value in physical.items()}
 
 
 def identify(
@@ -268,7 +293,7 @@ def train(
             (problem.source, problem.given) if isinstance(problem, Problem) else (problem, {})
         )
         where = Path(temporary) / "run" if out is None else Path(out)
-        folder, values = begin(source, {**given, **parameters}, where)
+        folder, values = begin(source, {**given, **named(source, parameters)}, where)
         display = Display(values["seed"], values["seeds"], progress or StringIO())
         try:
             carry_out(folder, values, transport, display, lambda: None)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -221,3 +222,26 @@ def test_the_trajectories_of_a_recorded_run_are_the_plants_own(tmp_path: Path) -
         lengths.add(len(episode.actions))
     assert lengths == {small.values["horizon"]} and len(others) > 3
     pdeloop.identify((first.states[:, 0], first.actions[:, 0]), n_s=2)
+
+
+@pytest.mark.parametrize("call", [pdeloop.problem, pdeloop.train])
+@pytest.mark.parametrize(
+    ("problem", "given", "meant"),
+    [
+        ("burgers", {"viscosity": 2e-3}, "physical={'viscosity': 0.002}"),
+        ("allen-cahn", {"diffusivty": 1}, "physical={'diffusivity': 1}"),
+        ("wave", {"speed": 2.0}, "physical={'speed': 2.0}"),
+    ],
+)
+def test_a_parameter_of_the_equation_is_told_where_it_belongs(call, problem, given, meant) -> None:
+    with pytest.raises(ValueError, match=re.escape(f"did you mean the equation's own, {meant}?")):
+        call(problem, **given)
+
+
+def test_a_training_takes_the_equations_parameters_as_a_problem_does() -> None:
+    physical = {"viscosity": 2e-3}
+    run = pdeloop.train(str(SMALL), physical=physical, **TWO_POINT)
+    other = pdeloop.train(pdeloop.problem(SMALL, physical=physical), **TWO_POINT)
+    assert run.values["physical.viscosity"] == 2e-3 and same_bits(run.policies, other.policies)
+    with pytest.raises(ValueError, match="physical is 3; expected a dict of names and numbers"):
+        pdeloop.train(str(SMALL), physical=3)

@@ -1,0 +1,75 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""What an environment and its agent exchange: the spaces, and what `info` says."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Box, Space
+from numpy.typing import NDArray
+
+from loop_interfaces.arrays import Array
+from pde_sim_node.plant import MEAN_FIELD, Plant
+
+
+def spaces(plant: Plant) -> tuple[Space[Any], Space[Any]]:
+    """Of an observation (state_size,) and of an action (n_a,)."""
+    own = plant.instruments
+    bound = np.inf if own.measurement_noise or own.sensors else plant.divergence_bound
+    limit = own.action_limit or action_scale(plant)
+    observation = Box(-bound, bound, (plant.state_size,), np.float64)
+    return observation, Box(-limit, limit, (plant.n_a,), np.float64)
+
+
+def action_scale(plant: Plant) -> float:
+    """The magnitude at which all n_a actions cost as much as the error of the mean initial state.
+
+    b with b^2 1'R1 = (z_0 - z_r)'Q(z_0 - z_r): a law that costs less than no control seldom leaves
+    [-b, b]. 1 if that state is the target. The plant begins an episode.
+    """
+    _, of_ones = plant.evaluate(plant.field_target[np.newaxis], np.ones((1, plant.n_a)))
+    return float(np.sqrt(mean_field_error(plant) / of_ones[0])) or 1.0
+
+
+def mean_field_error(plant: Plant) -> float:
+    """(z_0 - z_r)'Q(z_0 - z_r) of the mean initial state. The plant begins an episode."""
+    batch = plant.batch
+    plant.reset([MEAN_FIELD])
+    _, costs = plant.evaluate(plant.states, np.zeros((1, plant.n_a)))
+    if batch:
+        plant.reset(np.arange(batch))
+    return float(costs[0])
+
+
+def told(plant: Plant, costs: Array) -> dict[str, Array]:
+    """What `info` says of each environment.
+
+    cost (M,): the stage cost of the step that ended; distance (M,): root mean square over the grid of
+    z - z_r, of the field itself; target (M, state_size): z_r as it is observed.
+    """
+    error = plant.states - plant.field_target
+    distance = np.sqrt(np.einsum("mi,mi->m", error, error) / plant.n_z)
+    target = np.broadcast_to(plant.target, (len(costs), plant.state_size))
+    return {"cost": costs, "distance": distance, "target": target}
+
+
+def one(info: Mapping[str, Array], m: int) -> dict[str, Any]:
+    """What is told of environment m, its numbers as Python's."""
+    return {
+        name: value[m].copy() if value.ndim > 1 else float(value[m]) for name, value in info.items()
+    }
+
+
+def masked(info: Mapping[str, Array], mask: NDArray[np.bool_]) -> dict[str, Any]:
+    """What is told of the environments of a mask, as Gymnasium's vector environments have it.
+
+    Zeros elsewhere, and with each entry `name` its mask `_name`.
+    """
+    found: dict[str, Any] = {}
+    for name, value in info.items():
+        kept = np.zeros(value.shape)
+        kept[mask] = value[mask]
+        found |= {name: kept, f"_{name}": mask.copy()}
+    return found

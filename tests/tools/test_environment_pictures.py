@@ -1,0 +1,150 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The frames of environments, and the films that Gymnasium makes of them."""
+
+from __future__ import annotations
+
+import copy
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.error import DependencyNotInstalled
+from gymnasium.wrappers import RecordVideo
+from gymnasium.wrappers.vector import RecordVideo as RecordVideos
+
+import pdeloop
+from loop_interfaces.grid import Axis, Grid
+from loop_interfaces.problem import shipped_problems
+from pdeloop.environments import environment_id
+from pdeloop.environments.picture import Picture
+
+BURGERS = "pdeloop/Burgers-v0"
+GRID: dict[str, Any] = {"n_z": 32, "horizon": 4}
+
+
+@pytest.mark.parametrize("problem", shipped_problems())
+def test_a_frame_shows_the_field_of_each_problem(problem: str) -> None:
+    env = gymnasium.make(environment_id(problem), render_mode="rgb_array", n_z=64)
+    env.reset(seed=1)
+    first = env.render()
+    assert isinstance(first, np.ndarray) and first.dtype == np.uint8 and first.shape[2] == 3
+    assert len(np.unique(first.reshape(-1, 3), axis=0)) > 20
+    env.step(env.action_space.high)
+    after = env.render()
+    assert after.shape == first.shape and not np.array_equal(after, first)
+    assert np.array_equal(env.render(), after)
+
+
+def test_without_a_mode_nothing_is_drawn() -> None:
+    env, batch = gymnasium.make(BURGERS, **GRID), gymnasium.make_vec(BURGERS, 2, **GRID)
+    env.reset(seed=0), batch.reset(seed=0)
+    assert env.unwrapped.render() is None and batch.render() is None
+
+
+def test_a_batch_draws_each_of_its_environments() -> None:
+    batch = gymnasium.make_vec(BURGERS, 2, render_mode="rgb_array", **GRID)
+    batch.reset(seed=4)
+    frames = batch.render()
+    single = gymnasium.make(BURGERS, render_mode="rgb_array", **GRID)
+    single.reset(seed=5)
+    assert len(frames) == 2 and np.array_equal(frames[1], single.render())
+    assert not np.array_equal(frames[0], frames[1])
+    other = copy.deepcopy(batch)
+    assert np.array_equal(other.render()[0], frames[0])
+
+
+@pytest.mark.parametrize(
+    "grid",
+    [Grid.vector(6), Grid((Axis("y", 1.0, 2), Axis("x", 1.0, 3))), Grid.interval(1.0, 3, "uv")],
+)
+def test_states_of_any_grid_are_drawn(grid: Grid) -> None:
+    class Any6:
+        n_a = 2
+
+        def __init__(self) -> None:
+            self.grid, self.field_target = grid, np.zeros(6)
+            self.states, self.actions = np.arange(6.0)[np.newaxis], np.ones((1, 2))
+
+    plant: Any = Any6()
+    picture = Picture()
+    frame = picture.frame(plant, 0)
+    plant.states = -plant.states
+    assert not np.array_equal(picture.frame(plant, 0), frame)
+
+
+def test_where_matplotlib_is_missing_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = gymnasium.make(BURGERS, render_mode="rgb_array", **GRID)
+    env.reset(seed=0)
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(DependencyNotInstalled, match=r"pip install 'pdeloop\[report\]'"):
+        env.render()
+
+
+@pytest.fixture
+def clips(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, float]]:
+    """Number of frames and frames a second of the films made; a stand-in writes them, not MoviePy."""
+    made: list[tuple[int, float]] = []
+
+    class ImageSequenceClip:
+        def __init__(self, frames: list[np.ndarray], fps: float) -> None:
+            assert len({frame.shape for frame in frames}) == 1
+            made.append((len(frames), fps))
+
+        def write_videofile(self, path: str, **how: Any) -> None:
+            Path(path).write_bytes(b"")
+
+    names = ("moviepy", "moviepy.video", "moviepy.video.io", "moviepy.video.io.ImageSequenceClip")
+    for name in names:
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
+    sys.modules[names[-1]].ImageSequenceClip = ImageSequenceClip  # type: ignore[attr-defined]
+    return made
+
+
+def episode(env: gymnasium.Env[Any, Any]) -> None:
+    env.reset(seed=0)
+    while not env.step(env.action_space.sample())[3]:
+        pass
+
+
+def test_a_film_has_a_frame_for_each_state(clips: list[tuple[int, float]], tmp_path: Path) -> None:
+    env = gymnasium.make(BURGERS, render_mode="rgb_array", **GRID)
+    film = RecordVideo(env, str(tmp_path / "one"), episode_trigger=lambda _: True)
+    episode(film), episode(film)
+    film.close()
+    assert clips == [(GRID["horizon"] + 1, env.metadata["render_fps"])] * 2
+    batch = gymnasium.make_vec(BURGERS, 3, render_mode="rgb_array", **GRID)
+    films = RecordVideos(batch, str(tmp_path / "many"), episode_trigger=lambda _: True)
+    films.reset(seed=0)
+    for _ in range(GRID["horizon"]):
+        films.step(films.action_space.sample())
+    films.close()
+    assert len(clips) == 3
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("moviepy") is None, reason="MoviePy is not installed: extra rl"
+)
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_a_film_is_written(tmp_path: Path) -> None:
+    env = gymnasium.make(BURGERS, render_mode="rgb_array", **GRID)
+    film = RecordVideo(env, str(tmp_path / "films"), episode_trigger=lambda _: True)
+    episode(film)
+    film.close()
+    (written,) = tmp_path.glob("films/*.mp4")
+    assert written.stat().st_size > 1000 and b"ftyp" in written.read_bytes()[:32]
+
+
+def test_what_is_drawn_is_not_part_of_the_episode() -> None:
+    """The bits with and without a picture are the same."""
+    env = gymnasium.make(BURGERS, render_mode="rgb_array", **GRID)
+    plant = pdeloop.problem("burgers", **GRID).plant()
+    env.reset(seed=3), plant.reset([3])
+    for _ in range(GRID["horizon"]):
+        env.render()
+        assert np.array_equal(env.step(np.ones(6))[0], plant.step(np.ones((1, 6)))[0])
