@@ -56,7 +56,8 @@ INSTRUMENTS = _section(
 ACTUATORS = _section(
     "PT",
     Spec("actuator_positions", [], 0.0, 1.0, group="problem").means(
-        "centres of the n_a actuators as shares of L; none: equally spaced, or as the equation has them"
+        "centres of the n_a actuators as shares of L; none: n_x // n_a points apart, or as the "
+        "equation has them"
     ),
     Spec(
         "actuator_shape",

@@ -8,10 +8,11 @@ from numpy.typing import ArrayLike, NDArray
 
 
 def indicator_supports(n_z: int, n_a: int, width: float) -> NDArray[np.float64]:
-    """Phi_j(x_i) of n_a equally spaced actuators, (n_z, n_a), entries 0 or 1.
+    """Phi_j(x_i) of n_a actuators, n_z // n_a grid points apart, (n_z, n_a), entries 0 or 1.
 
     With w = width n_z and s = n_z // n_a, support j is 1 on the grid indices int(c - w/2) <= i <
-    int(c + w/2) around its centre c = int((j + 0.5) s): controlgym's convention. ValueError where
+    int(c + w/2) around its centre c = int((j + 0.5) s): controlgym's convention. Where n_a does not
+    divide n_z, the last n_z - n_a s points are beyond all of them. ValueError where
     they would together be wider than the domain, one holds no grid point, or one leaves the grid.
     """
     if not width > 0:

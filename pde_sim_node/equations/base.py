@@ -159,7 +159,7 @@ class Equation(ABC):
         """
 
     def supports(self, x: Field, n_a: int, width: float) -> Field:
-        """Phi_j(x_i), the shapes of the actuators: equally spaced and 1 on a ``width`` of the domain.
+        """Phi_j(x_i), the shapes of the actuators: n_x // n_a points apart, 1 on a ``width`` of L.
 
         Override it for actuators of another shape or at other places.
 

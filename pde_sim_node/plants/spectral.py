@@ -48,7 +48,7 @@ class SpectralPlant(BatchPlant):
         "indicator", "gaussian" with ``width`` as standard deviation, or "equation", as
         `Equation.supports` has it.
     positions
-        Centres of the actuators as fractions of the domain; none: equally spaced, or as
+        Centres of the actuators as fractions of the domain; none: n_x // n_a points apart, or as
         `Equation.supports` has them.
     sample_time
         Sampling time, a whole multiple of ``integration_time``.
