@@ -41,23 +41,33 @@ class Workspace:
 
         Compiling it again would be most of what the tests of an installation do.
         """
-        load_compiled(resolve(str(SMALL), {}))
         (library,) = self.prefix.glob("lib/python*/site-packages")
-        for installed in library.iterdir():
-            for path in (ROOT / installed.name).rglob("*.nb[ic]"):
-                target = library / path.relative_to(ROOT)
-                target.parent.mkdir(exist_ok=True)
-                shutil.copy2(path, target)
+        add_compiled(library)
 
     def executable(self, name: str) -> Path:
         """The file that `ros2 run pdeloop NAME` and launch_ros look for."""
         return self.prefix / "lib" / "pdeloop" / name
 
 
+def add_compiled(library: Path) -> None:
+    """Put what Numba has compiled of the sources beside their copies in a folder of packages."""
+    load_compiled(resolve(str(SMALL), {}))
+    for installed in library.iterdir():
+        for path in (ROOT / installed.name).rglob("*.nb[ic]"):
+            target = library / path.relative_to(ROOT)
+            target.parent.mkdir(exist_ok=True)
+            shutil.copy2(path, target)
+
+
+def copy_sources(folder: Path) -> Path:
+    """A clean copy of the sources in a new folder."""
+    shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(*_NOT_SOURCES))
+    return folder
+
+
 def build(folder: Path, *options: str) -> Workspace:
     """A workspace in `folder`, after `colcon build OPTIONS`."""
-    source = folder / "src" / "pdeloop"
-    shutil.copytree(ROOT, source, ignore=shutil.ignore_patterns(*_NOT_SOURCES))
+    copy_sources(folder / "src" / "pdeloop")
     clean = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "AMENT_PREFIX_PATH")}
     clean["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{clean['PATH']}"
     done = subprocess.run(

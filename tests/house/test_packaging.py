@@ -1,0 +1,104 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Containers, workflow and citation call the two commands, and agree with the project's metadata."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import tomllib
+from pathlib import Path
+
+import pytest
+import yaml
+
+from tests.support.interpreter import ROOT
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+TARGETS = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+CITATION = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+
+
+def made(command: str) -> set[str]:
+    """The targets of the Makefile that a shell command asks for."""
+    words = shlex.split(command, comments=True)
+    return set(words[words.index("make") + 1 :]) if "make" in words else set()
+
+
+def instructions(path: Path) -> list[tuple[str, str]]:
+    lines = [line for line in path.read_text().splitlines() if line and not line.startswith("#")]
+    return [(line.partition(" ")[0], line.partition(" ")[2]) for line in lines]
+
+
+def supported(image: str) -> bool:
+    """Whether an image is named without a host, and has a Python that the project runs with."""
+    name = re.fullmatch(r"python:(\d+)\.(\d+)-[a-z]+", image)
+    least = re.fullmatch(r">=(\d+)\.(\d+)", PROJECT["requires-python"])
+    assert least
+    return bool(name) and tuple(map(int, name.groups())) >= tuple(map(int, least.groups()))
+
+
+def test_the_image_is_set_up_and_runs_the_first_command() -> None:
+    steps = instructions(ROOT / "Dockerfile")
+    (image,) = [value for name, value in steps if name == "FROM"]
+    assert supported(image)
+    assert [made(value) for name, value in steps if name == "RUN"] == [{"setup"}]
+    (command,) = [json.loads(value) for name, value in steps if name == "CMD"]
+    assert command == ["make", "run"]
+    assert [name for name, _ in steps].index("COPY") < [name for name, _ in steps].index("RUN")
+
+
+def test_nothing_that_a_clone_has_is_left_out_of_the_image() -> None:
+    ignored = [
+        line.rstrip("/")
+        for line in (ROOT / ".dockerignore").read_text().splitlines()
+        if not line.startswith("#")
+    ]
+    never_committed = {
+        line.rstrip("/")
+        for line in (ROOT / ".gitignore").read_text().splitlines()
+        if not line.startswith("#")
+    }
+    assert {line.removeprefix("**/") for line in ignored} <= never_committed
+
+
+def test_the_development_container_is_set_up_by_the_makefile() -> None:
+    described = json.loads((ROOT / ".devcontainer" / "devcontainer.json").read_text())
+    assert supported(described["image"])
+    assert made(described["postCreateCommand"]) == {"setup"}
+    settings = described["customizations"]["vscode"]["settings"]
+    assert settings["python.defaultInterpreterPath"].endswith("/.venv/bin/python")
+
+
+def test_the_workflow_calls_the_two_commands_and_builds_the_wheel() -> None:
+    workflow = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())
+    (job,) = workflow["jobs"].values()
+    commands = [step["run"] for step in job["steps"] if "run" in step]
+    called = [made(command) for command in commands]
+    assert {"run"} in called and {"test"} in called
+    assert set().union(*called) <= TARGETS
+    assert any("pip wheel --no-deps" in command for command in commands)
+    # In YAML 1.1 the word on is true.
+    assert {"push", "pull_request"} <= set(workflow[True])
+
+
+def test_the_citation_says_what_the_project_says() -> None:
+    assert CITATION["version"] == PROJECT["version"]
+    assert CITATION["repository-code"] == PROJECT["urls"]["Repository"]
+    assert [author["name"] for author in CITATION["authors"]] == [
+        author["name"] for author in PROJECT["authors"]
+    ]
+    heading = rf"^## \[{re.escape(CITATION['version'])}\] - {CITATION['date-released']}$"
+    assert re.search(heading, (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    (paper,) = CITATION["references"]
+    assert (
+        paper["identifiers"][0]["value"].removeprefix("arXiv:") in (ROOT / "README.md").read_text()
+    )
+
+
+@pytest.mark.parametrize("name", ["cff-version", "message", "title", "authors", "type", "license"])
+def test_the_citation_has_what_its_format_asks_for(name: str) -> None:
+    """The Citation File Format 1.2.0; a date is one."""
+    assert CITATION[name]
+    assert CITATION["cff-version"] == "1.2.0" and CITATION["type"] == "software"
+    assert CITATION["date-released"].isoformat() == str(CITATION["date-released"])
