@@ -84,7 +84,8 @@ def affine_law(K: Array, b: Array) -> Law:
 
     def law(_: int, states: Array) -> Array:
         # einsum: of each row by itself, where a matrix product rounds by the number of rows.
-        return np.einsum("mi,ji->mj", states, K) + b
+        actions: Array = np.einsum("mi,ji->mj", states, K) + b
+        return actions
 
     return law
 
@@ -109,8 +110,9 @@ class Samples:
             n = min(len(actions), len(states) - 1)
             if n < 1:
                 continue
-            finite = np.isfinite(states).all(axis=1)
-            kept = finite[:n] & finite[1 : n + 1] & np.isfinite(actions[:n]).all(axis=1)
+            finite = np.isfinite(states)
+            whole = np.hstack([finite[:n], finite[1 : n + 1], np.isfinite(actions[:n])])
+            kept = whole.all(axis=1)
             parts.append((states[:n][kept], actions[:n][kept], states[1 : n + 1][kept]))
         if not parts:
             return Samples(*(np.empty((0, 0)) for _ in range(3)))
@@ -140,6 +142,11 @@ def linearised(model: FieldModel, state: Array, action: Array) -> tuple[Array, A
     states = np.broadcast_to(state, eye.shape)
     actions = np.broadcast_to(action, (model.n_z, model.n_a))
     return model.pull_back(states, actions, eye)
+
+
+def numbers_of(arrays: Mapping[str, NDArray[np.generic]], name: str) -> Array:
+    """Real numbers among arrays."""
+    return np.asarray(arrays[name], dtype=np.float64)
 
 
 def text_of(arrays: Mapping[str, NDArray[np.generic]], name: str) -> str:

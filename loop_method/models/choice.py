@@ -11,6 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -128,18 +130,21 @@ def _kinds(n_z: int, components: int, settings: FieldModelSettings, few: bool) -
     kinds: dict[str, Fit] = {}
     if components == 1 and n_z >= 8:
         for form in FORMS:
-            kinds[form.name] = lambda samples, form=form: fit_spectral(samples, form, settings)
+            kinds[form.name] = partial(fit_spectral, form=form, settings=settings)
     if n_z % components == 0 and n_z // components >= 3:
         for kind, ridge in POINT_RIDGES.items():
-            kinds[kind] = lambda samples, kind=kind, ridge=ridge: fit_finite_difference(
-                samples, kind, settings, components=components, ridge=ridge
-            )
-        kinds["x5-shared"] = lambda samples: fit_finite_difference(
-            samples, "x5-shared", settings, components=components, degree=5
-        )
+            own: dict[str, Any] = {
+                "kind": kind,
+                "settings": settings,
+                "components": components,
+                "ridge": ridge,
+            }
+            kinds[kind] = partial(fit_finite_difference, **own)
+        own = {"kind": "x5-shared", "settings": settings, "components": components, "degree": 5}
+        kinds["x5-shared"] = partial(fit_finite_difference, **own)
     if n_z <= settings.dense:
         for kind, ridge in LINEAR_RIDGES.items():
-            kinds[kind] = lambda samples, kind=kind, ridge=ridge: fit_linear(samples, kind, ridge)
+            kinds[kind] = partial(fit_linear, kind=kind, ridge=ridge)
     if few:  # a model of many unknowns reproduces what it is fitted to, whatever it is worth
         kinds = {k: fit for k, fit in kinds.items() if k[:2] != "x1" and k[:6] != "linear"}
     return kinds

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from loop_interfaces.arrays import Array
 from loop_interfaces.jit.cache import cached_njit, jit
-from loop_method.models.base import Arrays, linearised, text_of
+from loop_method.models.base import Arrays, linearised, numbers_of, text_of
 
 Feature = tuple[tuple[int, ...], int]
 """A monomial, as its components, and the order of its derivative."""
@@ -32,6 +32,10 @@ def features_of(components: int, degree: int = 3) -> tuple[Feature, ...]:
     monomials = [m for p in (1, 2, 3) for m in combinations_with_replacement(range(components), p)]
     monomials += [(c,) * p for c in range(components) for p in range(4, degree + 1)]
     return tuple((m, j) for m in monomials for j in range(orders.get(len(m), 1)))
+
+
+Table = NDArray[np.int64]
+"""A feature a row, as `FiniteDifferenceModel.table` has them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +72,7 @@ class FiniteDifferenceModel:
         return int(self.B.shape[1])
 
     @cached_property
-    def table(self) -> NDArray[np.int64]:
+    def table(self) -> Table:
         """Rows: number of factors, the factors, and the order, of each feature."""
         rows = [[len(m), *m, *(-1,) * (MOST_FACTORS - len(m)), order] for m, order in self.features]
         return np.array(rows, dtype=np.int64)
@@ -120,7 +124,7 @@ class FiniteDifferenceModel:
         table = np.asarray(arrays["table"]).tolist()
         features = tuple((tuple(row[1 : 1 + row[0]]), row[-1]) for row in table)
         coefficients, B, constant = (
-            np.asarray(arrays[name]) for name in ("coefficients", "B", "constant")
+            numbers_of(arrays, name) for name in ("coefficients", "B", "constant")
         )
         substeps = int(arrays["substeps"].item())
         return FiniteDifferenceModel(
@@ -176,7 +180,7 @@ def difference(ring: Array, order: int, out: Array) -> None:
 
 @jit
 def rate(
-    z: Array, table: Array, C: Array, force: Array, ring: Array, value: Array, out: Array
+    z: Array, table: Table, C: Array, force: Array, ring: Array, value: Array, out: Array
 ) -> None:
     """dz/dt, components by points."""
     components, n_x = z.shape
@@ -194,7 +198,7 @@ def rate(
 
 @jit
 def transposed_rate(
-    z: Array, y: Array, table: Array, C: Array, ring: Array, value: Array, on_m: Array, out: Array
+    z: Array, y: Array, table: Table, C: Array, ring: Array, value: Array, on_m: Array, out: Array
 ) -> None:
     """(d rate/dz)^T y."""
     components, n_x = z.shape
@@ -230,7 +234,7 @@ def transposed_rate(
 
 @jit
 def runge_kutta(
-    z: Array, table: Array, C: Array, force: Array, h: float, stages: Array, k: Array, ring: Array,
+    z: Array, table: Table, C: Array, force: Array, h: float, stages: Array, k: Array, ring: Array,
     value: Array,
 ) -> None:  # fmt: skip
     """An internal step in place; stages (4, ..): where the rates k (4, ..) were taken."""
@@ -249,7 +253,7 @@ def runge_kutta(
 
 @cached_njit()
 def advance(
-    states: Array, actions: Array, table: Array, C: Array, B: Array, constant: Array, substeps: int,
+    states: Array, actions: Array, table: Table, C: Array, B: Array, constant: Array, substeps: int,
     after: Array,
 ) -> None:  # fmt: skip
     """Write the states a sampling time later."""
@@ -267,7 +271,7 @@ def advance(
 
 @cached_njit()
 def pull_back(
-    states: Array, actions: Array, covectors: Array, table: Array, C: Array, B: Array,
+    states: Array, actions: Array, covectors: Array, table: Table, C: Array, B: Array,
     constant: Array, substeps: int, on_states: Array, on_actions: Array,
 ) -> None:  # fmt: skip
     """Write the transposed products."""
@@ -311,7 +315,7 @@ def pull_back(
 
 @cached_njit()
 def mean_features(
-    states: Array, actions: Array, after: Array, table: Array, C: Array, B: Array, constant: Array,
+    states: Array, actions: Array, after: Array, table: Table, C: Array, B: Array, constant: Array,
     substeps: int, found: Array, miss: Array,
 ) -> None:  # fmt: skip
     """Write the features' means by the trapezoidal rule, and the misses."""

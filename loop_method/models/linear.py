@@ -9,7 +9,7 @@ import numpy as np
 
 from loop_interfaces.arrays import Array
 from loop_interfaces.jit.cache import cached_njit
-from loop_method.models.base import Arrays, Samples, text_of
+from loop_method.models.base import Arrays, Samples, numbers_of, text_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ class LinearModel:
     @staticmethod
     def from_arrays(arrays: Arrays) -> LinearModel:
         """The model of `arrays`."""
-        A, B, constant = (np.asarray(arrays[name]) for name in ("A", "B", "constant"))
+        A, B, constant = (numbers_of(arrays, name) for name in ("A", "B", "constant"))
         return LinearModel(text_of(arrays, "kind"), A, B, constant)
 
 

@@ -37,8 +37,8 @@ def errors(model: FieldModel, rollouts: Sequence[Measured], target: Array, worst
     found = []
     for rollout in rollouts:
         measured = np.asarray(rollout.states)
-        finite = np.isfinite(measured).all(axis=1)
-        steps = min(len(rollout.actions), int(np.argmin([*finite, False])) - 1)
+        finite = np.append(np.isfinite(measured).all(axis=1), False)
+        steps = min(len(rollout.actions), int(np.argmin(finite)) - 1)
         if steps < 1:
             continue
         measured = measured[: steps + 1]

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.arrays import Array
-from loop_method.models.base import Arrays, linearised, text_of
+from loop_method.models.base import Arrays, linearised, numbers_of, text_of
 from spectral_solver.polynomial_step import Polynomials, PolynomialStep
 
 Spectrum = NDArray[np.complex128]
@@ -112,11 +112,13 @@ class SpectralModel:
     @staticmethod
     def from_arrays(arrays: Arrays) -> SpectralModel:
         """The model of `arrays`."""
-        names = ("linear", "multipliers", "polynomials", "B", "constant")
-        given = [np.asarray(arrays[name]) for name in names]
         return SpectralModel(
             text_of(arrays, "kind"),
-            *given,
+            np.asarray(arrays["linear"], dtype=np.complex128),
+            np.asarray(arrays["multipliers"], dtype=np.complex128),
+            numbers_of(arrays, "polynomials"),
+            numbers_of(arrays, "B"),
+            numbers_of(arrays, "constant"),
             substeps=int(arrays["substeps"].item()),
             clip=float(arrays["clip"].item()),
         )

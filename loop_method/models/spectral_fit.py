@@ -143,7 +143,7 @@ def _regression(model: SpectralModel, samples: Samples) -> _Regression | None:
         except ValueError:  # it grows beyond all bounds within a substep
             return None
         before, after = (rfft(z) / model.n_z for z in (samples.before, samples.after))
-        y, phi = after - np.exp(L) * before, phi_functions(L)[0]
+        y, phi = after - np.exp(L) * before, phi_functions(L)[0].astype(np.complex128)
     ok = np.isfinite(y).all(axis=1) & np.isfinite(W).all(axis=(0, 2))
     if 2 * ok.sum() < len(samples) or not np.isfinite(phi).all():
         return None
