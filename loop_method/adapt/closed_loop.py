@@ -1,0 +1,146 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The cost of a law on a model of the whole field, and its exact gradient.
+
+The law is a = theta [s; 1] with theta = [K_a b] and s = U^T z, saturated at the action limit. From an
+initial field z_0 it costs
+
+    J = 1/T sum_{k < T} (q |z_k - z_r|^2 + r |a_k|^2),        z_{k+1} = f(z_k, a_k),
+
+with f the model. With eta_k = dJ/dz_k, eta_T = 0, the gradient follows backwards in time,
+
+    g_k   = (df/da)^T eta_{k+1} + 2 r/T a_k        (0 where a_k is saturated),
+    eta_k = (df/dz)^T eta_{k+1} + 2 q/T (z_k - z_r) + U K_a^T g_k,
+    dJ/dtheta = sum_k g_k [s_k; 1]^T.
+
+It costs about three simulations, whatever the number of gains.
+
+References
+----------
+Griewank, Walther, "Evaluating Derivatives", SIAM 2008, chapter 3 (reverse mode).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from loop_interfaces.arrays import Array
+from loop_method.models import FieldModel
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedLoop:
+    """A model of the whole field under laws on the basis U, and their cost.
+
+    Attributes
+    ----------
+    model : FieldModel
+    U : (n_z, n_s) array
+        Basis of the projected state s = U^T z.
+    target : (n_z,) array
+        z_r.
+    state_weight, action_weight : float
+        q and r.
+    horizon : int
+        T, the steps of an episode.
+    action_limit : float
+        Magnitude at which actions saturate; 0 for none.
+    """
+
+    model: FieldModel
+    U: Array
+    target: Array
+    state_weight: float
+    action_weight: float
+    horizon: int
+    action_limit: float = 0.0
+
+    @cached_property
+    def one(self) -> float:
+        """The last feature of the law: 0 where b = K_b U^T z_r cannot be anything but 0, else 1."""
+        s_r = self.U.T @ self.target
+        return 1.0 if s_r @ s_r > 1e-20 * (self.target @ self.target) else 0.0
+
+    def simulate(self, theta: Array, fields: Array) -> Simulation:
+        """Roll theta (n_a, n_s + 1) out from the fields (F, n_z)."""
+        K, b = theta[:, :-1], self.one * theta[:, -1]
+        states = np.empty((self.horizon + 1, *fields.shape))
+        actions = np.empty((self.horizon, len(fields), len(theta)))
+        costs, finite = np.zeros(len(fields)), np.ones(len(fields), dtype=bool)
+        states[0] = fields
+        with np.errstate(all="ignore"):
+            for k in range(self.horizon):
+                a = states[k] @ self.U @ K.T + b
+                if self.action_limit:
+                    np.clip(a, -self.action_limit, self.action_limit, out=a)
+                error = states[k] - self.target
+                costs += self.state_weight * np.einsum("fi,fi->f", error, error)
+                costs += self.action_weight * np.einsum("fi,fi->f", a, a)
+                # What is not finite stays so; the others go on from numbers that a model can take.
+                finite &= np.isfinite(costs)
+                a[~finite] = 0.0
+                actions[k] = a
+                after = self.model.step(states[k], a)
+                finite &= np.isfinite(after).all(axis=1)
+                after[~finite] = 0.0
+                states[k + 1] = after
+        costs /= self.horizon
+        costs[~finite] = np.inf
+        return Simulation(states, actions, costs)
+
+    def costs(self, theta: Array, fields: Array) -> Array:
+        """J from each of the fields (F, n_z); infinite where the simulation is not finite."""
+        return self.simulate(theta, fields).costs
+
+    def gradient(self, theta: Array, fields: Array, weights: Array) -> tuple[float, Array]:
+        """The weighted sum of the costs, and its gradient (n_a, n_s + 1).
+
+        Infinite, with a gradient of zero, where a cost of positive weight is.
+        """
+        simulation = self.simulate(theta, fields)
+        gradient = np.zeros_like(theta)
+        if not np.isfinite(simulation.costs[weights > 0.0]).all():
+            return np.inf, gradient
+        states, actions = simulation.states, simulation.actions
+        K, eta = theta[:, :-1], np.zeros_like(fields)
+        share = 2.0 / self.horizon * weights[:, None]
+        for k in reversed(range(self.horizon)):
+            z, a = states[k], actions[k]
+            eta, g = self.model.pull_back(z, a, eta)
+            g = g + self.action_weight * share * a
+            if self.action_limit:
+                g = g * (np.abs(a) < self.action_limit)
+            eta = eta + self.state_weight * share * (z - self.target) + g @ K @ self.U.T
+            gradient[:, :-1] += g.T @ (z @ self.U)
+            gradient[:, -1] += self.one * g.sum(axis=0)
+        counted = weights > 0.0
+        return float(weights[counted] @ simulation.costs[counted]), gradient
+
+    def theta(self, policy: Array) -> Array:
+        """[K_a b] of a policy [K_a K_b], (n_a, n_s + 1)."""
+        n_s = self.U.shape[1]
+        return np.column_stack([policy[:, :n_s], policy[:, n_s:] @ (self.U.T @ self.target)])
+
+    def policy(self, theta: Array, near: Array) -> Array:
+        """[K_a K_b] of theta; among the K_b with the wanted b the one next to that of `near`."""
+        n_s, s_r = self.U.shape[1], self.U.T @ self.target
+        policy = near.copy()
+        policy[:, :n_s] = theta[:, :n_s]
+        if self.one:
+            missing = theta[:, n_s] - near[:, n_s:] @ s_r
+            policy[:, n_s:] += np.outer(missing, s_r / float(s_r @ s_r))
+        return policy
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """States (T + 1, F, n_z), actions (T, F, n_a), and the mean stage cost of each field (F,).
+
+    From where a field's simulation is not finite its states and actions are zero.
+    """
+
+    states: Array
+    actions: Array
+    costs: Array

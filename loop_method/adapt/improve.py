@@ -1,0 +1,168 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A law that costs less on a model of the whole field.
+
+L-BFGS on the weighted cost over initial fields, in the coordinates
+
+    x = G^{1/2} theta F^{1/2},        G = R + B^T P B,        F = mean [s; 1][s; 1]^T,
+
+with P of the linear-quadratic problem at the target: of a linear plant the cost has the Hessian 2 I
+there, so that few steps suffice and none of them depends on the units of actions and states.
+
+References
+----------
+Nocedal, Wright, "Numerical Optimization", 2nd ed., algorithm 7.5 (L-BFGS). Byrd, Lu, Nocedal, Zhu, SIAM
+J. Sci. Comput. 16, 1995 (the implementation).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+
+from loop_interfaces.arrays import Array
+from loop_method.adapt.closed_loop import ClosedLoop
+from loop_method.adapt.settings import ModelBasedSettings
+
+FAR = 10.0
+"""What a law without a finite cost counts, per cost of the law to begin with."""
+
+
+@dataclass(frozen=True, eq=False)
+class Improvement:
+    """A law, and its weighted cost on the fields where the law to begin with has a finite one.
+
+    Attributes
+    ----------
+    theta : (n_a, n_s + 1) array
+    before, after : float
+    steps : int
+        Of L-BFGS.
+    """
+
+    theta: Array
+    before: float
+    after: float
+    steps: int
+
+
+class Coordinates:
+    """x of theta, and back.
+
+    left: L^{-T} of G = L L^T; right: the same of F.
+    """
+
+    def __init__(self, curvature: Array, moment: Array) -> None:
+        self._left, self._right = (
+            linalg.solve_triangular(
+                linalg.cholesky(matrix, lower=True), np.eye(len(matrix)), lower=True
+            ).T
+            for matrix in (curvature, moment)
+        )
+
+    def theta(self, x: Array) -> Array:
+        """The law with the coordinates x, of any shape."""
+        theta: Array = self._left @ x.reshape(len(self._left), -1) @ self._right.T
+        return theta
+
+    def gradient(self, by_theta: Array) -> Array:
+        """d/dx of d/dtheta, (n_a (n_s + 1),)."""
+        by_x: Array = (self._left.T @ by_theta @ self._right).ravel()
+        return by_x
+
+
+def improve(
+    loop: ClosedLoop,
+    theta: Array,
+    fields: Array,
+    weights: Array,
+    curvature: Array,
+    settings: ModelBasedSettings,
+) -> Improvement | None:
+    """The law after a descent, or None where no law to begin with is finite on the model.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+        The model and the cost.
+    theta : (n_a, n_s + 1) array
+        The law to begin with. It is halved where its simulations are not finite from any field.
+    fields, weights : (F, n_z) and (F,) arrays
+        Initial fields; those from which the law to begin with is not finite are left out.
+    curvature : (n_a, n_a) array
+        G.
+    settings : ModelBasedSettings
+        Constants of the descent.
+    """
+    for _ in range(settings.halvings + 1):
+        simulation = loop.simulate(theta, fields)
+        finite = np.isfinite(simulation.costs) & (weights > 0.0)
+        if finite.any():
+            break
+        theta = 0.5 * theta
+    else:
+        return None
+    fields, weights = fields[finite], weights[finite] / weights[finite].sum()
+    s = simulation.states[:-1, finite] @ loop.U
+    features = np.concatenate([s, np.full((*s.shape[:2], 1), loop.one)], axis=2)
+    moment = np.einsum("kfi,kfj,f->ij", features, features, weights) / len(features)
+    size = float(np.trace(moment[:-1, :-1])) / (len(moment) - 1)
+    if not (size > 0.0 and np.isfinite(moment).all()):
+        return None
+    # s and the constant each in its own unit.
+    moment[np.diag_indices(len(moment))] += settings.isotropy * np.append(
+        np.full(len(moment) - 1, size), 1.0
+    )
+    return _descend(loop, theta, fields, weights, Coordinates(curvature, moment), settings)
+
+
+def _descend(
+    loop: ClosedLoop,
+    theta: Array,
+    fields: Array,
+    weights: Array,
+    coordinates: Coordinates,
+    settings: ModelBasedSettings,
+) -> Improvement:
+    # Not at the top: a node that never improves a law has no need of it.
+    from scipy.optimize import minimize
+
+    before, by_theta = loop.gradient(theta, fields, weights)
+    # Of a quadratic cost the step -g/2 leads to its minimum. L-BFGS begins with one of unit length.
+    unit = 0.5 * float(np.linalg.norm(coordinates.gradient(by_theta)))
+    if not (unit > 0.0 and np.isfinite(unit) and before > 0.0):
+        return Improvement(theta, before, before, 0)
+    best, values = Improvement(theta, before, before, 0), [1.0]
+
+    def objective(y: Array) -> tuple[float, Array]:
+        nonlocal best
+        at = theta + coordinates.theta(unit * y)
+        cost, gradient = loop.gradient(at, fields, weights)
+        if not (cost < FAR * before and np.isfinite(gradient).all()):
+            return FAR, np.zeros_like(y)
+        if cost < best.after:
+            best = Improvement(at, before, cost, best.steps)
+        return cost / before, unit / before * coordinates.gradient(gradient)
+
+    def stop_when_flat(_: Array) -> None:
+        values.append(best.after / before)
+        earlier = values[max(len(values) - 1 - settings.window, 0)]
+        few = len(values) <= settings.window
+        if not few and earlier - values[-1] <= settings.least_gain * values[-1]:
+            raise StopIteration
+
+    minimize(
+        objective,
+        np.zeros(theta.size),
+        jac=True,
+        method="L-BFGS-B",
+        callback=stop_when_flat,
+        options={
+            "maxiter": settings.iterations,
+            "maxcor": settings.memory,
+            "ftol": 0.0,
+            "gtol": 0.0,
+        },
+    )
+    return Improvement(best.theta, before, best.after, len(values) - 1)

@@ -1,0 +1,114 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Initial fields that are like the measured ones, as many as one wants.
+
+A law that is best on a few fields is not on their neighbours. On a model further fields cost no
+rollout, so it is improved on draws of a normal distribution as well, with the mean m of the n measured
+fields and the covariance
+
+    C = (1 + 1/n) ((1 - rho) S + rho P),        S = 1/(n - 1) sum (z_i - m)(z_i - m)^T,
+
+where P is the mean of S over all shifts along each component of the state: the covariance of a
+distribution that looks alike everywhere, of which a few fields tell much. The share rho is the one that
+is nearest to the true covariance in the mean: with Q the part of a matrix that is not invariant,
+
+    rho = E|Q S - E Q S|^2 / E|Q S|^2.
+
+It is 1 where fields look alike everywhere and falls as 1/n where they do not. The factor 1 + 1/n is the
+uncertainty of m. Draws have exactly this mean and, in as many directions as they can, this covariance:
+what is quadratic in the field is then averaged without an error of sampling.
+
+References
+----------
+Ledoit, Wolf, "A well-conditioned estimator for large-dimensional covariance matrices", J. Multivariate
+Analysis 88, 2004.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import linalg
+
+from loop_interfaces.arrays import Array
+
+KEPT = 0.999
+"""Share of the variance whose directions are drawn from."""
+
+
+def mixtures(fields: Array, count: int, rng: np.random.Generator, components: int = 1) -> Array:
+    """Draws (count, n_z) of the distribution above; none from fewer than two fields.
+
+    Parameters
+    ----------
+    fields : (n, n_z) array
+        Measured initial fields.
+    count : int
+        At least 2, to have the right mean and covariance.
+    rng : numpy.random.Generator
+        Of the draws.
+    components : int
+        Fields that stand one after the other in a state.
+    """
+    n, n_z = fields.shape
+    mean = fields.mean(axis=0)
+    deviations = fields - mean
+    if n < 2 or not deviations.any():
+        return np.empty((0, n_z))
+    rho = invariant_share(fields, components)
+    covariance = (1.0 - rho) * deviations.T @ deviations / (n - 1)
+    if rho > 0.0:
+        covariance += rho * averaged_over_shifts(deviations, components) / (n - 1)
+    values, vectors = linalg.eigh((1.0 + 1.0 / n) * covariance)
+    values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
+    kept = int(np.searchsorted(np.cumsum(values), KEPT * values.sum())) + 1
+    draws = rng.standard_normal((count, min(kept, n_z)))
+    draws -= draws.mean(axis=0)
+    if draws.shape[1] < count:
+        triangle = linalg.cholesky(draws.T @ draws / count, lower=True)
+        draws = linalg.solve_triangular(triangle, draws.T, lower=True).T
+    drawn: Array = (
+        mean + (draws * np.sqrt(values[: draws.shape[1]])) @ vectors[:, : draws.shape[1]].T
+    )
+    return drawn
+
+
+def invariant_share(fields: Array, components: int = 1) -> float:
+    """rho of the fields (n, n_z), between 0 and 1; 1 of two fields, which do not tell.
+
+    Examples
+    --------
+    >>> waves = [np.cos(np.arange(32) * np.pi / 8 + p) for p in np.arange(12) * 0.7]
+    >>> invariant_share(np.array(waves)) > 0.8
+    True
+    >>> bumps = [a * np.exp(-np.arange(32.0)) for a in np.arange(12) + 1.0]
+    >>> invariant_share(np.array(bumps)) < 0.2
+    True
+    """
+    n = len(fields)
+    deviations = fields - fields.mean(axis=0)
+    if n < 3:
+        return 1.0
+    parts = deviations.reshape(n, components, -1)
+    spectra = np.fft.fft(parts, axis=2)
+    # <d d^T, e e^T> = (d . e)^2. Of their means over shifts it is that of the cross spectra.
+    cross = np.einsum("nax,nbx->nabx", spectra, spectra.conj()) / parts.shape[2]
+    invariant = np.einsum("nabx,mabx->nm", cross, cross.conj()).real
+    own = (deviations @ deviations.T) ** 2
+    products = own - invariant
+    total = float(products.sum()) / n
+    spread = float(np.trace(products)) - total
+    if total <= 1e-12 * float(own.sum()) / n:  # all of it is invariant
+        return 0.0
+    return float(np.clip(spread / ((n - 1) * total), 0.0, 1.0))
+
+
+def averaged_over_shifts(deviations: Array, components: int = 1) -> Array:
+    """The sum of d d^T of the deviations (n, n_z), averaged over shifts along each component."""
+    n, n_z = deviations.shape
+    points = n_z // components
+    spectra = np.fft.fft(deviations.reshape(n, components, points), axis=2)
+    cross = np.einsum("nax,nbx->abx", spectra, spectra.conj())
+    rows = np.fft.ifft(cross, axis=2).real / points
+    index = np.arange(points)
+    shifts = (index[:, None] - index[None, :]) % points
+    averaged: Array = rows[:, :, shifts].transpose(0, 2, 1, 3).reshape(n_z, n_z)
+    return averaged

@@ -1,0 +1,248 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A law on a model: its cost and gradient, the fields it is improved on, and a known optimum."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from loop_method.adapt.closed_loop import ClosedLoop
+from loop_method.adapt.improve import improve
+from loop_method.adapt.mixtures import averaged_over_shifts, invariant_share, mixtures
+from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.design.lqt import track
+from loop_method.models.linear import LinearModel
+from loop_method.models.spectral import SpectralModel
+from loop_method.reduce.reduced_model import ReducedModel
+
+N_Z, N_S, N_A, T = 16, 5, 2, 12
+
+
+def bent() -> SpectralModel:
+    """A plant with squares and cubes."""
+    rng = np.random.default_rng(0)
+    k = 1j * np.arange(N_Z // 2 + 1)
+    return SpectralModel(
+        kind="poly3",
+        linear=0.2 * k + 0.02 * k**2,
+        multipliers=np.array([0.05 * k, 0.1 + 0.0 * k]),
+        polynomials=np.array([[0.5, 0.0], [0.2, -0.4]]),
+        B=0.3 * rng.normal(size=(N_Z, N_A)),
+        constant=0.1 * rng.normal(size=N_Z),
+        substeps=2,
+    )
+
+
+def loop(limit: float = 0.0) -> ClosedLoop:
+    rng = np.random.default_rng(1)
+    U = np.linalg.qr(rng.normal(size=(N_Z, N_S)))[0]
+    return ClosedLoop(bent(), U, rng.normal(size=N_Z), 1.5, 0.4, T, limit)
+
+
+def fields(count: int) -> np.ndarray:
+    return np.random.default_rng(2).normal(size=(count, N_Z))
+
+
+@pytest.mark.parametrize("limit", [0.0, 0.4])
+def test_the_gradient_is_that_of_finite_differences(limit: float) -> None:
+    closed, start, weights = loop(limit), fields(3), np.array([0.5, 0.2, 0.3])
+    theta = 0.3 * np.random.default_rng(3).normal(size=(N_A, N_S + 1))
+    cost, gradient = closed.gradient(theta, start, weights)
+    assert cost == pytest.approx(weights @ closed.costs(theta, start), rel=1e-14)
+    saturated = np.abs(closed.simulate(theta, start).actions) == limit
+    assert saturated.any() == bool(limit) and not saturated.all()
+    h, finite = 1e-6, np.zeros_like(theta)
+    for index in np.ndindex(theta.shape):
+        step = np.zeros_like(theta)
+        step[index] = h
+        rise = closed.costs(theta + step, start) - closed.costs(theta - step, start)
+        finite[index] = weights @ rise / (2.0 * h)
+    np.testing.assert_allclose(gradient, finite, rtol=1e-6, atol=1e-7)
+
+
+def test_a_cost_is_the_mean_stage_cost_along_the_model() -> None:
+    closed, theta = loop(), np.full((N_A, N_S + 1), 0.1)
+    z, total = fields(1), 0.0
+    for _ in range(T):
+        a = z @ closed.U @ theta[:, :-1].T + theta[:, -1]
+        total += 1.5 * float(np.sum((z - closed.target) ** 2)) + 0.4 * float(np.sum(a**2))
+        z = closed.model.step(z, a)
+    assert closed.costs(theta, fields(1))[0] == pytest.approx(total / T, rel=1e-13)
+
+
+def test_a_policy_and_its_law_act_alike() -> None:
+    closed = loop()
+    policy = np.random.default_rng(4).normal(size=(N_A, 2 * N_S))
+    theta = closed.theta(policy)
+    np.testing.assert_array_equal(closed.policy(theta, policy), policy)
+    moved = closed.policy(theta + 1.0, policy)
+    np.testing.assert_allclose(closed.theta(moved), theta + 1.0, rtol=1e-12)
+
+
+def test_without_a_target_in_the_basis_a_law_has_no_constant_part() -> None:
+    closed = replace(loop(), target=np.zeros(N_Z))
+    theta = np.ones((N_A, N_S + 1))
+    same = theta * np.append(np.ones(N_S), 0.0)
+    np.testing.assert_array_equal(
+        closed.costs(0.1 * theta, fields(2)), closed.costs(0.1 * same, fields(2))
+    )
+    assert not closed.gradient(0.1 * theta, fields(2), np.full(2, 0.5))[1][:, -1].any()
+
+
+@dataclass(frozen=True, eq=False)
+class Fragile:
+    """A model that breaks down from fields above 10."""
+
+    model: SpectralModel
+
+    def step(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        after = self.model.step(states, actions)
+        after[np.abs(states).max(axis=1) > 10.0] = np.nan
+        return after
+
+    def __getattr__(self, name: str):  # type: ignore[no-untyped-def]
+        return getattr(self.model, name)
+
+
+def test_what_is_not_finite_is_left_out_and_changes_no_other_field() -> None:
+    whole = loop()
+    fragile = replace(whole, model=Fragile(bent()))
+    start = np.concatenate([fields(2), np.full((1, N_Z), 11.0)])
+    theta = np.full((N_A, N_S + 1), 0.1)
+    costs = fragile.costs(theta, start)
+    np.testing.assert_array_equal(costs[:2], whole.costs(theta, start[:2]))
+    assert np.isinf(costs[2])
+    cost, gradient = fragile.gradient(theta, start, np.full(3, 1 / 3))
+    assert np.isinf(cost) and not gradient.any()
+    cost, gradient = fragile.gradient(theta, start, np.array([0.5, 0.5, 0.0]))
+    expected = whole.gradient(theta, start[:2], np.full(2, 0.5))
+    assert cost == expected[0]
+    np.testing.assert_allclose(gradient, expected[1], rtol=1e-12)
+    arguments = np.eye(N_A), ModelBasedSettings()
+    found = improve(fragile, theta, start, np.full(3, 1 / 3), *arguments)
+    alone = improve(whole, theta, start[:2], np.full(2, 0.5), *arguments)
+    assert found is not None and alone is not None and found.after < found.before
+    assert found.after == pytest.approx(alone.after, rel=1e-3)
+    assert improve(fragile, theta, start[2:], np.ones(1), *arguments) is None
+
+
+def test_an_overflowing_law_is_halved_until_it_is_finite() -> None:
+    closed, weights = loop(), np.full(3, 1 / 3)
+    found = improve(
+        closed, np.full((N_A, N_S + 1), 1e3), fields(3), weights, np.eye(N_A), ModelBasedSettings()
+    )
+    assert found is not None and np.isfinite(found.theta).all()
+    assert np.isinf(closed.costs(np.full((N_A, N_S + 1), 1e3), fields(3))).all()
+    assert found.after < 0.5 * found.before
+
+
+def test_the_riccati_law_of_a_linear_plant_is_reached() -> None:
+    """Over a long horizon the law of the algebraic Riccati equation is optimal from every field."""
+    rng = np.random.default_rng(5)
+    A, B = rng.normal(size=(4, 4)), rng.normal(size=(4, 2))
+    A *= 1.05 / np.abs(np.linalg.eigvals(A)).max()
+    target = np.array([0.5, -0.2, 0.3, 0.1])
+    best = track(ReducedModel(A=A, B=B, U=np.eye(4)), state_weight=2.0, action_weight=0.1).policy
+    model = LinearModel("linear", A, B, np.zeros(4))
+    closed = ClosedLoop(model, np.eye(4), target, 2.0, 0.1, 200)
+    start, weights = rng.normal(size=(6, 4)), np.full(6, 1 / 6)
+    steady = ModelBasedSettings(iterations=200, least_gain=1e-10)
+    riccati = closed.theta(best)
+    found = improve(closed, 0.6 * riccati, start, weights, np.eye(2), steady)
+    assert found is not None
+    cost = float(weights @ closed.costs(riccati, start))
+    assert found.before > 1.03 * cost
+    assert found.after == pytest.approx(cost, rel=1e-3)
+    # The fields' transients are a small part of 200 steps, and so is what they say of the gains.
+    np.testing.assert_allclose(found.theta, riccati, atol=0.05)
+
+
+def test_the_same_improvement_has_the_same_bits() -> None:
+    arguments = fields(3), np.full(3, 1 / 3), np.eye(N_A), ModelBasedSettings(iterations=5)
+    one, other = (improve(loop(), np.zeros((N_A, N_S + 1)), *arguments) for _ in range(2))
+    assert one is not None and other is not None and one.steps == other.steps <= 5
+    assert one.theta.tobytes() == other.theta.tobytes()
+
+
+def test_units_of_actions_and_states_do_not_change_an_improvement() -> None:
+    """A plant in other units takes the same steps: x has none."""
+    closed, start = loop(), fields(3)
+    scale, size = 100.0, 1e-3
+    other = replace(
+        closed,
+        model=LinearModel("linear", 0.5 * np.eye(N_Z), bent().B, np.zeros(N_Z)),
+    )
+    scaled = replace(
+        other,
+        model=LinearModel("linear", 0.5 * np.eye(N_Z), bent().B * scale / size, np.zeros(N_Z)),
+        target=scale * other.target,
+        state_weight=other.state_weight / scale**2,
+        action_weight=other.action_weight / size**2,
+    )
+    settings = ModelBasedSettings(iterations=4, least_gain=0.0)
+    weights, G = np.full(3, 1 / 3), np.array([[2.0, 0.5], [0.5, 1.0]])
+    theta = 0.1 * np.ones((N_A, N_S + 1))
+    units = np.append(np.full(N_S, size / scale), size)
+    one = improve(other, theta, start, weights, G, settings)
+    two = improve(scaled, theta * units, scale * start, weights, G / size**2, settings)
+    assert one is not None and two is not None
+    np.testing.assert_allclose(two.theta / units, one.theta, rtol=1e-5, atol=1e-7)
+
+
+def test_mixtures_have_the_mean_and_covariance_they_claim() -> None:
+    rng = np.random.default_rng(6)
+    measured = rng.normal(size=(4, 20)) * np.exp(-np.arange(20) / 3.0)
+    drawn = mixtures(measured, 40, rng)
+    mean, n = measured.mean(axis=0), len(measured)
+    np.testing.assert_allclose(drawn.mean(axis=0), mean, atol=1e-12)
+    rho, deviations = invariant_share(measured), measured - mean
+    own = deviations.T @ deviations
+    covariance = (1 - rho) * own + rho * averaged_over_shifts(deviations)
+    covariance *= (1 + 1 / n) / (n - 1)
+    found = (drawn - mean).T @ (drawn - mean) / len(drawn)
+    assert np.trace(found) == pytest.approx(np.trace(covariance), rel=2e-3)
+    np.testing.assert_allclose(found, covariance, atol=2e-3 * np.trace(covariance))
+    assert 0.0 < rho < 1.0
+
+
+def test_one_field_or_equal_fields_have_no_mixtures() -> None:
+    rng = np.random.default_rng(7)
+    assert mixtures(fields(1), 5, rng).shape == (0, N_Z)
+    assert mixtures(np.ones((3, N_Z)), 5, rng).shape == (0, N_Z)
+
+
+@pytest.mark.parametrize("components", [1, 2, 3])
+def test_shifts_are_averaged_along_each_component(components: int) -> None:
+    deviations = np.random.default_rng(8).normal(size=(5, 12))
+    parts = deviations.reshape(5, components, -1)
+    shifted = [np.roll(parts, s, axis=2).reshape(5, 12) for s in range(parts.shape[2])]
+    expected = np.mean([d.T @ d for d in shifted], axis=0)
+    np.testing.assert_allclose(averaged_over_shifts(deviations, components), expected, atol=1e-12)
+
+
+def test_the_invariant_share_is_that_of_its_definition() -> None:
+    measured = np.random.default_rng(9).normal(size=(5, 8)) + np.arange(8)
+    deviations = measured - measured.mean(axis=0)
+
+    def rest(matrix: np.ndarray) -> np.ndarray:
+        turned = [np.roll(np.roll(matrix, s, axis=0), s, axis=1) for s in range(8)]
+        return matrix - np.mean(turned, axis=0)
+
+    parts = np.array([rest(np.outer(d, d)) for d in deviations])
+    spread = np.sum((parts - parts.mean(axis=0)) ** 2) / (5 * 4)
+    expected = spread / np.sum(parts.mean(axis=0) ** 2)
+    assert invariant_share(measured) == pytest.approx(min(expected, 1.0), rel=1e-10)
+
+
+def test_fields_that_look_alike_everywhere_are_told_from_those_that_do_not() -> None:
+    rng, x = np.random.default_rng(10), 2 * np.pi * np.arange(64) / 64
+    waves = [sum(rng.normal() * np.cos(j * x) + rng.normal() * np.sin(j * x) for j in (1, 2, 3))]
+    waves += [
+        sum(rng.normal() * np.cos(j * x) + rng.normal() * np.sin(j * x) for j in (1, 2, 3))
+        for _ in range(19)
+    ]
+    bumps = rng.uniform(0.9, 1.1, size=(20, 1)) * np.exp(-((x - np.pi) ** 2) * 20.0)
+    assert invariant_share(np.array(waves)) > 0.4
+    assert invariant_share(bumps) < 0.1
