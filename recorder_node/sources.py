@@ -37,6 +37,10 @@ class Source:
 CLOCK = Source(Channel("/clock", "rosgraph_msgs/msg/Clock"))
 """Simulated time, one topic for all pairs."""
 DIAGNOSTICS = Source(Channel("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"))
+PARAMETERS_TOPIC = "/recorder/parameters"
+"""Under this name, which nobody publishes, the recorder writes the nodes' parameters into the bag: they
+are then in whatever becomes of it, a copy of its file or a converted bag."""
+NOTES = Source(Channel(PARAMETERS_TOPIC, TEXT_TYPE, latched=True))
 ROSOUT = Source(Channel("/rosout", "rcl_interfaces/msg/Log", latched=True, depth=1000))
 
 

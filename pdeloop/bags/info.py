@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,12 +18,8 @@ SHOWN = 40
 def describe(path: Path) -> dict[str, Any]:
     """What is in the bag at `path`: the content of `pdeloop bag info --json`."""
     bag = Bag(path)
-    counts: Counter[tuple[str, str]] = Counter()
-    first, last = None, None
-    for message in bag.messages():
-        counts[message.topic, message.type] += 1
-        first = message.when if first is None else min(first, message.when)
-        last = message.when if last is None else max(last, message.when)
+    found, findings = bag.survey, bag.findings()
+    first, last = found.first, found.last
     episodes = []
     for episode in bag.episodes():
         episodes.append(
@@ -45,13 +40,15 @@ def describe(path: Path) -> dict[str, Any]:
         "files": len(bag.files),
         "finished": bag.finished,
         "bytes": sum(file.stat().st_size for file in bag.files),
-        "messages": sum(counts.values()),
+        "missing": findings.missing,
+        "differences": findings.differences,
+        "messages": found.counts.total(),
         "first": first,
         "last": last,
         "seconds": 0.0 if first is None or last is None else (last - first) / 1e9,
         "topics": [
             {"topic": topic, "type": kind, "messages": count}
-            for (topic, kind), count in sorted(counts.items())
+            for (topic, kind), count in sorted(found.counts.items())
         ],
         "runs": sorted(bag.parameters()),
         "episodes": episodes,
@@ -71,6 +68,8 @@ def info_text(content: dict[str, Any]) -> str:
         lines.append(
             "  not finished: its recorder was stopped; what follows is what it had written"
         )
+    lines += [f"  missing: {text}" for text in content["missing"]]
+    lines += [f"  {text}" for text in content["differences"]]
     width = max((len(topic["topic"]) for topic in content["topics"]), default=0)
     lines += [
         f"  {topic['topic']:<{width}}  {topic['messages']:>9}  {topic['type']}"

@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from io import BytesIO
@@ -37,6 +38,8 @@ RATIO, SLACK = 100, 64 * 2**20
 """A file of n bytes may decompress to RATIO n + SLACK bytes."""
 MAX_TEXT = 100_000_000
 """Bytes of a text beside the bag."""
+CONVERTED = "-mcap"
+"""How the name of a bag ends that was converted as we advise; the rest is that of the bag it was."""
 MAX_NAME = 256
 """Characters of a topic's name or type, which ROS and DDS allow."""
 
@@ -106,8 +109,8 @@ def _records(path: Path) -> Iterator[McapRecord]:
             if left < 0:
                 raise BagError(
                     f"{path} ({size} bytes) decompresses to more than {RATIO} times its size "
-                    f"and {SLACK} bytes; expected less of a recording. If it is one, convert it "
-                    "to an uncompressed bag (ros2 bag convert)"
+                    f"and {SLACK} bytes; expected less of a recording. If it is one, "
+                    f"{_conversion(path.parent, 'convert')}"
                 )
             yield from _in_chunk(_decompressed(record))
 
@@ -184,10 +187,16 @@ def files(folder: Path) -> list[Path]:
     ):
         if found:
             raise BagError(
-                f"{folder} is {kind}; expected MCAP (with compressed chunks, if any). Convert it: "
-                f"rosbags-convert --src {folder} --dst {folder}-mcap --dst-storage mcap"
+                f"{folder} is {kind}; expected MCAP (with compressed chunks, if any). "
+                f"{_conversion(folder)}"
             )
     return sorted(folder.glob("*.mcap"), key=lambda path: (len(path.name), path.name))
+
+
+def _conversion(folder: Path, begin: str = "Convert") -> str:
+    """How to make a bag of the one in `folder` that can be read, as a command to be typed."""
+    src, dst = (shlex.quote(str(path)) for path in (folder, f"{folder}{CONVERTED}"))
+    return f"{begin} it: rosbags-convert --src {src} --dst {dst} --dst-storage mcap"
 
 
 def text_of(path: Path) -> str:

@@ -8,18 +8,25 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from functools import cache
+from contextlib import suppress
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
 from loop_interfaces.arrays import Array
 from loop_interfaces.documents import parse_json
-from loop_interfaces.topics import TARGET
+from loop_interfaces.files import read_json
 from pdeloop.bags.episodes import EpisodeIndex, RecordedEpisode
-from pdeloop.bags.mcap_messages import Message, files, finished, read, text_of
+from pdeloop.bags.mcap_messages import CONVERTED, Message, files, finished, read, text_of
+from pdeloop.bags.metadata import Findings, check, read_metadata, repeated
+from pdeloop.bags.survey import Survey, by_run, survey
 from recorder_node.bag import METADATA, BagError
 from recorder_node.recording import PARAMETERS
 from recorder_node.sources import source_of
+from tuner_node.run_folder import RunFolder
+
+RUN_FILE = "run.json"
+"""Beside the bags of a run: its id (tuner_node.run_folder)."""
 
 
 class Bag:
@@ -37,12 +44,17 @@ class Bag:
                 raise BagError(f"{path} is a run without a bag; pdeloop train --record records one")
             raise BagError(f"no bag in {path}: there is no .mcap file")
         self.path = path
-        self.files = found
+        self.files = _in_time(found)
 
     @property
     def finished(self) -> bool:
         """Whether it was closed properly."""
         return all(map(finished, self.files)) and (self.path / METADATA).exists()
+
+    @cached_property
+    def survey(self) -> Survey:
+        """What stands in its files."""
+        return survey(self.files)
 
     def messages(self) -> Iterator[Message]:
         """The messages in the order in which they were written."""
@@ -50,20 +62,43 @@ class Bag:
             yield from read(file)
 
     def target(self) -> Array | None:
-        """The target z_r, which is among the first messages of a bag; None if it has none."""
-        for message in self.messages():
-            source = source_of(message.topic)
-            if source is not None and source.array is TARGET:
-                return source.codec.decode(message.data).values
-        return None
+        """The target z_r; None if the bag has none."""
+        return self.survey.target
+
+    def findings(self) -> Findings:
+        """What of its files is missing, or otherwise than its metadata says. BagError if unreadable."""
+        told = read_metadata(self.path)
+        found = Findings() if told is None else check(self.path, told, self.survey)
+        found.differences += repeated(self.survey)
+        return found
 
     def parameters(self) -> dict[int, dict[str, Any]]:
-        """The nodes' parameters by run, as far as the bag or the run's folder knows them."""
-        try:
-            content = parse_json(text_of(self.path / PARAMETERS) or "{}")
-            return {int(run): dict(values) for run, values in content.items()}
-        except (ValueError, TypeError, AttributeError) as error:
-            raise BagError(f"{self.path / PARAMETERS} cannot be read: {error}") from error
+        """The nodes' parameters by run, as far as the bag or what it came from knows them.
+
+        They stand in the bag itself, if it was recorded by this version or a later one, and beside
+        it; beside the bag that it was converted from, if it lies where our advice puts it; and in
+        the folder of the run.
+        """
+        known: dict[int, dict[str, Any]] = {}
+        origin = self.path.with_name(self.path.name.removesuffix(CONVERTED))
+        for content in (
+            _of_run(self.path.parent),
+            _beside(origin / PARAMETERS),
+            _beside(self.path / PARAMETERS),
+            self.survey.parameters,
+        ):
+            for run, values in content.items():
+                known[run] = known.get(run, {}) | values
+        return known
+
+    def contradicting_parameters(self) -> list[str]:
+        """Where parameters beside the bag are others than in it, in words."""
+        return [
+            f"{PARAMETERS} has other parameters of run {run} than the bag itself: {name}"
+            for run, values in _beside(self.path / PARAMETERS).items()
+            for name, value in values.items()
+            if value != self.survey.parameters.get(run, {}).get(name, value)
+        ]
 
     def episodes(self) -> Iterator[RecordedEpisode]:
         """The episodes in the order of their ends, each when nothing more of it is to come."""
@@ -82,3 +117,30 @@ def bags_of(path: Path) -> list[Bag]:
     if not numbered or files(path):
         return [Bag(path)]
     return [Bag(p) for p in sorted(numbered, key=lambda p: (len(p.name), p.name))]
+
+
+def _in_time(found: list[Path]) -> list[Path]:
+    """The files of a bag by the times of their first messages; by their names where these are equal."""
+    if len(found) < 2:
+        return found
+    times = {}
+    for path in found:
+        times[path] = 0
+        with suppress(BagError, StopIteration):  # what is wrong with it is said when it is read
+            times[path] = next(read(path)).when
+    return sorted(found, key=lambda path: times[path])
+
+
+def _beside(path: Path) -> dict[int, dict[str, Any]]:
+    """The parameters by run in a file that may not be there."""
+    try:
+        return by_run(parse_json(text_of(path) or "{}"))
+    except ValueError as error:
+        raise BagError(f"{path} cannot be read: {error}") from error
+
+
+def _of_run(folder: Path) -> dict[int, dict[str, Any]]:
+    """The parameters in the folder of a run, by its id; nothing where they are not there or damaged."""
+    with suppress(ValueError, LookupError, TypeError):
+        return {int(read_json(folder / RUN_FILE)["run"]): RunFolder(folder).parameters()}
+    return {}

@@ -44,7 +44,7 @@ def add(commands: Commands) -> None:
         _bag_verify,
         help="recompute states, actions, costs, models and policies",
         description="Recompute states, actions, costs, models and policies, and compare them to "
-        "the bit. Exit code 1 if anything differs, or nothing can be recomputed.",
+        "the bit. Exit code 1 if anything differs or is missing, or nothing can be recomputed.",
         example="pdeloop bag verify runs/burgers-20260101-120000-1",
     )
     info.add_argument("bag", type=a_path, metavar="BAG", help="folder of a bag or of a run")
@@ -56,7 +56,10 @@ def add(commands: Commands) -> None:
         help="folder of a bag, or of a run with all its bags",
     )
     verify.add_argument(
-        "--parameters", type=a_path, metavar="FILE", help="instead of those in the bag"
+        "--parameters",
+        type=a_path,
+        metavar="FILE",
+        help="instead of those in the bag: a run's parameters.yaml, a bag's parameters.json",
     )
     add_equation(verify)
     for action in (info, verify):
@@ -88,4 +91,4 @@ def _bag_verify(options: argparse.Namespace) -> int:
     if not report.compared:
         why = "; ".join(report.notes) or "no episode is complete"
         raise ParameterError(f"nothing was recomputed, so nothing is verified: {why}")
-    return 1 if report.count else 0
+    return 0 if report.good else 1

@@ -40,7 +40,8 @@ from loop_interfaces.topics import ACTION, COST, START, STATE
 from pdeloop.bags.episodes import EpisodeIndex, RecordedEpisode
 from pdeloop.bags.info import describe, info_text
 from pdeloop.bags.reader import Bag, bags_of
-from pdeloop.bags.verify import _Run, verify
+from pdeloop.bags.recorded_run import RecordedRun
+from pdeloop.bags.verify import verify
 from pdeloop.cli import main
 from pdeloop.identification import identify_bag
 from recorder_node import bag as bag_module
@@ -52,6 +53,8 @@ from tests.support.small_disk import read_only_folder, small_disk
 
 RUN = 2**52 + 1
 SECOND = 10**9
+MESSAGES = 1 + 2 * (1 + 6 + 6 + 1) + 1
+"""Of the bag `written`: a time, two episodes, the parameters of the run."""
 WHAT = [*sources("/left"), CLOCK]
 BY_TOPIC = {source.array: source for source in WHAT if source.array}
 
@@ -112,7 +115,7 @@ def killed(bag: Path) -> Path:
 def test_rosbags_reads_what_was_written_with_its_definitions(tmp_path):
     path = written(tmp_path)
     with AnyReader([path]) as reader:
-        assert reader.message_count == 1 + 2 * (1 + 6 + 6 + 1)
+        assert reader.message_count == MESSAGES
         states = [c for c in reader.connections if c.topic == "/left/state"]
         for connection, _, raw in reader.messages(states):
             message = reader.deserialize(raw, connection.msgtype)
@@ -129,7 +132,7 @@ def test_mcap_reads_what_was_written_with_its_definitions(tmp_path):
     with (path / "bag.mcap").open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
         summary = reader.get_summary()
-        assert summary is not None and summary.statistics.message_count == 29
+        assert summary is not None and summary.statistics.message_count == MESSAGES
         assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
         seen = 0
         for _, channel, _, message in reader.iter_decoded_messages(topics="/left/state"):
@@ -144,7 +147,7 @@ def test_metadata_tells_of_every_topic_what_rosbag2_tells(tmp_path):
     path = written(tmp_path)
     content = yaml.safe_load((path / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     assert (content["version"], content["storage_identifier"]) == (9, "mcap")
-    assert (content["message_count"], content["relative_file_paths"]) == (29, ["bag.mcap"])
+    assert (content["message_count"], content["relative_file_paths"]) == (MESSAGES, ["bag.mcap"])
     known = {
         t["topic_metadata"]["name"]: t["topic_metadata"]
         for t in content["topics_with_message_count"]
@@ -710,7 +713,7 @@ def test_another_target_than_the_plants_is_a_difference(monkeypatch):
     target = Bag(OLD).target()
     assert target is not None
     monkeypatch.setattr(Bag, "target", lambda bag: target + 1.0)
-    monkeypatch.setattr(_Run, "finish", lambda run: None)
+    monkeypatch.setattr(RecordedRun, "finish", lambda run, claims: None)
     assert verify(OLD).differences[0].startswith("target of run 1299076055067259, entry [0, 0]")
 
 

@@ -22,8 +22,10 @@ from pdeloop.bags.reader import Bag
 from pdeloop.bags.verify import verify
 from pdeloop.identification import identify_bag
 from recorder_node.bag import BagWriter, Channel
+from recorder_node.sources import PARAMETERS_TOPIC
 from tests.support.loop_harness import Processes, until
 from tests.support.operator_harness import operator
+from tests.support.recorded_here import messages_of, write
 from tests.support.small import RECORDED, SMALL, paced, same_bits
 from tests.support.small_disk import read_only_folder, small_disk
 from tests.support.small_loop import (
@@ -44,7 +46,8 @@ EPISODES = ITERATIONS + 3  # exploration, check, the iterations, evaluation
 def test_a_recorded_run_is_complete_and_everything_in_it_is_recomputed(recorded):
     assert_same_training(recorded, in_process(iterations=ITERATIONS, seeds=2))
     report = verify(recorded)
-    assert (report.count, report.incomplete, report.notes) == (0, [], [])
+    assert (report.count, report.missing) == (0, [])
+    assert (report.incomplete, report.notes) == ([], [])
     assert report.episodes == EPISODES
     assert report.compared["policies"] == report.compared["costs"] - 2
     assert report.compared["steps"] == report.compared["costs"] * STEPS
@@ -133,9 +136,8 @@ def test_identify_from_a_bag_equals_the_live_model(recorded):
 
 
 def test_identify_needs_nothing_but_the_topics_of_a_foreign_plant(recorded, tmp_path):
-    copy = tmp_path / "bag"
-    shutil.copytree(recorded / "bag", copy)
-    (copy / "parameters.json").unlink()
+    own = [m for m in messages_of(recorded / "bag") if m.topic != PARAMETERS_TOPIC]
+    copy = write(tmp_path / "bag", [own])
     found = identify_bag(copy, {"reduced_order": 4}, environment=0)
     with np.load(recorded / "policy.npz") as live:
         assert same_bits(pack(found.model), live["model"][0])
@@ -291,9 +293,9 @@ def test_a_second_recording_of_a_run_gets_a_bag_of_its_own(loop, tmp_path):
     loop.wait(loop.pdeloop("train", "--resume", str(out), "--record"), LIMIT)
     assert_same_training(out, in_process(iterations=iterations))
     second = verify(out / "bag-2")
-    assert (second.count, second.notes) == (0, []), second.text()
+    assert (second.count, second.missing, second.notes) == (0, [], []), second.text()
     both = verify(out)
-    assert (both.count, both.notes) == (0, [])
+    assert (both.count, both.missing, both.notes) == (0, [], []), both.text()
     assert len(both.incomplete) <= 1  # the one that the signal cut short
     assert both.compared["policies"] == 2 + 2 * iterations + 30
 
@@ -335,6 +337,8 @@ def test_a_killed_recorder_is_started_again_and_goes_on_in_another_bag(loop, tmp
     assert_same_training(out, in_process(iterations=40))
     report = verify(out)
     assert report.count == 0, report.text()
+    (missing,) = report.missing  # while no recorder was there
+    assert "rollouts that the training asked for" in missing
     assert describe(out / "bag-2")["finished"]
 
 

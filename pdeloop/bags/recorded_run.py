@@ -1,0 +1,271 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The recorded episodes of a run: each is computed again, then the training that asked for them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Container, Mapping
+from typing import Any
+
+import numpy as np
+
+from controller_node.identification import DesignSettings, design
+from loop_interfaces import model_rows
+from loop_interfaces.arrays import Array
+from loop_interfaces.episodes import EPISODES_PER_START
+from loop_interfaces.frames import Frame
+from loop_interfaces.parameters import recorded_values, with_budget
+from loop_interfaces.spec import ParameterError
+from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn, noise_seeds
+from pdeloop.bags.episodes import RecordedEpisode
+from pdeloop.bags.numbering import gaps, gaps_text
+from pdeloop.bags.report import Report
+from pdeloop.bags.run_claims import RunClaims, compare_parameters, compare_results
+from pdeloop.episode import rollout
+from pdeloop.in_process import LocalPair
+from tuner_node.batch import Batch
+from tuner_node.budget import PURPOSES
+from tuner_node.build import build_training
+
+_TUNERS = ("seed", "seeds", "rollouts", "iterations", "start", "optimizer")
+
+
+class RecordedRun:
+    """The episodes of one run, and what they must be."""
+
+    def __init__(
+        self,
+        number: int,
+        values: Mapping[str, Any] | None,
+        report: Report,
+        target: Array | None,
+    ) -> None:
+        self._name, self._report = f"run {number}", report
+        self._rollouts: dict[bytes, list[str]] = {}
+        """What was recorded, in words, by what identifies a rollout (`_keys`)."""
+        self._answered: Counter[bytes] = Counter()
+        """How many of them have their costs."""
+        self._complete: set[bytes] = set()
+        """Those of complete episodes."""
+        self._numbers: set[int] = set()
+        """Of all episodes, whatever was recorded of them."""
+        self._models: dict[int, Frame] = {}
+        """The models that policies are about, by their number."""
+        self._values: dict[str, Any] | None = None
+        if values is None:
+            self._note(
+                "its parameters are not in the bag, so nothing is recomputed (give them with "
+                "--parameters FILE: the parameters.yaml of the run, or the parameters.json that the "
+                "recorder wrote beside its bag)"
+            )
+            return
+        self._given = set(values)
+        try:
+            self._values = with_budget(recorded_values(values))
+        except ParameterError as error:
+            raise ParameterError(f"{self._name}: {error}") from error
+        self._pair = LocalPair(self._values)
+        self._fingerprint = self._pair.fingerprint
+        self._same_plant = True
+        if target is not None:
+            own = self._pair.plant.target[np.newaxis]
+            report.compare("targets", f"target of {self._name}", target[np.newaxis], own)
+
+    def episode(self, episode: RecordedEpisode) -> None:
+        """Check one episode."""
+        report, where = self._report, f"episode {episode.name}"
+        self._numbers.add(episode.number)
+        for text in episode.contradictions:
+            report.differs(f"{where}: {text}")
+        if episode.void:
+            return
+        if episode.missing:
+            report.incomplete.append(f"{where} lacks {', '.join(episode.missing)}")
+        self._keep(episode)
+        if self._values is None or episode.start is None or episode.cost is None:
+            return
+        if self._same_plant and episode.cost.plant != self._fingerprint:
+            self._same_plant = False
+            self._note(
+                f"recorded with another fingerprint of the plant ({episode.cost.plant}; here it is "
+                f"{self._fingerprint}): its parameters or the source of its equation are others. "
+                "What it computes is compared all the same"
+            )
+        if not episode.missing:
+            self._run_again(episode, where)
+
+    def finish(self, claims: RunClaims | None) -> None:
+        """Run the training again, until it has asked for all that was recorded.
+
+        claims: what the run's folder says, if it is known; the training is then run as far as that.
+        """
+        if claims is not None and self._values is not None:
+            compare_parameters(claims, self._values, self._report)
+        if not self._follow(claims):
+            self._miss_unfollowed()
+
+    def _follow(self, claims: RunClaims | None) -> bool:
+        """Run the training again; whether it could be followed to where it is to be."""
+        if self._values is None or not (self._rollouts or claims):
+            return False
+        if unknown := [name for name in _TUNERS if name not in self._given]:
+            self._note(
+                f"the tuner's {', '.join(unknown)} not known, so its policies cannot be followed"
+            )
+            return False
+        training = build_training({**self._values, "plant": self._fingerprint})
+        pair = LocalPair(self._values, self._pair.plant)
+        pair.follow(training)
+        unseen = dict(self._rollouts)
+        lost = _Lost(self._rollouts, self._complete, everything=not self._continues(claims))
+        while unseen or (claims is not None and not claims.reached(training)):
+            if (batch := training.next_batch()) is None:
+                break
+            for key in _keys(batch.rows, batch.policies, training.generation):
+                lost.look(key, training.phase)
+                if unseen.pop(key, None) and not batch.exploratory:
+                    self._report.count_compared("policies", self._answered[key])
+            if batch.policies is not None and (
+                known := self._models.pop(training.generation, None)
+            ):
+                assert training.models is not None
+                where = f"models number {known.step} of {self._name}"
+                self._report.compare("models", where, known.values, training.models)
+            try:
+                training.finish(pair.run(batch, self._values["max_batch"]))
+            except ValueError as error:  # an exploration without a model, as it was then
+                self._note(f"the training ends there: {error}")
+                return False
+            pair.follow(training)
+        for places in unseen.values():
+            for place in places:
+                self._report.differs(f"policy of {place}: the training asks for none like it")
+        if claims is not None:
+            lost.reach_end()
+            compare_results(claims, training, self._report)
+        if missing := lost.text():
+            between = gaps(self._numbers)
+            told = f"; the bag has nothing of {gaps_text(between)}" if between else ""
+            self._report.missing.append(f"{self._name}: {missing}{told}")
+        return True
+
+    def _continues(self, claims: RunClaims | None) -> bool:
+        """Whether the bag begins with a later start of the tuner, so that another one has the rest."""
+        first = min(self._numbers, default=0)
+        return claims is None and first // EPISODES_PER_START > 1 and not gaps({first})
+
+    def _miss_unfollowed(self) -> None:
+        """Name what is missing where no training tells what was asked for."""
+        if between := gaps(self._numbers):
+            self._report.missing.append(f"{self._name}: {gaps_text(between)}")
+        if lost := [place for key, place in self._rollouts.items() if key not in self._complete]:
+            count = sum(map(len, lost))
+            self._report.missing.append(
+                f"{self._name}: {count} rollouts that are in no complete episode, the first of "
+                f"{lost[0][0]}"
+            )
+
+    def _note(self, text: str) -> None:
+        self._report.notes.append(f"{self._name}: {text}")
+
+    def _keep(self, episode: RecordedEpisode) -> None:
+        """Note what the rollouts of an episode were, to be looked for in the training."""
+        if episode.start is None or (episode.policy is None and not episode.exploratory):
+            return
+        policies = None if episode.policy is None else episode.policy.values
+        for i, key in enumerate(_keys(episode.start.values, policies, episode.start.step)):
+            place = f"episode {episode.name}, environment {i}"
+            self._rollouts.setdefault(key, []).append(place)
+            self._answered[key] += episode.cost is not None
+            if not episode.missing:
+                self._complete.add(key)
+        if episode.bases is not None:
+            self._models[episode.bases.step] = episode.bases
+
+    def _run_again(self, episode: RecordedEpisode, where: str) -> None:
+        """The whole episode from its seeds, under its policies or its excitation."""
+        assert episode.start is not None and episode.cost is not None
+        report, plant, rows = self._report, self._pair.plant, episode.start.values
+        states, actions = episode.trajectory()
+        if states.shape[1:] != (len(rows), plant.state_size) or actions.shape[2] != plant.n_a:
+            report.differs(f"{where}: states and actions do not have the plant's shape")
+            return
+        policies = None if episode.policy is None else episode.policy.values
+        if episode.bases is not None:
+            self._pair.use_models(episode.bases.values)
+        if episode.exploratory or episode.bases is not None:
+            law = self._pair.law(Batch(rows, None if episode.exploratory else policies))
+        else:  # the models that the policies are about are in another bag
+            law = lambda k, z: actions[k]  # noqa: E731
+        seeds = rows[:, StartColumn.SEED].astype(np.int64)
+        again = rollout(plant, law, seeds, noise_seeds(rows))
+        report.compare("initial fields", f"z_0 of {where}", states[0], again.states[0])
+        for what, name, first, recorded, computed in (
+            ("actions", "a", 0, actions, again.actions),
+            ("steps", "z", 1, states[1:], again.states[1:]),
+        ):
+            for k in range(len(recorded)):
+                text = f"{name}_{k + first} of {where}"
+                if not report.compare(what, text, recorded[k], computed[k]):
+                    break
+        costs = again.costs.rows()
+        report.compare("costs", f"cost of {where}", episode.cost.values, costs)
+        if episode.model is not None and (costs[:, CostColumn.ENDED] == COMPLETED).all():
+            assert self._values is not None
+            settings = DesignSettings.of(self._values)
+            for env, model in enumerate(episode.model.values):
+                own = design([(states[:, env], actions[:, env])], plant.target, settings)
+                text = f"model of {where}, environment {env}"
+                report.compare("rows of models", text, model, model_rows.pack(own))
+
+
+class _Lost:
+    """Counts the rollouts that a training asks for and that are in no complete episode.
+
+    recorded: those of which something was recorded, complete: of which all was; everything: count from
+    the training's beginning on, and not only from the first one that was recorded.
+    """
+
+    def __init__(
+        self, recorded: Container[bytes], complete: Container[bytes], *, everything: bool
+    ) -> None:
+        self._recorded, self._complete, self._begun = recorded, complete, everything
+        self._lost: Counter[str] = Counter()
+        self._since: Counter[str] = Counter()
+        """Those since the last one that was recorded: they may come after the end of the recording."""
+
+    def look(self, key: bytes, phase: str) -> None:
+        """Take the next rollout that the training asks for, in a phase of it."""
+        if key in self._recorded:
+            self._begun = True
+            self.reach_end()
+        if key not in self._complete and self._begun:
+            (self._lost if key in self._recorded else self._since)[phase] += 1
+
+    def reach_end(self) -> None:
+        """What was asked for so far should have been recorded."""
+        self._lost += self._since
+        self._since.clear()
+
+    def text(self) -> str:
+        """What is missing in words; empty if nothing is."""
+        if not (total := self._lost.total()):
+            return ""
+        parts = ", ".join(f"{PURPOSES[phase]} {count}" for phase, count in self._lost.items())
+        many = "1 rollout" if total == 1 else f"{total} rollouts"
+        return f"{many} that the training asked for ({parts}), in no complete episode"
+
+
+def _keys(rows: Array, policies: Array | None, models: int) -> list[bytes]:
+    """What identifies each rollout, bit by bit: its seeds, and the policy if there is one.
+
+    A policy stands with the number of the models it is about, as each exploration repeats the
+    rollouts without control.
+    """
+    rows = np.ascontiguousarray(rows)
+    if policies is None:
+        return [row.tobytes() for row in rows]
+    return [
+        models.to_bytes(8, "little") + row.tobytes() + np.ascontiguousarray(policy).tobytes()
+        for row, policy in zip(rows, policies, strict=True)
+    ]

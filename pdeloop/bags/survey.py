@@ -1,0 +1,110 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""What stands in the files of a bag, in one pass over them: counts, times, parameters, the target."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from loop_interfaces.arrays import Array
+from loop_interfaces.documents import parse_json
+from loop_interfaces.topics import TARGET
+from pdeloop.bags.mcap_messages import Message, finished, read
+from recorder_node.bag import BagError
+from recorder_node.sources import PARAMETERS_TOPIC, source_of
+
+MAX_PARAMETERS = 10_000_000
+"""Bytes of a message with parameters."""
+
+
+@dataclass
+class FileSurvey:
+    """One file: messages by topic and type, the first and the last time (ns), a digest of all of it.
+
+    finished: whether its recorder came to its end.
+    """
+
+    path: Path
+    finished: bool = False
+    counts: Counter[tuple[str, str]] = field(default_factory=Counter)
+    first: int | None = None
+    last: int | None = None
+    digest: bytes = b""
+
+    @property
+    def name(self) -> str:
+        return self.path.name
+
+    @property
+    def messages(self) -> int:
+        return self.counts.total()
+
+
+@dataclass
+class Survey:
+    """All files of a bag.
+
+    parameters: those of the nodes, by run, as far as they stand in the files; target: z_r, None if
+    there is none.
+    """
+
+    files: list[FileSurvey] = field(default_factory=list)
+    parameters: dict[int, dict[str, Any]] = field(default_factory=dict)
+    target: Array | None = None
+
+    @property
+    def counts(self) -> Counter[tuple[str, str]]:
+        """Messages by topic and type."""
+        return sum((file.counts for file in self.files), Counter[tuple[str, str]]())
+
+    @property
+    def first(self) -> int | None:
+        return min((file.first for file in self.files if file.first is not None), default=None)
+
+    @property
+    def last(self) -> int | None:
+        return max((file.last for file in self.files if file.last is not None), default=None)
+
+
+def survey(files: Sequence[Path]) -> Survey:
+    """Look through the files once. BagError where one is damaged."""
+    found, known = Survey(), cache(source_of)
+    for path in files:
+        file, digest = FileSurvey(path), hashlib.blake2b()
+        for message in read(path):
+            file.counts[message.topic, message.type] += 1
+            file.first = message.when if file.first is None else min(file.first, message.when)
+            file.last = message.when if file.last is None else max(file.last, message.when)
+            digest.update(message.data)
+            if message.topic == PARAMETERS_TOPIC:
+                _take_parameters(found.parameters, message, path)
+            source = None if found.target is not None else known(message.topic)
+            if source is not None and source.array is TARGET:
+                found.target = source.codec.decode(message.data).values
+        file.digest, file.finished = digest.digest(), finished(path)
+        found.files.append(file)
+    return found
+
+
+def _take_parameters(known: dict[int, dict[str, Any]], message: Message, path: Path) -> None:
+    """Take what the recorder noted of a run's parameters; the latest note of a run has all of them."""
+    try:
+        if len(message.data) > MAX_PARAMETERS:
+            raise ValueError(f"they have more than {MAX_PARAMETERS} bytes")
+        known |= by_run(parse_json(message.data[8:].rstrip(b"\0")))
+    except ValueError as error:
+        raise BagError(f"the parameters in {path} cannot be read: {error}") from error
+
+
+def by_run(content: object) -> dict[int, dict[str, Any]]:
+    """The parameters by run that a JSON object holds. ValueError unless it is one."""
+    try:
+        assert isinstance(content, dict)
+        return {int(run): dict(values) for run, values in content.items()}
+    except (AssertionError, TypeError, ValueError) as error:
+        raise ValueError("expected an object with an object of parameters for each run") from error
