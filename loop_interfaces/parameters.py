@@ -169,6 +169,11 @@ EXECUTION = _section(
 )
 """How plant and controller use the machine."""
 
+OPTIMIZER = Spec("optimizer", "gauss_newton", nodes="T", group="budget and method").means(
+    "method of the adapt phase, by the name that an installed package offers it under; its settings "
+    "are 'optimizer_settings.*'"
+)
+
 TUNER = _section(
     "T",
     Spec("seed", 0, 0, MAX_SEED, group="budget and method").means(
@@ -182,8 +187,8 @@ TUNER = _section(
         f"among them; 0: {ROLLOUTS}, unless 'iterations' is given"
     ),
     Spec("iterations", 0, 0, 1_000_000, group="budget and method").means(
-        "instead of 'rollouts', for the optimizer two_point: iterations of two rollouts each, "
-        "after exploration and check, as the paper counts; 0: not given"
+        "instead of 'rollouts', for an optimizer that counts iterations, after exploration and check, "
+        "as the paper does for its two rollouts each; 0: not given"
     ),
     Spec("start", "lqt", choices=("lqt", "zero"), group="budget and method").means(
         "where the policy starts: the LQT gains of the reduced model, or zero"
@@ -195,7 +200,8 @@ TUNER = _section(
     Spec("identification_attempts", 3, 1, 1000).means(
         "exploratory episodes a seed may use until its LQT law beats no control on a sampled "
         "field, which the adaptation begins with if none does; 1: take the first, unchecked, as "
-        "the paper does; gauss_newton with few sensors explores once and compares the law itself"
+        "the paper does; an optimizer that compares the law itself where there are few sensors "
+        "explores once there"
     ),
     Spec("evaluation_fields", 10, 1, 1000, group="budget and method").means(
         "sampled initial fields of the closing evaluation"
@@ -215,12 +221,7 @@ TUNER = _section(
     Spec("max_attempts", 5, 1, 1000, live=True).means(
         "attempts at one episode after which the run stops with an error"
     ),
-    Spec(
-        "optimizer",
-        "gauss_newton",
-        choices=("two_point", "gauss_newton"),
-        group="budget and method",
-    ).means("method of the adapt phase"),
+    OPTIMIZER,
     Spec("recorder", "none", choices=("none", "start", "required")).means(
         "none: run without one; start: begin when a recorder is ready, go on if it stops; "
         "required: stop if it stops"
@@ -253,12 +254,6 @@ def with_budget(values: Mapping[str, Any]) -> dict[str, Any]:
     """The parameters with the default budget, if they give none."""
     given = values["rollouts"] or values["iterations"]
     return {**values, "rollouts": values["rollouts"] if given else ROLLOUTS}
-
-
-def with_identification(given: Mapping[str, Any]) -> dict[str, Any]:
-    """The given parameters, with the identification of an optimizer that was tuned for the paper's."""
-    tuned_for_dmdc = given.get("optimizer") == "two_point"
-    return {**({"identification": "dmdc"} if tuned_for_dmdc else {}), **given}
 
 
 def as_recorded(values: Mapping[str, Any]) -> dict[str, Any]:

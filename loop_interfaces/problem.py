@@ -2,12 +2,19 @@
 """Where the problems are, and a problem's resolved parameters. No ROS import."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from loop_interfaces.parameters import table, with_budget, with_identification
-from loop_interfaces.spec import ParameterError, check, check_names, exponent_hint, read_yaml
+from loop_interfaces.parameters import table, with_budget
+from loop_interfaces.spec import (
+    OPTIMIZER_SETTINGS,
+    ParameterError,
+    check,
+    check_names,
+    exponent_hint,
+    read_yaml,
+)
 from loop_interfaces.text import shown
 
 
@@ -44,17 +51,23 @@ def find_problem(name: str) -> Path:
     )
 
 
-def load_parameters(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
+def load_parameters(
+    name: str,
+    options: Mapping[str, Any],
+    preferred: Callable[[Mapping[str, Any]], Mapping[str, Any]] = lambda given: given,
+) -> dict[str, Any]:
     """The checked parameters of all nodes: a problem's file, then `options`, then the defaults.
 
-    `physical.*` are included as given; a relative file of an equation ('file.py:Class') is taken
+    preferred: adds defaults that depend on what is given. `physical.*` and `optimizer_settings.*` are
+    included as given; a relative file of an equation ('file.py:Class') is taken
     relative to the YAML file.
     """
     path = find_problem(name)
-    given = with_identification({**read_yaml(path), **options})
+    given = dict(preferred({**read_yaml(path), **options}))
     check_names(given, [spec.name for spec in table()])
     given["equation"] = _equation_path(str(given.get("equation", "")), path)
-    return {**with_budget(check(table(), given)), **_physical(given)}
+    settings = {k: value for k, value in given.items() if k.startswith(OPTIMIZER_SETTINGS)}
+    return {**with_budget(check(table(), given)), **_physical(given), **settings}
 
 
 def _physical(given: Mapping[str, Any]) -> dict[str, float]:

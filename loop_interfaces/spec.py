@@ -22,6 +22,9 @@ from loop_interfaces.files import FileError, read_bounded
 from loop_interfaces.text import shown
 
 Value = bool | int | float | str | list[str] | list[float]
+OPTIMIZER_SETTINGS = "optimizer_settings."
+FREE = ("physical.", OPTIMIZER_SETTINGS)
+"""How the names of parameters begin that an equation or an optimiser declares."""
 MAX_YAML_BYTES = 1_000_000
 MAX_PARAMETERS, MAX_NAME = 10_000, 500
 _FILE_NAME = re.compile(r"[^\W_][\w.-]{,99}")
@@ -187,7 +190,7 @@ def check_names(names: Iterable[str], known: Iterable[str]) -> None:
     """Raises ParameterError for the first name that is not known, with the nearest known one."""
     known = list(known)
     for name in names:
-        if name not in known and not name.startswith("physical."):
+        if name not in known and not name.startswith(FREE):
             close = difflib.get_close_matches(name, known, n=1)
             hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known)}"
             raise ParameterError(f"unknown parameter {shown(name)}; {hint}")
@@ -212,7 +215,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
             raise ParameterError(
                 f"{path} is not a ROS parameter file; expected '/**:' with 'ros__parameters:' in it"
             )
-        flat.update(_flatten(body))
+        flat.update(flatten(body))
     return flat
 
 
@@ -228,7 +231,8 @@ def read_document(path: Path) -> Any:
         raise ParameterError(f"{path} is not valid YAML: {error}") from error
 
 
-def _flatten(body: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
+def flatten(body: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested parameters by dotted names."""
     flat: dict[str, Any] = {}
     for key, value in body.items():
         name = f"{prefix}{key}"
@@ -237,7 +241,7 @@ def _flatten(body: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
                 f"the name of a parameter has more than {MAX_NAME} characters: {shown(name)}"
             )
         if isinstance(value, dict):
-            flat.update(_flatten(value, f"{name}."))
+            flat.update(flatten(value, f"{name}."))
         else:
             flat[name] = value
         if len(flat) > MAX_PARAMETERS:

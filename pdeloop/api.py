@@ -20,6 +20,7 @@ from controller_node import identification
 from loop_interfaces.arrays import Array
 from loop_interfaces.parameters import table
 from loop_interfaces.problem import load_parameters
+from loop_interfaces.spec import FREE, flatten
 from loop_method.reduce.identifiability import IdentifiabilityWarning
 from loop_method.reduce.reduced_model import ReducedModel
 from pde_sim_node.build import build_equation, build_plant
@@ -32,6 +33,7 @@ from pdeloop.interruption import Interruption
 from pdeloop.pairs import Transport
 from pdeloop.training_run import begin, carry_out
 from tuner_node.build import build_training
+from tuner_node.optimizer_parameters import training_parameters
 from tuner_node.run_folder import resuming
 
 __all__ = ["Problem", "identify", "problem", "train"]
@@ -106,7 +108,7 @@ class Problem:
             The plant diverged, or the seed is out of range.
         """
         own = {"seed": seed, "seeds": 1, "model": ""}
-        training = build_training(load_parameters(self.source, {**self.given, **own}))
+        training = build_training(training_parameters(self.source, {**self.given, **own}))
         batch = training.next_batch()
         assert batch is not None
         episode = LocalPair(self.values).roll_out(batch)
@@ -153,7 +155,7 @@ def problem(
     ((101, 64), (100, 6))
     """
     given = named(str(source), {**parameters, "physical": physical})
-    values = load_parameters(str(source), given)
+    values = training_parameters(str(source), given)
     build_equation(values)  # refuses physical parameters that it does not have
     return Problem(str(source), given, values)
 
@@ -169,9 +171,10 @@ def named(source: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
         raise ValueError(f"physical is {physical!r}; expected a dict of names and numbers")
     if "equation" in given:
         given["equation"] = allow(given["equation"])
+    given = flatten(given)
     known = [spec.name for spec in table()]
     for name, value in given.items():
-        if name in known or name.startswith("physical."):
+        if name in known or name.startswith(FREE):
             continue
         equation = {"equation": given["equation"]} if "equation" in given else {}
         kind = configured_equation(load_parameters(source, equation)["equation"])
@@ -258,7 +261,7 @@ def train(
     progress
         Where to show it, like sys.stdout; it is silent if not given.
     parameters
-        As of `problem`: seed, seeds, rollouts, optimizer, ...
+        As of `problem`: seed, seeds, rollouts, optimizer, optimizer_settings={"fields": 5}, ...
 
     Returns
     -------

@@ -20,7 +20,6 @@ import controller_node.law
 from controller_node.identification import DesignSettings, check_sizes
 from loop_interfaces.files import FileError, make_own_folder
 from loop_interfaces.isolation import NETWORK, loopback_environment
-from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_equation, build_plant
 from pdeloop.display import Display, ProgressFile
 from pdeloop.domain import own_domain
@@ -32,6 +31,7 @@ from pdeloop.pairs import LoopNode, Transport
 from pdeloop.supervisor import Child, NodeError, Supervisor, node_command
 from tuner_node import narration
 from tuner_node.build import build_training
+from tuner_node.optimizer_parameters import training_parameters
 from tuner_node.run_folder import RunFolder, RunFolderError, resuming, timestamp
 from tuner_node.run_store import RunWriter
 
@@ -46,7 +46,7 @@ def resolve(problem: str, options: Mapping[str, Any]) -> dict[str, Any]:
 
     Nothing is compiled.
     """
-    values = load_parameters(problem, options)
+    values = training_parameters(problem, options)
     plant = build_plant(values, compiled=False)
     if not values["model"]:
         check_sizes(DesignSettings.of(values), plant.state_size, plant.horizon)

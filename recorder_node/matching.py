@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from loop_interfaces.parameters import table
 from loop_interfaces.ros.peers import Peers
+from loop_interfaces.spec import FREE
 
 PATIENCE = 10.0
 """Seconds in which the graph is expected to show a node's name and its parameter services."""
@@ -52,5 +53,5 @@ class Matching:
             name: value
             for peer in self._peers.known
             for name, value in (peer.values or {}).items()
-            if name in known or name.startswith("physical.")
+            if name in known or name.startswith(FREE)
         }

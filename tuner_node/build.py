@@ -15,11 +15,11 @@ from loop_interfaces.model_rows import unpack
 from loop_interfaces.parameters import model_order, noisy
 from loop_interfaces.signature import design_digest
 from loop_interfaces.spec import ParameterError
-from loop_method.adapt import Context, GaussNewton, Optimizer, TwoPoint
-from loop_method.adapt.gauss_newton import FIELDS
+from loop_method.adapt import Context, Optimizer
 from tuner_node.batch import UNKNOWN_PLANT, TrainingSettings
 from tuner_node.dispatch import Dispatcher
 from tuner_node.exploration import least_variance
+from tuner_node.optimizer_parameters import kind_of, settings_of
 from tuner_node.rollouts import CHECK, EXPLORATION
 from tuner_node.run_folder import RunIdentity
 from tuner_node.training import Training
@@ -56,7 +56,7 @@ def read_model(path: Path, n_a: int) -> NDArray[np.float64]:
     return model
 
 
-def check_budget(values: Mapping[str, Any], trajectories: bool, step: int) -> None:
+def check_budget(values: Mapping[str, Any], kind: type[Optimizer], step: int) -> None:
     """ParameterError unless the budget is given in one way and allows one step of the optimiser."""
     name, rollouts = values["optimizer"], values["rollouts"]
     if values["iterations"]:
@@ -64,14 +64,14 @@ def check_budget(values: Mapping[str, Any], trajectories: bool, step: int) -> No
             raise ParameterError(
                 "parameters 'rollouts' and 'iterations' both set the budget; give one of them"
             )
-        if name != TwoPoint.name:
+        if not kind.iteration_rollouts:
             raise ParameterError(
                 f"parameter 'iterations' is {values['iterations']}; expected 'rollouts' instead: the "
                 f"optimizer '{name}' counts no iterations"
             )
         return
     parts = {}
-    if trajectories or not values["model"]:
+    if kind.needs_trajectories or not values["model"]:
         parts["for the exploration"] = EXPLORATION
     if not values["model"] and values["identification_attempts"] > 1:
         parts["to check the first law"] = CHECK
@@ -91,31 +91,20 @@ def build_training(values: Mapping[str, Any]) -> Training:
             f"parameter 'reduced_order' is 0 and 'seeds' is {values['seeds']}; expected one seed, as "
             "the models of a batch have one order"
         )
-    from_zero = values["start"] == "zero"
-    learning_rate = values["learning_rate_from_zero" if from_zero else "learning_rate"]
-    trajectories = values["optimizer"] == GaussNewton.name
+    kind = kind_of(values)
+    chosen = settings_of(kind, values)
 
     def make_optimizer(
         policy: NDArray[np.float64], seed: int, context: Context | None, rollouts: int
     ) -> Optimizer:
-        if trajectories:
-            assert context is not None
-            return GaussNewton(policy, seed=seed, rollouts=rollouts, context=context)
-        return TwoPoint(
-            policy,
-            seed=seed,
-            rollouts=rollouts,
-            learning_rate=learning_rate,
-            smoothing_radius=values["smoothing_radius"],
-        )
+        return kind(policy, seed=seed, rollouts=rollouts, settings=chosen, context=context)
 
     # One at every point measures the whole state.
     sensors = values["sensors"] if values["sensors"] < values["n_z"] else 0
-    if sensors and trajectories:  # Gauss-Newton compares the first law itself
+    if sensors and kind.compares_first_law:
         values = {**values, "identification_attempts": 1}
-    # To change the policy once, Gauss-Newton measures the one that it begins with and a candidate.
-    step = 2 * FIELDS if trajectories else 2
-    check_budget(values, trajectories, step)
+    step = kind.first_step(chosen)
+    check_budget(values, kind, step)
     given = {
         item.name: values[item.name] for item in fields(TrainingSettings) if item.name in values
     }
@@ -137,9 +126,9 @@ def build_training(values: Mapping[str, Any]) -> Training:
     }
     settings = TrainingSettings(
         **given,
-        adaptation=2 * values["iterations"],
+        adaptation=kind.iteration_rollouts * values["iterations"],
         step=step,
-        trajectories=trajectories,
+        trajectories=kind.needs_trajectories,
         noise=noisy(values),
     )
     return Training(settings, make_optimizer, plant=values["plant"] or UNKNOWN_PLANT)

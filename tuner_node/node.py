@@ -30,11 +30,13 @@ from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.node_main import ConfigurationError, node_main
 from loop_interfaces.ros.parameters import declare, given_parameters, on_change
 from loop_interfaces.ros.suspend_watchdog import sleep_for
+from loop_interfaces.spec import FREE
 from tuner_node import narration
 from tuner_node.build import build_dispatcher, build_training
 from tuner_node.diagnostics import TunerDiagnostics
 from tuner_node.errors import ContradictionError, DispatchError
 from tuner_node.narration import Narration
+from tuner_node.optimizer_parameters import kind_of, setting_specs, with_settings
 from tuner_node.pair import PairPublication
 from tuner_node.participants import Participants, Publishers
 from tuner_node.results import summarise
@@ -58,8 +60,9 @@ def declare_parameters(node: Node) -> dict[str, Any]:
     """The tuner's parameters, and the problem's, which together define the training."""
     given = given_parameters(node)
     values = with_budget(declare(node, taken_by("tuner_node"), given))
-    # The equation's own parameters are the plant's to check; here they only identify the run.
-    return values | {name: value for name, value in given.items() if name.startswith("physical.")}
+    # Those of the equation are the plant's to check; here they only identify the run.
+    values |= {name: value for name, value in given.items() if name.startswith(FREE)}
+    return with_settings(values) | declare(node, setting_specs(kind_of(values)), given)
 
 
 class TunerNode:

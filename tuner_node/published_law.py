@@ -36,5 +36,5 @@ def check_law(
         if not np.allclose(actions, law, rtol=TOLERANCE, atol=TOLERANCE * scale):
             raise ValueError(
                 "the actions are not those of the law a = K_a U^T z + K_b U^T z_r, which this "
-                "optimizer needs; with a control law of your own use the optimizer 'two_point'"
+                "optimizer needs; with a control law of your own use one that learns from costs alone"
             )

@@ -12,12 +12,13 @@ everything that `restore` needs to go on as if nothing had happened, to the last
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from loop_interfaces.arrays import Array
+from loop_method.settings import Settings as _Settings
 
 Row = dict[str, float | int | bool | str]
 State = dict[str, NDArray[np.generic]]
@@ -145,16 +146,58 @@ class Context:
 
 
 class Optimizer(Protocol):
-    """The interface of an optimiser.
+    """The interface of an optimiser: what its class declares, and what an object of it does.
 
     A history row holds JSON numbers, booleans and strings; a cost that is not finite is left out of
     it. Every row has `rollouts` (told so far, in total) and `diverged` (how many of those told now
     did).
+
+    Parameters
+    ----------
+    policy0 : (n_a, 2 n_s) array
+        Where to start, [K_a K_b].
+    seed : int
+        Determines everything random.
+    rollouts : int
+        The budget.
+    settings : Settings
+        Of the class's own type.
+    context : Context, optional
+        What is known of the problem, if it needs trajectories.
     """
 
-    @property
-    def name(self) -> str:
-        """The name that selects this optimiser."""
+    name: ClassVar[str]
+    """The name that selects this optimiser."""
+    Settings: ClassVar[type[_Settings]] = _Settings
+    """Its constants; none if it does not say otherwise."""
+    needs_trajectories: ClassVar[bool] = False
+    """Whether results have to come with their trajectories."""
+    compares_first_law: ClassVar[bool] = False
+    """Whether it compares the first law with no control itself where the state is that of few sensors,
+    so that the plant is explored once and no law is checked before."""
+    iteration_rollouts: ClassVar[int] = 0
+    """Rollouts of an iteration, for a budget that is counted in them; 0: it counts none."""
+    preferences: ClassVar[Mapping[str, Any]] = {}
+    """Parameters of the training with the defaults that it was tuned for."""
+
+    def __init__(
+        self,
+        policy0: ArrayLike,
+        *,
+        seed: int,
+        rollouts: int,
+        settings: Any,
+        context: Context | None = None,
+    ) -> None: ...
+
+    @classmethod
+    def first_step(cls, settings: Any) -> int:
+        """Rollouts of its first step, without which there is nothing to adapt with."""
+
+    @classmethod
+    def settings_of(cls, values: Mapping[str, Any], given: Mapping[str, Any]) -> Any:
+        """The settings of a training with these parameters; given: those of `Settings` by name."""
+        return cls.Settings(**given)
 
     @property
     def policy(self) -> Array:

@@ -34,6 +34,7 @@ from loop_interfaces.array_files import Arrays, taken
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import (
     Context,
+    Optimizer,
     Record,
     Rollout,
     RolloutResult,
@@ -46,13 +47,12 @@ from loop_method.adapt.base import (
 from loop_method.adapt.proposals import Proposer
 from loop_method.adapt.trajectories import Records
 from loop_method.seeds import field_seed
+from loop_method.settings import Settings, setting
 
-__all__ = ["GaussNewton"]
+__all__ = ["GaussNewton", "GaussNewtonSettings"]
 
 Stamps = NDArray[np.int64]
 
-FIELDS = 3
-"""M, initial fields that judge a policy in the beginning."""
 _DAMPING = (1e-4, 1.0, 100.0)  # smallest, first, largest after a rejection
 _ABORT = 1.05
 _MEMORY = 40
@@ -61,6 +61,18 @@ _MEMORY = 40
 _SMALL = 0.02
 _NONE = -1
 _STAMPS = ("fields", "incumbents", "trials", "others")
+
+
+@dataclass(frozen=True, kw_only=True)
+class GaussNewtonSettings(Settings):
+    """What can be set."""
+
+    fields: int = setting(
+        3,
+        "initial fields M that judge a policy in the beginning; they grow to twice as many",
+        1,
+        1000,
+    )
 
 
 @dataclass(eq=False)
@@ -124,7 +136,7 @@ class SearchState:
         return {int(s) for s in (*self.incumbents, *self.trials, *self.others)} - {_NONE}
 
 
-class GaussNewton:
+class GaussNewton(Optimizer):
     """Gauss-Newton policy optimisation on measured trajectories.
 
     Parameters
@@ -137,13 +149,15 @@ class GaussNewton:
         The budget. A step takes up to M of them, and the start another M.
     context : Context
         Basis, target, weights, horizon and the exploratory trajectory.
-    fields : int
-        M, initial fields that judge a policy: more fit the distribution better, at M rollouts a
-        step. They grow to twice as many, one after each accepted step that gains less than 2 % of the
-        cost: a short step needs more of them to be judged.
+    settings : GaussNewtonSettings
+        `fields`: more fit the distribution better, at M rollouts a step. One is added after each
+        accepted step that gains less than 2 % of the cost: a short step needs more to be judged.
     """
 
     name = "gauss_newton"
+    Settings = GaussNewtonSettings
+    needs_trajectories = True
+    compares_first_law = True
 
     def __init__(
         self,
@@ -151,11 +165,14 @@ class GaussNewton:
         *,
         seed: int,
         rollouts: int,
-        context: Context,
-        fields: int = FIELDS,
+        settings: GaussNewtonSettings | None = None,
+        context: Context | None = None,
     ) -> None:
-        require_positive(rollouts=rollouts, fields=fields)
-        self._now = SearchState.begin(checked_policy(policy0), fields)
+        require_positive(rollouts=rollouts)
+        if context is None:
+            raise ValueError("Gauss-Newton needs the context: trajectories were not asked for")
+        settings = settings or GaussNewtonSettings()
+        self._now = SearchState.begin(checked_policy(policy0), settings.fields)
         self._proposer = Proposer(context, self._now.policy)
         self._sensors = context.sensors
         # One field says little with few sensors: the law has to beat no control on all of them.
@@ -164,8 +181,13 @@ class GaussNewton:
             self._now.proposed = True
         self._seed = seed
         self._budget = rollouts
-        self._field_count = fields
+        self._field_count = settings.fields
         self._records = Records(_MEMORY, 3.0 * float(np.abs(context.exploration.states).max()))
+
+    @classmethod
+    def first_step(cls, settings: GaussNewtonSettings) -> int:
+        """To change the policy once it measures the one that it begins with and a candidate."""
+        return 2 * settings.fields
 
     @property
     def policy(self) -> Array:

@@ -19,6 +19,8 @@ Spall, "Introduction to Stochastic Search and Optimization", chapter 7.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +28,8 @@ from numpy.typing import ArrayLike, NDArray
 from loop_interfaces.array_files import taken
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import (
+    Context,
+    Optimizer,
     Rollout,
     RolloutResult,
     Row,
@@ -35,9 +39,29 @@ from loop_method.adapt.base import (
     require_results,
 )
 from loop_method.seeds import DIRECTION_STREAM, field_seed
+from loop_method.settings import Settings
 
 
-class TwoPoint:
+@dataclass(frozen=True, kw_only=True)
+class TwoPointSettings(Settings):
+    """The constants of the method, which are parameters of the problem, as the paper has them.
+
+    Attributes
+    ----------
+    learning_rate : float
+        eta, for the mean stage cost. Too large: rollouts diverge and it halves itself.
+    smoothing_radius : float
+        r. Too large: the estimate is that of a smoother cost, and rollouts diverge.
+    """
+
+    learning_rate: float
+    smoothing_radius: float = 0.1
+
+    def __post_init__(self) -> None:
+        require_positive(learning_rate=self.learning_rate, smoothing_radius=self.smoothing_radius)
+
+
+class TwoPoint(Optimizer):
     """Policy optimisation from costs alone.
 
     Parameters
@@ -48,13 +72,14 @@ class TwoPoint:
         Determines all directions and fields.
     rollouts : int
         The budget, spent in floor(rollouts / 2) steps.
-    learning_rate : float
-        eta, for the mean stage cost. Too large: rollouts diverge and it halves itself.
-    smoothing_radius : float
-        r. Too large: the estimate is that of a smoother cost, and rollouts diverge.
+    settings : TwoPointSettings
     """
 
     name = "two_point"
+    Settings = TwoPointSettings
+    iteration_rollouts = 2
+    # Its learning rates were chosen for the gains of this identification.
+    preferences: ClassVar[Mapping[str, Any]] = {"identification": "dmdc"}
 
     def __init__(
         self,
@@ -62,18 +87,28 @@ class TwoPoint:
         *,
         seed: int,
         rollouts: int,
-        learning_rate: float,
-        smoothing_radius: float = 0.1,
+        settings: TwoPointSettings,
+        context: Context | None = None,
     ) -> None:
-        require_positive(
-            rollouts=rollouts, learning_rate=learning_rate, smoothing_radius=smoothing_radius
-        )
+        require_positive(rollouts=rollouts)
         self._policy = checked_policy(policy0)
         self._seed = seed
         self._steps = rollouts // 2
-        self._learning_rate = learning_rate
-        self._radius = smoothing_radius
+        self._learning_rate = settings.learning_rate
+        self._radius = settings.smoothing_radius
         self._tells = 0
+
+    @classmethod
+    def first_step(cls, settings: TwoPointSettings) -> int:
+        return 2
+
+    @classmethod
+    def settings_of(cls, values: Mapping[str, Any], given: Mapping[str, Any]) -> TwoPointSettings:
+        """From the problem's parameters; eta is another one where the policy starts from zero."""
+        rate = "learning_rate_from_zero" if values["start"] == "zero" else "learning_rate"
+        return TwoPointSettings(
+            learning_rate=values[rate], smoothing_radius=values["smoothing_radius"]
+        )
 
     @property
     def policy(self) -> Array:

@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeAlias
 
-from loop_interfaces.parameters import PROBLEM, TUNER, flags
+from loop_interfaces.parameters import OPTIMIZER, PROBLEM, TUNER, flags
 from loop_interfaces.problem import shipped_problems
 from loop_interfaces.spec import ParameterError
 
@@ -104,23 +105,60 @@ def add_flags(parser: argparse._ActionsContainer, group: str) -> None:
     """The flags of a group of parameters (loop_interfaces.parameters)."""
     for spec in flags(group):
         own = "the problem's, or " if spec in PROBLEM else ""
-        parser.add_argument(
+        action = parser.add_argument(
             spec.flag,
             type=_word if spec.choices else str if spec.numbers else spec.type,
             choices=spec.choices or None,
             metavar=None if spec.choices else _METAVAR.get(spec.type, "X"),
             help=f"{spec.description} [{own}{spec.default}]".replace("%", "%%"),
         )
+        if spec is OPTIMIZER:
+            action.completer = _optimizers  # type: ignore[attr-defined]
+
+
+def _optimizers(prefix: str, **_: object) -> list[str]:
+    """The names of the optimisers, for the completion of the shells."""
+    from loop_method.adapt.registry import offered
+
+    return list(offered())
+
+
+def add_set(parser: argparse._ActionsContainer) -> None:
+    """The flag --set, for parameters without a flag of their own; see `given_flags`."""
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        type=_assignment,
+        metavar="NAME=VALUE",
+        help="any other parameter of the problem, the equation (physical.NAME) or the optimizer "
+        "(optimizer_settings.NAME), as in a problem's file; may be repeated",
+    )
+
+
+def _assignment(text: str) -> tuple[str, object]:
+    name, equals, value = text.partition("=")
+    if not (name and equals):
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=VALUE")
+    for kind in (int, float):
+        with contextlib.suppress(ValueError):
+            return name, kind(value)
+    return name, {"true": True, "false": False}.get(value, value)
 
 
 def given_flags(options: argparse.Namespace) -> dict[str, object]:
-    """The parameters whose flags were given, by name."""
-    given = [(spec, getattr(options, spec.name)) for spec in flags()]
-    return {
+    """The parameters whose flags were given, or that --set was given for, by name."""
+    named = [(spec, getattr(options, spec.name)) for spec in flags()]
+    given: dict[str, object] = {
         spec.name: spec.parse(value) if spec.numbers else value
-        for spec, value in given
+        for spec, value in named
         if value is not None
     }
+    for name, value in options.set:
+        if name in given:
+            raise ParameterError(f"parameter '{name}' is given twice; give it once")
+        given[name] = value
+    return given
 
 
 def _word(text: str) -> str:

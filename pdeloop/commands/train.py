@@ -14,6 +14,7 @@ from pdeloop.commands.common import (
     add_flags,
     add_json,
     add_problem,
+    add_set,
     allow_equation,
     command,
     given_flags,
@@ -40,6 +41,7 @@ def add(commands: Commands) -> None:
     add_flags(problem, "problem")
     method = train.add_argument_group("budget and method")
     add_flags(method, "budget and method")
+    add_set(method)
     add = method.add_argument
     add(
         "--model",

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_interfaces.parameters import TUNER
-from loop_method.adapt import GaussNewton, Optimizer, RolloutResult, TwoPoint
-from loop_method.adapt.two_point import direction
+from loop_method.adapt import Optimizer, RolloutResult, TwoPoint
+from loop_method.adapt.two_point import TwoPointSettings, direction
 from loop_method.seeds import field_seed
 
 SHAPE = (2, 6)
@@ -26,7 +25,13 @@ def cost(policy: np.ndarray, field_seed: int) -> float:
 
 
 def two_point(**changes: Any) -> TwoPoint:
-    settings: dict[str, Any] = {"seed": 3, "rollouts": 24, "learning_rate": 1e-3}
+    constants = {"learning_rate": 1e-3, "smoothing_radius": 0.1}
+    constants |= {name: changes.pop(name) for name in constants if name in changes}
+    settings: dict[str, Any] = {
+        "seed": 3,
+        "rollouts": 24,
+        "settings": TwoPointSettings(**constants),
+    }
     return TwoPoint(POLICY, **(settings | changes))
 
 
@@ -186,14 +191,10 @@ def test_refuses_bad_parameters(name: str, value: float) -> None:
 
 
 def test_refuses_bad_policies() -> None:
-    settings: dict[str, Any] = {"seed": 0, "rollouts": 16, "learning_rate": 1.0}
+    settings: dict[str, Any] = {"seed": 0, "rollouts": 16}
+    settings["settings"] = TwoPointSettings(learning_rate=1.0)
     for policy in (POLICY[0], POLICY[:, :5], POLICY[:0]):
         with pytest.raises(ValueError, match="must have shape"):
             TwoPoint(policy, **settings)
     with pytest.raises(ValueError, match="must be finite"):
         TwoPoint(POLICY * np.inf, **settings)
-
-
-def test_the_parameter_knows_every_optimiser_by_its_name() -> None:
-    (spec,) = (spec for spec in TUNER if spec.name == "optimizer")
-    assert set(spec.choices) == {TwoPoint.name, GaussNewton.name}

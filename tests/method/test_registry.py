@@ -1,0 +1,146 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Which optimiser a name stands for, what it declares, and its settings as parameters."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from loop_interfaces.spec import ParameterError
+from loop_method.adapt import GaussNewton, Optimizer, TwoPoint
+from loop_method.adapt.gauss_newton import GaussNewtonSettings
+from loop_method.adapt.registry import offered, optimizer_kind
+from loop_method.settings import Settings, setting
+from tests.support.small import parameters, same_bits, train_here
+from tuner_node.build import build_training
+from tuner_node.optimizer_parameters import settings_of, training_parameters
+
+FOREIGN = """
+from loop_method.adapt.two_point import TwoPoint
+
+class Halved(TwoPoint):
+    name = "halved"
+    preferences = {"identification": "field"}
+
+    def tell(self, results):
+        return super().tell(results) | {"halved": True}
+
+class Whole(TwoPoint):
+    name = "whole"
+
+class Partial:
+    name = "partial"
+
+NUMBER = 3
+"""
+
+
+def offer(folder: Path, package: str, *entries: str) -> None:
+    """What an installation of a package leaves: its metadata, with entry points."""
+    about = folder / f"{package}-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("\n".join(["[pdeloop.optimizers]", *entries]))
+
+
+@pytest.fixture
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "foreign.py").write_text(FOREIGN)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    entries = "halved = foreign:Halved", "two_point = foreign:Whole", "partial = foreign:Partial"
+    offer(tmp_path, "first", *entries, "lost = foreign:Lost", "number = foreign:NUMBER")
+    yield tmp_path
+    sys.modules.pop("foreign", None)
+
+
+def test_ours_are_offered_as_those_of_others_are() -> None:
+    assert optimizer_kind("gauss_newton") is GaussNewton
+    assert optimizer_kind("two_point") is TwoPoint
+
+
+def test_an_installed_package_offers_its_optimisers_by_name(installed: Path) -> None:
+    assert optimizer_kind("halved").name == "halved"
+    assert optimizer_kind("two_point") is TwoPoint, "no package takes a name of ours"
+    assert {"halved", "two_point", "gauss_newton"} <= set(offered())
+    offer(installed, "second", "halved = foreign:Whole")
+    with pytest.raises(ValueError, match="'halved' is offered by several installed packages"):
+        optimizer_kind("halved")
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("adam", "unknown optimizer 'adam': give one of gauss_newton, halved, .*two_point$"),
+        ("lost", "'lost': foreign:Lost cannot be loaded: .*Lost"),
+        ("number", "'number': NUMBER must be a class"),
+        ("partial", "'partial': Partial does not define ask, tell, .*needs_trajectories"),
+    ],
+)
+def test_what_is_no_optimiser_is_refused_in_a_sentence(installed: Path, name, words) -> None:
+    with pytest.raises(ValueError, match=words) as refused:
+        optimizer_kind(name)
+    assert "\n" not in str(refused.value)
+
+
+def test_one_of_another_package_trains_with_what_it_declares(installed: Path) -> None:
+    """It is TwoPoint by another name, and comes to the same policy."""
+    own = train_here(parameters(optimizer="halved", iterations=3))
+    assert all(row["halved"] for row in own.history)
+    ours = train_here(parameters(optimizer="two_point", iterations=3))
+    assert same_bits(own.policies(), ours.policies())
+    assert training_parameters("burgers", {"optimizer": "halved"})["identification"] == "field"
+
+
+def test_an_optimiser_prefers_defaults_and_overrides_nothing() -> None:
+    assert training_parameters("burgers", {"optimizer": "two-point"})["identification"] == "dmdc"
+    given = {"optimizer": "two_point", "identification": "regression"}
+    assert training_parameters("burgers", given)["identification"] == "regression"
+    assert training_parameters("burgers", {})["identification"] == "regression"
+
+
+def test_settings_are_parameters_of_the_training() -> None:
+    values = training_parameters("burgers", {"optimizer_settings": {"fields": 5}})
+    assert values["optimizer_settings.fields"] == 5
+    assert settings_of(GaussNewton, values) == GaussNewtonSettings(fields=5)
+    assert build_training({**values, "rollouts": 13}).settings.step == 10
+    with pytest.raises(ParameterError, match=r"at least 13: .*10 for a step"):
+        build_training({**values, "rollouts": 12})
+    assert training_parameters("burgers", {})["optimizer_settings.fields"] == 3
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"fields": 0}, "'optimizer_settings.fields' is 0; expected a whole number from 1 to"),
+        ({"fields": "many"}, "'optimizer_settings.fields' is 'many'; expected a whole number"),
+        (
+            {"field": 2},
+            "'optimizer_settings.field' of the optimizer 'gauss_newton'; known: .*fields",
+        ),
+    ],
+)
+def test_settings_are_checked_before_anything_runs(options, words) -> None:
+    with pytest.raises(ParameterError, match=words):
+        training_parameters("burgers", {"optimizer_settings": options})
+
+
+def test_an_optimiser_without_settings_says_so() -> None:
+    with pytest.raises(ParameterError, match="of the optimizer 'two_point'; it has no settings"):
+        training_parameters("burgers", {"optimizer": "two_point", "optimizer_settings": {"r": 1.0}})
+
+
+def test_settings_know_their_ranges() -> None:
+    @dataclass(frozen=True, kw_only=True)
+    class Own(Settings):
+        step: float = setting(0.1, "length of a step", 1e-6, 10.0, unit="m")
+        norm: str = setting("l2", "norm of a step", choices=("l1", "l2"))
+
+    assert Own(step=2) == Own(step=2.0)
+    for wrong, words in (({"step": 11.0}, "from 1e-06 to 10 \\(m\\)"), ({"norm": "l3"}, "l1, l2")):
+        with pytest.raises(ParameterError, match=words):
+            Own(**wrong)
+    assert [spec.name for spec in Own.specs()] == ["step", "norm"]
+    assert Optimizer.Settings.specs() == ()
