@@ -24,7 +24,7 @@ from launch_ros.actions import Node
 
 from loop_interfaces.parameters import flags
 from loop_interfaces.protocol import STOPPED
-from loop_interfaces.spec import ParameterError
+from loop_interfaces.spec import ParameterError, assignment
 from pde_sim_node.equations import allow
 from pdeloop.pairs import PAIR, PAIRS, Transport
 from pdeloop.supervisor import RECORDER_GRACE
@@ -35,6 +35,7 @@ FLAGS = flags()
 ARGUMENTS = {
     # Those of the plant are arguments of the loop.
     **{s.name: ("", f"{s.description} [the problem's]") for s in FLAGS if "P" not in s.nodes},
+    "set": ("", "other parameters as pdeloop train --set has them: NAME=VALUE,NAME=VALUE"),
     "model": ("", "start from this model of pdeloop identify; empty: identify one"),
     "out": ("", "new folder of the results; empty: runs/PROBLEM-TIME"),
     "resume": ("", "folder of an interrupted run to continue; empty: a new run"),
@@ -106,6 +107,7 @@ def training(context: LaunchContext) -> list[Any]:
 def run_folder(given: dict[str, str]) -> Path:
     """The folder of the run: a new one, or that of the run to continue."""
     own: dict[str, Any] = {s.name: s.parse(given[s.name]) for s in FLAGS if given[s.name]}
+    own |= dict(assignment(text) for text in filter(None, given["set"].split(",")))
     if given["model"]:
         own["model"] = str(Path(given["model"]).resolve())
     equation = {"equation": allow(given["equation"])} if given["equation"] else {}

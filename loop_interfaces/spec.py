@@ -179,6 +179,21 @@ def _plain(number: float) -> str:
     return str(int(number)) if whole else f"{number:g}"
 
 
+def assignment(text: str) -> tuple[str, Value]:
+    """Name and value of a text 'NAME=VALUE'; its parameter says later what the value has to be.
+
+    >>> assignment("physical.viscosity=1e-3")
+    ('physical.viscosity', 0.001)
+    """
+    name, equals, value = text.partition("=")
+    if not (name and equals):
+        raise ParameterError(f"{shown(text)} is not of the form NAME=VALUE")
+    for kind in (int, float):
+        with contextlib.suppress(ValueError):
+            return name, kind(value)
+    return name, {"true": True, "false": False}.get(value, value)
+
+
 def exponent_hint(value: object) -> str:
     """What to do with a text like '1e12', which YAML 1.1 does not read as a number; else empty."""
     if isinstance(value, str) and len(value) < 100 and _EXPONENT.fullmatch(value):

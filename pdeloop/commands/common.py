@@ -4,14 +4,13 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeAlias
 
 from loop_interfaces.parameters import OPTIMIZER, PROBLEM, TUNER, flags
 from loop_interfaces.problem import shipped_problems
-from loop_interfaces.spec import ParameterError
+from loop_interfaces.spec import ParameterError, assignment
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 """Where a command adds its parser."""
@@ -129,21 +128,18 @@ def add_set(parser: argparse._ActionsContainer) -> None:
         "--set",
         action="append",
         default=[],
-        type=_assignment,
+        type=_an_assignment,
         metavar="NAME=VALUE",
         help="any other parameter of the problem, the equation (physical.NAME) or the optimizer "
         "(optimizer_settings.NAME), as in a problem's file; may be repeated",
     )
 
 
-def _assignment(text: str) -> tuple[str, object]:
-    name, equals, value = text.partition("=")
-    if not (name and equals):
-        raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=VALUE")
-    for kind in (int, float):
-        with contextlib.suppress(ValueError):
-            return name, kind(value)
-    return name, {"true": True, "false": False}.get(value, value)
+def _an_assignment(text: str) -> tuple[str, object]:
+    try:
+        return assignment(text)
+    except ParameterError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def given_flags(options: argparse.Namespace) -> dict[str, object]:

@@ -188,6 +188,7 @@ def test_a_launched_training_has_the_nodes_and_parameters_that_exist(launched, t
         iterations=3,
         real_time_factor=50,
         view="true",
+        set="physical.viscosity=2e-2,horizon=20",
     )
     assert [(node["executable"], node["namespace"]) for node in nodes] == [
         ("recorder_node", ""),
@@ -204,6 +205,7 @@ def test_a_launched_training_has_the_nodes_and_parameters_that_exist(launched, t
         assert node["parameters"][0] == str(run / "parameters.yaml")
     values = read_yaml(run / "parameters.yaml")
     assert (values["iterations"], values["real_time_factor"], values["n_z"]) == (3, 50.0, 32)
+    assert (values["physical.viscosity"], values["horizon"]) == (2e-2, 20)
     by_name = {node["executable"]: given_to(node) for node in nodes}
     assert by_name["tuner_node"]["recorder"] == "start"
     assert by_name["tuner_node"]["plant"] == fingerprint(values)

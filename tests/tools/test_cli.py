@@ -34,6 +34,33 @@ def train(out: Path, *more: str, problem: Path = SMALL) -> int:
     )
 
 
+def test_any_parameter_can_be_set_and_is_recorded(tmp_path) -> None:
+    more = ("--set", "physical.viscosity=2e-2", "--set", "horizon=20", "--set", "start=zero")
+    assert train(tmp_path / "run", *more) == 0
+    values = RunFolder(tmp_path / "run").values()
+    assert (values["physical.viscosity"], values["horizon"], values["start"]) == (2e-2, 20, "zero")
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (("--set", "horizn=20"), "unknown parameter 'horizn'; did you mean 'horizon'?"),
+        (("--set", "horizon=many"), "'horizon' is 'many'; expected a whole number"),
+        (("--set", "iterations=3"), "parameter 'iterations' is given twice; give it once"),
+        (("--set", "equation=own.py:Own"), "is code, which is not run because a file names it"),
+        (
+            ("--optimizer", "gauss-newton", "--set", "optimizer_settings.feilds=2"),
+            "unknown parameter 'optimizer_settings.feilds' of the optimizer 'gauss_newton'",
+        ),
+    ],
+)
+def test_what_is_set_is_checked_like_everything_else(tmp_path, capsys, more, words) -> None:
+    out = str(tmp_path / "o")
+    given = ("train", str(SMALL), "--in-process", "--iterations", "2", "--out", out)
+    assert words in error_of(capsys, *given, *more)
+    assert not (tmp_path / "o").exists()
+
+
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [

@@ -245,7 +245,8 @@ def test_gauss_newton_refuses_actions_that_are_not_those_of_the_law(limit):
     result = pair.run(training.next_batch())
     bent = [replace(t, actions=np.tanh(t.actions)) for t in result.trajectories]
     before = training.budget.by_purpose()
-    with pytest.raises(ValueError, match=r"not those of the law .* use one that learns from costs alone"):
+    words = r"not those of the law .* use one that learns from costs alone"
+    with pytest.raises(ValueError, match=words):
         training.finish(replace(result, trajectories=bent))
     assert training.budget.by_purpose() == before
 
