@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,11 @@ from numpy.typing import NDArray
 
 from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import pack
-from loop_interfaces.parameters import noisy
+from loop_interfaces.parameters import PROBLEM, noisy
+from loop_interfaces.spec import ParameterError
 from loop_interfaces.topics import CostColumn
 from loop_method.seeds import Purpose, derive, evaluation_noise
-from pde_sim_node.build import build_equation
+from pde_sim_node.build import build_equation, build_plant
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.finished_run import FinishedRun
 from pdeloop.in_process import LocalPair
@@ -23,6 +25,9 @@ from tuner_node.batch import Batch
 from tuner_node.rollouts import EVALUATED
 from tuner_node.run_folder import RunFolderError
 
+_UNCHANGED: Mapping[str, Any] = {}
+EVALUATES = {spec.name for spec in PROBLEM if "P" in spec.nodes} - {"problem", "equation"}
+"""The parameters of the plant and the cost, by name."""
 ROUNDED = 0.1
 """Relative difference of a mean cost that other rounding may explain where the field is chaotic."""
 SAME = 1e-6
@@ -30,19 +35,48 @@ SAME = 1e-6
 
 
 def evaluate(
-    run: FinishedRun, *, fields: int, seed: int, mean_field: bool = False
+    run: FinishedRun,
+    *,
+    fields: int,
+    seed: int,
+    mean_field: bool = False,
+    changes: Mapping[str, Any] = _UNCHANGED,
 ) -> dict[str, Array]:
     """Costs of no control, LQT and the adapted policy of a run, with the built-in plant and law.
 
-    The fields are drawn from the seed, or it is the mean one of their distribution. Returns mean
-    stage costs (training seeds, fields) by controller. ValueError where the run had another plant
-    or law, or its equation is code that is not allowed.
+    The fields are drawn from the seed, or it is the mean one of their distribution. changes:
+    parameters of the plant or the cost that differ from those of the run, whose policies stay.
+    Returns mean stage costs (training seeds, fields) by controller. ValueError where the run had
+    another plant or law, its equation is code that is not allowed, or its policies do not fit the
+    changed plant.
     """
     build_equation(run.values)  # refuses code that the user has not named
     if reason := another_loop(run):
         raise RunFolderError(f"{reason}; its policies cannot be evaluated here")
     seeds = len(run.policies)
+    if changes:
+        run = changed(run, changes)
     return _costs(run, _pair(run), seeds, fields=fields, seed=seed, mean_field=mean_field)
+
+
+def changed(run: FinishedRun, changes: Mapping[str, Any]) -> FinishedRun:
+    """A run's policies with another plant or cost. ParameterError for what would change neither."""
+    for name in changes:
+        if name not in EVALUATES and not name.startswith("physical."):
+            raise ParameterError(
+                f"parameter '{name}' changes nothing about policies that are there; expected one of "
+                "the plant or the cost, such as horizon, state_weight or physical.*"
+            )
+    values = {**run.values, **changes}
+    build_equation(values)  # refuses physical parameters that it does not have
+    plant = build_plant(values, compiled=False)
+    size, n_a = len(run.models[0].U), run.policies.shape[1]
+    if (plant.state_size, plant.n_a) != (size, n_a):
+        raise ParameterError(
+            f"the policies are of a state of {size} numbers and of {n_a} actuators; the changed plant "
+            f"has {plant.state_size} and {plant.n_a}"
+        )
+    return replace(run, values=values)
 
 
 def another_loop(run: FinishedRun) -> str:

@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 from loop_interfaces.parameters import OPTIMIZER, PROBLEM, TUNER, flags
 from loop_interfaces.problem import shipped_problems
-from loop_interfaces.spec import ParameterError, assignment
+from loop_interfaces.spec import ParameterError
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 """Where a command adds its parser."""
@@ -122,39 +122,14 @@ def _optimizers(prefix: str, **_: object) -> list[str]:
     return list(offered())
 
 
-def add_set(parser: argparse._ActionsContainer) -> None:
-    """The flag --set, for parameters without a flag of their own; see `given_flags`."""
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        type=_an_assignment,
-        metavar="NAME=VALUE",
-        help="any other parameter of the problem, the equation (physical.NAME) or the optimizer "
-        "(optimizer_settings.NAME), as in a problem's file; may be repeated",
-    )
-
-
-def _an_assignment(text: str) -> tuple[str, object]:
-    try:
-        return assignment(text)
-    except ParameterError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-
-
 def given_flags(options: argparse.Namespace) -> dict[str, object]:
-    """The parameters whose flags were given, or that --set was given for, by name."""
+    """The parameters whose flags were given, by name."""
     named = [(spec, getattr(options, spec.name)) for spec in flags()]
-    given: dict[str, object] = {
+    return {
         spec.name: spec.parse(value) if spec.numbers else value
         for spec, value in named
         if value is not None
     }
-    for name, value in options.set:
-        if name in given:
-            raise ParameterError(f"parameter '{name}' is given twice; give it once")
-        given[name] = value
-    return given
 
 
 def _word(text: str) -> str:

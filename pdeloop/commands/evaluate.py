@@ -16,6 +16,7 @@ from pdeloop.commands.common import (
     command,
     refuse_other_equation,
 )
+from pdeloop.commands.settings import add_set, read_settings
 from pdeloop.output import print_json
 
 
@@ -41,6 +42,7 @@ def add(commands: Commands) -> None:
         action="store_true",
         help="the mean of the initial distribution instead of sampled fields",
     )
+    add_set(evaluate, "the policies under another parameter of the plant or the cost: any")
     add_equation(evaluate)
     add_json(evaluate, "print the costs as JSON: {controller: [[cost a field] a seed]}")
 
@@ -53,9 +55,16 @@ def _evaluate(options: argparse.Namespace) -> int:
     allow_equation(options)
     DEFAULTS["evaluation_fields"].check(options.fields, "--fields")
     DEFAULTS["evaluation_seed"].check(options.seed, "--seed")
+    changes = read_settings(options.settings)
     run = load_run(options.folder)
     refuse_other_equation(options, run.values["equation"])
-    costs = evaluate(run, fields=options.fields, seed=options.seed, mean_field=options.mean_field)
+    costs = evaluate(
+        run,
+        fields=options.fields,
+        seed=options.seed,
+        mean_field=options.mean_field,
+        changes=changes,
+    )
     if options.json:
         print_json({name: table.tolist() for name, table in costs.items()})
     else:

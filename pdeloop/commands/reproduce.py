@@ -16,6 +16,7 @@ from pdeloop.commands.common import (
     allow_equation,
     command,
 )
+from pdeloop.commands.settings import add_set, read_settings
 from pdeloop.commands.study import add_execution, carry_out
 
 if TYPE_CHECKING:
@@ -46,6 +47,7 @@ def add(commands: Commands) -> None:
         help="exploratory episodes a seed may use until LQT beats no control; 1: the first, "
         f"unchecked, as in the paper [{DEFAULTS['identification_attempts'].default}]",
     )
+    add_set(reproduce, "for all trainings, any parameter")
     add_equation(reproduce)
     add_execution(reproduce)
 
@@ -61,8 +63,13 @@ def _reproduce(options: argparse.Namespace) -> int:
     if options.iterations == 0:
         raise ParameterError("--iterations is 0; expected a whole number of at least 1")
 
+    settings = read_settings(options.settings)
+    for name in names:
+        if name in settings:
+            raise ParameterError(f"--set {name}: give --{name.replace('_', '-')}, which sets it")
+
     def study_in(folder: Path) -> Study:
-        there = None if options.problems or given else reproduction_in(folder)
-        return there or study_of(options.problems, given)
+        there = None if options.problems or given or settings else reproduction_in(folder)
+        return there or study_of(options.problems, given).having(settings)
 
     return carry_out("reproduce", options, study_in, beside_the_paper)

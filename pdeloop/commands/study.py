@@ -22,6 +22,7 @@ from pdeloop.commands.common import (
     allow_equation,
     command,
 )
+from pdeloop.commands.settings import add_set, read_settings
 from pdeloop.output import print_json
 
 if TYPE_CHECKING:
@@ -47,6 +48,7 @@ def add(commands: Commands) -> None:
         metavar="STUDY.yaml",
         help="problems, seeds, variants, settings",
     )
+    add_set(study, "for all trainings, any parameter")
     add_equation(study)
     add_execution(study)
 
@@ -143,9 +145,13 @@ def _study(options: argparse.Namespace) -> int:
             "no study given; expected a YAML file, or --out DIR of one to continue"
         )
 
+    settings = read_settings(options.settings)
+    if options.file is None and settings:
+        raise ParameterError("--out DIR alone continues a study with its own parameters: no --set")
+
     def study_in(folder: Path) -> Study:
         if options.file is None:
             return kept(folder)
-        return Study.of(read_document(options.file), options.file.parent)
+        return Study.of(read_document(options.file), options.file.parent).having(settings)
 
     return carry_out("study", options, study_in)

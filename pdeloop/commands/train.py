@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 
+from loop_interfaces.parameters import PROBLEM, VIEWER
 from loop_interfaces.problem import shipped_problems
 from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import (
@@ -14,12 +15,12 @@ from pdeloop.commands.common import (
     add_flags,
     add_json,
     add_problem,
-    add_set,
     allow_equation,
     command,
     given_flags,
     refuse_other_equation,
 )
+from pdeloop.commands.settings import add_set, joined, read_settings
 
 
 def add(commands: Commands) -> None:
@@ -41,7 +42,6 @@ def add(commands: Commands) -> None:
     add_flags(problem, "problem")
     method = train.add_argument_group("budget and method")
     add_flags(method, "budget and method")
-    add_set(method)
     add = method.add_argument
     add(
         "--model",
@@ -49,6 +49,7 @@ def add(commands: Commands) -> None:
         metavar="FILE",
         help="start from this model of `pdeloop identify --out` instead of identifying one",
     )
+    add_set(method)
     run = train.add_argument_group("run")
     add = run.add_argument
     add("--out", type=a_path, metavar="DIR", help="folder of the results [runs/PROBLEM-TIME]")
@@ -95,7 +96,11 @@ def _train(options: argparse.Namespace) -> int:
         view=options.view,
     )
     transport.require()
-    given = given_flags(options)
+    settings = read_settings(options.settings)
+    own_viewer = {spec.name for spec in VIEWER if spec.name not in {s.name for s in PROBLEM}}
+    if not options.view and (unused := sorted(own_viewer & {*settings})):
+        raise ParameterError(f"--set {unused[0]} is of the viewer: add --view")
+    given = joined(given_flags(options), settings)
     for name in ("rollouts", "iterations"):
         if given.get(name) == 0:
             raise ParameterError(f"--{name} is 0; expected a whole number of at least 1")

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -110,6 +110,18 @@ class Study:
                 raise StudyError(f"problem '{name}' of {file}; expected names that differ")
             files[name] = file
         return cls(files, tuple(sorted(set(seeds))), variants, settings, curves)
+
+    def having(self, settings: Mapping[str, Any]) -> Study:
+        """The study in which all trainings have these settings, instead of its own.
+
+        StudyError for one that a variant sets, and for seeds, which a study has itself.
+        """
+        for name in settings:
+            if name in ("seed", "seeds"):
+                raise StudyError(f"'{name}' of a study is in its 'seeds', not a setting")
+            if other := [variant for variant, own in self.variants.items() if name in own]:
+                raise StudyError(f"'{name}' is set by variant '{other[0]}' itself; change it there")
+        return replace(self, settings={**self.settings, **settings})
 
     def content(self) -> dict[str, Any]:
         """What `of` makes this study of."""

@@ -1,0 +1,91 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The flag --set NAME=VALUE: any parameter, by its name in docs/interfaces.md."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from loop_interfaces.parameters import table
+from loop_interfaces.spec import OPTIMIZER_SETTINGS, ParameterError, assignment, check_names
+from loop_interfaces.text import shown
+
+PHYSICAL = "physical."
+"""Before the name of a parameter of the equation; `OPTIMIZER_SETTINGS` is that of an optimiser's."""
+OWN_FLAGS = {
+    "out": "--out",
+    "resume": "--resume",
+    "model": "--model",
+    "pairs": "--pairs",
+    "recorder": "--record",
+    "bag": "--record",
+}
+"""Parameters that follow from a flag of the command, or are not a training's."""
+
+
+def add_set(parser: argparse._ActionsContainer, what: str = "any parameter") -> None:
+    """The flag --set, which may be given several times."""
+    action = parser.add_argument(
+        "--set",
+        dest="settings",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help=f"{what}, by its name in docs/interfaces.md; {PHYSICAL}NAME of the equation, and "
+        f"{OPTIMIZER_SETTINGS}NAME of the optimizer; may be repeated",
+    )
+
+    def complete(prefix: str, **_: object) -> list[str]:
+        return [f"{spec.name}=" for spec in table() if spec.name.startswith(prefix)]
+
+    action.completer = complete  # type: ignore[attr-defined]  # as argcomplete asks for it
+
+
+def read_settings(texts: Iterable[str]) -> dict[str, Any]:
+    """The parameters that --set gives, checked one by one.
+
+    ParameterError, one sentence, for an unknown name, a value out of range, and one given twice.
+
+    >>> read_settings(["horizon=20", "physical.viscosity=1e-3", "actuator_positions=0.1,0.5"])
+    {'horizon': 20, 'physical.viscosity': 0.001, 'actuator_positions': [0.1, 0.5]}
+    """
+    found: dict[str, Any] = {}
+    specs = {spec.name: spec for spec in table()}
+    for text in texts:
+        name, given, value = (part.strip() for part in text.partition("="))
+        name = name if "." in name else name.lstrip("-").replace("-", "_")
+        if not (given and name):
+            raise ParameterError(
+                f"--set is {shown(text)}; expected NAME=VALUE, such as horizon=100"
+            )
+        if name in found:
+            raise ParameterError(f"parameter '{name}' is given twice; give it once")
+        if name.startswith(PHYSICAL):
+            found[name] = _number(name, value)
+            continue
+        if name.startswith(OPTIMIZER_SETTINGS):  # the optimiser knows what the value has to be
+            found[name] = assignment(f"{name}={value}")[1]
+            continue
+        check_names([name], specs)
+        if name in OWN_FLAGS:
+            raise ParameterError(f"--set {name}: give {OWN_FLAGS[name]}, which sets it")
+        spec = specs[name]
+        if spec.choices:
+            value = value.replace("-", "_")
+        found[name] = spec.parse(value)
+    return found
+
+
+def joined(flags: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Parameters of flags and of --set together; ParameterError for one that both give."""
+    if both := sorted({*flags} & {*settings}):
+        raise ParameterError(f"parameter '{both[0]}' is given twice; give it once")
+    return {**flags, **settings}
+
+
+def _number(name: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise ParameterError(f"--set {name} is {shown(text)}; expected a number") from None
