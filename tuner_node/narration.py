@@ -107,10 +107,9 @@ def closing_lines(problem: str, summary: Row, folder: object) -> list[str]:
     who = f"seed {summary['seed']}"
     if seeds > 1:
         who = f"seeds {summary['seed']} to {summary['seed'] + seeds - 1}"
-    percent = 100 * reduction["ratio_of_means"]
-    change = f"   ({abs(percent):.1f} % {'below' if percent >= 0 else 'above'} LQT"
+    change = f"   ({against_lqt(reduction['ratio_of_means'])}"
     if seeds > 1:
-        change += f"; mean of the seeds' ratios {100 * reduction['mean_of_ratios']:.1f} %"
+        change += f"; on average over the seeds {against_lqt(reduction['mean_of_ratios'])}"
 
     def cost(name: str) -> str:
         if diverged[name]:
@@ -135,10 +134,26 @@ def closing_lines(problem: str, summary: Row, folder: object) -> list[str]:
         )
     if not any(summary["changed"]):
         lines.append("  nothing was adapted: the policies are those that the adaptation began with")
-    elif not summary["improved"]:
-        where = " for every seed" if seeds > 1 else ""
-        lines.append(f"  the adaptation did not improve on the LQT law{where}")
+    elif worse := _worse_than_lqt(summary):
+        which = f" for {len(worse)} of {seeds} seeds: {_listed(worse)}" if seeds > 1 else ""
+        lines.append(f"  the adapted law costs more than the LQT law{which}")
     return [*lines, f"  results in {folder}"] if folder else lines
+
+
+def against_lqt(reduction: float) -> str:
+    """How far a cost lies below LQT's, or above it, as a share of that.
+
+    >>> against_lqt(0.317), against_lqt(-1.504)
+    ('31.7 % below LQT', '150.4 % above LQT')
+    """
+    return f"{abs(100 * reduction):.1f} % {'below' if reduction >= 0 else 'above'} LQT"
+
+
+def _worse_than_lqt(summary: Row) -> list[int]:
+    """The seeds whose adapted law costs more than their LQT law, or diverged where that did not."""
+    costs = summary["costs"]
+    pairs = zip(costs["lqt"], costs["adapted"], strict=True)
+    return [summary["seed"] + m for m, (lqt, adapted) in enumerate(pairs) if not adapted <= lqt]
 
 
 def several_publishers(found: Mapping[str, Sequence[str]]) -> list[str]:

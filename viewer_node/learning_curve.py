@@ -30,9 +30,10 @@ class LearningCurve:
     """Mean stage cost by the rollouts that a seed has made, or by episode where only topics tell.
 
     axis, phase: what x is, what the training does; budget: the rollouts of a seed, 0 if unknown;
-    references: mean stage costs to compare with, by controller; evaluations: those of each seed's
-    closing evaluation; diverged: rollouts of the adaptation that did; version: differs after each
-    change, and from curve to curve.
+    references: mean stage costs of the closing evaluation, by controller, all on the same fields;
+    evaluations: the same of each seed; checked: those of the check, on fields of its own. The points
+    are costs on the training's fields, with which none of these compares. diverged: rollouts of the
+    adaptation that did; version: differs after each change, and from curve to curve.
     """
 
     axis: str = "episode"
@@ -40,6 +41,7 @@ class LearningCurve:
     budget: int = 0
     references: dict[str, float] = field(default_factory=dict)
     evaluations: dict[int, dict[str, float]] = field(default_factory=dict)
+    checked: dict[str, float] = field(default_factory=dict)
     diverged: int = 0
     version: int = field(default_factory=lambda: next(_VERSIONS))
     _points: dict[int, dict[int, tuple[float, float, float]]] = field(default_factory=dict)
@@ -63,7 +65,7 @@ class LearningCurve:
                 case "checked" if row["accepted"]:
                     self._checked[int(row["seed"])] = float(row["none"]), float(row["lqt"])
                     none, lqt = np.mean(list(self._checked.values()), axis=0).tolist()
-                    self.references |= {"none": none, "lqt": lqt}
+                    self.checked = {"none": none, "lqt": lqt}
                 case "evaluated":
                     names = ("none", "lqt", "adapted")
                     self.evaluations[int(row["seed"])] = {n: float(row[n]) for n in names}
@@ -96,8 +98,8 @@ class LearningCurve:
     def episode(self, rollouts: Rollouts) -> None:
         """Take an episode that is over, from the topics alone.
 
-        One with a rollout without control is a comparison: it gives the references. Any other one
-        with a policy is a point.
+        One with a rollout without control is a comparison, and one of all three controllers gives the
+        references. Any other one with a policy is a point.
         """
         self.version = next(_VERSIONS)
         self.phase = "identify" if rollouts.explores else "policy"
@@ -105,9 +107,10 @@ class LearningCurve:
             return
         if "none" in rollouts.controllers:
             self.phase = "compare"
-            for name in ("none", "lqt"):
-                if (mean := rollouts.mean_cost(name)) is not None:
-                    self.references[name] = mean
+            if all_three := rollouts.compared("none", "lqt", "adapted"):
+                self.references = all_three
+            elif only_two := rollouts.compared("none", "lqt"):
+                self.checked = only_two
             return
         self.diverged += int((~rollouts.completed).sum())
         x = 1 + max(self._rollouts.values(), default=0)
@@ -175,6 +178,7 @@ class LearningCurve:
             "paid": [min(paid, default=0), max(paid, default=0)],
             "diverged": self.diverged,
             "references": self.references,
+            "checked": self.checked,
             "evaluations": self.evaluations,
             "x": xs.tolist(),
             "mean": mean,

@@ -148,9 +148,11 @@ class LoopView:
         for controller, name in COSTS.items():
             if (mean := rollouts.mean_cost(controller)) is not None:
                 self._numbers[name] = mean
-        if self._numbers.get("cost_lqt", 0.0) > 0.0 and "cost" in self._numbers:
-            share = self._numbers["cost"] / self._numbers["cost_lqt"]
-            self._numbers["reduction"] = 100.0 * (1.0 - share)
+        same = rollouts.compared(
+            "lqt", "adapted"
+        )  # costs on other fields compare with none of these
+        if same.get("lqt", 0.0) > 0.0:
+            self._numbers["reduction"] = 100.0 * (1.0 - same["adapted"] / same["lqt"])
         if self.curve_from_topics:
             self.curve.episode(rollouts)
 

@@ -30,7 +30,7 @@ class Rollouts:
     explores: whether it was an exploration; controllers (M,): 'none', 'lqt' or 'adapted', the keys
     of loop_interfaces.controllers, empty for an exploration and if the policy is not known; mean
     (M,): stage costs; completed (M,): whether they did not diverge; models (M,): indices of the
-    reduced models.
+    reduced models; fields (M,): seeds of the initial fields.
     """
 
     explores: bool
@@ -38,6 +38,7 @@ class Rollouts:
     mean: Array
     completed: NDArray[np.bool_]
     models: NDArray[np.int64]
+    fields: NDArray[np.int64]
 
     def mean_cost(self, controller: str) -> float | None:
         """Mean over the completed rollouts of one controller; None if there are none."""
@@ -45,6 +46,16 @@ class Rollouts:
             return None
         rows = self.completed & (self.controllers == controller)
         return float(self.mean[rows].mean()) if rows.any() else None
+
+    def compared(self, *controllers: str) -> dict[str, float]:
+        """The mean costs of these controllers, if each was completed on the same fields; else empty."""
+        if not len(self.controllers):
+            return {}
+        rows = {name: self.completed & (self.controllers == name) for name in controllers}
+        fields = {frozenset(self.fields[own].tolist()) for own in rows.values()}
+        if len(fields) > 1 or not all(fields):
+            return {}
+        return {name: float(self.mean[own].mean()) for name, own in rows.items()}
 
 
 def remember(known: dict[Key, Frame], key: Key, frame: Frame, most: int = MAX_KEPT) -> None:
@@ -90,6 +101,7 @@ class RolloutCosts:
             frame.values[:, CostColumn.MEAN],
             frame.values[:, CostColumn.ENDED] == COMPLETED,
             start.values[:, StartColumn.MODEL].astype(np.int64),
+            start.values[:, StartColumn.SEED].astype(np.int64),
         )
 
     def controller(self, run: int, episode: int, environment: int) -> str:

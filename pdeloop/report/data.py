@@ -47,13 +47,16 @@ class Behaviour:
 class Curve:
     """A controller's cost while it learns: it holds from so many rollouts on.
 
-    rollouts (N,): how many a seed's adaptation has used; relative (N, S): cost over the seed's LQT
-    cost, NaN where a rollout diverged.
+    rollouts (N,): how many a seed's adaptation has used; costs (N, S): by then, NaN where a rollout
+    diverged. over_lqt: each is that of a policy on the fields of the closing evaluation, divided by
+    the cost of the seed's LQT law on the same; else they were measured on the training's own fields,
+    which change as it goes on, so that nothing that was measured on others compares with them.
     """
 
     controller: str
     rollouts: Array
-    relative: Array
+    costs: Array
+    over_lqt: bool
 
 
 @dataclass(frozen=True)
@@ -159,7 +162,7 @@ def _reproduced(study: Study, folder: Path, name: str) -> ProblemData:
             except ValueError as error:
                 raise RunFolderError(f"{path} cannot be read: {error}") from error
             seeds.append((used, costs / base))
-        curves += _curve(controller, seeds)
+        curves += _curve(controller, seeds, over_lqt=True)
     ratio = field_means(runs["lqt_po"].costs["adapted"]) / lqt
     known = max(1, int(np.isfinite(ratio).sum()))
     median = int(np.argsort(ratio, kind="stable")[(known - 1) // 2])
@@ -167,29 +170,29 @@ def _reproduced(study: Study, folder: Path, name: str) -> ProblemData:
 
 
 def _history(run: FinishedRun) -> list[Curve]:
-    """The costs in the optimiser's rows."""
-    lqt = field_means(run.costs["lqt"])
+    """The measured costs in the rows of the optimiser, whichever it is."""
     seeds = []
-    for seed, base, before in zip(run.seeds, lqt, run.before, strict=True):
+    for seed, before in zip(run.seeds, run.before, strict=True):
         rows = [row for row in run.result["history"] if row["seed"] == seed]
+        rows.sort(key=lambda row: int(row["rollouts"]))
         costs = np.array([row.get("cost", np.nan) for row in rows], dtype=np.float64)
-        costs[~(costs < DIVERGED_COST)] = np.nan
+        costs[~(np.abs(costs) < DIVERGED_COST)] = np.nan
         used = np.array([row["rollouts"] - before for row in rows], dtype=np.float64)
-        seeds.append((used, costs / base))
-    return _curve("adapted", seeds)
+        seeds.append((used, costs))
+    return _curve("adapted", seeds, over_lqt=False)
 
 
-def _curve(controller: str, seeds: Sequence[tuple[Array, Array]]) -> list[Curve]:
-    """One curve from each seed's rollouts and relative costs; none where nothing was learned.
+def _curve(controller: str, seeds: Sequence[tuple[Array, Array]], *, over_lqt: bool) -> list[Curve]:
+    """One curve from each seed's rollouts and costs; none where nothing was learned.
 
     Seeds may use their rollouts in unequal portions: a cost holds until the next one.
     """
     used = np.unique(np.concatenate([rollouts for rollouts, _ in seeds]))
-    relative = np.full((len(used), len(seeds)), np.nan)
+    known = np.full((len(used), len(seeds)), np.nan)
     for s, (rollouts, costs) in enumerate(seeds):
         last = np.searchsorted(rollouts, used, side="right") - 1
-        relative[last >= 0, s] = costs[last[last >= 0]]
-    return [Curve(controller, used, relative)] if np.isfinite(relative).any() else []
+        known[last >= 0, s] = costs[last[last >= 0]]
+    return [Curve(controller, used, known, over_lqt)] if np.isfinite(known).any() else []
 
 
 def _problem(runs: Mapping[str, FinishedRun], curves: Sequence[Curve], shown: int) -> ProblemData:
@@ -197,7 +200,8 @@ def _problem(runs: Mapping[str, FinishedRun], curves: Sequence[Curve], shown: in
     data = ProblemData(runs, curves, shown, build_plant(values))
     if not curves:
         data.missing.append(
-            "Training curves: LQT diverged, or every rollout of the adaptation did, or there was none."
+            "Training curves: no rollout of the adaptation was completed, or there was none to "
+            "compare with."
         )
     if reason := another_loop(data.first):
         data.missing.append(

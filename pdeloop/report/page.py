@@ -88,12 +88,19 @@ def _shared(problems: Sequence[ProblemData]) -> Drawn:
     learned = [problem for problem in problems if problem.curves]
     if learned:
         seeds = max(len(problem.first.seeds) for problem in learned)
+        over_lqt = all(curve.over_lqt for problem in learned for curve in problem.curves)
+        what = (
+            "divided by the cost of LQT, of both on the fields of the closing evaluation"
+            if over_lqt
+            else "on the training's own fields, which change as it goes on. So no cost on other "
+            "fields, LQT's among them, compares with it; the table compares all on the same fields"
+        )
         over = f" Line and band: mean and standard deviation over {seeds} seeds." * (seeds > 1)
         yield (
             "training-curves",
             "Cost while learning",
-            "Cost against the rollouts of the adaptation, which exploration and check precede, divided "
-            f"by the cost of LQT.{over} Lower is better.",
+            "Mean stage cost against the rollouts of the adaptation, which exploration and check "
+            f"precede, {what}.{over} Lower is better.",
             learning.training_curves(learned),
         )
     yield (
@@ -111,7 +118,7 @@ def _of_problem(problem: ProblemData) -> Drawn:
     for controller in problem.runs:
         history = problem.history(controller)
         judged = [row["accepted"] for row in history if "accepted" in row]
-        if judged:
+        if learning.has_steps(history):
             yield (
                 f"{name}-steps",
                 f"Steps of {NAMES['gauss_newton']}",  # no other optimiser judges its steps

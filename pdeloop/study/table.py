@@ -31,6 +31,7 @@ CAVEAT = (
     "and with it LQT's cost, varies much from seed to seed: with few seeds such an interval is wide, "
     "and still too narrow."
 )
+ABOVE = "A negative percentage is one above LQT."
 MARK = "*"
 """Of what was computed in other environments."""
 AVERAGES = ("ratio of the means", "mean of the ratios")
@@ -107,12 +108,21 @@ def text(table: Sequence[Mapping[str, Any]]) -> str:
             *aligned(costs, 2),
             "",
             *aligned(below, 2),
+            *([ABOVE] if any(above(row["below_lqt_percent"]) for row in table) else []),
             CAVEAT,
             *([lost] if lost else []),
             *(f"{MARK}: some trainings had {each}; the last bits may differ." for each in others),
             *(f"WARNING: {sentence}" for sentence in beside_no_control(table)),
         ]
     )
+
+
+def above(found: Mapping[str, Any] | None) -> bool:
+    """Whether a share below LQT's cost, or an end of its interval, is one above it."""
+    if found is None:
+        return False
+    intervals = [*(found["ratio_interval"] or ()), *(found["mean_interval"] or ())]
+    return bool(min(found["ratio_of_means"], found["mean_of_ratios"], *intervals) < 0)
 
 
 def beside_no_control(table: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -198,13 +198,13 @@ def test_what_diverged_has_no_point_and_broken_lines_are_left_out():
     )
 
 
-def test_references_are_those_of_the_check_and_then_of_the_evaluation():
+def test_references_are_those_of_the_evaluation_alone_as_all_others_are_on_other_fields():
     curve = LearningCurve()
     curve.row({"event": "checked", "seed": 0, "none": 9.0, "lqt": 99.0, "accepted": False})
     assert curve.references == {}
     for seed, lqt in ((0, 2.0), (1, 4.0)):
         curve.row({"event": "checked", "seed": seed, "none": 9.0, "lqt": lqt, "accepted": True})
-    assert curve.references == {"none": 9.0, "lqt": 3.0}
+    assert curve.references == {} and curve.checked == {"none": 9.0, "lqt": 3.0}
     curve.row({"event": "evaluated", "seed": 0, "none": 8.0, "lqt": 2.5, "adapted": 1.5})
     assert curve.references == {"none": 8.0, "lqt": 2.5, "adapted": 1.5}
     assert curve.evaluations == {0: {"none": 8.0, "lqt": 2.5, "adapted": 1.5}}
@@ -240,7 +240,7 @@ def test_the_time_that_is_left_follows_from_the_rollouts_of_the_last_minute():
     assert curve.remaining(130.0) is None
 
 
-def test_from_the_topics_alone_policies_are_points_and_a_row_without_control_is_a_reference():
+def test_from_the_topics_alone_policies_are_points_and_all_three_controllers_an_evaluation():
     curve, costs = LearningCurve(), RolloutCosts()
     acts = [[3, -1, 0, 0], [3, -1, 0, 0], [4, -1, 0, 1], [4, -1, 0, 1]]
 
@@ -255,7 +255,7 @@ def test_from_the_topics_alone_policies_are_points_and_a_row_without_control_is_
     gains = gains.copy()
     gains[:2] = 0.0
     episode(acts, gains, [8.0, 10.0, 1.0, 1.0])
-    assert curve.references == {"none": 9.0} and len(points(curve)) == 1
+    assert curve.references == {} and len(points(curve)) == 1  # LQT's law is not known
     episode([[3, 17, 0.1, 0]], gains, [50.0])
     assert len(points(curve)) == 1 and curve.phase == "identify"
     episode(acts, np.ones((4, 2, 3)), [1e9, 1e9, 2.0, 2.0], ended=12)

@@ -144,8 +144,10 @@ def test_a_curve_is_the_cost_of_the_policy_at_so_many_rollouts(folder):
             ends = problem.costs[name].mean(axis=1)
             start = "none" if name == "pure_po" else "lqt"
             beginning = problem.costs[start].mean(axis=1)
-            np.testing.assert_allclose(curve.relative[0], beginning / lqt, rtol=1e-12)
-        np.testing.assert_allclose(curve.relative[-1], ends / lqt, rtol=1e-12)
+            np.testing.assert_allclose(curve.costs[0], beginning / lqt, rtol=1e-12)
+            ends = ends / lqt
+        assert curve.over_lqt is not is_run(folder)  # both on the same fields, or no ratio
+        np.testing.assert_allclose(curve.costs[-1], ends, rtol=1e-12)
 
 
 def test_the_page_says_what_it_reports(folder, tab):

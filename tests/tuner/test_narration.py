@@ -122,7 +122,7 @@ def test_the_closing_words_have_the_ranges_the_budget_and_the_folder():
         "  mean stage cost without control  4",
         "  mean stage cost with LQT         2.5 (2 to 3)",
         "  mean stage cost after adaptation 1.5 (1 to 2)   "
-        "(40.0 % below LQT; mean of the seeds' ratios 41.7 %)",
+        "(40.0 % below LQT; on average over the seeds 41.7 % below LQT)",
         "  results in runs/a",
     ]
     assert warnings(summary()) == [] and not failed(summary())
@@ -146,10 +146,32 @@ def test_what_adapted_nothing_is_no_gain():
     assert "  nothing was adapted: the policies are those that the adaptation began with" in lines
 
 
-def test_a_law_that_became_worse_is_no_improvement():
-    for seeds, words in ((1, "did not improve on the LQT law"), (2, "the LQT law for every seed")):
-        lines = closing_lines("kdv", summary(seeds=seeds, improved=False), "")
-        assert lines[-1].endswith(words)
+def test_averages_of_different_signs_say_which_side_each_is_on():
+    reduction = {"ratio_of_means": -1.504, "mean_of_ratios": 0.12}
+    line = closing_lines("kdv", summary(reduction=reduction), "")[3]
+    assert line.endswith("(150.4 % above LQT; on average over the seeds 12.0 % below LQT)")
+    reduction = {"ratio_of_means": 0.3, "mean_of_ratios": -0.76}
+    line = closing_lines("kdv", summary(reduction=reduction), "")[3]
+    assert line.endswith("(30.0 % below LQT; on average over the seeds 76.0 % above LQT)")
+    assert "-" not in line
+
+
+@pytest.mark.parametrize(
+    ("lqt", "adapted", "words"),
+    [
+        ([2.0], [2.5], "  the adapted law costs more than the LQT law"),
+        ([2.0, 3.0], [2.5, 1.0], "more than the LQT law for 1 of 2 seeds: 4"),
+        ([2.0, 3.0], [1.0, 3.5], "more than the LQT law for 1 of 2 seeds: 5"),
+        ([2.0, 3.0], [2.5, 3.5], "more than the LQT law for 2 of 2 seeds: 4, 5"),
+        ([2.0, 3.0], [2.0, 2.9], "  mean stage cost after adaptation 2.45 (2 to 2.9)"),
+    ],
+)
+def test_the_seeds_whose_law_became_worse_are_named_and_no_other(lqt, adapted, words):
+    costs = {"none": [9.0] * len(lqt), "lqt": lqt, "adapted": adapted}
+    improved = all(a <= b for a, b in zip(adapted, lqt, strict=True))
+    changes = {"seeds": len(lqt), "seed": 4, "costs": costs, "improved": improved}
+    text = closing_lines("kdv", summary(**changes), "")[-1]
+    assert (words in text and text.endswith(words)) or (improved and words in text)
 
 
 def test_several_publishers_of_a_topic_are_a_warning():

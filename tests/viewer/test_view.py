@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -55,8 +56,14 @@ def view() -> LoopView:
     return made
 
 
-def begin(shown: LoopView, policies, episode: int = 1, noise: tuple[float, ...] = ()) -> None:
-    rows = [(i, -1.0, 0.0, 0.0, *noise) for i in range(len(policies))]
+def begin(
+    shown: LoopView,
+    policies,
+    episode: int = 1,
+    noise: tuple[float, ...] = (),
+    fields: Sequence[float] = (),
+) -> None:
+    rows = [(field, -1.0, 0.0, 0.0, *noise) for field in fields or range(len(policies))]
     shown.model(frame(pack(MODEL)[None], 0, step=1), 0.0)
     shown.policy(frame(policies, episode, step=1), 0.0)
     shown.start(frame(rows, episode, step=1), 0.0)
@@ -92,7 +99,9 @@ def test_costs_are_told_apart_by_the_gains_that_caused_them(noise):
     shown = view()
     lqt = MODEL.policy
     adapted = lqt + 0.1
-    begin(shown, [np.zeros_like(lqt), lqt, adapted, adapted, adapted], noise=noise)
+    begin(
+        shown, [np.zeros_like(lqt), lqt, adapted, adapted, adapted], noise=noise, fields=[7.0] * 5
+    )
     costs = [(10.0, 100.0, -1), (5.0, 50.0, -1), (4.0, 40.0, -1), (2.0, 20.0, -1), (1e9, 1e10, 3)]
     shown.cost(frame(costs), 0.0)
     for environment, controller in enumerate(("none", "lqt", "adapted")):
@@ -112,6 +121,20 @@ def test_costs_are_told_apart_by_the_gains_that_caused_them(noise):
     assert numbers["gain_change"] == pytest.approx(0.1 * np.sqrt(lqt.size) / np.linalg.norm(lqt))
     shown.cost(frame([(9.0, 90.0, -2)] * 3, episode=2), 0.0)  # void: not a cost
     assert shown.numbers()["cost"] == 3.0
+
+
+def test_a_reduction_is_that_of_costs_on_the_same_fields():
+    shown, lqt = view(), MODEL.policy
+    adapted = lqt + 0.1
+    begin(shown, [lqt, adapted], fields=(7.0, 7.0))
+    shown.cost(frame([(5.0, 50.0, -1), (3.0, 30.0, -1)]), 0.0)
+    assert shown.numbers()["reduction"] == pytest.approx(40.0)
+    begin(shown, [adapted, adapted], episode=3, fields=(8.0, 9.0))
+    shown.cost(frame([(50.0, 500.0, -1), (50.0, 500.0, -1)], episode=3), 0.0)
+    assert shown.numbers()["reduction"] == pytest.approx(40.0)
+    begin(shown, [lqt, adapted], episode=4, fields=(8.0, 9.0))
+    shown.cost(frame([(50.0, 500.0, -1), (1.0, 10.0, -1)], episode=4), 0.0)
+    assert shown.numbers()["reduction"] == pytest.approx(40.0)
 
 
 def test_gains_without_their_model_are_never_taken_for_lqt():

@@ -112,8 +112,13 @@ export function curveChart(model) {
     return [bottom, top];
   }
 
-  function summary({ references: { lqt, adapted }, diverged }) {
+  function summary({ references: { lqt, adapted }, checked, diverged }) {
     const words = [];
+    if (adapted === undefined && checked.lqt !== undefined) {
+      const { none, lqt: first } = checked;
+      const without = none === undefined ? "" : `${text(none)} without control, `;
+      words.push(`check, on a field of its own: ${without}${text(first)} with ${model.controllers.lqt}`);
+    }
     if (adapted !== undefined && lqt) {
       const share = 100 * (1 - adapted / lqt);
       const side = share >= 0 ? "below" : "above";
@@ -130,7 +135,7 @@ export function curveChart(model) {
     let grown = 10; // in jumps, so that the curve stays where it is for a while
     while (grown < last) grown *= 2;
     const end = budget ? Math.max(budget, last) : grown;
-    const references = ["none", "lqt"].filter((name) => told.references[name] !== undefined);
+    const references = ["none", "lqt", "adapted"].filter((name) => told.references[name] !== undefined);
     const [bottom, top] = range(told, references.map((name) => told.references[name]));
     const log = bottom > 0 && top / bottom > 6;
     const room = 0.12 * (top - bottom) || 0.5 * Math.abs(top) || 1;
@@ -144,7 +149,8 @@ export function curveChart(model) {
     const flat = references.map((name) => {
       const cost = told.references[name];
       const outside = cost > span[1] ? ` ${text(cost)} ↑` : cost < span[0] ? ` ${text(cost)} ↓` : "";
-      return { label: `${controllers[name]}${outside}`, stroke: colour(name), dash: name === "none" ? DOTTED : DASHED, width: 1.5 };
+      const label = `${controllers[name]}, evaluated${outside}`;
+      return { label, stroke: colour(name), dash: name === "none" ? DOTTED : DASHED, width: 1.5 };
     });
     chart.show({
       data: [
@@ -160,7 +166,7 @@ export function curveChart(model) {
         { label: "low", ...hidden },
         ...seeds.map((_, i) => ({ ...hidden, label: `seed ${told.seeds[i]}`, stroke: colour("seed"), width: 1 })),
         ...flat,
-        { label: `${controllers.adapted} (band: ${told.band})`, stroke: colour("adapted"), width: 2, value },
+        { label: `while learning, on its own fields (band: ${told.band})`, stroke: colour("adapted"), width: 2, value },
       ],
       bands: [{ series: [1, 2], fill: colour("band") }],
       x: { label: axis, range: [0, end], whole: true },

@@ -147,7 +147,8 @@ function Figures({ status, curve }) {
   const { remaining, rounds, episodes } = status;
   const closing = references.adapted; // what the closing evaluation gave counts, once it is there
   const cost = closing ?? mean.at(-1) ?? null;
-  const share = references.lqt && cost !== null ? 100 * (1 - cost / references.lqt) : null;
+  // Only then are both costs on the same fields.
+  const share = references.lqt && closing !== undefined ? 100 * (1 - closing / references.lqt) : null;
   const side = share === null ? "" : share >= 0 ? " % below" : " % above";
   const count = paid[0] === paid[1] ? paid[1] : `${paid[0]} to ${paid[1]}`;
   const rows = [
@@ -199,7 +200,10 @@ function Seeds({ curve, controllers }) {
   const known = Object.entries(evaluations);
   if (!known.length) return null;
   const names = ["none", "lqt", "adapted"];
-  const below = ({ lqt, adapted }) => `${text(Number((100 * (1 - adapted / lqt)).toFixed(1)))} %`;
+  const below = ({ lqt, adapted }) => {
+    const share = 100 * (1 - adapted / lqt);
+    return `${Math.abs(share).toFixed(1)} % ${share >= 0 ? "below" : "above"}`;
+  };
   const rows = known.length > 1 ? [...known, ["mean", references]] : known;
   return html`
     <section id="seeds-panel" class="panel seeds" aria-labelledby="seeds-title">
@@ -209,7 +213,7 @@ function Seeds({ curve, controllers }) {
           <tr>
             <th>seed</th>
             ${names.map((name) => html`<th>${controllers[name]}</th>`)}
-            <th>below ${controllers.lqt}</th>
+            <th>against ${controllers.lqt}</th>
           </tr>
           ${rows.map(
             ([seed, costs]) => html`
