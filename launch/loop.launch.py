@@ -19,9 +19,11 @@ from launch.events.process import ProcessExited
 from launch_ros.actions import Node
 
 from loop_interfaces.isolation import NETWORK
-from loop_interfaces.parameters import flags
+from loop_interfaces.parameters import OF_THE_PLANT, flags
 from loop_interfaces.problem import find_problem, load_parameters, shipped_problems
-from pde_sim_node.equations import ALLOWED, allow
+from pde_sim_node.build import complete
+from pde_sim_node.equations import OWN_EQUATIONS
+from pde_sim_node.plants.loading import OWN_PLANTS
 from pdeloop.pairs import PAIRS, pair_cores, pair_nodes
 from pdeloop.supervisor import REFUSED
 
@@ -31,6 +33,7 @@ ARGUMENTS = {
     "namespace": ("", "namespace of all nodes; empty: none"),
     "pairs": ("1", PAIRS.description),
     "equation": ("", "the problem's PDE; own code (file.py:Class) has to be named here, too"),
+    "plant": ("", "a plant in its place; own code (file.py:Class) has to be named here, too"),
     **{spec.name: ("", f"{spec.description} [the problem's]") for spec in PLANT_FLAGS},
     "network": ("false", "true: let messages leave this machine; false: loopback only"),
     "log_level": ("info", "least severe messages that are shown"),
@@ -63,14 +66,20 @@ def pairs_of_nodes(context: LaunchContext) -> list[Any]:
     given = context.launch_configurations
     own = {spec.name: spec.parse(given[spec.name]) for spec in PLANT_FLAGS if given[spec.name]}
     actions: list[Any] = []
-    if given["equation"]:
-        own["equation"] = allow(given["equation"])
-        actions.append(SetEnvironmentVariable(ALLOWED, context.environment[ALLOWED]))
+    for kind in (OWN_EQUATIONS, OWN_PLANTS):
+        if given[kind.word]:
+            own[kind.word] = kind.allow(given[kind.word])
+            allowed = context.environment[kind.variable]
+            actions.append(SetEnvironmentVariable(kind.variable, allowed))
     if given["network"] == "true":
         actions.append(SetEnvironmentVariable(NETWORK, "1"))
     # Read here, too, so that what is wrong is said before a node starts; and because the nodes would
     # look for a relative file of an equation in their working directory.
-    own["equation"] = load_parameters(given["problem"], own)["equation"]
+    values = load_parameters(given["problem"], own)
+    own["equation"] = values["equation"]
+    if values["plant"]:  # what it says itself is to be known to the other nodes, too
+        _, values = complete(values)
+        own |= {name: values[name] for name in ("plant", *OF_THE_PLANT)}
     problem = find_problem(given["problem"]).resolve()
     return actions + [
         Node(

@@ -25,7 +25,8 @@ from launch_ros.actions import Node
 from loop_interfaces.parameters import flags
 from loop_interfaces.protocol import STOPPED
 from loop_interfaces.spec import ParameterError, assignment
-from pde_sim_node.equations import allow
+from pde_sim_node.equations import OWN_EQUATIONS
+from pde_sim_node.plants.loading import OWN_PLANTS
 from pdeloop.pairs import PAIR, PAIRS, Transport
 from pdeloop.supervisor import RECORDER_GRACE
 from pdeloop.training_run import begin, reopen, unused
@@ -110,7 +111,8 @@ def run_folder(given: dict[str, str]) -> Path:
     own |= dict(assignment(text) for text in filter(None, given["set"].split(",")))
     if given["model"]:
         own["model"] = str(Path(given["model"]).resolve())
-    equation = {"equation": allow(given["equation"])} if given["equation"] else {}
+    kinds = [kind for kind in (OWN_EQUATIONS, OWN_PLANTS) if given[kind.word]]
+    code = {kind.word: kind.allow(given[kind.word]) for kind in kinds}
     if given["resume"]:
         if own or given["out"]:
             names = ", ".join([*own, *["out"] * bool(given["out"])])
@@ -120,7 +122,7 @@ def run_folder(given: dict[str, str]) -> Path:
         reopen(Path(given["resume"]))
         return Path(given["resume"]).resolve()
     out = Path(given["out"]) if given["out"] else None
-    return begin(given["problem"], {**own, **equation}, out)[0].resolve()
+    return begin(given["problem"], {**own, **code}, out)[0].resolve()
 
 
 def end_with_tuner(event: ProcessExited, context: LaunchContext) -> list[Any]:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,6 +33,11 @@ class Axis:
         i L / (n - 1), or the points are centres of cells, at (i + 1/2) L / n.
     unit : str
         Of the length.
+
+    Raises
+    ------
+    ValueError
+        The length is not positive, or there are no points.
     """
 
     name: str
@@ -83,6 +89,11 @@ class Grid:
     numbers : int
         Size of a plain vector.
 
+    Raises
+    ------
+    ValueError
+        There are neither axes nor numbers, or both, or no components.
+
     Examples
     --------
     >>> Grid((Axis("y", 1.0, 21, periodic=False), Axis("x", 2.0, 41, periodic=False)), ("u", "v")).size
@@ -106,7 +117,21 @@ class Grid:
 
     @classmethod
     def vector(cls, numbers: int, name: str = "z", unit: str = "") -> Grid:
-        """Of a state that is no field."""
+        """Of a state that is no field.
+
+        Parameters
+        ----------
+        numbers
+            How many it has.
+        name
+            Of all of them, as figures show it.
+        unit
+            Of their values.
+
+        Returns
+        -------
+        Grid
+        """
         return cls((), (name,), unit, numbers)
 
     @classmethod
@@ -119,13 +144,79 @@ class Grid:
         periodic: bool = True,
         walls: bool = True,
     ) -> Grid:
-        """Of fields on [0, length], of `size` points each."""
+        """Of fields on [0, length].
+
+        Parameters
+        ----------
+        length
+            L, in m.
+        size
+            Points of each field.
+        components
+            Names of the fields.
+        periodic, walls
+            As of `Axis`.
+
+        Returns
+        -------
+        Grid
+        """
         return cls((Axis("x", length, size, periodic, walls),), tuple(components))
+
+    @property
+    def text(self) -> str:
+        """As a parameter has it; see `parse`."""
+        axes = [[a.name, a.length, a.size, a.periodic, a.walls, a.unit] for a in self.axes]
+        return json.dumps([axes, list(self.components), self.unit, self.numbers])
+
+    @classmethod
+    def parse(cls, text: str) -> Grid:
+        """The grid of a parameter.
+
+        Parameters
+        ----------
+        text
+            As of `text`.
+
+        Returns
+        -------
+        Grid
+
+        Raises
+        ------
+        ValueError
+            The text is no grid's.
+
+        Examples
+        --------
+        >>> Grid.parse(Grid.vector(3).text) == Grid.vector(3)
+        True
+        """
+        try:
+            axes, components, unit, numbers = json.loads(text)
+            return cls(
+                tuple(
+                    Axis(str(name), float(length), int(size), bool(periodic), bool(walls), str(own))
+                    for name, length, size, periodic, walls, own in axes
+                ),
+                tuple(map(str, components)),
+                str(unit),
+                int(numbers),
+            )
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{text[:200]!a} is no grid: {error}") from error
 
     @property
     def shape(self) -> tuple[int, ...]:
         """Points along each axis, of one component; (n,) of a plain vector."""
         return tuple(axis.size for axis in self.axes) or (self.numbers,)
+
+    @property
+    def line(self) -> Axis:
+        """What a curve of a component is drawn over: its one axis, or the number of a number."""
+        if len(self.axes) == 1:
+            return self.axes[0]
+        return Axis("number", float(self.points), self.points, unit="")
 
     @property
     def points(self) -> int:
@@ -148,11 +239,32 @@ class Grid:
         return len(self.axes) == 1 and self.axes[0].periodic
 
     def fields(self, states: Array) -> Array:
-        """States (..., size) as their components on the grid, (..., components, *shape); a view."""
+        """States as their components on the grid.
+
+        Parameters
+        ----------
+        states : (..., size)
+            Any number of states.
+
+        Returns
+        -------
+        (..., components, *shape)
+            The same numbers.
+        """
         return states.reshape(*states.shape[:-1], len(self.components), *self.shape)
 
     def part(self, component: int) -> slice:
-        """Where the numbers of a component are in a state."""
+        """Where the numbers of a component are in a state.
+
+        Parameters
+        ----------
+        component
+            Its index.
+
+        Returns
+        -------
+        slice
+        """
         return slice(component * self.points, (component + 1) * self.points)
 
     def equally_spaced(self, count: int) -> NDArray[np.int64]:
@@ -160,6 +272,15 @@ class Grid:
 
         Along an axis of n points c of them are at int((j + 1/2) n / c). On several axes the counts
         have `count` as their product and give distances that are as equal as can be.
+
+        Parameters
+        ----------
+        count
+            How many points.
+
+        Returns
+        -------
+        (count,) int64
 
         Raises
         ------

@@ -92,11 +92,18 @@ PROBLEM = _section(
         "PDE of the plant: a shipped or installed name; or code that the user has to allow, "
         "'package.module:Class' or 'path/to/file.py:Class'"
     ),
+    Spec("plant", "").means(
+        "plant of a user's own in place of an equation: an installed name; or code that the user has "
+        "to allow, 'path/to/file.py:Name' or 'package.module:Name', a class or function that makes it"
+    ),
+    Spec("grid", "", nodes="PTV").means(
+        "axes and components of the state, as JSON, which the plant says; empty: one periodic axis"
+    ),
     Spec("length", 1.0, positive=True, unit="m", nodes="PTV").means(
         "length L of the periodic domain"
     ),
-    Spec("n_z", 128, 8, 65536, multiple_of=2).means(
-        "size of the state: the grid points, times the components of the equation"
+    Spec("n_z", 128, 1, 2**20).means(
+        "size of the state: the grid points, times the components; of an equation even, 8 or more"
     ),
     Spec("n_a", 6, 1, 1024, nodes="PCT").means("actuators, the size of the action"),
     Spec("actuator_width", 0.15, positive=True, maximum=1).means(
@@ -141,7 +148,14 @@ PROBLEM = _section(
     ),
     *INSTRUMENTS,
 )
-"""What a problem's YAML file may set, besides `physical.*` (the equation's own parameters)."""
+"""What a problem's YAML file may set, besides `physical.*` (those of the equation or plant itself)."""
+POINTS = Spec("n_z", 128, 8, 65536, multiple_of=2)
+"""The size of the state of an equation."""
+OF_THE_PLANT = (
+    *("grid", "length", "n_z", "n_a", "sample_time", "horizon"),
+    *("state_weight", "action_weight", "divergence_bound", "reduced_order"),
+)
+"""What a plant of a user's own says itself where a problem does not."""
 
 PLANT = _section(
     "P",
@@ -211,7 +225,7 @@ TUNER = _section(
     ),
     Spec("out", "").means("folder of the results and the checkpoint; empty: keep nothing"),
     Spec("resume", False).means("continue the run whose checkpoint is in 'out'"),
-    Spec("plant", 0, 0, 2**53 - 1).means(
+    Spec("plant_fingerprint", 0, 0, 2**53 - 1).means(
         "fingerprint of the plant that is to be trained; 0: the first one that answers"
     ),
     Spec("max_batch", 1024, 1, 65536, live=True).means("environments of one episode at the most"),
@@ -259,7 +273,15 @@ def with_budget(values: Mapping[str, Any]) -> dict[str, Any]:
 def as_recorded(values: Mapping[str, Any]) -> dict[str, Any]:
     """Parameters of a run or a bag: one that knows no identification had the only one there was."""
     old = "dmdc_rank" in values and "identification" not in values
-    return {**values, **({"identification": "dmdc"} if old else {})}
+    return with_names({**values, **({"identification": "dmdc"} if old else {})})
+
+
+def with_names(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters by their present names: a number as `plant` was the fingerprint once."""
+    plant = values.get("plant", "")
+    if isinstance(plant, str):
+        return dict(values)
+    return {**values, "plant": "", "plant_fingerprint": plant}
 
 
 def recorded_values(values: Mapping[str, Any]) -> dict[str, Any]:

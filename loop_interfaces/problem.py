@@ -2,11 +2,12 @@
 """Where the problems are, and a problem's resolved parameters. No ROS import."""
 
 import math
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from loop_interfaces.parameters import table, with_budget
+from loop_interfaces.parameters import OF_THE_PLANT, POINTS, table, with_budget, with_names
 from loop_interfaces.spec import (
     OPTIMIZER_SETTINGS,
     ParameterError,
@@ -59,32 +60,69 @@ def load_parameters(
     """The checked parameters of all nodes: a problem's file, then `options`, then the defaults.
 
     preferred: adds defaults that depend on what is given. `physical.*` and `optimizer_settings.*` are
-    included as given; a relative file of an equation ('file.py:Class') is taken
-    relative to the YAML file.
+    included as given; a relative file of own code ('file.py:Class') is taken relative to the YAML file.
+    name: empty where the options name a plant, which needs no file. What a plant of a user's own says
+    itself (OF_THE_PLANT) is left out where nothing else is given.
     """
-    path = find_problem(name)
-    given = dict(preferred({**read_yaml(path), **options}))
+    path = find_problem(name) if name or not options.get("plant") else None
+    given = dict(preferred({**(read_yaml(path) if path else {}), **options}))
+    given = with_names(given)
     check_names(given, [spec.name for spec in table()])
-    given["equation"] = _equation_path(str(given.get("equation", "")), path)
+    folder = path.resolve().parent if path else Path.cwd()
+    for code in ("equation", "plant"):
+        given[code] = _from(folder, str(given.get(code, "")))
+    if given["plant"]:
+        given.setdefault("problem", _words(given["plant"]))
+        values = own_values(given, check(table(), given))
+    else:
+        given["equation"] = given["equation"] or "burgers"
+        POINTS.check(given.get("n_z", POINTS.default))
+        values = check(table(), given)
     settings = {k: value for k, value in given.items() if k.startswith(OPTIMIZER_SETTINGS)}
-    return {**with_budget(check(table(), given)), **_physical(given), **settings}
+    return with_budget(values) | _physical(given) | settings
 
 
-def _physical(given: Mapping[str, Any]) -> dict[str, float]:
-    physical: dict[str, float] = {}
+def own_values(given: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters of a plant of a user's own, without what it says itself and nobody else gives."""
+    if given.get("equation"):
+        raise ParameterError(
+            f"parameters 'equation' and 'plant' are both given ({given['equation']}, "
+            f"{given['plant']}); give one of them"
+        )
+    return {
+        **{k: v for k, v in values.items() if k in given or k not in OF_THE_PLANT},
+        "equation": "",
+    }
+
+
+def _physical(given: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters of the equation, which are numbers, or of the plant."""
+    physical: dict[str, Any] = {}
     for name, value in given.items():
         if name.startswith("physical."):
             value = value.tolist() if hasattr(value, "tolist") else value  # NumPy's
-            if isinstance(value, bool) or not isinstance(value, (int, float)):
+            number = isinstance(value, (int, float)) and not isinstance(value, bool)
+            if given["plant"] and isinstance(value, (bool, int, float, str, list)):
+                physical[name] = value
+            elif number:
+                physical[name] = math.inf if abs(value) >= 2**1000 else float(value)
+            else:
                 raise ParameterError(
                     f"parameter '{name}' is {shown(value)}; expected a number{exponent_hint(value)}"
                 )
-            physical[name] = math.inf if abs(value) >= 2**1000 else float(value)
     return physical
 
 
-def _equation_path(equation: str, yaml_file: Path) -> str:
-    file, colon, name = equation.rpartition(":")
+def _from(folder: Path, code: str) -> str:
+    """The name of code, with a relative file taken from there."""
+    file, colon, name = code.rpartition(":")
     if colon and file.endswith(".py") and not Path(file).is_absolute():
-        return f"{(yaml_file.resolve().parent / file)}:{name}"
-    return equation or "burgers"
+        return f"{folder / file}:{name}"
+    return code
+
+
+def _words(plant: str) -> str:
+    """The name of a problem that has no file: path/to/rod.py:HeatedRod is heated-rod."""
+    name = plant.rpartition(":")[2].rpartition(".")[2]
+    words = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|[^A-Za-z0-9]+", "-", name)
+    return words.strip("-").lower() or "plant"

@@ -2,50 +2,17 @@
 """A plant from a problem's resolved parameters."""
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import asdict, fields
 from typing import Any
 
 from loop_interfaces.parameters import INSTRUMENTS
+from loop_interfaces.spec import ParameterError
 from pde_sim_node.equations import Equation, configured_equation
 from pde_sim_node.instruments import InstrumentedPlant
 from pde_sim_node.plant import Instruments, Plant
-from pde_sim_node.plants import SpectralPlant
-
-
-def build_equation(values: Mapping[str, Any]) -> Equation:
-    """The equation named by `equation`, with `length` and `physical.*`. ValueError if none fits."""
-    kind = configured_equation(str(values["equation"]))
-    known = [item.name for item in fields(kind) if item.name != "length"]
-    physical = {
-        name.removeprefix("physical."): value
-        for name, value in values.items()
-        if name.startswith("physical.")
-    }
-    for name in physical:
-        if name not in known:
-            raise ValueError(
-                f"unknown parameter 'physical.{name}' of {kind.name}; known: {', '.join(known)}"
-            )
-    return kind(length=values["length"], **physical)
-
-
-def build_plant(values: Mapping[str, Any], *, compiled: bool = True) -> Plant:
-    """The plant of a problem. ValueError, one sentence, if the parameters do not fit together.
-
-    compiled: its step is compiled now, which can take long; otherwise with the first step.
-    """
-    equation = build_equation(values)
-    grid = {name: values[name] for name in _GRID}
-    grid |= {name: values[f"actuator_{name}"] for name in ("width", "shape", "positions")}
-    plant = SpectralPlant(equation, **grid, compiled=compiled)
-    instruments = Instruments(**{spec.name: values[spec.name] for spec in INSTRUMENTS})
-    return plant if instruments.ideal else InstrumentedPlant(plant, instruments)
-
-
-def fingerprint(values: Mapping[str, Any]) -> int:
-    """The fingerprint of a problem's plant; see `definition.Definition`."""
-    return build_plant(values, compiled=False).definition.fingerprint
-
+from pde_sim_node.plants import DynamicsPlant, SpectralPlant
+from pde_sim_node.plants.dynamics_plant import SETTABLE
+from pde_sim_node.plants.loading import PHYSICAL, Made, make, physical_of
 
 _GRID = (
     "n_z",
@@ -57,3 +24,71 @@ _GRID = (
     "action_weight",
     "divergence_bound",
 )
+_FIXED = ("n_z", "n_a", "sample_time")
+"""What a plant of a user's own says, and a problem cannot change."""
+
+
+def build_equation(values: Mapping[str, Any]) -> Equation:
+    """The equation named by `equation`, with `length` and `physical.*`. ValueError if none fits."""
+    kind = configured_equation(str(values["equation"]))
+    known = [item.name for item in fields(kind) if item.name != "length"]
+    physical = physical_of(values)
+    for name in physical:
+        if name not in known:
+            raise ParameterError(
+                f"unknown parameter 'physical.{name}' of {kind.name}; known: {', '.join(known)}"
+            )
+    return kind(length=values["length"], **physical)
+
+
+def build_plant(values: Mapping[str, Any], *, compiled: bool = True) -> Plant:
+    """The plant of a problem. ValueError, one sentence, if the parameters do not fit together.
+
+    compiled: its step is compiled now, which can take long; otherwise with the first step.
+    """
+    return _build(values, compiled)[0]
+
+
+def fingerprint(values: Mapping[str, Any]) -> int:
+    """The fingerprint of a problem's plant; see `definition.Definition`."""
+    return build_plant(values, compiled=False).definition.fingerprint
+
+
+def complete(values: Mapping[str, Any], *, compiled: bool = True) -> tuple[Plant, dict[str, Any]]:
+    """The plant of a problem, as of `build_plant`, and the parameters with all that it says itself."""
+    plant, physical = _build(values, compiled)
+    own = {name: getattr(plant, name) for name in (*_FIXED, *SETTABLE)}
+    axes = plant.grid.axes
+    own |= {"grid": plant.grid.text, "length": axes[-1].length if axes else 1.0, "reduced_order": 0}
+    given = {**values, **{f"{PHYSICAL}{name}": value for name, value in physical.items()}}
+    return plant, {**own, **given} if values["plant"] else {**given, "grid": own["grid"]}
+
+
+def _build(values: Mapping[str, Any], compiled: bool) -> tuple[Plant, Mapping[str, Any]]:
+    """A plant, and the parameters of the equation or plant itself, the defaults among them."""
+    plant, physical = _own_plant(values) if values["plant"] else _spectral_plant(values, compiled)
+    instruments = Instruments(**{spec.name: values[spec.name] for spec in INSTRUMENTS})
+    return plant if instruments.ideal else InstrumentedPlant(plant, instruments), physical
+
+
+def _spectral_plant(values: Mapping[str, Any], compiled: bool) -> tuple[Plant, Mapping[str, Any]]:
+    equation = build_equation(values)
+    grid = {name: values[name] for name in _GRID}
+    grid |= {name: values[f"actuator_{name}"] for name in ("width", "shape", "positions")}
+    physical = asdict(equation)
+    del physical["length"]
+    return SpectralPlant(equation, **grid, compiled=compiled), physical
+
+
+def _own_plant(values: Mapping[str, Any]) -> tuple[Plant, Mapping[str, Any]]:
+    made: Made = make(values)
+    plant, given = made.plant, {name: values[name] for name in SETTABLE if name in values}
+    if not isinstance(plant, Plant):
+        plant = DynamicsPlant(plant, **given)
+    for name in (*_FIXED, *SETTABLE):
+        if name in values and values[name] != getattr(plant, name):
+            raise ParameterError(
+                f"parameter '{name}' is {values[name]!r}, and that of {values['plant']} is "
+                f"{getattr(plant, name)!r}; leave it out"
+            )
+    return plant, made.parameters

@@ -10,8 +10,9 @@ import numpy as np
 from numba import types
 from numba.core.errors import NumbaError
 
+from loop_interfaces.own_code import in_one_line, located
 from pde_sim_node.equations import Equation, Field, LinearEquation, Spectrum
-from pde_sim_node.equations.base import in_one_line, located, result_of
+from pde_sim_node.equations.base import result_of
 from spectral_solver.exact import exact_step
 from spectral_solver.kernel import etdrk4_step
 from spectral_solver.memory import StepSettings

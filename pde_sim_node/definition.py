@@ -6,9 +6,13 @@ from __future__ import annotations
 import hashlib
 import inspect
 import json
+import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import CodeType
 from typing import Any
+
+import numpy as np
 
 from loop_interfaces.frames import MAX_ID
 
@@ -40,10 +44,54 @@ class Definition:
         return 1 + int.from_bytes(digest[:8], "big") % (MAX_ID - 1)
 
 
-def module_sources(kind: type, root: type) -> list[str]:
+def sources_of(kind: type, root: type) -> list[str]:
     """The source of a class and of the classes it is derived from, as far as they derive from `root`.
 
     Each with its whole module: constants and functions beside the class are part of it.
     """
-    kinds = [base for base in kind.__mro__ if issubclass(base, root)]
-    return [inspect.getsource(inspect.getmodule(base) or base) for base in kinds]
+    return [source_of(base) for base in kind.__mro__ if issubclass(base, root)]
+
+
+def source_of(kind: type) -> str:
+    """The source of a class' module; of one that was typed into an interpreter, its own or its code."""
+    for source in (inspect.getmodule(kind), kind):
+        try:
+            return inspect.getsource(source or kind)
+        except (OSError, TypeError):
+            continue
+    functions = sorted(vars(kind).items())
+    return repr([(n, code_of(own.__code__)) for n, own in functions if inspect.isfunction(own)])
+
+
+def code_of(code: CodeType) -> Any:
+    """What a function does, the same in each process."""
+    constants = [code_of(c) if isinstance(c, CodeType) else repr(c) for c in code.co_consts]
+    return code.co_code.hex(), code.co_names, constants
+
+
+def described(name: str, value: Any) -> Any:
+    """A parameter as JSON can hold it.
+
+    Raises
+    ------
+    ValueError
+        It is an object that cannot be told from another one.
+    """
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, list | tuple):
+        return [described(name, item) for item in value]
+    if isinstance(value, Mapping):
+        return {str(key): described(name, item) for key, item in value.items()}
+    if isinstance(value, np.ndarray) and value.dtype != object:
+        raw = np.ascontiguousarray(value).tobytes()
+        return [str(value.dtype), list(value.shape), hashlib.sha256(raw).hexdigest()]
+    try:
+        return hashlib.sha256(pickle.dumps(value)).hexdigest()
+    except Exception as error:
+        raise ValueError(
+            f"the parameter {name} is a {type(value).__name__}, which has no fingerprint; give "
+            f"numbers, texts or arrays ({error})"
+        ) from error

@@ -13,6 +13,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 
@@ -22,29 +23,49 @@ from loop_interfaces.files import FileError
 from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.parameters import PLANT, taken_by
+from loop_interfaces.problem import own_values
 from loop_interfaces.protocol import Publication
 from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.node_main import node_main
 from loop_interfaces.ros.parameters import declare, given_parameters, on_change
 from loop_interfaces.samples import ACTION_KIND, clock_message
-from loop_interfaces.spec import Spec
+from loop_interfaces.spec import Spec, check
 from loop_interfaces.topics import ACTION, COST, PAUSED, START, STATE, TARGET
-from pde_sim_node.build import build_plant
+from pde_sim_node.build import complete
 from pde_sim_node.diagnostics import PlantDiagnostics
 from pde_sim_node.equations import configured_equation
 from pde_sim_node.lockstep import Lockstep, Timing
+from pde_sim_node.plant import Plant
+from pde_sim_node.plants.loading import PHYSICAL, physical_of
 from pde_sim_node.run_record import RunRecord
 
 FAST_PATH = import_module("pde_sim_node.fast_path") if find_spec("fast_path") else None
 """Answers actions in compiled code, where that can be had; without it the lock-step answers all."""
 
 
-def declare_parameters(node: Node) -> dict[str, Any]:
-    """The plant's parameters, with the chosen equation's own under `physical.`."""
+def declare_parameters(node: Node) -> tuple[Plant, dict[str, Any]]:
+    """The plant, and its parameters, with those of the equation or plant itself under `physical.`."""
     given = given_parameters(node)
     physical = {name: value for name, value in given.items() if name.startswith("physical.")}
-    values = declare(node, taken_by("pde_sim_node"), given)
-    specs = [
+    said = [spec for spec in taken_by("pde_sim_node") if spec.name == "grid"]  # by the plant
+    specs = [spec for spec in taken_by("pde_sim_node") if spec not in said]
+    if given.get("plant"):
+        plant, values = complete(own_values(given, check(specs, given)) | physical)
+        declare(node, specs, values)
+        for name in physical_of(values):
+            of_it = ParameterDescriptor(description="a parameter of the plant", read_only=True)
+            node.declare_parameter(PHYSICAL + name, values[PHYSICAL + name], of_it, True)
+    else:
+        values = declare(node, specs, given)
+        values |= physical | declare(node, physical_specs(str(values["equation"])), given)
+        plant, values = complete(values)
+    declare(node, said, values)
+    return plant, values
+
+
+def physical_specs(equation: str) -> list[Spec]:
+    """The parameters of an equation, under `physical.`."""
+    return [
         Spec(
             f"physical.{item.name}",
             float(item.default),  # type: ignore[arg-type]
@@ -52,19 +73,17 @@ def declare_parameters(node: Node) -> dict[str, Any]:
             item.metadata["maximum"],
             unit=item.metadata.get("unit", ""),
         ).means(item.metadata["description"])
-        for item in fields(configured_equation(str(values["equation"])))
+        for item in fields(configured_equation(equation))
         if item.name != "length"
     ]
-    return {**physical, **values, **declare(node, specs, given)}
 
 
 class PlantNode:
     """Moves messages between the topics and the lock-step protocol."""
 
     def __init__(self, node: Node, loop: NodeLoop) -> None:
-        values = declare_parameters(node)
+        plant, values = declare_parameters(node)
         pin_process(values["pin"])
-        plant = build_plant(values)
         if FAST_PATH and plant.parallel is not None:
             # Before there is a publisher: a peer that discovers one expects answers.
             FAST_PATH.load_compiled()

@@ -278,7 +278,23 @@ class Plant(Protocol):
         """
 
     def adjoint(self) -> Adjoint:
-        """The transposed derivative of its step; ValueError, one sentence, where there is none."""
+        """The transposed derivative of its step.
+
+        Returns
+        -------
+        Adjoint
+
+        Raises
+        ------
+        ValueError
+            There is none; one sentence says why.
+        """
 
     def refined(self) -> "Plant | None":
-        """The same plant with half the internal time step; None where there is none to halve."""
+        """The same plant with half the internal time step.
+
+        Returns
+        -------
+        Plant or None
+            None where there is no step to halve.
+        """

@@ -19,11 +19,14 @@ import importlib
 # Not from `typing`: `python -m pdeloop` is here before its working directory is off the module path.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from loop_interfaces.grid import Axis as Axis
+    from loop_interfaces.grid import Grid as Grid
     from loop_method.design.lqt import track as track
     from loop_method.reduce.identifiability import IdentifiabilityWarning as IdentifiabilityWarning
     from loop_method.reduce.identifiability import NotIdentifiableError as NotIdentifiableError
     from loop_method.reduce.order import study_orders as study_orders
     from loop_method.reduce.reduced_model import ReducedModel as ReducedModel
+    from pde_sim_node.dynamics import Dynamics as Dynamics
     from pde_sim_node.plant import Plant as Plant
     from pdeloop.api import Problem as Problem
     from pdeloop.api import identify as identify
@@ -47,6 +50,8 @@ _NAMES = {
     "loop_method.design.lqt": ("track",),
     "loop_method.reduce.order": ("study_orders",),
     "loop_method.reduce.reduced_model": ("ReducedModel",),
+    "loop_interfaces.grid": ("Axis", "Grid"),
+    "pde_sim_node.dynamics": ("Dynamics",),
     "pde_sim_node.plant": ("Plant",),
     "pdeloop.api": ("Problem", "identify", "problem", "train"),
     "pdeloop.data_file": ("read_measurements",),

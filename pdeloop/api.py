@@ -18,14 +18,17 @@ from numpy.typing import ArrayLike
 
 from controller_node import identification
 from loop_interfaces.arrays import Array
+from loop_interfaces.own_code import refuse_while_executed
 from loop_interfaces.parameters import table
 from loop_interfaces.problem import load_parameters
 from loop_interfaces.spec import FREE, flatten
 from loop_method.reduce.identifiability import IdentifiabilityWarning
 from loop_method.reduce.reduced_model import ReducedModel
-from pde_sim_node.build import build_equation, build_plant
-from pde_sim_node.equations import allow, configured_equation
+from pde_sim_node.build import build_plant, complete
+from pde_sim_node.dynamics import Dynamics
+from pde_sim_node.equations import OWN_EQUATIONS, configured_equation
 from pde_sim_node.plant import Plant
+from pde_sim_node.plants.loading import OWN_PLANTS, hand_over
 from pdeloop.display import Display
 from pdeloop.finished_run import FinishedRun, load_run
 from pdeloop.in_process import LocalPair
@@ -46,7 +49,7 @@ class Problem:
     Attributes
     ----------
     source : str
-        Name or YAML file that it was made from.
+        Name or YAML file that it was made from; empty for a plant alone.
     given : dict
         The parameters that replace those of the file.
     values : dict
@@ -108,7 +111,8 @@ class Problem:
             The plant diverged, or the seed is out of range.
         """
         own = {"seed": seed, "seeds": 1, "model": ""}
-        training = build_training(training_parameters(self.source, {**self.given, **own}))
+        values = training_parameters(self.source, {**self.given, **own})
+        training = build_training({**self.values, **values})
         batch = training.next_batch()
         assert batch is not None
         episode = LocalPair(self.values).roll_out(batch)
@@ -116,9 +120,10 @@ class Problem:
 
 
 def problem(
-    source: str | Path = "burgers",
+    source: str | Path | None = None,
     *,
-    physical: Mapping[str, float] | None = None,
+    plant: Dynamics | Plant | str | None = None,
+    physical: Mapping[str, Any] | None = None,
     **parameters: Any,
 ) -> Problem:
     """A shipped problem or one from a YAML file, with other parameters where they are given.
@@ -126,9 +131,13 @@ def problem(
     Parameters
     ----------
     source
-        A name that `pdeloop problems` lists, or the path of a YAML file.
+        A name that `pdeloop problems` lists, or the path of a YAML file; burgers if neither it nor a
+        plant is given.
+    plant
+        A plant of one's own: an object of a class derived from `Dynamics`, or a name
+        ('file.py:Class'), whose code is then run. Without a `source` the rest is as the class has it.
     physical
-        The equation's own parameters, like {"viscosity": 1e-3}.
+        The parameters of the equation itself, like {"viscosity": 1e-3}, or of a plant that is named.
     parameters
         Any parameter of docs/interfaces.md by name: n_z, n_a, horizon, measurement_noise, ... Code of
         an own equation ('file.py:Class') is run if it is named here as `equation`.
@@ -154,14 +163,28 @@ def problem(
     >>> states.shape, actions.shape
     ((101, 64), (100, 6))
     """
-    given = named(str(source), {**parameters, "physical": physical})
-    values = training_parameters(str(source), given)
-    build_equation(values)  # refuses physical parameters that it does not have
-    return Problem(str(source), given, values)
+    name = "burgers" if source is None and plant is None else str(source or "")
+    given = named(name, {**parameters, "physical": physical, "plant": plant})
+    _, values = complete(training_parameters(name, given), compiled=False)
+    return Problem(name, given, values)
+
+
+def _plant_named(plant: Dynamics | Plant | str) -> dict[str, Any]:
+    """The parameters of a plant that is given; ValueError for what is none."""
+    if isinstance(plant, str):
+        return {"plant": OWN_PLANTS.allow(plant)}
+    if not isinstance(plant, Dynamics | Plant):
+        raise ValueError(
+            f"plant is {plant!r}; expected an object of a class derived from Dynamics, or a name "
+            "like 'file.py:Class'"
+        )
+    return hand_over(plant)
 
 
 def named(source: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
     """The parameters by their names, those of `physical` among them; code that is named is allowed.
+
+    A plant may be an object, for whose name and parameters it then stands.
 
     ValueError, with what was meant, where a parameter of the equation is given as one of the problem.
     """
@@ -170,10 +193,12 @@ def named(source: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(physical, Mapping):
         raise ValueError(f"physical is {physical!r}; expected a dict of names and numbers")
     if "equation" in given:
-        given["equation"] = allow(given["equation"])
+        given["equation"] = OWN_EQUATIONS.allow(given["equation"])
+    if (plant := given.pop("plant", None)) is not None:
+        given |= _plant_named(plant)
     given = flatten(given)
     known = [spec.name for spec in table()]
-    for name, value in given.items():
+    for name, value in given.items() if plant is None else ():
         if name in known or name.startswith(FREE):
             continue
         equation = {"equation": given["equation"]} if "equation" in given else {}
@@ -240,8 +265,9 @@ def identify(
 
 
 def train(
-    problem: Problem | str,
+    problem: Problem | str | None = None,
     *,
+    plant: Dynamics | Plant | str | None = None,
     out: str | Path | None = None,
     over_topics: bool = False,
     progress: TextIO | None = None,
@@ -252,7 +278,9 @@ def train(
     Parameters
     ----------
     problem
-        A problem, or its name.
+        A problem, or its name; not needed with a plant.
+    plant
+        A plant of one's own, as of `problem`.
     out
         Folder of the results, as the command line keeps them; none is kept if not given.
     over_topics
@@ -285,7 +313,8 @@ def train(
     >>> run.policies.shape, run.costs["adapted"].shape
     ((1, 6, 8), (1, 2))
     """
-    if not isinstance(problem, Problem | str):
+    refuse_while_executed("trains")
+    if not isinstance(problem, Problem | str) and (problem is not None or plant is None):
         raise ValueError(f"problem is {problem!r}; expected a Problem or its name")
     if over_topics and out is None:
         raise ValueError("a training over topics needs a folder for its results and logs: give out")
@@ -293,8 +322,9 @@ def train(
     transport.require()
     with TemporaryDirectory() as temporary:
         source, given = (
-            (problem.source, problem.given) if isinstance(problem, Problem) else (problem, {})
+            (problem.source, problem.given) if isinstance(problem, Problem) else (problem or "", {})
         )
+        parameters |= {} if plant is None else {"plant": plant}
         where = Path(temporary) / "run" if out is None else Path(out)
         folder, values = begin(source, {**given, **named(source, parameters)}, where)
         display = Display(values["seed"], values["seeds"], progress or StringIO())

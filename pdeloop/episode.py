@@ -12,7 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from controller_node.policy import ProjectedLaw
 from loop_interfaces.arrays import Array, float_array
+from pde_sim_node.dynamics import Dynamics
 from pde_sim_node.plant import MEAN_FIELD, EpisodeCosts, Plant
+from pde_sim_node.plants.loading import as_plant
 
 __all__ = ["EpisodeRecord", "Law", "finite_array", "mean_field_cost", "projected_law", "rollout"]
 
@@ -55,7 +57,7 @@ class EpisodeRecord:
 
 
 def rollout(
-    plant: Plant,
+    plant: Plant | Dynamics,
     law: Law,
     seeds: ArrayLike,
     noise: NDArray[np.int64] | None = None,
@@ -67,7 +69,7 @@ def rollout(
     Parameters
     ----------
     plant
-        Whose episode it is; one that is under way there ends.
+        Whose episode it is; one that is under way there ends. Or the `Dynamics` to make one of.
     law
         Is called once a step, in order, with the plant's own array, which it must not change.
     seeds : (M,) int, or (M, n_z)
@@ -98,8 +100,7 @@ def rollout(
     >>> (episode.costs.diverged_step < 0).all()
     np.True_
     """
-    if not isinstance(plant, Plant):
-        raise ValueError(f"plant is {plant!r}; expected a Plant")
+    plant = as_plant(plant)
     if not callable(law):
         raise ValueError(f"law is {law!r}; expected a function of k and the states")
     z = plant.reset(seeds, noise)

@@ -16,7 +16,7 @@ from loop_interfaces.parameters import PROBLEM, noisy
 from loop_interfaces.spec import ParameterError
 from loop_interfaces.topics import CostColumn
 from loop_method.seeds import Purpose, derive, evaluation_noise
-from pde_sim_node.build import build_equation, build_plant
+from pde_sim_node.build import build_plant
 from pde_sim_node.plant import DIVERGED_COST
 from pdeloop.finished_run import FinishedRun
 from pdeloop.in_process import LocalPair
@@ -50,7 +50,7 @@ def evaluate(
     another plant or law, its equation is code that is not allowed, or its policies do not fit the
     changed plant.
     """
-    build_equation(run.values)  # refuses code that the user has not named
+    build_plant(run.values)  # refuses code that the user has not named
     if reason := another_loop(run):
         raise RunFolderError(f"{reason}; its policies cannot be evaluated here")
     seeds = len(run.policies)

@@ -19,7 +19,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loop_interfaces.arrays import Array
+from pde_sim_node.dynamics import Dynamics
 from pde_sim_node.plant import EpisodeCosts, Plant
+from pde_sim_node.plants.loading import as_plant
 from pdeloop.episode import EpisodeRecord, Law, finite_array, finite_basis, rollout
 
 __all__ = ["CostGradient", "Gradients", "features"]
@@ -62,7 +64,7 @@ class Gradients:
     Parameters
     ----------
     plant
-        Used for the rollouts, which end its episode.
+        Used for the rollouts, which end its episode; or a `Dynamics` with a method `pull_back`.
 
     Raises
     ------
@@ -79,9 +81,9 @@ class Gradients:
     ((20, 1, 6), (1, 128))
     """
 
-    def __init__(self, plant: Plant) -> None:
-        self.plant = plant
-        self._adjoint = plant.adjoint()
+    def __init__(self, plant: Plant | Dynamics) -> None:
+        self.plant = as_plant(plant)
+        self._adjoint = self.plant.adjoint()
 
     def of_actions(self, actions: ArrayLike, fields: ArrayLike) -> CostGradient:
         """J and dJ/da of given actions.

@@ -165,7 +165,7 @@ class Transport:
             "out": str(folder.resolve()),
             "resume": True,  # so that one that is started again goes on where it was
             "recorder": self.recorder,
-            "plant": fingerprint(RunFolder(folder).values()),
+            "plant_fingerprint": fingerprint(RunFolder(folder).values()),
         }
         return [*nodes, LoopNode("tuner_node", "tuner_node", tuner)]
 

@@ -53,7 +53,7 @@ def plot_episode(plant: Plant, episode: EpisodeRecord, environment: int = 0) -> 
             f"environment is {environment}; expected one of the {batch} of an episode that was kept"
         )
     times = plant.sample_time * np.arange(steps + 1)
-    components, axis = plant.grid.components, plant.grid.axes[0]
+    components, axis = plant.grid.components, plant.grid.line
     extent = (0.0, times[-1], 0.0, axis.length)
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(6.4, 1.6 + 1.7 * len(components)))

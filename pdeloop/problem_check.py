@@ -226,7 +226,7 @@ def draw(values: Mapping[str, Any], path: Path) -> None:
     plant = _field_plant(values, compiled=False)
     fields = plant.reset([MEAN_FIELD, *range(DRAWN)]).copy()
     grid = plant.grid
-    names, axis = grid.components, grid.axes[0]
+    names, axis = grid.components, grid.line
     figure = Figure(figsize=(7.0, 0.6 + 2.4 * len(names)), layout="constrained")
     actuated = 0
     for i, (ax, name) in enumerate(

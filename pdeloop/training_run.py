@@ -11,7 +11,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,8 @@ import controller_node.law
 from controller_node.identification import DesignSettings, check_sizes
 from loop_interfaces.files import FileError, make_own_folder
 from loop_interfaces.isolation import NETWORK, loopback_environment
-from pde_sim_node.build import build_equation, build_plant
+from loop_interfaces.own_code import OwnCodeError
+from pde_sim_node.build import build_plant, complete
 from pdeloop.display import Display, ProgressFile
 from pdeloop.domain import own_domain
 from pdeloop.in_process import LocalPair, train
@@ -46,13 +46,10 @@ def resolve(problem: str, options: Mapping[str, Any]) -> dict[str, Any]:
 
     Nothing is compiled.
     """
-    values = training_parameters(problem, options)
-    plant = build_plant(values, compiled=False)
+    plant, values = complete(training_parameters(problem, options), compiled=False)
     if not values["model"]:
         check_sizes(DesignSettings.of(values), plant.state_size, plant.horizon)
-    physical = asdict(build_equation(values))
-    del physical["length"]
-    return {**values, **{f"physical.{name}": value for name, value in physical.items()}}
+    return values
 
 
 def load_compiled(values: Mapping[str, Any]) -> None:
@@ -64,10 +61,11 @@ def load_compiled(values: Mapping[str, Any]) -> None:
     notice.daemon = True
     notice.start()
     try:
-        build_plant(values)
+        plant = build_plant(values)
         controller_node.law.load_compiled()
         if importlib.util.find_spec("fast_path"):
-            for node in ("controller_node", "pde_sim_node"):
+            compiled = ["pde_sim_node"] * (plant.parallel is not None)
+            for node in ("controller_node", *compiled):
                 importlib.import_module(f"{node}.fast_path").load_compiled()
     finally:
         notice.cancel()
@@ -166,7 +164,12 @@ def _train_here(
             check()
 
         # Nothing is saved on the way out of an interruption: it may come in the middle of an update.
-        train(training, LocalPair(values), report, max_batch=values["max_batch"])
+        try:
+            train(training, LocalPair(values), report, max_batch=values["max_batch"])
+        except OwnCodeError as error:
+            raise OwnCodeError(
+                f"{error} (continue with: {resuming(folder)} --in-process)"
+            ) from error
         try:
             writer.finish({"transport": "in-process", "controller": BUILT_IN})
         except OSError as error:

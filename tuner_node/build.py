@@ -131,7 +131,7 @@ def build_training(values: Mapping[str, Any]) -> Training:
         trajectories=kind.needs_trajectories,
         noise=noisy(values),
     )
-    return Training(settings, make_optimizer, plant=values["plant"] or UNKNOWN_PLANT)
+    return Training(settings, make_optimizer, plant=values["plant_fingerprint"] or UNKNOWN_PLANT)
 
 
 def build_dispatcher(

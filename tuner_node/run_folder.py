@@ -56,7 +56,7 @@ TRANSIENT = (
         "episode_timeout",
         "max_attempts",
         "recorder",
-        "plant",
+        "plant_fingerprint",
     ),
     *(spec.name for spec in (*PLANT, *EXECUTION, *RECORDER, *VIEWER)),
 )
@@ -136,7 +136,7 @@ class RunFolder:
             identity = RunIdentity(int(known["run"]), int(known["incarnation"]) + 1, paused)
             if not (0 < identity.run < MAX_ID and 0 < identity.incarnation < 2**21):
                 raise ValueError("ids out of range")
-            plant = {"plant": parameters.get("plant", 0)}
+            plant = {"plant_fingerprint": parameters.get("plant_fingerprint", 0)}
             return self._identify(identity, known["parameters"] | plant)
         except RunFolderError:
             raise
@@ -296,7 +296,7 @@ class RunFolder:
             "run": identity.run,
             "incarnation": identity.incarnation,
             "paused": identity.paused,
-            "plant": parameters.get("plant", 0),
+            "plant": parameters.get("plant_fingerprint", 0),
             "parameters": {k: v for k, v in parameters.items() if k not in TRANSIENT},
         }
         write_atomically(self.path / "run.json", json.dumps(content).encode())

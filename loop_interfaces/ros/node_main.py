@@ -14,6 +14,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args, try_shutdown
 
 from loop_interfaces.isolation import PROFILE, check_profile, is_confined, outside_sockets
+from loop_interfaces.own_code import OwnCodeError
 from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.parameters import take_over
 from loop_interfaces.start import on_signals
@@ -89,7 +90,8 @@ def node_main(
 
     A process that was suspended for long joins again, as a new participant. 1 with one line on
     stderr when the node cannot start as it was asked to: a ConfigurationError,
-    or a ValueError while it is made (a parameter out of range, a plant that cannot be built).
+    or a ValueError while it is made (a parameter out of range, a plant that cannot be built); and when
+    code of the user's own fails.
     """
     try:
         _refuse_other_words(name, args)
@@ -110,7 +112,7 @@ def node_main(
                 if not loop.suspended:
                     return code
                 former = node
-    except ConfigurationError as error:
+    except (ConfigurationError, OwnCodeError) as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 1
     except Exception:  # a bug: say where, and let a supervisor start the node again

@@ -18,7 +18,7 @@ from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 
-from loop_interfaces.parameters import table
+from loop_interfaces.parameters import table, with_names
 from loop_interfaces.spec import ParameterError, Spec, check_names
 
 UNANSWERED = 1.0
@@ -31,6 +31,7 @@ def given_parameters(node: Node) -> dict[str, Any]:
     given = {name: parameter.value for name, parameter in node._parameter_overrides.items()}
     # rcl knows no type of an empty list, and gives it no value.
     given = {name: [] if value is None else value for name, value in given.items()}
+    given = with_names(given)
     known = [spec.name for spec in table()]
     ros_own = [name for name in given if name.split(".")[0] in ("use_sim_time", "qos_overrides")]
     check_names(set(given) - set(ros_own), known)

@@ -22,6 +22,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.own_code import located
 from loop_interfaces.text import shown
 from pde_sim_node.supports import indicator_supports
 
@@ -56,18 +57,6 @@ def result_of(method: Callable[..., Any], *arguments: Any) -> Any:
         return method(*arguments)
     except Exception as error:
         raise ValueError(f"{method.__name__} of the equation fails: {located(error)}") from error
-
-
-def located(error: Exception) -> str:
-    """An exception in one line, with the line of the function that the `try` block called."""
-    called = error.__traceback__.tb_next if error.__traceback__ else None
-    where = f"{called.tb_frame.f_code.co_filename}, line {called.tb_lineno}: " if called else ""
-    return f"{where}{in_one_line(error)}"
-
-
-def in_one_line(error: Exception) -> str:
-    """Kind and text of an exception."""
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from loop_interfaces.grid import Grid
 from pde_sim_node.actuators import actuator_supports
 from pde_sim_node.arguments import grid_points, internal_steps, positive, whole
 from pde_sim_node.compiled_step import compiled_step, load
-from pde_sim_node.definition import Definition, module_sources
+from pde_sim_node.definition import Definition, sources_of
 from pde_sim_node.equations import Equation, LinearEquation
 from pde_sim_node.equations.base import result_of
 from pde_sim_node.plant import MEAN_FIELD, Adjoint
@@ -160,7 +160,7 @@ class SpectralPlant(BatchPlant):
             values["actuator_shape"] = self.shape
         if len(self.positions):
             values["actuator_positions"] = [float(position) for position in self.positions]
-        sources = module_sources(type(self.equation), Equation)
+        sources = sources_of(type(self.equation), Equation)
         return Definition({**values, **asdict(self.equation)}, sources)
 
     def adjoint(self) -> Adjoint:

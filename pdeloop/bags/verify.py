@@ -65,12 +65,12 @@ def verify(*paths: Path, parameters: Path | None = None) -> Report:
     return report
 
 
-def equations(*paths: Path, parameters: Path | None = None) -> list[str]:
-    """The equations that `verify` runs with the same arguments, as far as they are known."""
+def recorded_parameters(*paths: Path, parameters: Path | None = None) -> list[Mapping[str, Any]]:
+    """The parameters of the runs that `verify` computes with the same arguments, as far as known."""
     bags = [] if parameters is not None else [bag for path in paths for bag in bags_of(path)]
     known, every = _known(bags, parameters)
     runs = [*known.values(), *([every] if every else [])]
-    return sorted({str(values["equation"]) for values in runs if "equation" in values})
+    return [values for values in runs if "equation" in values]
 
 
 def _check_files(bag: Bag, report: Report) -> None:

@@ -10,11 +10,11 @@ from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import (
     Commands,
     a_path,
-    add_equation,
     add_json,
-    allow_equation,
+    add_own_code,
+    allow_own_code,
     command,
-    refuse_other_equation,
+    refuse_other_code,
 )
 from pdeloop.output import print_json
 
@@ -61,7 +61,7 @@ def add(commands: Commands) -> None:
         metavar="FILE",
         help="instead of those in the bag: a run's parameters.yaml, a bag's parameters.json",
     )
-    add_equation(verify)
+    add_own_code(verify)
     for action in (info, verify):
         add_json(action)
 
@@ -78,11 +78,11 @@ def _bag_info(options: argparse.Namespace) -> int:
 
 
 def _bag_verify(options: argparse.Namespace) -> int:
-    from pdeloop.bags.verify import equations, verify
+    from pdeloop.bags.verify import recorded_parameters, verify
 
-    allow_equation(options)
-    if known := equations(*options.bag, parameters=options.parameters):
-        refuse_other_equation(options, *known)
+    allow_own_code(options)
+    if known := recorded_parameters(*options.bag, parameters=options.parameters):
+        refuse_other_code(options, *known)
     report = verify(*options.bag, parameters=options.parameters)
     if options.json:
         print_json(asdict(report))

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 from pdeloop.commands.common import (
     Commands,
     a_path,
-    add_equation,
     add_json,
-    allow_equation,
+    add_own_code,
+    allow_own_code,
     command,
 )
 from pdeloop.output import print_json
@@ -28,7 +28,7 @@ OF_A_NODE = {
     "n_z": ("controller",),
 }
 """The options that only the check of a node has, and of which."""
-OF_A_FILE = ("equation", "picture")
+OF_A_FILE = ("equation", "plant", "picture")
 
 
 def add(commands: Commands) -> None:
@@ -47,8 +47,11 @@ def add(commands: Commands) -> None:
     )
     check.add_argument(
         "problem",
+        nargs="?",
+        default="",
         metavar="FILE",
-        help="a problem's YAML file, or a shipped name; or plant, controller, tuner",
+        help="a problem's YAML file, or a shipped name; or plant, controller, tuner; not needed with "
+        "--plant",
     )
     whole, real = _number(int, 1, 65536), _number(float, 0.1, 86400.0)
     add_option = check.add_argument_group("of a node").add_argument
@@ -58,7 +61,7 @@ def add(commands: Commands) -> None:
     add_option("--limit", type=real, metavar="S", help="seconds that the check may take [600]")
     add_option("--namespace", metavar="NS", help="where its topics are")
     add_option("--network", action="store_true", default=None, help="it may run on another machine")
-    add_equation(check)
+    add_own_code(check)
     check.add_argument(
         "--picture",
         type=a_path,
@@ -69,6 +72,8 @@ def add(commands: Commands) -> None:
 
 
 def _check(options: argparse.Namespace) -> int:
+    if not options.problem and options.plant is None:
+        options.refuse("give a problem's FILE, --plant NAME, or plant, controller or tuner")
     of_a_node = options.problem in ROLES
     given = {name: getattr(options, name) for name in (*OF_A_NODE, *OF_A_FILE)}
     given = {name: value for name, value in given.items() if value is not None}
@@ -86,7 +91,7 @@ def _check(options: argparse.Namespace) -> int:
         from pdeloop.problem_check import check, draw
         from pdeloop.training_run import load_compiled, resolve
 
-        values = resolve(options.problem, allow_equation(options))
+        values = resolve(options.problem, allow_own_code(options))
         if options.picture is not None:
             draw(values, options.picture)  # before the check, which takes longer
         load_compiled(values)

@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TypeAlias
 
+from loop_interfaces.own_code import identity
 from loop_interfaces.parameters import OPTIMIZER, PROBLEM, TUNER, flags
 from loop_interfaces.problem import shipped_problems
 from loop_interfaces.spec import ParameterError
@@ -55,35 +56,40 @@ def a_path(text: str) -> Path:
     return Path(text)
 
 
-def add_equation(parser: argparse._ActionsContainer) -> None:
-    """The flag --equation; see `allow_equation`."""
-    parser.add_argument(
-        "--equation",
-        metavar="NAME",
-        help="the problem's PDE; own code, 'file.py:Class' or 'package.module:Class', has to be named "
-        "here, too, as a file alone runs none",
-    )
-
-
-def allow_equation(options: argparse.Namespace) -> dict[str, str]:
-    """Allow the code that --equation names; the parameter, if it was given."""
-    if options.equation is None:
-        return {}
-    from pde_sim_node.equations import allow
-
-    return {"equation": allow(options.equation)}
-
-
-def refuse_other_equation(options: argparse.Namespace, *equations: str) -> None:
-    """ParameterError if --equation names none of these, which those of a run are."""
-    from pde_sim_node.equations import identity
-
-    named = options.equation
-    if named is not None and identity(named) not in map(identity, equations):
-        raise ParameterError(
-            f"--equation is {named}, and that of the run is {', '.join(equations)}; leave it out, or "
-            "name the run's"
+def add_own_code(parser: argparse._ActionsContainer) -> None:
+    """The flags --equation and --plant; see `allow_own_code`."""
+    for word, what in (("equation", "the problem's PDE"), ("plant", "a plant in its place")):
+        parser.add_argument(
+            f"--{word}",
+            metavar="NAME",
+            help=f"{what}; own code, 'file.py:Class' or 'package.module:Class', has to be named here, "
+            "too, as a file alone runs none",
         )
+
+
+def allow_own_code(options: argparse.Namespace) -> dict[str, str]:
+    """Allow the code that --equation or --plant names; the parameters that were given."""
+    from pde_sim_node.equations import OWN_EQUATIONS
+    from pde_sim_node.plants.loading import OWN_PLANTS
+
+    given = {}
+    for kind in (OWN_EQUATIONS, OWN_PLANTS):
+        named = getattr(options, kind.word)
+        if named is not None:
+            given[kind.word] = kind.allow(named)
+    return given
+
+
+def refuse_other_code(options: argparse.Namespace, *runs: Mapping[str, object]) -> None:
+    """ParameterError if --equation or --plant names none that these parameters of runs name."""
+    for word in ("equation", "plant"):
+        named = getattr(options, word)
+        known = sorted({str(values.get(word, "")) for values in runs})
+        if named is not None and identity(named) not in map(identity, known):
+            theirs = ", ".join(filter(None, known)) or "none"
+            raise ParameterError(
+                f"--{word} is {named}, and that of the run is {theirs}; leave it out, or name the run's"
+            )
 
 
 def add_problem(

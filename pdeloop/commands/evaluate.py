@@ -10,11 +10,11 @@ from pdeloop.commands.common import (
     DEFAULTS,
     Commands,
     a_path,
-    add_equation,
     add_json,
-    allow_equation,
+    add_own_code,
+    allow_own_code,
     command,
-    refuse_other_equation,
+    refuse_other_code,
 )
 from pdeloop.commands.settings import add_set, read_settings
 from pdeloop.output import print_json
@@ -43,7 +43,7 @@ def add(commands: Commands) -> None:
         help="the mean of the initial distribution instead of sampled fields",
     )
     add_set(evaluate, "the policies under another parameter of the plant or the cost: any")
-    add_equation(evaluate)
+    add_own_code(evaluate)
     add_json(evaluate, "print the costs as JSON: {controller: [[cost a field] a seed]}")
 
 
@@ -52,12 +52,12 @@ def _evaluate(options: argparse.Namespace) -> int:
     from pdeloop.finished_run import load_run
     from tuner_node import narration
 
-    allow_equation(options)
+    allow_own_code(options)
     DEFAULTS["evaluation_fields"].check(options.fields, "--fields")
     DEFAULTS["evaluation_seed"].check(options.seed, "--seed")
     changes = read_settings(options.settings)
     run = load_run(options.folder)
-    refuse_other_equation(options, run.values["equation"])
+    refuse_other_code(options, run.values)
     costs = evaluate(
         run,
         fields=options.fields,

@@ -9,10 +9,10 @@ from loop_interfaces.text import printable
 from pdeloop.commands.common import (
     Commands,
     a_path,
-    add_equation,
-    allow_equation,
+    add_own_code,
+    allow_own_code,
     command,
-    refuse_other_equation,
+    refuse_other_code,
 )
 
 
@@ -29,7 +29,7 @@ def add(commands: Commands) -> None:
     report.add_argument(
         "folder", type=a_path, metavar="DIR", help="folder of a finished run or reproduction"
     )
-    add_equation(report)
+    add_own_code(report)
     report.add_argument("--out", type=a_path, metavar="DIR", help="[DIR/report]")
 
 
@@ -37,9 +37,9 @@ def _report(options: argparse.Namespace) -> int:
     from pdeloop.report.data import gather
     from pdeloop.report.page import report
 
-    allow_equation(options)
+    allow_own_code(options)
     data = gather(options.folder)
-    refuse_other_equation(options, *(one.first.values["equation"] for one in data.problems))
+    refuse_other_code(options, *(one.first.values for one in data.problems))
     page = report(data, options.out)
     for sentence in data.missing:
         print(f"not shown: {printable(sentence)}")

@@ -11,9 +11,9 @@ from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import (
     DEFAULTS,
     Commands,
-    add_equation,
+    add_own_code,
     add_problem,
-    allow_equation,
+    allow_own_code,
     command,
 )
 from pdeloop.commands.settings import add_set, read_settings
@@ -48,14 +48,14 @@ def add(commands: Commands) -> None:
         f"unchecked, as in the paper [{DEFAULTS['identification_attempts'].default}]",
     )
     add_set(reproduce, "for all trainings, any parameter")
-    add_equation(reproduce)
+    add_own_code(reproduce)
     add_execution(reproduce)
 
 
 def _reproduce(options: argparse.Namespace) -> int:
     from pdeloop.reproduction import beside_the_paper, reproduction_in, study_of
 
-    allow_equation(options)
+    allow_own_code(options)
     names = ("seeds", "iterations", "seed", "identification_attempts")
     given = {n: getattr(options, n) for n in names if getattr(options, n) is not None}
     for name, value in given.items():

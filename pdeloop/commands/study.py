@@ -17,9 +17,9 @@ from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import (
     Commands,
     a_path,
-    add_equation,
     add_json,
-    allow_equation,
+    add_own_code,
+    allow_own_code,
     command,
 )
 from pdeloop.commands.settings import add_set, read_settings
@@ -49,7 +49,7 @@ def add(commands: Commands) -> None:
         help="problems, seeds, variants, settings",
     )
     add_set(study, "for all trainings, any parameter")
-    add_equation(study)
+    add_own_code(study)
     add_execution(study)
 
 
@@ -139,7 +139,7 @@ def _study(options: argparse.Namespace) -> int:
     from pdeloop.study.description import Study
     from pdeloop.study.run import kept
 
-    allow_equation(options)
+    allow_own_code(options)
     if options.file is None and options.out is None:
         raise ParameterError(
             "no study given; expected a YAML file, or --out DIR of one to continue"

@@ -11,14 +11,14 @@ from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import (
     Commands,
     a_path,
-    add_equation,
     add_flags,
     add_json,
+    add_own_code,
     add_problem,
-    allow_equation,
+    allow_own_code,
     command,
     given_flags,
-    refuse_other_equation,
+    refuse_other_code,
 )
 from pdeloop.commands.settings import add_set, joined, read_settings
 
@@ -38,7 +38,7 @@ def add(commands: Commands) -> None:
     problem = train.add_argument_group("problem")
     names = ", ".join(shipped_problems())
     add_problem(problem, f"{names}, or the path of a problem's YAML file")
-    add_equation(problem)
+    add_own_code(problem)
     add_flags(problem, "problem")
     method = train.add_argument_group("budget and method")
     add_flags(method, "budget and method")
@@ -104,7 +104,7 @@ def _train(options: argparse.Namespace) -> int:
     for name in ("rollouts", "iterations"):
         if given.get(name) == 0:
             raise ParameterError(f"--{name} is 0; expected a whole number of at least 1")
-    own = allow_equation(options)
+    own = allow_own_code(options)
     if options.model is not None:
         given["model"] = str(options.model.resolve())
     if options.resume is not None:
@@ -114,15 +114,16 @@ def _train(options: argparse.Namespace) -> int:
                 "give it alone (or with --in-process)"
             )
         values = reopen(options.resume)
-        refuse_other_equation(options, values["equation"])
+        refuse_other_code(options, values)
         return run(options.resume, values, transport, options.json)
-    if options.problem is None:
+    if options.problem is None and options.plant is None:
         raise ParameterError(
             f"no problem given; expected one of {', '.join(shipped_problems())}, a YAML file, "
-            "or --resume DIR"
+            "--plant NAME, or --resume DIR"
         )
     given |= own
-    if options.sensor_delays is not None and not resolve(options.problem, given)["sensors"]:
+    problem = options.problem or ""
+    if options.sensor_delays is not None and not resolve(problem, given)["sensors"]:
         raise ParameterError("--sensor-delays goes with --sensors N, or a problem with sensors")
-    folder, values = begin(options.problem, given, options.out)
+    folder, values = begin(problem, given, options.out)
     return run(folder, values, transport, options.json)

@@ -11,10 +11,12 @@ import numpy as np
 
 import pdeloop
 from loop_interfaces.parameters import PROBLEM, table
+from pde_sim_node.dynamics import Dynamics
 from pde_sim_node.plant import Plant
+from pde_sim_node.plants.loading import as_plant
 from pdeloop.api import Problem
 
-Source = str | Path | Problem | Plant
+Source = str | Path | Problem | Plant | Dynamics
 """What an environment is made of: a problem's name or file, or what Python has of it."""
 
 OTHERS = {
@@ -50,7 +52,7 @@ def plant_of(source: Source, parameters: Mapping[str, Any], num_envs: int) -> Pl
         return pdeloop.problem(source, **parameters).plant(num_envs)
     if parameters:
         raise ValueError(f"{next(iter(parameters))!r} is given with {source!r}, which has its own")
-    plant = source.plant(num_envs) if isinstance(source, Problem) else source
+    plant = source.plant(num_envs) if isinstance(source, Problem) else as_plant(source)
     plant.reset(np.arange(num_envs))
     return plant
 

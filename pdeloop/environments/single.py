@@ -28,8 +28,8 @@ class Environment(gymnasium.Env[Array, Array]):
     Parameters
     ----------
     problem
-        Name or YAML file, as of `pdeloop.problem`; or a `Problem`, or a `Plant`, which is then the
-        environment's own.
+        Name or YAML file, as of `pdeloop.problem`; or a `Problem`, a `Plant`, which is then the
+        environment's own, or a `Dynamics`.
     divergence_penalty
         Subtracted from the reward of the step that diverges.
     render_mode : {"rgb_array"}, optional

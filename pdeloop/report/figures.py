@@ -61,7 +61,7 @@ def _maps(
     fields = [b.states[:, own] for b in problem.behaviours]
     # A few extreme points, a shock's tip or a divergence, would leave no contrast to the rest.
     low, high = np.nanpercentile(np.stack(fields), (0.3, 99.7))
-    axis = problem.plant.grid.axes[0]
+    axis = problem.plant.grid.line
     for ax, values in zip(axes, fields, strict=True):
         ax.set_facecolor("0.9")
         extent = (0.0, end, 0.0, axis.length)
@@ -73,11 +73,11 @@ def _maps(
 
 def _profiles(problem: ProblemData, own: slice, axes: Sequence[Axes], name: str) -> None:
     """Its initial and final profiles, and the target."""
-    axis = problem.plant.grid.axes[0]
+    axis = problem.plant.grid.line
     for ax, b in zip(axes, problem.behaviours, strict=True):
         colour = COLOURS[b.controller]
         ax.plot(
-            problem.plant.grid.axes[0].points,
+            problem.plant.grid.line.points,
             b.states[0, own],
             ":",
             color="0.45",
@@ -85,14 +85,14 @@ def _profiles(problem: ProblemData, own: slice, axes: Sequence[Axes], name: str)
             label="initial field",
         )
         ax.plot(
-            problem.plant.grid.axes[0].points,
+            problem.plant.grid.line.points,
             problem.plant.field_target[own],
             color="black",
             linewidth=0.9,
             label="target",
         )
         ax.plot(
-            problem.plant.grid.axes[0].points, b.states[-1, own], color=colour, label="final field"
+            problem.plant.grid.line.points, b.states[-1, own], color=colour, label="final field"
         )
         ax.set_xlim(0, axis.length)
         ax.set_xlabel(axis.label)

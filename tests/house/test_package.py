@@ -208,7 +208,7 @@ def test_a_launched_training_has_the_nodes_and_parameters_that_exist(launched, t
     assert (values["physical.viscosity"], values["horizon"]) == (2e-2, 20)
     by_name = {node["executable"]: given_to(node) for node in nodes}
     assert by_name["tuner_node"]["recorder"] == "start"
-    assert by_name["tuner_node"]["plant"] == fingerprint(values)
+    assert by_name["tuner_node"]["plant_fingerprint"] == fingerprint(values)
     assert by_name["tuner_node"]["pairs"] == by_name["recorder_node"]["pairs"] == ["pair0", "pair1"]
     assert [given_to(node).get("publish_clock") for node in nodes[3::2]] == [None, False]
 

@@ -452,7 +452,7 @@ def test_a_part_that_a_crash_left_is_replaced(tmp_path):
 
 def test_every_start_of_a_tuner_has_a_number_of_its_own_and_the_folder_to_itself(tmp_path):
     """Also one that is started by hand: `pdeloop train` locks the folder itself."""
-    values = parameters(out=str(tmp_path / "run"), resume=False, plant=77)
+    values = parameters(out=str(tmp_path / "run"), resume=False, plant_fingerprint=77)
     for incarnation in (1, 2, 3):
         with ExitStack() as locks, ExitStack() as others:
             _, identity = open_run(values, build_training(values), locks, print)

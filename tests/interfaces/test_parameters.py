@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loop_interfaces.parameters import NODES, table, taken_by
+from loop_interfaces.parameters import NODES, table, taken_by, with_names
 from loop_interfaces.problem import load_parameters, shipped_problems
 from loop_interfaces.spec import ParameterError as Refused
 from loop_interfaces.spec import Spec, check_names
@@ -23,8 +23,8 @@ SPECS = {spec.name: spec for spec in table()}
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [
-        ("n_z", 7, "'n_z' is 7; expected an even whole number from 8 to 65536"),
-        ("n_z", 64.0, "'n_z' is 64.0; expected an even whole number"),
+        ("n_z", 0, "'n_z' is 0; expected a whole number from 1 to 1048576"),
+        ("n_z", 64.0, "'n_z' is 64.0; expected a whole number"),
         ("n_a", True, "'n_a' is True; expected a whole number from 1 to 1024"),
         ("length", 0.0, "'length' is 0.0; expected a number above 0"),
         ("length", float("nan"), "'length' is nan; expected a number above 0"),
@@ -124,6 +124,21 @@ def test_an_unknown_problem_lists_the_known_ones():
         Refused, match="'burger'; expected one of allen-cahn, allen-cahn-modes, burgers, burgers-m"
     ):
         load_parameters("burger", {})
+
+
+@pytest.mark.parametrize("n_z", [7, 6, 65538])
+def test_the_points_of_an_equation_are_even_and_not_too_few_or_many(n_z):
+    with pytest.raises(
+        Refused, match=f"'n_z' is {n_z}; expected an even whole number from 8 to 65536"
+    ):
+        load_parameters("burgers", {"n_z": n_z})
+
+
+def test_a_number_as_plant_is_the_fingerprint_that_older_versions_called_so():
+    old = {"plant": 77, "n_z": 32}
+    assert with_names(old) == {"plant": "", "plant_fingerprint": 77, "n_z": 32}
+    values = load_parameters("burgers", old)
+    assert (values["plant"], values["plant_fingerprint"]) == ("", 77)
 
 
 def test_an_equation_file_is_found_beside_its_yaml(tmp_path):

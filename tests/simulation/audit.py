@@ -25,9 +25,9 @@ CAUSES = re.compile(
 
 
 @cache
-def undisturbed(iterations: int) -> Training:
+def undisturbed(iterations: int, own_plant: bool) -> Training:
     """The training in one process."""
-    return train_here(values(iterations))
+    return train_here(values(iterations, own_plant))
 
 
 def audit(plan: Plan) -> str:
@@ -42,7 +42,7 @@ def audit(plan: Plan) -> str:
     AssertionError
         Other bits, an error that names no cause, or one although only the network was bad.
     """
-    expected = undisturbed(plan.iterations)
+    expected = undisturbed(plan.iterations, plan.own_plant)
     with remembering():
         history = History(plan)
         end = history.run()

@@ -69,7 +69,7 @@ class History:
     """What happens. `run` gives the finished training, or the error with which the tuner ended."""
 
     def __init__(self, plan: Plan) -> None:
-        self.plan, self.values = plan, values(plan.iterations)
+        self.plan, self.values = plan, values(plan.iterations, plan.own_plant)
         self.rng = random.Random(plan.seed + 1)
         self.time = 0.0
         self.rows: list[Any] = []

@@ -55,7 +55,8 @@ class Plan:
     loss, duplicates, damage: probabilities that a message on a topic that is not reliable is lost,
     comes twice, or has a bit changed in what is in front of its values; delay: mean (s); rates: of
     the clocks of the processes; iterations: of the two-point method, 0 for Gauss-Newton, for which
-    the tuner reads states and actions; pairs: of plant and controller.
+    the tuner reads states and actions; pairs: of plant and controller; own_plant: instead of the small
+    problem's one of a user's own.
     """
 
     seed: int
@@ -66,6 +67,7 @@ class Plan:
     rates: tuple[float, ...] = (1.0, 1.0, 1.0)
     iterations: int = 1
     pairs: int = 1
+    own_plant: bool = False
     faults: tuple[Fault, ...] = ()
 
     @property
@@ -86,7 +88,8 @@ class Plan:
         for i in range(len(self.faults)):
             yield replace(self, faults=self.faults[:i] + self.faults[i + 1 :])
         quiet = Plan(self.seed)
-        for name in ("loss", "duplicates", "damage", "delay", "rates", "iterations", "pairs"):
+        names = "loss", "duplicates", "damage", "delay", "rates", "iterations", "pairs", "own_plant"
+        for name in names:
             if getattr(self, name) != getattr(quiet, name):
                 yield replace(self, **{name: getattr(quiet, name)})
 
@@ -124,5 +127,6 @@ def draw(seed: int) -> Plan:
         rates=tuple(rng.choices([1.0, 0.5, 2.0], k=len(MAIN))),
         iterations=iterations,
         pairs=pairs,
+        own_plant=seed % 5 == 4,
         faults=tuple(sorted(faults, key=lambda fault: fault.time)),
     )

@@ -19,6 +19,7 @@ from controller_node import identification
 from controller_node.identification import DesignSettings
 from controller_node.responder import Responder
 from loop_interfaces.frames import Frame
+from loop_interfaces.problem import load_parameters
 from loop_interfaces.protocol import ModelFailure, Publication
 from loop_interfaces.topics import (
     ACTION,
@@ -33,10 +34,12 @@ from loop_interfaces.topics import (
     Topic,
 )
 from loop_method.adapt.proposals import Proposer
-from pde_sim_node import build as plant_build
+from pde_sim_node.build import build_plant, complete
 from pde_sim_node.lockstep import Lockstep, Timing
 from pde_sim_node.plant import Plant
+from pde_sim_node.plants.loading import hand_over
 from tests.simulation.disk import Disk
+from tests.support.plants import Rods
 from tests.support.small import parameters
 from tuner_node import training_state
 from tuner_node.build import build_dispatcher, build_training
@@ -52,22 +55,22 @@ EVERY_PAIR = -1
 
 
 @cache
-def values(iterations: int) -> dict[str, Any]:
+def values(iterations: int, own_plant: bool) -> dict[str, Any]:
     """The parameters of the training: as few and as short episodes as have all of its phases."""
     budget: dict[str, Any] = {"optimizer": "gauss_newton", "rollouts": 9}
-    return parameters(
-        **({"iterations": iterations} if iterations else budget),
-        n_z=16,
-        n_a=2,
-        horizon=4,
-        integration_time=0.05,
-        reduced_order=2,
-        evaluation_fields=1,
-        identification_attempts=2,
-        max_attempts=8,
-        max_batch=2,
-        episode_timeout=10.0,
-    )
+    if iterations:
+        budget = {"optimizer": "two_point", "iterations": iterations}
+    limits: dict[str, Any] = {
+        "reduced_order": 2,
+        "evaluation_fields": 1,
+        "identification_attempts": 2,
+        "max_attempts": 8,
+        "max_batch": 2,
+        "episode_timeout": 10.0,
+    }
+    if own_plant:
+        return complete(load_parameters("", {**hand_over(Rods()), **budget, **limits}))[1]
+    return parameters(**budget, **limits, n_z=16, n_a=2, horizon=4, integration_time=0.05)
 
 
 _known: dict[bytes, Any] = {}
@@ -111,9 +114,9 @@ def _once(compute: Callable[[], Any], of: Any) -> Any:
 
 
 @cache
-def _plant(iterations: int, name: str) -> tuple[Plant, int]:
-    given = values(iterations)
-    return plant_build.build_plant(given), plant_build.fingerprint(given)
+def _plant(iterations: int, own_plant: bool, name: str) -> tuple[Plant, int]:
+    plant = build_plant(values(iterations, own_plant))
+    return plant, plant.definition.fingerprint
 
 
 class Process:
@@ -152,7 +155,7 @@ class Process:
 class PlantProcess(Process):
     def __init__(self, history: History, name: str, rate: float, pair: int) -> None:
         super().__init__(history, name, "plant", rate, pair)
-        plant, fingerprint = _plant(history.plan.iterations, name)
+        plant, fingerprint = _plant(history.plan.iterations, history.plan.own_plant, name)
         paused, signed_run = history.records.get(name, (False, 0))
         self.lockstep = Lockstep(
             copy.copy(plant),

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pde_sim_node.dynamics import Dynamics
 from pde_sim_node.equations import Burgers, Equation
 from pde_sim_node.plants import SpectralPlant
 
@@ -16,6 +17,22 @@ def plant_of(equation: Equation, **values: Any) -> SpectralPlant:
     """A plant with both weights 1, and of one internal step a sample, where nothing else is said."""
     values.setdefault("integration_time", values["sample_time"])
     return SpectralPlant(equation, **({"state_weight": 1.0, "action_weight": 1.0} | values))
+
+
+class Rods(Dynamics):
+    """Two rods of three cells that cool and are heated at one end, a cell of them a little unstable."""
+
+    n_z, n_a, horizon, sample_time = 6, 2, 4, 0.05
+
+    def initial_state(self, rng: np.random.Generator) -> np.ndarray:
+        return rng.uniform(0.5, 1.5, 6)
+
+    def step(self, z: np.ndarray, a: np.ndarray) -> np.ndarray:
+        rods = z.reshape(2, 3)
+        flow = np.diff(rods, axis=1, prepend=rods[:, :1], append=rods[:, -1:])
+        rods = rods + 0.3 * np.diff(flow, axis=1) - 0.02 * rods**3 + 0.01 * rods
+        rods[:, 0] += a
+        return rods.ravel()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,246 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Code of a user's own: what a name stands for, and which code may be run.
+
+A name is one of the project, an entry point of an installed package, ``package.module:Name`` or
+``path/to/file.py:Name``. The last two are Python code, which is executed to get it. So a name that a
+problem's file gives is not enough: the user has to name the same code, on the command line, in Python
+or in an environment variable, which the processes that are started inherit.
+"""
+
+from __future__ import annotations
+
+import copyreg
+import hashlib
+import importlib
+import os
+import shlex
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from loop_interfaces.text import shown
+
+_executing: list[Path] = []
+"""The files that are being executed, the innermost last."""
+
+
+class OwnCodeError(RuntimeError):
+    """Code of a user's own that fails in use; one sentence, which names the code and the reason."""
+
+
+@dataclass(frozen=True)
+class OwnCode:
+    """One kind of code that users may bring.
+
+    Attributes
+    ----------
+    word : str
+        What it is, and the parameter and the flag that name it: equation.
+    variable : str
+        The environment variable with the names of code that may be run, separated by commas.
+    shipped : mapping
+        What comes with the project, by name; no package takes these names.
+    """
+
+    word: str
+    variable: str
+    shipped: Mapping[str, Any]
+
+    @property
+    def group(self) -> str:
+        """The group of entry points by which an installed package offers it."""
+        return f"pdeloop.{self.word}s"
+
+    def allow(self, name: str) -> str:
+        """Allow code for this process and those it starts; its name from any folder."""
+        module, name_in_it = identity(name)
+        whole = f"{module}:{name_in_it}" if ":" in name else name
+        before = os.environ.get(self.variable)
+        os.environ[self.variable] = f"{before},{whole}" if before else whole
+        return whole
+
+    def configured(self, name: str, environment: Mapping[str, str] = os.environ) -> Any:
+        """What a problem's parameters name, if it may be run.
+
+        Raises
+        ------
+        ValueError
+            The name is code that is not allowed; or see `load`.
+        """
+        allowed = {identity(item.strip()) for item in environment.get(self.variable, "").split(",")}
+        if ":" in name and identity(name) not in allowed:
+            quoted = shlex.quote(name)
+            raise ValueError(
+                f"the {self.word} {shown(name)} is code, which is not run because a file names it; if "
+                f"you trust it, name it yourself: --{self.word} {quoted}, or for nodes and workers "
+                f"{self.variable}={quoted} in the environment"
+            )
+        return self.load(name)
+
+    def load(self, name: str) -> Any:
+        """What a name stands for; code is executed, whoever wrote it.
+
+        Raises
+        ------
+        ValueError
+            Nothing of that name can be loaded.
+        """
+        if name in self.shipped:
+            return self.shipped[name]
+        source, separator, name_in_it = name.rpartition(":")
+        if not separator:
+            return self._load_entry_point(name)
+        module = self._load_file(source) if source.endswith(".py") else self._load_module(source)
+        found = getattr(module, name_in_it, None)
+        if found is None:
+            raise ValueError(
+                f"{self.word} {shown(name)}: there is no {shown(name_in_it)} in {source}"
+            )
+        return found
+
+    def _load_entry_point(self, name: str) -> Any:
+        """What an installed package offers under that name."""
+        offered: dict[str, list[EntryPoint]] = {}
+        for entry in entry_points(group=self.group):
+            offered.setdefault(entry.name, []).append(entry)
+        found = {entry.value: entry for entry in offered.get(name, [])}
+        if not found:
+            known = [*self.shipped, *sorted(set(offered) - set(self.shipped))]
+            one_of = f"one of {', '.join(known)}, or " if known else ""
+            raise ValueError(
+                f"unknown {self.word} {shown(name)}: give {one_of}"
+                "'package.module:ClassName', or 'path/to/file.py:ClassName'"
+            )
+        if len(found) > 1:
+            raise ValueError(
+                f"{self.word} {shown(name)} is offered by several installed packages "
+                f"({', '.join(found)}): remove one, or give 'package.module:ClassName'"
+            )
+        (entry,) = found.values()
+        try:
+            return entry.load()
+        except Exception as error:
+            raise ValueError(
+                f"{self.word} {shown(name)}: {entry.value} cannot be loaded: {error}"
+            ) from error
+
+    def _load_module(self, dotted: str) -> ModuleType:
+        try:
+            return importlib.import_module(dotted)
+        except Exception as error:
+            raise ValueError(
+                f"the {self.word} module {shown(dotted)} cannot be imported: {error}"
+            ) from error
+
+    def _load_file(self, path: str) -> ModuleType:
+        try:
+            return load_file(Path(path), self.word)
+        except FileNotFoundError:
+            raise ValueError(f"the {self.word} file {shown(path)} does not exist") from None
+
+
+def identity(name: str) -> tuple[str, str]:
+    """Module or file, and the name in it: equal for equal code."""
+    module, _, name_in_it = name.rpartition(":")
+    return (str(Path(module).resolve()) if module.endswith(".py") else module), name_in_it
+
+
+def located(error: Exception) -> str:
+    """An exception in one line, with the line of the function that the `try` block called."""
+    called = error.__traceback__.tb_next if error.__traceback__ else None
+    where = f"{called.tb_frame.f_code.co_filename}, line {called.tb_lineno}: " if called else ""
+    return f"{where}{in_one_line(error)}"
+
+
+def in_one_line(error: Exception) -> str:
+    """Kind and text of an exception."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+
+
+def load_file(path: Path, word: str) -> ModuleType:
+    """Execute a file as a module, once for each content: an edited file is a new module.
+
+    FileNotFoundError, or ValueError if it cannot be executed.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(path)
+    path, source = path.resolve(), path.read_bytes()
+    # Numba keys its cache by the module's name: a name made of path and content is the same in the
+    # next process, and another one after an edit.
+    digest = hashlib.sha256(str(path).encode() + b"\0" + source).hexdigest()[:16]
+    module = ModuleType(f"{word}_{path.stem}_{digest}")
+    if module.__name__ in sys.modules:
+        return sys.modules[module.__name__]
+    module.__file__ = str(path)
+    sys.modules[module.__name__] = module
+    try:
+        with _being_executed(path):
+            exec(compile(source, path, "exec"), vars(module))
+    except Exception as error:
+        del sys.modules[module.__name__]
+        raise ValueError(
+            f"the {word} file {shown(str(path))} cannot be executed: {error}"
+        ) from error
+    for kind in vars(module).values():
+        own = isinstance(kind, type) and kind.__module__ == module.__name__
+        if own and kind.__reduce_ex__ is object.__reduce_ex__:
+            copyreg.pickle(kind, _reduced)  # by its file: no other process can import the module
+    return module
+
+
+def refuse_while_executed(what: str) -> None:
+    """RuntimeError if a file of own code, which is being executed to get at a name, does `what`.
+
+    A program that trains its own plant over topics would otherwise start itself again in each node.
+    """
+    if _executing:
+        raise RuntimeError(
+            f"{_executing[-1]} {what} while it is executed for what it defines; put that below "
+            "`if __name__ == '__main__':`"
+        )
+
+
+@contextmanager
+def _being_executed(path: Path) -> Iterator[None]:
+    """It finds modules beside it meanwhile, last: they hide none that is installed."""
+    _executing.append(path)
+    folder, before = str(path.parent), list(sys.path)
+    sys.path.append(folder)
+    try:
+        yield
+    finally:
+        _executing.pop()
+        if folder not in before:
+            sys.path.remove(folder)
+
+
+def _reduced(thing: Any) -> tuple[Any, ...]:
+    """How an object whose class came from a file is made again: as others, by another constructor."""
+    reduced: Any = object.__reduce_ex__(thing, 2)
+    _, (kind, *arguments), *rest = reduced
+    module = sys.modules[kind.__module__]
+    word = module.__name__.partition("_")[0]
+    return (
+        _bare,
+        (str(module.__file__), word, module.__name__, kind.__qualname__, *arguments),
+        *rest,
+    )
+
+
+def _bare(file: str, word: str, module: str, name: str, *arguments: Any) -> Any:
+    """The unpickled object without its state; ValueError if its file is another one by now."""
+    try:
+        found = load_file(Path(file), word)
+    except FileNotFoundError:
+        raise ValueError(f"the {word} file {shown(file)} does not exist") from None
+    if found.__name__ != module:
+        raise ValueError(
+            f"the {word} file {shown(file)} has changed since the plant was pickled: make it again"
+        )
+    kind: Callable[..., Any] = vars(found)[name]
+    return kind.__new__(kind, *arguments)  # type: ignore[arg-type]

@@ -1,0 +1,194 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A plant of one's own: z_{k+1} = f(z_k, a_k) of one state, and the numbers of its control task.
+
+>>> import numpy as np
+>>> class Chain(Dynamics):
+...     n_z, n_a, horizon = 64, 2, 30
+...     A = 0.9 * np.eye(64) + 0.05 * np.eye(64, k=1) + 0.05 * np.eye(64, k=-1)
+...     B = np.eye(64, 2)
+...
+...     def initial_state(self, rng):
+...         return rng.normal(size=64)
+...
+...     def step(self, z, a):
+...         return self.A @ z + self.B @ a
+>>> import pdeloop
+>>> run = pdeloop.train(plant=Chain(), reduced_order=4, rollouts=20)
+>>> bool(run.costs["adapted"].mean() < run.costs["none"].mean())
+True
+"""
+
+from __future__ import annotations
+
+import inspect
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+
+from loop_interfaces.arrays import Array
+from loop_interfaces.grid import Grid
+
+MEAN_DRAWS = 100
+"""Initial states whose average stands for the mean of their distribution."""
+
+
+class Dynamics(ABC):
+    """One environment of a plant, z_{k+1} = f(z_k, a_k), to be derived from.
+
+    A class derived from it says how many numbers a state and an action have, how a state begins and
+    how it advances. Batches of environments, seeds, costs, divergences, noise, sensors and everything
+    else of a plant come with that. What a class does not set has the value that is given here. They
+    may be set in ``__init__`` as well, whose arguments are the plant's parameters (`physical.NAME` in
+    a problem's file).
+
+    The same arguments must give the same bits: randomness only from the ``rng`` that is handed over,
+    no state that outlasts a call. `step` is called with one LAPACK thread.
+
+    Attributes
+    ----------
+    n_a : int
+        Size of an action; has to be set.
+    n_z : int
+        Size of a state; has to be set unless ``grid`` is.
+    grid : Grid or None
+        What the numbers of a state are; None: a plain vector.
+    target : array of n_z numbers, or number
+        State z_r to be tracked.
+    horizon : int
+        Steps of an episode.
+    sample_time : float
+        Time (s) of a step.
+    state_weight, action_weight : float
+        Q = state_weight I and R = action_weight I of the stage cost (z - z_r)'Q(z - z_r) + a'R a.
+    divergence_bound : float
+        A new state that is not finite or exceeds this magnitude anywhere ends the rollout.
+    supports : (n_z, n_a) or None
+        Where each actuator acts, for pictures.
+    batched : bool
+        Whether `step` takes M states (M, n_z) and actions (M, n_a) at once. What it returns for one of
+        them must not depend on the others, to the last bit, which a matrix product does not promise.
+
+    Examples
+    --------
+    See the module. docs/bring-your-own.md has more.
+    """
+
+    n_a: int
+    n_z: int = 0
+    grid: Grid | None = None
+    target: Any = 0.0
+    horizon: int = 100
+    sample_time: float = 1.0
+    state_weight: float = 1.0
+    action_weight: float = 1.0
+    divergence_bound: float = 1e3
+    supports: Array | None = None
+    batched: ClassVar[bool] = False
+
+    def __new__(cls, *arguments: Any, **named: Any) -> Dynamics:
+        """Remember the arguments, by which the plant is made again in other processes."""
+        made = super().__new__(cls)
+        if arguments or named:
+            object.__setattr__(made, "_given", (arguments, named))
+        return made
+
+    @abstractmethod
+    def initial_state(self, rng: np.random.Generator) -> Array:
+        """Draw a state from the distribution of initial states.
+
+        Parameters
+        ----------
+        rng
+            Source of everything random.
+
+        Returns
+        -------
+        (n_z,), or the grid's shape
+        """
+
+    @abstractmethod
+    def step(self, z: Array, a: Array) -> Array:
+        """The state after a sampling time in which the action is held.
+
+        Parameters
+        ----------
+        z : (n_z,)
+            z_k, a copy, which must stay as it is.
+        a : (n_a,)
+            a_k.
+
+        Returns
+        -------
+        (n_z,), or the grid's shape
+            z_{k+1}.
+        """
+
+    def mean_state(self) -> Array:
+        """The mean initial state, from which reports show the controllers.
+
+        Returns
+        -------
+        (n_z,), or the grid's shape
+            The average of 100 draws, unless a class says otherwise.
+        """
+        drawn = [self.initial_state(np.random.default_rng(seed)) for seed in range(MEAN_DRAWS)]
+        mean: Array = np.mean(drawn, axis=0)
+        return mean
+
+    def pull_back(self, z: Array, a: Array, y: Array) -> tuple[Array, Array]:
+        """The transposed derivative of `step`, for `pdeloop.Gradients`; not needed elsewhere.
+
+        Parameters
+        ----------
+        z : (n_z,)
+            z_k.
+        a : (n_a,)
+            a_k.
+        y : (n_z,)
+            Any vector.
+
+        Returns
+        -------
+        (n_z,), (n_a,)
+            (df/dz)^T y and (df/da)^T y.
+
+        Raises
+        ------
+        NotImplementedError
+            The class has none.
+        """
+        raise NotImplementedError
+
+    def refined(self) -> Dynamics | None:
+        """The same with half the internal time step, for `pdeloop check`.
+
+        Returns
+        -------
+        Dynamics or None
+            None where there is no step to halve.
+        """
+        return None
+
+
+def signature_of(maker: Callable[..., Any]) -> inspect.Signature:
+    """What a function or class is called with; of a class derived from Dynamics, its `__init__`."""
+    if not (isinstance(maker, type) and issubclass(maker, Dynamics)):
+        return inspect.signature(maker)
+    if maker.__init__ is object.__init__:
+        return inspect.Signature()
+    _, *parameters = inspect.signature(maker.__init__).parameters.values()
+    return inspect.Signature(parameters)
+
+
+def arguments_of(dynamics: Dynamics) -> Mapping[str, Any]:
+    """What an object was made with, by name, the defaults among them."""
+    arguments, named = getattr(dynamics, "_given", ((), {}))
+    bound = signature_of(type(dynamics)).bind(*arguments, **named)
+    bound.apply_defaults()
+    found: dict[str, Any] = {}
+    for name, value in bound.arguments.items():
+        further = bound.signature.parameters[name].kind is inspect.Parameter.VAR_KEYWORD
+        found |= value if further else {name: value}
+    return found

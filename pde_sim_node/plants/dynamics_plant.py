@@ -1,0 +1,225 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The plant of a user's `Dynamics`: M environments of it, in lock-step."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+from threadpoolctl import ThreadpoolController
+
+from loop_interfaces.arrays import Array, float_array
+from loop_interfaces.grid import Grid
+from loop_interfaces.own_code import OwnCodeError, located
+from pde_sim_node.definition import Definition, described, sources_of
+from pde_sim_node.dynamics import Dynamics, arguments_of
+from pde_sim_node.plant import MEAN_FIELD, Adjoint, Plant
+from pde_sim_node.plants.batch import BatchPlant
+
+SETTABLE = ("horizon", "state_weight", "action_weight", "divergence_bound")
+"""What a problem may set in place of the class."""
+
+
+class DynamicsPlant(BatchPlant):
+    """M environments of z_{k+1} = f(z_k, a_k).
+
+    Parameters
+    ----------
+    dynamics
+        The user's object; it is not changed.
+    settings
+        `SETTABLE` in place of what it has.
+
+    Raises
+    ------
+    ValueError
+        The class does not say what is needed, or something unusable; the message names it.
+    """
+
+    def __init__(self, dynamics: Dynamics, **settings: Any) -> None:
+        self.dynamics, self.name = dynamics, type(dynamics).__qualname__
+        if not hasattr(dynamics, "n_a"):
+            raise ValueError(f"{self.name} must set n_a, the size of an action")
+        given = {name: getattr(dynamics, name) for name in ("n_a", "sample_time", *SETTABLE)}
+        try:
+            grid = self._checked_grid()
+            target = np.broadcast_to(float_array("target", dynamics.target), grid.size).copy()
+            super().__init__(grid=grid, target=target, **(given | settings))
+        except ValueError as error:
+            raise ValueError(f"{self.name}: {error}") from error
+        if not np.isfinite(target).all():
+            raise ValueError(f"{self.name}: target must be finite, got NaN or infinity")
+        self.supports = None if dynamics.supports is None else self._checked_supports()
+        self._blas: ThreadpoolController | None = None
+        self._modules = 0
+        self._mean: Array | None = None
+
+    def __repr__(self) -> str:
+        return (
+            f"{type(self).__name__}({self.name}: state of {self.n_z}, {self.n_a} actuators, "
+            f"{self.horizon} steps of {self.sample_time:g})"
+        )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the handles of libraries of this process."""
+        return vars(self) | {"_blas": None}
+
+    def _checked_grid(self) -> Grid:
+        grid, n_z = self.dynamics.grid, self.dynamics.n_z
+        if grid is None:
+            if not n_z:
+                raise ValueError("expected n_z, the size of a state, or a grid")
+            return Grid.vector(n_z)
+        if n_z and n_z != grid.size:
+            raise ValueError(f"n_z is {n_z}, but its grid has {grid.size} numbers")
+        return grid
+
+    def _checked_supports(self) -> Array:
+        supports = float_array("supports", np.asarray(self.dynamics.supports))
+        if supports.shape != (self.n_z, self.n_a):
+            raise ValueError(
+                f"{self.name}: supports must have shape {(self.n_z, self.n_a)}, got {supports.shape}"
+            )
+        return supports
+
+    @property
+    def definition(self) -> Definition:
+        """The object's arguments, the source of its class, and what a problem sets in its place."""
+        settings = {name: getattr(self, name) for name in SETTABLE}
+        arguments = {
+            f"physical.{name}": described(name, value)
+            for name, value in arguments_of(self.dynamics).items()
+        }
+        sources = sources_of(type(self.dynamics), Dynamics)[:-1]  # without that of Dynamics itself
+        return Definition({"plant": self.name, **settings, **arguments}, sources)
+
+    def adjoint(self) -> Adjoint:
+        """What the object's `pull_back` gives; ValueError if it has none."""
+        if type(self.dynamics).pull_back is Dynamics.pull_back:
+            raise ValueError(
+                f"{self.name} has no derivatives, which exact gradients need: it has no method "
+                "pull_back(z, a, y)"
+            )
+        return _DynamicsAdjoint(self)
+
+    def refined(self) -> Plant | None:
+        """Of the object's `refined`."""
+        finer = self.dynamics.refined()
+        if finer is None:
+            return None
+        return DynamicsPlant(finer, **{name: getattr(self, name) for name in SETTABLE})
+
+    def _draw(self, seed: int) -> Array:
+        if seed == MEAN_FIELD:
+            if self._mean is None:
+                self._mean = self._state("mean_state", self._call("mean_state"))
+            mean: Array = self._mean
+            return mean
+        drawn = self._call("initial_state", np.random.default_rng(seed))
+        return self._state("initial_state", drawn)
+
+    def _state(self, method: str, returned: Any) -> Array:
+        """What a method returned, as an initial state."""
+        state: Array = self._numbers(method, returned, 1)[0]
+        if not np.isfinite(state).all():
+            raise OwnCodeError(f"{self.name}.{method} returned NaN or infinity")
+        return state
+
+    def _advance(self) -> None:
+        alive = np.flatnonzero(self.diverged_step < 0)
+        if not alive.size:
+            return
+        states, totals = self.states[alive], self.totals[alive]
+        lost = self._advanced(states, self.actions[alive], totals)
+        self.states[alive], self.totals[alive] = states, totals
+        self.diverged_step[alive[lost]] = self.step_index
+
+    def _evaluate(self, states: Array, actions: Array) -> Array:
+        costs = np.zeros(len(states))
+        self._advanced(states, actions, costs)
+        return costs
+
+    def _advanced(self, states: Array, actions: Array, totals: Array) -> Any:
+        """Advance states in place and add their stage costs; which of them diverged."""
+        new = self._next(states, actions)
+        totals += self.state_weight * np.square(states - self.field_target).sum(axis=1)
+        totals += self.action_weight * np.square(actions).sum(axis=1)
+        good = np.isfinite(totals) & (np.abs(new) <= self.divergence_bound).all(axis=1)
+        states[good] = new[good]
+        return ~good
+
+    def _next(self, states: Array, actions: Array) -> Array:
+        """The states after a step, (M, n_z); they may be anything."""
+        if self.dynamics.batched:
+            return self._numbers("step", self._step(states, actions), len(states))
+        one_by_one = zip(states, actions, strict=True)
+        return np.concatenate([self._numbers("step", self._step(z, a), 1) for z, a in one_by_one])
+
+    def _step(self, z: Array, a: Array) -> Any:
+        own_z, own_a = z.copy(), a.copy()
+        returned = self._call("step", own_z, own_a)
+        for name, own, handed in (("z", own_z, z), ("a", own_a, a)):
+            if not np.array_equal(own, handed):
+                raise OwnCodeError(
+                    f"{self.name}.step changes its argument {name}, which must stay as it is: work on "
+                    f"a copy, {name}.copy()"
+                )
+        return returned
+
+    def _call(self, method: str, *arguments: Any) -> Any:
+        """Call a method of the object, with one LAPACK thread: more of them round otherwise."""
+        if self._blas is None or self._modules != len(sys.modules):  # it may have loaded another
+            self._blas, self._modules = ThreadpoolController(), len(sys.modules)
+        function = getattr(self.dynamics, method)
+        with self._blas.limit(limits=1), np.errstate(over="ignore", invalid="ignore"):
+            try:
+                return function(*arguments)
+            except Exception as error:
+                raise OwnCodeError(f"{self.name}.{method} fails: {located(error)}") from error
+
+    def _numbers(self, method: str, returned: Any, count: int) -> Array:
+        """What a method returned, as (count, n_z) numbers."""
+        batch = (count,) if self.dynamics.batched and method == "step" else ()
+        grid = self.grid
+        shapes = [(*batch, grid.size), (*batch, len(grid.components), *grid.shape)]
+        if len(grid.components) == 1:
+            shapes.append((*batch, *grid.shape))
+        try:
+            numbers = float_array("it", returned)
+        except ValueError:
+            got = f"{type(returned).__name__}, which is no array of real numbers"
+        else:
+            if numbers.shape in shapes:
+                return numbers.reshape(count, grid.size)
+            got = f"an array of shape {numbers.shape}"
+        expected = " or ".join(str(shape) for shape in dict.fromkeys(shapes))
+        raise OwnCodeError(
+            f"{self.name}.{method} returned {got}; expected numbers of shape {expected}"
+        )
+
+
+class _DynamicsAdjoint:
+    """Pulls covectors back with the object's `pull_back`."""
+
+    def __init__(self, plant: DynamicsPlant) -> None:
+        self._plant = plant
+
+    def pull_back(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array]:
+        """See `pde_sim_node.plant.Adjoint.pull_back`."""
+        plant = self._plant
+        if plant.dynamics.batched:
+            pulled = [plant._call("pull_back", states, actions, covectors)]
+        else:
+            each = zip(states, actions, covectors, strict=True)
+            pulled = [plant._call("pull_back", z, a, y) for z, a, y in each]
+        try:
+            on_states, on_actions = (
+                float_array("it", np.stack(part)) for part in zip(*pulled, strict=True)
+            )
+            return on_states.reshape(states.shape), on_actions.reshape(actions.shape)
+        except (TypeError, ValueError) as error:
+            raise OwnCodeError(
+                f"{plant.name}.pull_back must return two arrays of {plant.n_z} and {plant.n_a} "
+                f"numbers: {error}"
+            ) from error

@@ -1,0 +1,157 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A plant of a user's own from a problem's parameters: by its name, or the object of a Python program.
+
+Which code may be run: `loop_interfaces.own_code`.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+import sys
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from loop_interfaces.own_code import OwnCode, located
+from loop_interfaces.spec import ParameterError
+from loop_interfaces.text import shown
+from pde_sim_node.definition import described
+from pde_sim_node.dynamics import Dynamics, arguments_of, signature_of
+from pde_sim_node.plant import Plant
+from pde_sim_node.plants.dynamics_plant import DynamicsPlant
+
+OWN_PLANTS = OwnCode("plant", "PDELOOP_PLANTS", {})
+OBJECT = "object of a Python program:"
+"""How a parameter begins that no file can hold."""
+PHYSICAL = "physical."
+
+
+class Made(NamedTuple):
+    """A plant, and the parameters with which it was made, by name."""
+
+    plant: Dynamics | Plant
+    parameters: Mapping[str, Any]
+
+
+_objects: dict[str, Made] = {}
+"""What was handed over in this process, by its name and parameters."""
+
+
+def physical_of(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters `physical.NAME`, by NAME."""
+    return {
+        name.removeprefix(PHYSICAL): value
+        for name, value in values.items()
+        if name.startswith(PHYSICAL)
+    }
+
+
+def make(values: Mapping[str, Any]) -> Made:
+    """What the parameter `plant` names, made with `physical.*`.
+
+    Raises
+    ------
+    ValueError
+        It is code that is not allowed, or cannot be loaded, or made with these parameters.
+    """
+    name, physical = str(values["plant"]), physical_of(values)
+    known = _objects.get(_key(name, physical))
+    if known is not None:
+        return known
+    for own, value in physical.items():
+        if isinstance(value, str) and value.startswith(OBJECT):
+            raise ParameterError(
+                f"parameter '{PHYSICAL}{own}' of {name} was an object of the Python program that "
+                "made the plant; such a plant can be used in that program alone"
+            )
+    maker = OWN_PLANTS.configured(name)
+    if not callable(maker):
+        raise ValueError(f"plant {shown(name)} must be a class or a function, got {maker!r}")
+    arguments = fitting(maker, physical, name)
+    try:
+        made = maker(**arguments)
+    except Exception as error:
+        raise ValueError(f"the plant {shown(name)} cannot be made: {located(error)}") from error
+    if not isinstance(made, Dynamics | Plant):
+        raise ValueError(
+            f"plant {shown(name)} must be a class derived from pdeloop.Dynamics, or make one of its "
+            f"objects, got {made!r}"
+        )
+    defaults = signature_of(maker).parameters.values()
+    stored = {p.name: p.default for p in defaults if _storable(p.default)}
+    return Made(made, stored | arguments)
+
+
+def fitting(maker: Callable[..., Any], given: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """The arguments to make it with: a whole number where it has a fraction as default is one, too.
+
+    ParameterError for one that it does not take, and where one is missing.
+    """
+    signature = signature_of(maker)
+    known = signature.parameters
+    any_name = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in known.values())
+    arguments = dict(given)
+    for own, value in given.items():
+        if own not in known and not any_name:
+            names = ", ".join(known) or "none"
+            raise ParameterError(f"unknown parameter '{PHYSICAL}{own}' of {name}; known: {names}")
+        default = known[own].default if own in known else None
+        if isinstance(default, float) and type(value) is int:
+            arguments[own] = float(value)
+        elif type(default) is int and isinstance(value, float) and value.is_integer():
+            arguments[own] = int(value)
+    try:
+        signature.bind(**arguments)
+    except TypeError as error:
+        raise ParameterError(
+            f"the plant {shown(name)} cannot be made: {error}; give it as '{PHYSICAL}NAME'"
+        ) from error
+    return arguments
+
+
+def hand_over(plant: Dynamics | Plant) -> dict[str, Any]:
+    """The parameters that name an object of this program: for it, and where it can be made again.
+
+    Its code is allowed here and in the processes that are started.
+    """
+    kind = type(plant)
+    module = sys.modules[kind.__module__]
+    importable = bool(getattr(module, "__package__", "")) and module.__name__ != "__main__"
+    file = getattr(module, "__file__", None)
+    source = module.__name__ if importable or not file else file
+    arguments = arguments_of(plant) if isinstance(plant, Dynamics) else {}
+    stored = {
+        name: described(name, value) if _storable(value) else f"{OBJECT} {described(name, value)}"
+        for name, value in arguments.items()
+        if _storable(value) or not _is_default(kind, name, value)
+    }
+    name = OWN_PLANTS.allow(f"{source}:{kind.__qualname__}")
+    _objects[_key(name, stored)] = Made(plant, stored)
+    return {"plant": name} | {f"{PHYSICAL}{own}": value for own, value in stored.items()}
+
+
+def as_plant(plant: object) -> Plant:
+    """A plant as the loop needs it, from one or from a `Dynamics`; ValueError for anything else."""
+    if isinstance(plant, Dynamics):
+        return DynamicsPlant(plant)
+    if not isinstance(plant, Plant):
+        raise ValueError(f"plant is {plant!r}; expected a Plant, or an object of a Dynamics")
+    return plant
+
+
+def _storable(value: object) -> bool:
+    """Whether a YAML file and ROS parameters can hold it."""
+    if isinstance(value, list):
+        return bool(value) and len({type(item) for item in value}) == 1 and _storable(value[0])
+    return isinstance(value, bool | int | float | str | np.number)
+
+
+def _is_default(kind: type, name: str, value: object) -> bool:
+    known = signature_of(kind).parameters
+    return name in known and known[name].default is value
+
+
+def _key(name: str, physical: Mapping[str, Any]) -> str:
+    return json.dumps([name, dict(physical)], sort_keys=True)

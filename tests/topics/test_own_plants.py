@@ -1,0 +1,74 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Plants of a user's own in a process of their own: the bits of one process, recorded, and failures."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import pdeloop
+from pde_sim_node.plants.loading import OWN_PLANTS
+from tests.support.interpreter import ROOT
+from tests.support.loop_harness import Processes
+from tests.support.small import same_bits
+from tests.support.small_loop import LIMIT
+
+pytestmark = pytest.mark.topics
+PLANTS = ROOT / "examples" / "plants"
+LINEAR, PLATE = f"{PLANTS}/random_linear.py:RandomLinear", f"{PLANTS}/plate.py:Plate"
+BUDGET = {"rollouts": 9, "evaluation_fields": 2, "reduced_order": 6}
+FLAGS = [
+    word for name, value in BUDGET.items() for word in (f"--{name.replace('_', '-')}", str(value))
+]
+
+
+def policies(folder: Path) -> np.ndarray:
+    with np.load(folder / "policy.npz") as arrays:
+        return np.asarray(arrays["policy"])
+
+
+@pytest.mark.parametrize(
+    ("name", "given"), [(LINEAR, {"radius": 0.9}), (PLATE, {"nx": 6, "ny": 4})]
+)
+def test_a_plant_of_ones_own_is_trained_over_topics_to_the_same_bits_and_recorded(
+    loop: Processes,
+    tmp_path: Path,
+    name: str,
+    given: dict[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    problem = tmp_path / "own.yaml"
+    problem.write_text(json.dumps({"/**": {"ros__parameters": {"physical": given}}}))
+    out = tmp_path / "run"
+    words = [str(problem), "--plant", name, *FLAGS, "--record", "--out", str(out)]
+    loop.wait(loop.pdeloop("train", *words), LIMIT)
+    monkeypatch.setenv(OWN_PLANTS.variable, "")
+    run = pdeloop.train(pdeloop.problem(plant=name, physical=given), **BUDGET)
+    assert same_bits(policies(out), run.policies)
+    assert json.loads((out / "result.json").read_text())["plant"] == run.result["plant"]
+    verified = loop.wait(loop.pdeloop("bag", "verify", str(out), "--plant", name), LIMIT)
+    assert "no difference, to the bit" in verified
+    refused = loop.wait(loop.pdeloop("bag", "verify", str(out)), LIMIT, code=1)
+    assert "is code, which is not run because a file names it" in refused
+
+
+def test_a_plant_that_fails_ends_its_node_and_the_training_with_the_cause(
+    loop: Processes, tmp_path: Path
+) -> None:
+    own = tmp_path / "own.py"
+    own.write_text(
+        (PLANTS / "random_linear.py")
+        .read_text()
+        .replace(
+            "        return self.A @ z",
+            "        assert abs(z).max() < 3.5, 'too hot'\n        return self.A @ z",
+        )
+    )
+    words = ["--plant", f"{own}:RandomLinear", *FLAGS, "--out", str(tmp_path / "run")]
+    told = loop.wait(loop.pdeloop("train", *words), LIMIT, code=1)
+    assert f"pde_sim_node: RandomLinear.step fails: {own}, line 21: AssertionError: too hot" in told
+    assert "Traceback" not in told
