@@ -68,7 +68,6 @@ def changed(run: FinishedRun, changes: Mapping[str, Any]) -> FinishedRun:
                 "the plant or the cost, such as horizon, state_weight or physical.*"
             )
     values = {**run.values, **changes}
-    build_equation(values)  # refuses physical parameters that it does not have
     plant = build_plant(values, compiled=False)
     size, n_a = len(run.models[0].U), run.policies.shape[1]
     if (plant.state_size, plant.n_a) != (size, n_a):
