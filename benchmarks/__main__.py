@@ -31,7 +31,6 @@ PROGRAMS = {
     "realtime": "jitter and missed deadlines at P1's 20 Hz and at 1 kHz",
     "pairs": "1, 2, 4 pairs on hosts made of network namespaces (needs root)",
     "baselines": "optimisers and methods of others at equal rollouts, with intervals over seeds",
-    "reinforcement": "learning curve of PPO or SAC of stable-baselines3",
     "general": "held-out plants and initial fields: first law, adapted law and what is possible",
     "optimum": "what the policy class and any controller at all could reach, by exact gradients",
     "overhead": "how much a recorder, a viewer or an open page of pdeloop monitor slows the loop",

@@ -13,11 +13,11 @@ about the fields of `TEST` after other trainings.
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import itertools
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -85,7 +85,7 @@ def run(
     rollouts
         Budgets, of all rollouts before the evaluation.
     seeds
-        How many; those of the study if not given.
+        How many; those of the study if not given, and all of `TUNING_SEEDS` with `tune`.
     methods
         Only these; all of the file if not given.
     settings
@@ -151,16 +151,25 @@ def chosen(
     if unknown:
         raise ValueError(f"no method {', '.join(unknown)}; expected some of {', '.join(entries)}")
     entries = {name: entries[name] for name in methods or entries}
-    for library in (LIBRARIES[name] for name in entries if name in LIBRARIES):
-        importlib.import_module(library)  # says what to install, before anything runs
     study = replace(study, settings={**study.settings, "evaluation_seed": TEST, **pairs(settings)})
+    require_libraries(entries)
     if seeds is not None:
         study = replace(study, seeds=tuple(range(seeds)))
     if tune:
         entries = candidates(entries, pairs(tune))
         settings_ = {**study.settings, "evaluation_seed": VALIDATION}
-        study = replace(study, seeds=TUNING_SEEDS, settings=settings_)
+        study = replace(study, seeds=TUNING_SEEDS[:seeds], settings=settings_)
     return study, entries
+
+
+def require_libraries(labels: Iterable[str]) -> None:
+    """ValueError if what a method needs is not installed, before anything runs."""
+    for label in labels:
+        library, extra = LIBRARIES.get(label.partition("+")[0], (None, ""))
+        if library is not None and importlib.util.find_spec(library) is None:
+            raise ValueError(
+                f"{label} needs {library}: pip install 'pdeloop[{extra}]', or leave it out of --methods"
+            )
 
 
 def pairs(words: Sequence[str]) -> dict[str, Any]:
@@ -240,7 +249,7 @@ def iqm(values: Array, axis: int = -1) -> Any:
 
 
 def table(folder: Path, budget: int) -> list[dict[str, Any]]:
-    """A row for each method that has results in DIR/METHOD/SEED, the best first."""
+    """A row for each method with results in DIR/METHOD/SEED, the best first; `costs`: of the seeds."""
     rows = []
     for place in sorted(folder.iterdir()):
         results = [read_json(path) for path in sorted(place.glob("*/result.json"))]
@@ -256,6 +265,7 @@ def table(folder: Path, budget: int) -> list[dict[str, Any]]:
                 "seeds": len(results),
                 "cost": float(iqm(means)),
                 "interval": interval((means,), iqm),
+                "costs": means.tolist(),
                 "mean": float(means.mean()),
                 "worst": float(means.max()),
                 "diverged": int((costs >= DIVERGED_COST).any(axis=1).sum()),

@@ -93,15 +93,19 @@ def lqt_law(values: Values) -> tuple[LocalPair, Law, int]:
     return pair, law, int(training.budget.paid[0])
 
 
-def cma_es(values: Values, *, sigma: float, population: int) -> tuple[LocalPair, Law, int]:
+def cma_es(
+    values: Values, *, sigma: float, population: int, separable: bool = False
+) -> tuple[LocalPair, Law, int]:
     """CMA-ES on the gains of the law a = K_a s + b, from those of LQ tracking.
 
     A generation shares one initial field, and the mean of the last one is the result. The
     coordinates X = [K_a b] F^(1/2), F the second moments of [s; 1] in the rollouts of the check, have
-    the unit of an action, of which `sigma` is the first standard deviation. Hansen,
-    "The CMA evolution strategy: a tutorial", arXiv:1604.00772.
+    the unit of an action, of which `sigma` is the first standard deviation. `separable` adapts
+    variances alone. Hansen, "The CMA evolution strategy: a tutorial",
+    arXiv:1604.00772; Ros, Hansen, "A simple modification in CMA-ES achieving linear time and space
+    complexity", PPSN 2008.
     """
-    from cmaes import CMA
+    from cmaes import CMA, SepCMA
 
     pair = LocalPair(values)
     training = warm_start(values, pair)
@@ -123,7 +127,7 @@ def cma_es(values: Values, *, sigma: float, population: int) -> tuple[LocalPair,
         gains: Array = start + np.hstack([step[:, :n_s], b])
         return gains
 
-    search = CMA(
+    search: Any = (SepCMA if separable else CMA)(
         np.zeros(values["n_a"] * (n_s + 1)),
         sigma,
         seed=values["seed"],
@@ -370,6 +374,20 @@ def true_model(values: Values, *, candidates: int) -> tuple[LocalPair, Law, int]
     return sensed, LikeliestField(sensed.plant, true, law, seeds), int(training.budget.paid[0])
 
 
+def ppo(values: Values, **constants: Any) -> tuple[LocalPair, Law, int]:
+    """Proximal policy optimisation, as `benchmarks.reinforcement` has it."""
+    from benchmarks.reinforcement import learn
+
+    return learn(values, "ppo", **constants)
+
+
+def sac(values: Values, **constants: Any) -> tuple[LocalPair, Law, int]:
+    """Soft actor-critic, as `benchmarks.reinforcement` has it."""
+    from benchmarks.reinforcement import learn
+
+    return learn(values, "sac", **constants)
+
+
 METHODS: dict[str, Method] = {
     "no-control": no_control,
     "lqt": lqt_law,
@@ -378,6 +396,13 @@ METHODS: dict[str, Method] = {
     "cma-es": cma_es,
     "lqg": lqg,
     "true-model": true_model,
+    "ppo": ppo,
+    "sac": sac,
 }
-LIBRARIES = {"mpc": "osqp", "cma-es": "cmaes"}
-"""What a method needs besides the project's own dependencies: the extra `bench`."""
+LIBRARIES = {
+    "mpc": ("osqp", "bench"),
+    "cma-es": ("cmaes", "bench"),
+    "ppo": ("stable_baselines3", "rl"),
+    "sac": ("stable_baselines3", "rl"),
+}
+"""What a method needs besides the project's own dependencies, and the extra that has it."""

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import baselines, reinforcement
+from benchmarks import baselines
 from benchmarks.__main__ import parser
 from benchmarks.baselines import TEST, TUNING_SEEDS, VALIDATION, iqm, refuse_other_constants, run
 from benchmarks.methods import (
@@ -47,11 +47,14 @@ CONSTANTS: dict[str, dict[str, Any]] = {
     "true-model": {"candidates": 16},
 }
 ROLLOUTS = 11
+AGENTS = ("ppo", "sac")
+"""Need the extra rl, and have tests of their own."""
 
 
 def values_of(method: str) -> dict[str, Any]:
-    if library := LIBRARIES.get(method):
-        pytest.importorskip(library, reason=f"needs {library}: pip install 'pdeloop[bench]'")
+    library, extra = LIBRARIES.get(method, ("", ""))
+    if library:
+        pytest.importorskip(library, reason=f"needs {library}: pip install 'pdeloop[{extra}]'")
     sensors = {"sensors": 8} if method in ("lqg", "true-model") else {}
     return {**parameters(rollouts=ROLLOUTS, optimizer="gauss_newton"), **sensors}
 
@@ -61,7 +64,7 @@ def costs(files: dict[str, bytes]) -> tuple[np.ndarray, int]:
     return np.array(result["costs_by_field"]["adapted"][0]), result["rollouts"][0]["total"]
 
 
-@pytest.mark.parametrize("method", sorted({*METHODS, "gauss-newton"} - {"no-control"}))
+@pytest.mark.parametrize("method", sorted({*METHODS, "gauss-newton"} - {"no-control", *AGENTS}))
 def test_a_method_improves_on_no_control_pays_for_each_rollout_and_sees_no_field_of_a_table(
     method: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -177,6 +180,7 @@ def test_the_table_has_the_best_first_and_counts_what_diverges(tmp_path: Path) -
         ("better", 0, 2.5),
         ("worse", 1, 3.0),
     ]
+    assert rows[0]["costs"] == [1.0, 2.0, 3.0, 4.0]
     rows = [{"problem": "p", **row} for row in rows]
     lines = baselines.text({"limits": {"p": 2.0}, "rows": rows}).splitlines()
     assert lines[0] == "| p | 20 rollouts | over the limit |"
@@ -247,12 +251,58 @@ def test_a_comparison_is_a_study_that_is_continued(
         run([str(file)], **{**how, "seeds": 1})
 
 
+def test_what_a_method_needs_is_said_before_anything_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    how: dict[str, Any] = {"folder": tmp_path}
+    with pytest.raises(
+        ValueError, match=r"ppo\+plain needs stable_baselines3: pip install .*\[rl\]"
+    ):
+        run(["kdv"], methods=["gauss-newton", "ppo+plain"], **how)
+    with pytest.raises(ValueError, match=r"mpc needs osqp: pip install 'pdeloop\[bench\]'"):
+        run(["kdv"], methods=["mpc"], **how)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.skipif(
-    importlib.util.find_spec("stable_baselines3") is not None, reason="stable-baselines3 is there"
+    importlib.util.find_spec("stable_baselines3") is None,
+    reason="stable-baselines3 is not installed: extra rl",
 )
-def test_reinforcement_learning_says_what_it_needs() -> None:
-    with pytest.raises(ValueError, match="needs stable_baselines3, which no extra installs: see"):
-        reinforcement.run(str(SMALL))
+@pytest.mark.parametrize(
+    ("method", "constants"),
+    [
+        ("ppo", {"agent": "plain", "environments": 2, "episodes": 2}),
+        ("ppo", {"agent": "informed", "environments": 2, "episodes": 4, "log_std_init": -1.5}),
+        ("sac", {"agent": "plain", "learning_starts": 4}),
+        ("sac", {"agent": "informed", "environments": 2, "learning_starts": 4}),
+    ],
+)
+def test_agents_pay_for_each_rollout_and_are_functions_of_the_seed(
+    method: str, constants: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values = {**parameters(rollouts=9, seeds=1), "seed": 3}
+    asked: list[int] = []
+    reset = BatchPlant.reset
+
+    def noted(self: BatchPlant, seeds: Any, *rest: Any) -> Any:
+        asked.extend(np.ravel(seeds).tolist())
+        return reset(self, seeds, *rest)
+
+    monkeypatch.setattr(BatchPlant, "reset", noted)
+    first, again = (METHODS[method](values, **constants) for _ in range(2))
+    for split in (TEST, VALIDATION):
+        assert not {*asked} & {*evaluation_fields({**values, "evaluation_seed": split})}
+    seeds, costs = [1, 2], []
+    for pair, law, paid in (first, again):
+        # An exploration and a check of two rollouts, where the agent is told of them.
+        before = 3 if constants["agent"] == "informed" else 0
+        update = constants.get("episodes") or constants.get("environments", 1)
+        assert paid == before + (9 - before) // update * update
+        costs.append(rollout(pair.plant, law, seeds, keep=False).costs.mean)
+    assert np.array_equal(*costs) and np.isfinite(costs[0]).all()
+    other = METHODS[method]({**values, "seed": 4}, **constants)
+    assert not np.array_equal(rollout(other[0].plant, other[1], seeds).costs.mean, costs[0])
 
 
 def test_the_command_line_hands_the_program_its_options_alone(
