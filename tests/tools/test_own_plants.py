@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -287,3 +288,9 @@ def test_a_script_trains_its_own_class_and_names_its_file(tmp_path: Path) -> Non
     assert (name, float(loss)) == (f"{script}:Rod", 0.2)
     plant = build_plant(values_of(script, **{"physical.loss": 0.2}))
     assert plant.definition.fingerprint == int(number)
+
+
+def test_the_page_shows_the_example_as_it_is() -> None:
+    page = (ROOT / "docs" / "bring-your-own.md").read_text()
+    (code,) = re.findall(r"```python\n(import numpy.*?)```", page, flags=re.DOTALL)
+    assert code.strip() in (PLANTS / "random_linear.py").read_text()
