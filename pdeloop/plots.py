@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from pde_sim_node.plant import Plant
 from pdeloop.episode import EpisodeRecord
 from pdeloop.finished_run import FinishedRun
-from pdeloop.report import figures, learning
+from pdeloop.report import figures, learning, planes
 from pdeloop.report.data import ProblemData, of_run
 from pdeloop.report.style import FIELD_MAP, STYLE, image
 
@@ -52,6 +52,9 @@ def plot_episode(plant: Plant, episode: EpisodeRecord, environment: int = 0) -> 
         raise ValueError(
             f"environment is {environment}; expected one of the {batch} of an episode that was kept"
         )
+    if len(plant.grid.axes) > 1:
+        with matplotlib.rc_context(STYLE):
+            return planes.episode(plant, episode, environment)
     times = plant.sample_time * np.arange(steps + 1)
     components, axis = plant.grid.components, plant.grid.line
     extent = (0.0, times[-1], 0.0, axis.length)

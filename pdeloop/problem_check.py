@@ -226,6 +226,12 @@ def draw(values: Mapping[str, Any], path: Path) -> None:
     plant = _field_plant(values, compiled=False)
     fields = plant.reset([MEAN_FIELD, *range(DRAWN)]).copy()
     grid = plant.grid
+    if len(grid.axes) > 1:
+        from pdeloop.report import planes
+
+        figure = planes.fields(plant, fields[0], fields[1])
+        figure.savefig(path, dpi=150, format=path.suffix[1:] or "png")
+        return
     names, axis = grid.components, grid.line
     figure = Figure(figsize=(7.0, 0.6 + 2.4 * len(names)), layout="constrained")
     actuated = 0

@@ -21,6 +21,7 @@ from std_msgs.msg import ColorRGBA, Float64
 from visualization_msgs.msg import Marker
 
 from loop_interfaces.affinity import lower_priority
+from loop_interfaces.grid import Grid
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.parameters import VIEWER, taken_by
 from loop_interfaces.ros.message_types import message_class
@@ -31,7 +32,7 @@ from loop_interfaces.topics import VIEWS
 from viewer_node.diagnostics import ViewerDiagnostics
 from viewer_node.loop_reader import PERIOD, LoopReader
 from viewer_node.loop_view import LoopView
-from viewer_node.picture import diverging
+from viewer_node.picture import diverging, plane_of
 
 GRAPH_PERIOD = 0.5
 """Period (s) of polling the ROS graph."""
@@ -48,6 +49,7 @@ class ViewerNode:
     def __init__(self, node: Node, loop: Observer) -> None:
         values = declare(node, taken_by("viewer_node"), given_parameters(node))
         self._length = float(values["length"])
+        self._grid = Grid.parse(values["grid"]) if values["grid"] else None
         weights = float(values["state_weight"]), float(values["action_weight"])
         self._view = LoopView(horizon=values["horizon"], weights=weights, curve_from_topics=False)
         self._diagnostics = ViewerDiagnostics(self._view)
@@ -97,8 +99,12 @@ class ViewerNode:
         for name, values in (("field", z), ("target", target)):
             if values is not None and self._wanted(name):
                 self._publishers[name].publish(self._marker(name, x, values))
-        if self._wanted("spacetime") and (fields := self._view.space_time(now)) is not None:
-            self._publishers["spacetime"].publish(self._picture(diverging(fields)))
+        if self._wanted("spacetime"):
+            fields = self._view.space_time(now)
+            if (plane := plane_of(self._grid, z)) is not None:
+                fields = plane
+            if fields is not None:
+                self._publishers["spacetime"].publish(self._picture(diverging(fields)))
 
     def _marker(self, name: str, x: NDArray[np.float64], values: NDArray[np.float64]) -> Marker:
         marker = Marker(ns=name, id=list(COLOURS).index(name), type=Marker.LINE_STRIP)

@@ -6,6 +6,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.arrays import Array
+from loop_interfaces.grid import Grid
+
 UNSEEN = (128, 128, 128)
 """Colour of steps that were not seen."""
 _NEGATIVE, _ZERO, _POSITIVE = (33, 102, 172), (247, 247, 247), (178, 24, 43)
@@ -20,6 +23,20 @@ def _colours() -> NDArray[np.uint8]:
 
 
 _COLOURS = _colours()
+
+
+def plane_of(grid: Grid | None, state: Array) -> NDArray[np.float32] | None:
+    """The components of a state on two axes or more as one picture, one below the other.
+
+    The last axis to the right, the one before upwards; of others the middle. None for what has fewer
+    axes, or is not of this grid.
+    """
+    if grid is None or len(grid.axes) < 2 or state.size != grid.size:
+        return None
+    fields = grid.fields(state)
+    while fields.ndim > 3:
+        fields = fields[:, fields.shape[1] // 2]
+    return np.concatenate([field[::-1] for field in fields]).astype(np.float32)
 
 
 def diverging(fields: NDArray[np.float32]) -> NDArray[np.uint8]:

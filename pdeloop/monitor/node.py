@@ -22,6 +22,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 
+from loop_interfaces.grid import Grid
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.ros.node_main import ros_node
 from loop_interfaces.ros.observer import Observer
@@ -220,6 +221,9 @@ def component_names(values: Mapping[str, Any]) -> list[str]:
     if values.get("sensors"):
         count = int(values.get("sensor_delays") or 1)
         return ["y", *(f"y {k} ago" for k in range(1, count))]
+    if values.get("grid"):
+        with contextlib.suppress(ValueError):
+            return list(Grid.parse(str(values["grid"])).components)
     equation = EQUATIONS.get(str(values.get("equation")))
     return ["u"] if equation is None else list(equation.components)
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import ModelRows
 from loop_method.reduce.order import OrderStudy
+from pdeloop.report import planes
 from pdeloop.report.data import Behaviour, ProblemData
 from pdeloop.report.style import COLOURS, FIELD_MAP, GAIN_MAP, NAMES, image, plain_log
 
@@ -23,6 +24,8 @@ Eigenvalues = NDArray[Any]
 
 def behaviour(problem: ProblemData) -> Figure:
     """From the mean initial field: the fields in space and time, the actions, the final profiles."""
+    if len(problem.plant.grid.axes) > 1:
+        return planes.behaviour(problem)
     shown, components = problem.behaviours, problem.plant.grid.components
     count, fields = len(shown), len(components)
     figure = Figure(figsize=(2.05 * count + 0.9, 1.5 + 2.0 * fields + 1.3 * (1 + fields)))

@@ -1,0 +1,145 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Figures of fields on more than one axis: snapshots as pictures, where curves over x do not do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from loop_interfaces.arrays import Array
+from loop_interfaces.grid import Grid
+from pde_sim_node.plant import Plant
+from pdeloop.report.style import COLOURS, FIELD_MAP, NAMES
+
+if TYPE_CHECKING:
+    from pdeloop.episode import EpisodeRecord
+    from pdeloop.report.data import ProblemData
+
+SHARES = (0.0, 0.25, 1.0)
+"""Shares of an episode after which a field is shown."""
+
+
+def behaviour(problem: ProblemData) -> Figure:
+    """From the mean initial field: each controller's fields, the target, and the actions."""
+    plant, shown = problem.plant, problem.behaviours
+    grid, count = plant.grid, len(shown)
+    rows = len(SHARES) * len(grid.components)
+    figure = Figure(figsize=(2.05 * (count + 1) + 0.9, 1.6 * rows + 1.8))
+    axes = figure.subplots(rows + 1, count + 1, squeeze=False)
+    steps = len(shown[0].states) - 1
+    for i, name in enumerate(grid.components):
+        low, high = _range([b.states[:, grid.part(i)] for b in shown], plant, i)
+        for s, share in enumerate(SHARES):
+            row, k = axes[len(SHARES) * i + s], round(share * steps)
+            for ax, b in zip(row, shown, strict=False):
+                drawn = plane(ax, grid, b.states[k], i, low, high)
+            row[0].set_ylabel(f"t = {k * plant.sample_time:.3g} s\n{grid.axes[-2].label}")
+            row[-1].set_axis_off()
+        last = axes[len(SHARES) * (i + 1) - 1, -1]
+        last.set_axis_on()
+        plane(last, grid, plant.field_target, i, low, high)
+        last.set_title("target")
+        own = axes[len(SHARES) * i : len(SHARES) * (i + 1)].ravel().tolist()
+        figure.colorbar(drawn, ax=own, label=name, pad=0.01, extend="both")
+    times: Array = plant.sample_time * np.arange(steps + 1)
+    for column, b in enumerate(shown):
+        outcome = f"mean stage cost {b.cost:.3g}"
+        outcome = f"diverged at step {b.diverged}" if b.diverged >= 0 else outcome
+        axes[0, column].set_title(f"{NAMES[b.controller]}\n{outcome}")
+        _held(axes[-1, column], times, b.actions, color=COLOURS[b.controller])
+    axes[-1, 0].set_ylabel("actions $a_j$")
+    axes[-1, -1].set_axis_off()
+    return figure
+
+
+def episode(plant: Plant, record: EpisodeRecord, environment: int) -> Figure:
+    """One environment of an episode: fields at some instants, and the actions."""
+    grid, fields = plant.grid, record.fields[:, environment]
+    components, steps = grid.components, len(fields) - 1
+    figure = Figure(figsize=(2.3 * len(SHARES) + 1.0, 2.0 * len(components) + 1.8))
+    axes = figure.subplots(
+        len(components) + 1, len(SHARES), squeeze=False, gridspec_kw={"hspace": 0.5}
+    )
+    for i, name in enumerate(components):
+        low, high = _range([fields[:, grid.part(i)]], plant, i)
+        for ax, share in zip(axes[i], SHARES, strict=True):
+            k = round(share * steps)
+            drawn = plane(ax, grid, fields[k], i, low, high)
+            ax.set_title(f"t = {k * plant.sample_time:.3g} s")
+        axes[i, 0].set_ylabel(grid.axes[-2].label)
+        figure.colorbar(drawn, ax=axes[i].tolist(), label=name, pad=0.01)
+    for ax in axes[-1]:
+        ax.remove()
+    below = figure.add_subplot(len(components) + 1, 1, len(components) + 1)
+    times: Array = plant.sample_time * np.arange(steps + 1)
+    _held(below, times, record.actions[:, environment])
+    below.set_ylabel("actions $a_j$")
+    return figure
+
+
+def fields(plant: Plant, mean: Array, drawn: Array) -> Figure:
+    """The mean initial field, a drawn one, the target and where the actuators act."""
+    grid, components = plant.grid, plant.grid.components
+    figure = Figure(figsize=(9.5, 0.6 + 2.2 * len(components)), layout="constrained")
+    axes = figure.subplots(len(components), 4, squeeze=False)
+    for i, name in enumerate(components):
+        low, high = _range([mean[None, grid.part(i)], drawn[None, grid.part(i)]], plant, i)
+        shown = {"mean initial field": mean, "a drawn one": drawn, "target": plant.field_target}
+        for ax, (title, field) in zip(axes[i], shown.items(), strict=False):
+            picture = plane(ax, grid, field, i, low, high)
+            ax.set_title(title)
+        figure.colorbar(picture, ax=axes[i, :3].tolist(), label=name)
+        axes[i, 0].set_ylabel(grid.axes[-2].label)
+        supports = supports_of(plant, i)
+        axes[i, 3].set_axis_off()
+        if supports is not None:
+            axes[i, 3].set_axis_on()
+            plane(axes[i, 3], grid, np.tile(supports, len(components)), i, 0.0, supports.max())
+            axes[i, 3].set_title("actuators")
+    return figure
+
+
+def plane(ax: Axes, grid: Grid, state: Array, component: int, low: float, high: float) -> Any:
+    """Draw a component of a state as a picture over the last two axes; of others the middle."""
+    values = grid.fields(state)[component]
+    while values.ndim > 2:
+        values = values[len(values) // 2]
+    y, x = grid.axes[-2:]
+    ax.set_facecolor("0.9")
+    ax.set_xlabel(x.label)
+    ax.spines[["top", "right"]].set_visible(True)
+    return ax.imshow(
+        values,
+        cmap=FIELD_MAP,
+        extent=(0.0, x.length, 0.0, y.length),
+        origin="lower",
+        vmin=low,
+        vmax=high if high > low else low + 1.0,
+    )
+
+
+def supports_of(plant: Plant, component: int) -> Array | None:
+    """Where the actuators act on a component, largest magnitude over all of them; None if unknown."""
+    if plant.supports is None:
+        return None
+    everywhere = np.zeros((plant.n_z, plant.n_a))
+    everywhere[plant.forced] = plant.supports
+    largest: Array = np.abs(everywhere[plant.grid.part(component)]).max(axis=1)
+    return largest if largest.any() else None
+
+
+def _range(parts: Sequence[Array], plant: Plant, component: int) -> tuple[float, float]:
+    """Of the colours, which a few extreme points do not decide."""
+    values = np.concatenate([part.ravel() for part in parts])
+    target = plant.field_target[plant.grid.part(component)]
+    low, high = np.nanpercentile(values, (0.3, 99.7))
+    return min(float(low), float(target.min())), max(float(high), float(target.max()))
+
+
+def _held(ax: Axes, times: Array, actions: Array, **how: Any) -> None:
+    ax.step(times, np.vstack([actions, actions[-1:]]), where="post", linewidth=0.8, **how)
+    ax.set_xlabel("t (s)")
