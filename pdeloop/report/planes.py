@@ -45,7 +45,7 @@ def behaviour(problem: ProblemData) -> Figure:
         last.set_title("target")
         own = axes[len(SHARES) * i : len(SHARES) * (i + 1)].ravel().tolist()
         figure.colorbar(drawn, ax=own, label=name, pad=0.01, extend="both")
-    times: Array = plant.sample_time * np.arange(steps + 1)
+    times = plant.sample_time * np.arange(steps + 1, dtype=np.float64)
     for column, b in enumerate(shown):
         outcome = f"mean stage cost {b.cost:.3g}"
         outcome = f"diverged at step {b.diverged}" if b.diverged >= 0 else outcome
@@ -75,7 +75,7 @@ def episode(plant: Plant, record: EpisodeRecord, environment: int) -> Figure:
     for ax in axes[-1]:
         ax.remove()
     below = figure.add_subplot(len(components) + 1, 1, len(components) + 1)
-    times: Array = plant.sample_time * np.arange(steps + 1)
+    times = plant.sample_time * np.arange(steps + 1, dtype=np.float64)
     _held(below, times, record.actions[:, environment])
     below.set_ylabel("actions $a_j$")
     return figure
