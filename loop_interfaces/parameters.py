@@ -259,6 +259,13 @@ VIEWER = _section(
 )
 
 
+EVALUATION = frozenset(
+    {spec.name for spec in PROBLEM if "P" in spec.nodes} - {"problem"}
+    | {"evaluation_fields", "evaluation_seed"}
+)
+"""The parameters of plant, cost and evaluation fields: what costs compare by, besides `physical.*`."""
+
+
 def table() -> tuple[Spec, ...]:
     """Every parameter of the nodes."""
     return (*PROBLEM, *PLANT, *EXECUTION, *TUNER, *RECORDER, *VIEWER)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import pack
-from loop_interfaces.parameters import PROBLEM, noisy
+from loop_interfaces.parameters import EVALUATION, noisy
 from loop_interfaces.spec import ParameterError
 from loop_interfaces.topics import CostColumn
 from loop_method.seeds import Purpose, derive, evaluation_noise
@@ -26,7 +26,7 @@ from tuner_node.rollouts import EVALUATED
 from tuner_node.run_folder import RunFolderError
 
 _UNCHANGED: Mapping[str, Any] = {}
-EVALUATES = {spec.name for spec in PROBLEM if "P" in spec.nodes} - {"problem", "equation"}
+EVALUATES = EVALUATION - {"equation", "evaluation_fields", "evaluation_seed"}
 """The parameters of the plant and the cost, by name."""
 ROUNDED = 0.1
 """Relative difference of a mean cost that other rounding may explain where the field is chaotic."""

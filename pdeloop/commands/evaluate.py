@@ -55,7 +55,7 @@ def _evaluate(options: argparse.Namespace) -> int:
     allow_own_code(options)
     DEFAULTS["evaluation_fields"].check(options.fields, "--fields")
     DEFAULTS["evaluation_seed"].check(options.seed, "--seed")
-    changes = read_settings(options.settings)
+    changes = read_settings(options.set)
     run = load_run(options.folder)
     refuse_other_code(options, run.values)
     costs = evaluate(

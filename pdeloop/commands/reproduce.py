@@ -63,7 +63,7 @@ def _reproduce(options: argparse.Namespace) -> int:
     if options.iterations == 0:
         raise ParameterError("--iterations is 0; expected a whole number of at least 1")
 
-    settings = read_settings(options.settings)
+    settings = read_settings(options.set)
     for name in names:
         if name in settings:
             raise ParameterError(f"--set {name}: give --{name.replace('_', '-')}, which sets it")

@@ -28,7 +28,6 @@ def add_set(parser: argparse._ActionsContainer, what: str = "any parameter") -> 
     """The flag --set, which may be given several times."""
     action = parser.add_argument(
         "--set",
-        dest="settings",
         action="append",
         default=[],
         metavar="NAME=VALUE",

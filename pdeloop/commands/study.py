@@ -145,7 +145,7 @@ def _study(options: argparse.Namespace) -> int:
             "no study given; expected a YAML file, or --out DIR of one to continue"
         )
 
-    settings = read_settings(options.settings)
+    settings = read_settings(options.set)
     if options.file is None and settings:
         raise ParameterError("--out DIR alone continues a study with its own parameters: no --set")
 

@@ -96,7 +96,7 @@ def _train(options: argparse.Namespace) -> int:
         view=options.view,
     )
     transport.require()
-    settings = read_settings(options.settings)
+    settings = read_settings(options.set)
     own_viewer = {spec.name for spec in VIEWER if spec.name not in {s.name for s in PROBLEM}}
     if not options.view and (unused := sorted(own_viewer & {*settings})):
         raise ParameterError(f"--set {unused[0]} is of the viewer: add --view")

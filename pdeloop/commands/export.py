@@ -1,0 +1,63 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""`pdeloop export`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from loop_interfaces.spec import ParameterError
+from pdeloop.commands.common import Commands, a_path, command
+
+
+def add(commands: Commands) -> None:
+    """The command `export`."""
+    export = command(
+        commands,
+        "export",
+        _export,
+        help="a run's law as .npz or C, its curve as .csv",
+        description="Write the law a = K_a U^T z + K_b s_r of a finished run for other programs: as "
+        ".npz with K_a, K_b, U, s_r and the model, which `pdeloop train --model` takes too, or as one "
+        "function in C99; and the cost after each step of the training as .csv.",
+        example="pdeloop export runs/burgers-20260101-120000-1 --out law.c --curve curve.csv",
+    )
+    add_argument = export.add_argument
+    add_argument("folder", type=a_path, metavar="RUN", help="folder of a finished run")
+    add_argument("--out", type=a_path, metavar="FILE", help="the law, as .npz or .c")
+    add_argument("--law", choices=("adapted", "lqt"), help="which law [adapted]")
+    add_argument("--seed", type=int, metavar="S", help="of which training seed [the first]")
+    add_argument("--curve", type=a_path, metavar="FILE", help="the curve of all seeds, as .csv")
+
+
+def _export(options: argparse.Namespace) -> int:
+    from loop_interfaces.files import write_atomically
+    from pdeloop.export import curve_csv, law_of
+    from pdeloop.finished_run import load_run
+
+    files = {"--out": (options.out, (".npz", ".c")), "--curve": (options.curve, (".csv",))}
+    if options.out is None and options.curve is None:
+        options.refuse("expected --out FILE for the law, --curve FILE for the curve, or both")
+    if options.out is None and not (options.law is None and options.seed is None):
+        options.refuse("--law and --seed choose a law: give --out FILE, or leave them out")
+    for flag, (path, suffixes) in files.items():
+        if path is not None and path.suffix.lower() not in suffixes:
+            raise ParameterError(
+                f"{flag} is {path}; expected a file that ends in {' or '.join(suffixes)}"
+            )
+    run = load_run(options.folder)
+    contents = {}
+    if options.out is not None:
+        law = law_of(run, options.law or "adapted", options.seed)
+        contents[options.out] = law.c() if options.out.suffix.lower() == ".c" else law.npz()
+        if run.result.get("controller", {}).get("law", "affine") != "affine":
+            print("WARNING: the run's controller was not seen to use this law", file=sys.stderr)
+    if options.curve is not None:
+        contents[options.curve] = curve_csv(run)
+    for path, content in contents.items():
+        try:
+            write_atomically(path, content)
+        except OSError as error:
+            raise ParameterError(f"cannot write {path}: {error.strerror}") from error
+        print(f"written to {path}")
+    return 0

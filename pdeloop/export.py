@@ -1,0 +1,111 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A law, or the curve of a training, in files for other programs."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from io import BytesIO, StringIO
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+
+from loop_interfaces.arrays import Array
+from loop_interfaces.model_rows import ModelRows, pack
+from loop_interfaces.spec import ParameterError
+from pdeloop.finished_run import FinishedRun
+
+LAWS = ("adapted", "lqt")
+CURVE = ("seed", "rollouts", "cost", "role", "accepted", "relative_cost", "diverged")
+"""Columns of a curve."""
+_C = Path(__file__).parent / "commands" / "template" / "law.c.txt"
+
+
+@dataclass(frozen=True, eq=False)
+class Law:
+    """a = K_a U^T z + K_b s_r, limited to +- limit where that is above 0.
+
+    model: with the law's own gains; sample_time in s; name: what it is the law of, in words.
+    """
+
+    model: ModelRows
+    limit: float
+    sample_time: float
+    name: str
+
+    def npz(self) -> bytes:
+        """As of `pdeloop identify --out`, which `pdeloop train --model` takes."""
+        arrays: dict[str, Any] = {
+            name: getattr(self.model, name) for name in self.model.__dataclass_fields__
+        }
+        content = BytesIO()
+        np.savez(
+            content,
+            model=pack(self.model)[np.newaxis],
+            sample_time=np.array(self.sample_time),
+            action_limit=np.array(self.limit),
+            **arrays,
+        )
+        return content.getvalue()
+
+    def c(self) -> bytes:
+        """One function in C99 without a library, whose numbers are the law's own to the bit."""
+        model = self.model
+        (n_z, n_s), n_a = model.U.shape, len(model.K_a)
+        constant = model.K_b @ model.s_r
+        filled = {
+            "name": " ".join(self.name.replace("*/", "").split()),
+            "sample_time": repr(self.sample_time),
+            "n_z": n_z,
+            "n_s": n_s,
+            "n_a": n_a,
+            "U": _rows(model.U.T),
+            "K_a": _rows(model.K_a),
+            "constant": ", ".join(map(_hex, constant)),
+            "limit": _hex(self.limit),
+        }
+        return Template(_C.read_text()).substitute(filled).encode()
+
+
+def law_of(run: FinishedRun, which: str = "adapted", seed: int | None = None) -> Law:
+    """A law of a run: adapted or lqt, of its first seed or a given one.
+
+    ParameterError for a seed that the run has not.
+    """
+    if which not in LAWS:
+        raise ParameterError(f"the law is '{which}'; expected one of {', '.join(LAWS)}")
+    seed = run.seeds[0] if seed is None else seed
+    if seed not in run.seeds:
+        raise ParameterError(
+            f"the run has no seed {seed}; expected one from {run.seeds[0]} to {run.seeds[-1]}"
+        )
+    m = run.seeds.index(seed)
+    gains = (run.policies if which == "adapted" else run.warm)[m]
+    model = run.models[m]
+    n_s = model.U.shape[1]
+    own = replace(model, K_a=gains[:, :n_s].copy(), K_b=gains[:, n_s:].copy())
+    name = f"the {which} law of {run.values['problem']}, seed {seed}"
+    return Law(own, float(run.values["action_limit"]), float(run.values["sample_time"]), name)
+
+
+def curve_csv(run: FinishedRun) -> bytes:
+    """How the cost fell: a line for each step of each seed's optimiser, with a line of names."""
+    rows: Iterable[Mapping[str, Any]] = (
+        row for row in run.result["history"] if row.get("event") == "adapted"
+    )
+    text = StringIO()
+    writer = csv.DictWriter(text, CURVE, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({name: row.get(name, "") for name in CURVE} for row in rows)
+    return text.getvalue().encode()
+
+
+def _rows(matrix: Array) -> str:
+    return ",\n    ".join("{" + ", ".join(map(_hex, row)) + "}" for row in matrix)
+
+
+def _hex(value: float) -> str:
+    return float(value).hex()
