@@ -17,7 +17,7 @@ from pdeloop.output import aligned
 
 SHOWN = 30
 """Parameters that the text names at most."""
-IGNORED = {"out", "resume", "plant", "pairs", "problem"}
+IGNORED = {"out", "resume", "plant_fingerprint", "pairs", "problem"}
 """Parameters that say where a run was, not what it was."""
 
 

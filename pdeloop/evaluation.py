@@ -26,7 +26,7 @@ from tuner_node.rollouts import EVALUATED
 from tuner_node.run_folder import RunFolderError
 
 _UNCHANGED: Mapping[str, Any] = {}
-EVALUATES = EVALUATION - {"equation", "evaluation_fields", "evaluation_seed"}
+EVALUATES = EVALUATION - {"equation", "plant", "grid", "evaluation_fields", "evaluation_seed"}
 """The parameters of the plant and the cost, by name."""
 ROUNDED = 0.1
 """Relative difference of a mean cost that other rounding may explain where the field is chaotic."""

@@ -35,7 +35,7 @@ def test_every_parameter_can_be_set_to_its_default_or_has_a_flag(spec: object) -
         with pytest.raises(ParameterError, match=f"give {OWN_FLAGS[name]}"):
             read_settings([f"{name}={text}"])
         return
-    text = text or "0.5"  # an empty list
+    text = "0.5" if default == [] else text
     found = read_settings([f"{name}={text}"])[name]
     assert found == (default if default != [] else [0.5]) or str(found) == str(default)
     assert read_settings([f"--{name.replace('_', '-')}={text}"]) == {name: found}
