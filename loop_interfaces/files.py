@@ -5,6 +5,7 @@ No symbolic link is followed.
 """
 
 import errno
+import fcntl
 import os
 import stat
 from io import BufferedReader
@@ -124,6 +125,23 @@ def open_own(path: Path, flags: int) -> BinaryIO:
         os.close(descriptor)
         raise OSError(errno.EINVAL, "it is no ordinary file", str(path))
     return os.fdopen(descriptor, "ab+" if flags & os.O_APPEND else "rb+")
+
+
+def try_lock(file: BinaryIO | BufferedReader, *, shared: bool = False) -> bool:
+    """Whether the lock of an open file could be taken, for as long as it is open.
+
+    FileError where its file system has no locks: then nobody may take it for free.
+    """
+    try:
+        fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        raise FileError(
+            f"cannot be locked ({error.strerror}), so nothing would keep two processes "
+            "from writing beside it at once; expected a file system with locks, such as a local disk"
+        ) from error
+    return True
 
 
 def open_ordinary(path: Path) -> BufferedReader:

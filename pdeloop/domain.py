@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import random
 import re
@@ -13,7 +12,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from loop_interfaces.files import FileError, open_own, private_folder
+from loop_interfaces.files import FileError, open_own, private_folder, try_lock
 from pde_sim_node.run_record import forget
 
 DOMAINS = range(1, 101)
@@ -56,10 +55,13 @@ def own_domain() -> Iterator[int]:
     for domain in random.sample(DOMAINS, len(DOMAINS)):
         with open_own(DOMAINS_FOLDER / str(domain), 0) as lock:
             try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                continue
-            if _unused(domain):
+                free = try_lock(lock)
+            except FileError as error:
+                raise DomainError(
+                    f"no ROS domain can be reserved: {DOMAINS_FOLDER / str(domain)} {error}; "
+                    "set TMPDIR to a folder on one"
+                ) from error
+            if free and _unused(domain):
                 forget(domain)
                 yield domain
                 return

@@ -18,7 +18,14 @@ from pathlib import Path
 from typing import BinaryIO
 
 from loop_interfaces.documents import parse_json
-from loop_interfaces.files import FileError, is_private, open_new, open_ordinary, private_folder
+from loop_interfaces.files import (
+    FileError,
+    is_private,
+    open_new,
+    open_ordinary,
+    private_folder,
+    try_lock,
+)
 from pdeloop.domain import DOMAINS_FOLDER
 
 _PREFIX = "live-"
@@ -79,11 +86,7 @@ def running() -> list[Live]:
 
 def is_locked(file: BinaryIO) -> bool:
     """Whether another process holds the lock of this open file."""
-    try:
-        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    return False
+    return not try_lock(file, shared=True)
 
 
 def _read(path: Path) -> list[Live]:

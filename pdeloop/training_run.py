@@ -95,10 +95,12 @@ def reopen(folder: Path) -> dict[str, Any]:
     run = RunFolder(folder)
     run.unfinished()
     values = run.values()
-    if (folder / "result.json").exists():
-        raise RunFolderError(f"the run in {folder} is complete; there is nothing to continue")
     try:
         with run.locked():
+            if (folder / "result.json").exists():
+                raise RunFolderError(
+                    f"the run in {folder} is complete; there is nothing to continue"
+                )
             run.hold(False)
     except FileError as error:
         raise RunFolderError(f"{folder}/run.json cannot be used: {error}") from error

@@ -14,7 +14,6 @@ logs/              one file a node, when the command line started them
 
 import contextlib
 import errno
-import fcntl
 import json
 import os
 import secrets
@@ -31,7 +30,14 @@ from numpy.typing import NDArray
 
 from loop_interfaces import model_rows
 from loop_interfaces.array_files import read_arrays, taken
-from loop_interfaces.files import make_folder, open_own, read_json, write_atomically
+from loop_interfaces.files import (
+    FileError,
+    make_folder,
+    open_own,
+    read_json,
+    try_lock,
+    write_atomically,
+)
 from loop_interfaces.frames import MAX_ID
 from loop_interfaces.parameters import (
     EXECUTION,
@@ -110,9 +116,27 @@ class RunFolder:
 
     def create(self, parameters: Mapping[str, Any]) -> None:
         """Begin a new training here. RunFolderError if the folder holds one or cannot be written."""
+        with self.made_and_locked():
+            self.begin(parameters)
+
+    @contextlib.contextmanager
+    def made_and_locked(self) -> Iterator[None]:
+        """Make the folder, if it can hold a new training, and keep other processes from it."""
         self.refuse_another()
         try:
             make_folder(self.path)
+        except OSError as error:
+            raise RunFolderError(f"cannot write to {self.path}: {error.strerror}") from error
+        with self.locked():
+            yield
+
+    def begin(self, parameters: Mapping[str, Any]) -> None:
+        """Begin a new training in the folder that the caller has locked: `create`.
+
+        RunFolderError if the folder holds one by now, or cannot be written.
+        """
+        self.refuse_another()
+        try:
             kept = {k: v for k, v in parameters.items() if k not in ("out", "resume")}
             # parameters.yaml comes last and whole: where it is, there is a run.
             self._identify(RunIdentity(1 + secrets.randbelow(MAX_ID - 1), 0), parameters)
@@ -221,11 +245,15 @@ class RunFolder:
             raise RunFolderError(f"cannot write to {self.path}: {error.strerror}") from error
         with file:
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
+                free = try_lock(file)
+            except FileError as error:
+                raise RunFolderError(
+                    f"{self.path / 'lock'} {error}: choose another folder for the run"
+                ) from error
+            if not free:
                 raise RunFolderError(
                     f"another process works on the run in {self.path}; let it end, or stop it"
-                ) from error
+                )
             yield
 
     def note(self, row: Mapping[str, Any]) -> None:

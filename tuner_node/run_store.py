@@ -117,15 +117,17 @@ def open_run(
 ) -> tuple[RunWriter | None, RunIdentity]:
     """Begin the run in the folder `out` of the tuner's parameters, or go on with it (`resume`).
 
-    locks: the folder is locked until it is closed. Without a folder nothing is written.
+    locks: the folder is locked until it is closed, before anything in it is looked at or written, as
+    somebody else may begin a run in it, too. Without a folder nothing is written.
     """
     if not values["out"]:
         return None, RunIdentity(1 + secrets.randbelow(MAX_ID - 1), 0)
     folder = RunFolder(Path(values["out"]))
     if values["resume"]:
-        folder.parameters()
+        folder.parameters()  # no lock is left where no run is
+        locks.enter_context(folder.locked())
     else:
-        folder.create(values)
-    locks.enter_context(folder.locked())
+        locks.enter_context(folder.made_and_locked())
+        folder.begin(values)
     writer = RunWriter(folder.path, values, training, warn=warn)
     return writer, writer.identity
