@@ -15,6 +15,7 @@ from launch.actions import (
     LogInfo,
     OpaqueFunction,
     RegisterEventHandler,
+    SetEnvironmentVariable,
     Shutdown,
 )
 from launch.event_handlers import OnProcessExit
@@ -25,6 +26,7 @@ from launch_ros.actions import Node
 from loop_interfaces.parameters import flags
 from loop_interfaces.protocol import STOPPED
 from loop_interfaces.spec import ParameterError, assignment
+from loop_method.adapt.registry import OWN_OPTIMIZERS
 from pde_sim_node.equations import OWN_EQUATIONS
 from pde_sim_node.plants.loading import OWN_PLANTS
 from pdeloop.pairs import PAIR, PAIRS, Transport
@@ -82,6 +84,9 @@ def training(context: LaunchContext) -> list[Any]:
     folder = run_folder(given)
     given["problem"] = str(folder / "parameters.yaml")
     actions: list[Any] = [LogInfo(msg=f"training in {folder}")]
+    if given["optimizer"]:
+        allowed = context.environment[OWN_OPTIMIZERS.variable]
+        actions.append(SetEnvironmentVariable(OWN_OPTIMIZERS.variable, allowed))
     for node in transport.nodes(folder):
         if node.package in PAIR:
             continue  # of the loop
@@ -111,9 +116,11 @@ def run_folder(given: dict[str, str]) -> Path:
     own |= dict(assignment(text) for text in filter(None, given["set"].split(",")))
     if given["model"]:
         own["model"] = str(Path(given["model"]).resolve())
-    kinds = [kind for kind in (OWN_EQUATIONS, OWN_PLANTS) if given[kind.word]]
+    kinds = [kind for kind in (OWN_EQUATIONS, OWN_PLANTS, OWN_OPTIMIZERS) if given[kind.word]]
     code = {kind.word: kind.allow(given[kind.word]) for kind in kinds}
     if given["resume"]:
+        if ":" in code.get("optimizer", ""):  # code of a run has to be named again
+            del own["optimizer"]
         if own or given["out"]:
             names = ", ".join([*own, *["out"] * bool(given["out"])])
             raise ParameterError(

@@ -65,12 +65,14 @@ def load_parameters(
     itself (OF_THE_PLANT) is left out where nothing else is given.
     """
     path = find_problem(name) if name or not options.get("plant") else None
-    given = dict(preferred({**(read_yaml(path) if path else {}), **options}))
-    given = with_names(given)
+    given = with_names({**(read_yaml(path) if path else {}), **options})
     check_names(given, [spec.name for spec in table()])
     folder = path.resolve().parent if path else Path.cwd()
     for code in ("equation", "plant"):
         given[code] = _from(folder, str(given.get(code, "")))
+    if "optimizer" in given:
+        given["optimizer"] = _from(folder, str(given["optimizer"]))
+    given = dict(preferred(given))
     if given["plant"]:
         given.setdefault("problem", _words(given["plant"]))
         values = own_values(given, check(table(), given))

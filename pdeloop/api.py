@@ -22,6 +22,7 @@ from loop_interfaces.own_code import refuse_while_executed
 from loop_interfaces.parameters import table
 from loop_interfaces.problem import load_parameters
 from loop_interfaces.spec import FREE, flatten
+from loop_method.adapt.registry import OWN_OPTIMIZERS
 from loop_method.reduce.identifiability import IdentifiabilityWarning
 from loop_method.reduce.reduced_model import ReducedModel
 from pde_sim_node.build import build_plant, complete
@@ -140,7 +141,7 @@ def problem(
         The parameters of the equation itself, like {"viscosity": 1e-3}, or of a plant that is named.
     parameters
         Any parameter of docs/interfaces.md by name: n_z, n_a, horizon, measurement_noise, ... Code of
-        an own equation ('file.py:Class') is run if it is named here as `equation`.
+        one's own ('file.py:Class') is run if it is named here as `equation` or `optimizer`.
 
     Returns
     -------
@@ -192,8 +193,9 @@ def named(source: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
     physical = given.pop("physical", None) or {}
     if not isinstance(physical, Mapping):
         raise ValueError(f"physical is {physical!r}; expected a dict of names and numbers")
-    if "equation" in given:
-        given["equation"] = OWN_EQUATIONS.allow(given["equation"])
+    for code in (OWN_EQUATIONS, OWN_OPTIMIZERS):
+        if code.word in given:
+            given[code.word] = code.allow(given[code.word])
     if (plant := given.pop("plant", None)) is not None:
         given |= _plant_named(plant)
     given = flatten(given)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
@@ -56,9 +56,19 @@ def a_path(text: str) -> Path:
     return Path(text)
 
 
-def add_own_code(parser: argparse._ActionsContainer) -> None:
-    """The flags --equation and --plant; see `allow_own_code`."""
-    for word, what in (("equation", "the problem's PDE"), ("plant", "a plant in its place")):
+_OWN_CODE = {
+    "equation": "the problem's PDE",
+    "plant": "a plant in its place",
+    "optimizer": "the method of the adapt phase",
+}
+
+
+def add_own_code(
+    parser: argparse._ActionsContainer, words: Sequence[str] = ("equation", "plant")
+) -> None:
+    """The flags --equation, --plant and --optimizer, or some of them; see `allow_own_code`."""
+    for word in words:
+        what = _OWN_CODE[word]
         parser.add_argument(
             f"--{word}",
             metavar="NAME",
@@ -68,22 +78,23 @@ def add_own_code(parser: argparse._ActionsContainer) -> None:
 
 
 def allow_own_code(options: argparse.Namespace) -> dict[str, str]:
-    """Allow the code that --equation or --plant names; the parameters that were given."""
+    """Allow the code that --equation, --plant or --optimizer names; the parameters that were given."""
+    from loop_method.adapt.registry import OWN_OPTIMIZERS
     from pde_sim_node.equations import OWN_EQUATIONS
     from pde_sim_node.plants.loading import OWN_PLANTS
 
     given = {}
-    for kind in (OWN_EQUATIONS, OWN_PLANTS):
-        named = getattr(options, kind.word)
+    for kind in (OWN_EQUATIONS, OWN_PLANTS, OWN_OPTIMIZERS):
+        named = getattr(options, kind.word, None)
         if named is not None:
             given[kind.word] = kind.allow(named)
     return given
 
 
 def refuse_other_code(options: argparse.Namespace, *runs: Mapping[str, object]) -> None:
-    """ParameterError if --equation or --plant names none that these parameters of runs name."""
-    for word in ("equation", "plant"):
-        named = getattr(options, word)
+    """ParameterError if a flag of own code names none that these parameters of runs name."""
+    for word in _OWN_CODE:
+        named = getattr(options, word, None)
         known = sorted({str(values.get(word, "")) for values in runs})
         if named is not None and identity(named) not in map(identity, known):
             theirs = ", ".join(filter(None, known)) or "none"
@@ -125,7 +136,7 @@ def _optimizers(prefix: str, **_: object) -> list[str]:
     """The names of the optimisers, for the completion of the shells."""
     from loop_method.adapt.registry import offered
 
-    return list(offered())
+    return offered()
 
 
 def given_flags(options: argparse.Namespace) -> dict[str, object]:

@@ -108,6 +108,8 @@ def _train(options: argparse.Namespace) -> int:
     if options.model is not None:
         given["model"] = str(options.model.resolve())
     if options.resume is not None:
+        if ":" in own.get("optimizer", ""):  # code of a run has to be named again
+            del given["optimizer"]
         if options.problem or given or options.out:
             raise ParameterError(
                 "--resume continues a run with its own parameters; "

@@ -1,0 +1,130 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""What is the same in all optimisers whose steps are alike: a base class for one of your own."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from loop_interfaces.array_files import taken
+from loop_interfaces.arrays import Array
+from loop_method.adapt.base import (
+    Context,
+    Optimizer,
+    Rollout,
+    RolloutResult,
+    Row,
+    State,
+    checked_policy,
+    require_positive,
+    require_results,
+)
+from loop_method.seeds import field_seed
+
+_STREAM = 0x53544550  # "STEP"; large, as in loop_method.seeds
+
+
+class StepOptimizer(Optimizer):
+    """An optimiser all of whose steps want as many rollouts, and improve the policy by their outcome.
+
+    A class derived from it has a `name`, and defines `rollouts` and `update`. The budget, the counts,
+    the history and checkpoints are here. Arguments: see `Optimizer`.
+
+    Attributes
+    ----------
+    policy : (n_a, 2 n_s) array
+        [K_a K_b] so far; `update` assigns the next one.
+    tells : int
+        Steps so far.
+    settings, context
+        As they were given.
+    """
+
+    step_rollouts: ClassVar[int] = 1
+    """Rollouts of a step."""
+    kept: ClassVar[Sequence[str]] = ()
+    """Attributes, arrays of float64 of a fixed shape, that a checkpoint holds besides the policy."""
+
+    def __init__(
+        self,
+        policy0: ArrayLike,
+        *,
+        seed: int,
+        rollouts: int,
+        settings: Any,
+        context: Context | None = None,
+    ) -> None:
+        require_positive(rollouts=rollouts)
+        self._policy = checked_policy(policy0)
+        self._seed, self._budget, self._tells = seed, rollouts, 0
+        self.settings, self.context = settings, context
+
+    @abstractmethod
+    def rollouts(self) -> list[Rollout]:
+        """The rollouts of this step: a function of the policy, `generator`, `field_seed` and `kept`."""
+
+    @abstractmethod
+    def update(self, results: Sequence[RolloutResult]) -> Row:
+        """Improve `policy` by the results of `rollouts`, in their order; what the history says of it.
+
+        A rollout that is not `usable` diverged: its cost means nothing.
+        """
+
+    @classmethod
+    def first_step(cls, settings: Any) -> int:
+        return cls.step_rollouts
+
+    @property
+    def generator(self) -> np.random.Generator:
+        """A generator of random numbers for this step, at its beginning each time it is asked for."""
+        return np.random.default_rng([self._seed, _STREAM, self._tells])
+
+    @property
+    def field_seed(self) -> int:
+        """The seed of an initial field for this step."""
+        return field_seed(self._seed, self._tells)
+
+    @property
+    def policy(self) -> Array:
+        return self._policy.copy()
+
+    @policy.setter
+    def policy(self, policy: ArrayLike) -> None:
+        self._policy = checked_policy(policy)
+
+    @property
+    def tells(self) -> int:
+        return self._tells
+
+    @property
+    def done(self) -> bool:
+        return (self._tells + 1) * self.step_rollouts > self._budget
+
+    def ask(self) -> list[Rollout]:
+        return [] if self.done else self.rollouts()
+
+    def tell(self, results: Sequence[RolloutResult]) -> Row:
+        require_results(results, 0 if self.done else self.step_rollouts)
+        row: Row = {
+            "rollouts": (self._tells + 1) * self.step_rollouts,
+            "diverged": sum(not result.usable for result in results),
+        }
+        row |= self.update(results)
+        self._tells += 1
+        return row
+
+    def state(self) -> State:
+        own = {name: np.array(getattr(self, name)) for name in self.kept}
+        return {"policy": self.policy, "tells": np.array(self._tells), **own}
+
+    def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
+        policy = taken(state, "policy", "f", self._policy.shape)
+        tells = int(taken(state, "tells", "i", ()))
+        own = {name: taken(state, name, "f", np.shape(getattr(self, name))) for name in self.kept}
+        self._policy, self._tells = policy.copy(), tells
+        for name, value in own.items():
+            setattr(self, name, value.copy())
