@@ -93,6 +93,9 @@ class InstrumentedPlant:
         self.plant, self.instruments = plant, instruments
         self.n_z, self.n_a, self.grid, self.forced = plant.n_z, plant.n_a, plant.grid, plant.forced
         self.supports = plant.supports
+        self.settable, self.quadratic = plant.settable, plant.quadratic
+        if instruments.process_noise and not plant.settable:
+            raise ValueError(f"process_noise cannot force {plant!r}: its state cannot be set")
         self.horizon, self.sample_time = plant.horizon, plant.sample_time
         self.state_weight, self.action_weight = plant.state_weight, plant.action_weight
         self.divergence_bound, self.field_target = plant.divergence_bound, plant.field_target

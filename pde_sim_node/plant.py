@@ -130,6 +130,10 @@ class Plant(Protocol):
         The numbers of a state that process noise forces.
     supports : (forced numbers, n_a) or None
         Where each actuator acts on these numbers, if that is known.
+    settable : bool
+        Whether its state can be set, so that `evaluate` works and process noise can force it.
+    quadratic : bool
+        Whether its stage cost is the one of the weights and the target.
     instruments : Instruments
         What stands between the state and the controller.
     parallel : ParallelStep or None
@@ -165,6 +169,10 @@ class Plant(Protocol):
 
     @property
     def state_size(self) -> int: ...
+    @property
+    def settable(self) -> bool: ...
+    @property
+    def quadratic(self) -> bool: ...
     @property
     def supports(self) -> Array | None: ...
     @property

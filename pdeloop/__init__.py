@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from loop_method.reduce.reduced_model import ReducedModel as ReducedModel
     from pde_sim_node.dynamics import Dynamics as Dynamics
     from pde_sim_node.plant import Plant as Plant
+    from pde_sim_node.plants.gymnasium_plant import from_gymnasium as from_gymnasium
     from pdeloop.api import Problem as Problem
     from pdeloop.api import identify as identify
     from pdeloop.api import problem as problem
@@ -53,6 +54,7 @@ _NAMES = {
     "loop_interfaces.grid": ("Axis", "Grid"),
     "pde_sim_node.dynamics": ("Dynamics",),
     "pde_sim_node.plant": ("Plant",),
+    "pde_sim_node.plants.gymnasium_plant": ("from_gymnasium",),
     "pdeloop.api": ("Problem", "identify", "problem", "train"),
     "pdeloop.data_file": ("read_measurements",),
     "pdeloop.episode": ("projected_law", "rollout"),

@@ -158,6 +158,8 @@ def reach(plant: Plant) -> Reach:
 
 def _actuators(plant: Plant) -> Finding:
     name = "modes"
+    if not plant.settable:
+        return Finding(name, True, "not checked: the state of the plant cannot be set")
     if plant.n_z > MAX_LINEARISED:
         return Finding(name, True, f"not checked: a state of more than {MAX_LINEARISED} numbers")
     found = reach(plant)

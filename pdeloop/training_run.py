@@ -20,6 +20,7 @@ from controller_node.identification import DesignSettings, check_sizes
 from loop_interfaces.files import FileError, make_own_folder
 from loop_interfaces.isolation import NETWORK, loopback_environment
 from loop_interfaces.own_code import OwnCodeError
+from loop_interfaces.spec import ParameterError
 from pde_sim_node.build import build_plant, complete
 from pdeloop.display import Display, ProgressFile
 from pdeloop.domain import own_domain
@@ -31,7 +32,7 @@ from pdeloop.pairs import LoopNode, Transport
 from pdeloop.supervisor import Child, NodeError, Supervisor, node_command
 from tuner_node import narration
 from tuner_node.build import build_training
-from tuner_node.optimizer_parameters import training_parameters
+from tuner_node.optimizer_parameters import kind_of, training_parameters
 from tuner_node.run_folder import RunFolder, RunFolderError, resuming, timestamp
 from tuner_node.run_store import RunWriter
 
@@ -47,6 +48,12 @@ def resolve(problem: str, options: Mapping[str, Any]) -> dict[str, Any]:
     Nothing is compiled.
     """
     plant, values = complete(training_parameters(problem, options), compiled=False)
+    kind = kind_of(values)
+    if kind.needs_trajectories and not plant.quadratic:
+        raise ParameterError(
+            f"the optimizer '{values['optimizer']}' learns from a quadratic cost about a target, and "
+            "this plant has none: take one that needs costs alone, such as two_point, or give a target"
+        )
     if not values["model"]:
         check_sizes(DesignSettings.of(values), plant.state_size, plant.horizon)
     return values

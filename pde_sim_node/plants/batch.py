@@ -35,6 +35,8 @@ class BatchPlant(ABC):
     parallel: ParallelStep | None = None
     forced = slice(None)
     supports: Array | None = None
+    settable = True
+    quadratic = True
 
     def __init__(
         self,

@@ -127,6 +127,8 @@ def hand_over(plant: Dynamics | Plant) -> dict[str, Any]:
         for name, value in arguments.items()
         if _storable(value) or not _is_default(kind, name, value)
     }
+    if not isinstance(plant, Dynamics):  # nobody knows what it was made with
+        stored = {"plant": f"{OBJECT} {plant.definition.fingerprint}"}
     name = OWN_PLANTS.allow(f"{source}:{kind.__qualname__}")
     _objects[_key(name, stored)] = Made(plant, stored)
     return {"plant": name} | {f"{PHYSICAL}{own}": value for own, value in stored.items()}

@@ -20,7 +20,8 @@ from tests.support.small_loop import LIMIT
 pytestmark = pytest.mark.topics
 PLANTS = ROOT / "examples" / "plants"
 LINEAR, PLATE = f"{PLANTS}/random_linear.py:RandomLinear", f"{PLANTS}/plate.py:Plate"
-BUDGET = {"rollouts": 9, "evaluation_fields": 2, "reduced_order": 6}
+PENDULUM = f"{PLANTS}/pendulum.py:upright"
+BUDGET = {"rollouts": 9, "evaluation_fields": 2, "reduced_order": 3}
 FLAGS = [
     word for name, value in BUDGET.items() for word in (f"--{name.replace('_', '-')}", str(value))
 ]
@@ -32,7 +33,8 @@ def policies(folder: Path) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("name", "given"), [(LINEAR, {"radius": 0.9}), (PLATE, {"nx": 6, "ny": 4})]
+    ("name", "given"),
+    [(LINEAR, {"radius": 0.9}), (PLATE, {"nx": 6, "ny": 4}), (PENDULUM, {"horizon": 20})],
 )
 def test_a_plant_of_ones_own_is_trained_over_topics_to_the_same_bits_and_recorded(
     loop: Processes,

@@ -1,0 +1,196 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A Gymnasium environment with box spaces as a plant: the state is what it observes."""
+
+from __future__ import annotations
+
+import copy
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from loop_interfaces.arrays import Array, float_array
+from loop_interfaces.grid import Grid
+from loop_interfaces.own_code import OwnCodeError, located
+from pde_sim_node.definition import Definition, described, source_of
+from pde_sim_node.plant import MEAN_FIELD
+from pde_sim_node.plants.batch import BatchPlant
+
+if TYPE_CHECKING:
+    from gymnasium import Env
+
+
+def from_gymnasium(
+    env: Env[Any, Any] | str,
+    *,
+    target: ArrayLike | None = None,
+    state_weight: float = 1.0,
+    action_weight: float = 1.0,
+    horizon: int = 0,
+    sample_time: float = 1.0,
+    divergence_bound: float = 1e6,
+) -> GymnasiumPlant:
+    """A plant of an environment of Gymnasium's with box spaces.
+
+    Its state is the observation, and its actions saturate at the bounds of the action space. With a
+    target the stage cost is that of every plant, q |o - o_r|^2 + r |a|^2. Without one it is minus the
+    reward, from which only optimisers that need costs alone can learn, such as two_point. An
+    environment that terminates has diverged. The mean field is what seed 0 begins with.
+
+    Parameters
+    ----------
+    env
+        The environment, of which copies are made, or its id for `gymnasium.make`.
+    target : (n_z,), optional
+        Observation to be tracked.
+    state_weight, action_weight
+        q and r.
+    horizon
+        Steps of an episode; 0: as its specification limits it.
+    sample_time
+        Time (s) of a step.
+    divergence_bound
+        An observation beyond this magnitude has diverged.
+
+    Returns
+    -------
+    GymnasiumPlant
+
+    Raises
+    ------
+    ValueError
+        The spaces are no boxes, nobody says how long an episode is, or the target does not fit.
+    """
+    import gymnasium
+
+    made: Env[Any, Any] = gymnasium.make(env) if isinstance(env, str) else env
+    limit = made.spec.max_episode_steps if made.spec is not None else None
+    for what, space in (("observation", made.observation_space), ("action", made.action_space)):
+        if not isinstance(space, gymnasium.spaces.Box):
+            raise ValueError(f"the {what} space of {made} must be a Box, got {space}")
+    if not (horizon or limit):
+        raise ValueError(f"{made} limits no episode: give horizon")
+    return GymnasiumPlant(
+        made,
+        target=target,
+        horizon=horizon or limit or 0,
+        sample_time=sample_time,
+        state_weight=state_weight,
+        action_weight=action_weight,
+        divergence_bound=divergence_bound,
+    )
+
+
+class GymnasiumPlant(BatchPlant):
+    """M copies of an environment in lock-step; see `from_gymnasium`."""
+
+    settable = False
+
+    def __init__(self, env: Env[Any, Any], *, target: ArrayLike | None, **settings: Any) -> None:
+        observed, acted = env.observation_space.shape or (), env.action_space.shape or ()
+        n_z, self.quadratic = int(np.prod(observed)), target is not None
+        wanted = float_array("target", np.zeros(n_z) if target is None else target).ravel()
+        if wanted.shape != (n_z,) or not np.isfinite(wanted).all():
+            raise ValueError(f"target must be {n_z} finite numbers, got shape {wanted.shape}")
+        self._first, self._shape, self._space = env, acted, env.action_space
+        self._envs: list[Env[Any, Any]] = []
+        n_a = int(np.prod(acted))
+        super().__init__(grid=Grid.vector(n_z, "o"), n_a=n_a, target=wanted, **settings)
+
+    def __repr__(self) -> str:
+        return (
+            f"{type(self).__name__}({self._first}: state of {self.n_z}, {self.n_a} actuators, "
+            f"{self.horizon} steps)"
+        )
+
+    @property
+    def definition(self) -> Definition:
+        """The specification, the source of the environment's class, and what is asked of it."""
+        spec, inner = self._first.spec, self._first.unwrapped
+        names = ("horizon", "sample_time", "state_weight", "action_weight", "divergence_bound")
+        values = {name: getattr(self, name) for name in names}
+        values["target"] = self.target.tolist() if self.quadratic else None
+        values["environment"] = (
+            json.loads(spec.to_json()) if spec is not None else described("env", vars(inner))
+        )
+        return Definition(values, [source_of(type(inner))])
+
+    def reset(self, seeds: ArrayLike, noise: NDArray[np.int64] | None = None) -> Array:
+        """Begin an episode; see `pde_sim_node.plant.Plant.reset`."""
+        given = np.asarray(seeds)
+        states = super().reset(seeds)
+        while len(self._envs) < len(states):
+            self._envs.append(copy.deepcopy(self._first))
+        for m, seed in enumerate(given.tolist()):
+            self._begin(self._envs[m], seed)
+        return states
+
+    def restart(self, environments: NDArray[np.intp], seeds: ArrayLike) -> Array:
+        """Begin again in some; see `pde_sim_node.plant.Plant.restart`."""
+        states = super().restart(environments, seeds)
+        for m, seed in zip(environments.tolist(), np.asarray(seeds).tolist(), strict=True):
+            self._begin(self._envs[m], seed)
+        return states
+
+    def _initial_states(self, seeds: NDArray[Any]) -> Array:
+        if seeds.ndim == 2:
+            raise ValueError(f"{self!r} begins from seeds only: its state cannot be set")
+        return super()._initial_states(seeds)
+
+    def _draw(self, seed: int) -> Array:
+        return self._begin(self._first, seed)
+
+    def _begin(self, env: Env[Any, Any], seed: int) -> Array:
+        try:
+            observation, _ = env.reset(seed=0 if seed == MEAN_FIELD else seed)
+        except Exception as error:
+            raise OwnCodeError(f"{self._first}.reset fails: {located(error)}") from error
+        state = self._numbers("reset", observation)
+        if not np.isfinite(state).all():
+            raise OwnCodeError(f"{self._first}.reset returned NaN or infinity")
+        return state
+
+    def _numbers(self, method: str, observation: Any) -> Array:
+        numbers = np.asarray(observation, dtype=np.float64)
+        if numbers.size != self.n_z:
+            raise OwnCodeError(
+                f"{self._first}.{method} returned an observation of shape {numbers.shape}; expected "
+                f"{self.n_z} numbers"
+            )
+        return numbers.ravel()
+
+    def _advance(self) -> None:
+        low, high = (np.ravel(bound).astype(np.float64) for bound in self._bounds)
+        np.clip(self.actions, low, high, out=self.actions)
+        for m in np.flatnonzero(self.diverged_step < 0):
+            action = self.actions[m].reshape(self._shape).astype(self._space.dtype)
+            try:
+                observation, reward, terminated, truncated, _ = self._envs[m].step(action)
+            except Exception as error:
+                raise OwnCodeError(f"{self._first}.step fails: {located(error)}") from error
+            if truncated and self.step_index + 1 < self.horizon:
+                raise OwnCodeError(
+                    f"{self._first} ends an episode after {self.step_index + 1} steps, and its horizon "
+                    f"is {self.horizon}: give a horizon of {self.step_index + 1} or less"
+                )
+            cost = -float(reward)
+            if self.quadratic:
+                error_squared = np.square(self.states[m] - self.target).sum()
+                cost = self.state_weight * float(error_squared)
+                cost += self.action_weight * float(np.square(self.actions[m]).sum())
+            self.totals[m] += cost
+            new = self._numbers("step", observation)
+            good = (np.abs(new) <= self.divergence_bound).all() and np.isfinite(self.totals[m])
+            if terminated or not good:
+                self.diverged_step[m] = self.step_index
+            else:
+                self.states[m] = new
+
+    @property
+    def _bounds(self) -> tuple[Any, Any]:
+        space: Any = self._space
+        return space.low, space.high
+
+    def _evaluate(self, states: Array, actions: Array) -> Array:
+        raise ValueError(f"{self!r} computes no step of a given state: its state cannot be set")

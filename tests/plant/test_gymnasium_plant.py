@@ -1,0 +1,88 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A Gymnasium environment as a plant, against the environment itself."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import pdeloop
+from loop_interfaces.own_code import OwnCodeError
+from pde_sim_node.instruments import InstrumentedPlant
+from pde_sim_node.plant import Instruments, Plant
+from pdeloop.cli import main
+from tests.support.interpreter import ROOT
+
+NAME = f"{ROOT}/examples/plants/pendulum.py"
+
+
+def test_it_is_the_environment_step_by_step_and_its_actions_saturate() -> None:
+    plant = pdeloop.from_gymnasium("Pendulum-v1", horizon=5)
+    assert isinstance(plant, Plant)
+    env = gymnasium.make("Pendulum-v1")
+    expected = [env.reset(seed=4)[0]]
+    states, rewards = [plant.reset([7, 4]).copy()], 0.0
+    for torque in (0.5, 9.0, -9.0, 0.0, 1.0):
+        observation, reward, *_ = env.step(np.clip([torque], -2, 2).astype(np.float32))
+        expected.append(observation)
+        rewards += float(reward)
+        states.append(plant.step(np.array([[0.0], [torque]])).copy())
+    assert np.array_equal(np.array(states)[:, 1], np.array(expected, dtype=np.float64))
+    assert plant.episode_costs().total[1] == -rewards
+
+
+def test_with_a_target_the_cost_is_quadratic_and_does_not_depend_on_the_batch() -> None:
+    def plant() -> Any:
+        return pdeloop.from_gymnasium(
+            "Pendulum-v1", target=[1.0, 0.0, 0.0], state_weight=2.0, action_weight=0.5, horizon=3
+        )
+
+    many, alone = plant(), plant()
+    many.reset([1, 2])
+    z = alone.reset([2]).copy()
+    total = 0.0
+    for a in (1.0, -3.0, 0.25):
+        total += 2.0 * ((z[0] - [1, 0, 0]) ** 2).sum() + 0.5 * np.clip(a, -2, 2) ** 2
+        many.step(np.array([[0.0], [a]]))
+        z = alone.step(np.array([[a]])).copy()
+        assert np.array_equal(z[0], many.states[1])
+    assert alone.totals[0] == many.totals[1] == pytest.approx(total)
+    assert many.definition.fingerprint == plant().definition.fingerprint
+    other = pdeloop.from_gymnasium("Pendulum-v1", horizon=3)
+    assert other.definition.fingerprint != many.definition.fingerprint
+
+
+def test_what_cannot_be_done_with_it_is_refused() -> None:
+    plant = pdeloop.from_gymnasium("Pendulum-v1", horizon=300)
+    with pytest.raises(ValueError, match="its state cannot be set"):
+        plant.evaluate(np.zeros((1, 3)), np.zeros((1, 1)))
+    with pytest.raises(ValueError, match="begins from seeds only"):
+        plant.reset(np.zeros((1, 3)))
+    with pytest.raises(ValueError, match="process_noise cannot force"):
+        InstrumentedPlant(plant, Instruments(process_noise=0.1))
+    with pytest.raises(ValueError, match="has no derivatives"):
+        pdeloop.Gradients(plant)
+    with pytest.raises(ValueError, match=r"the action space of .* must be a Box"):
+        pdeloop.from_gymnasium("CartPole-v1")
+    with pytest.raises(ValueError, match="target must be 3 finite numbers"):
+        pdeloop.from_gymnasium("Pendulum-v1", target=[1.0])
+    with pytest.raises(OwnCodeError, match=r"ends an episode after 200 steps, .* horizon is 300"):
+        pdeloop.rollout(plant, lambda k, z: np.zeros((1, 1)), [0])
+
+
+def test_an_optimiser_that_needs_a_target_is_refused_without_one(
+    tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PDELOOP_PLANTS", "")
+    words = ["train", "--plant", f"{NAME}:rewarded", "--in-process"]
+    assert main(words) == 1
+    assert "learns from a quadratic cost about a target, and this plant has none" in (
+        capsys.readouterr().err
+    )
+    budget = ["--rollouts", "9", "--evaluation-fields", "2", "--reduced-order", "3"]
+    assert main([*words, "--optimizer", "two_point", *budget, "--out", str(tmp_path / "run")]) == 0
+    assert main(["evaluate", str(tmp_path / "run"), "--plant", f"{NAME}:rewarded"]) == 0
