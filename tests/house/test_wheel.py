@@ -9,12 +9,14 @@ import subprocess
 import sys
 import sysconfig
 import venv
+from functools import partial
 from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
 
 from tests.support.colcon_workspace import ROOT, add_compiled, copy_sources
+from tests.support.made_once import made_once
 from tests.support.small import SMALL
 
 CLEAN = {
@@ -33,10 +35,8 @@ def run(*words: object, cwd: Path) -> str:
     return done.stdout
 
 
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def build_wheel(folder: Path) -> Path:
     """The wheel, built from a clean copy of the sources."""
-    folder = tmp_path_factory.mktemp("wheel")
     how = ("--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir", folder)
     sources = copy_sources(folder / "sources")
     run(sys.executable, "-m", "pip", "wheel", *how, sources, cwd=folder)
@@ -44,21 +44,19 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built
 
 
-@pytest.fixture(scope="module")
-def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def install(wheel: Path, prefix: Path) -> Path:
     """A virtual environment into which the wheel was installed from a local index.
 
     It has the packages of the present environment, so that nothing is fetched, but for the project.
     """
-    prefix = tmp_path_factory.mktemp("installed")
     venv.create(prefix, symlinks=True)
     (library,) = prefix.glob("lib/python*/site-packages")
     own = ("pdeloop", "__editable__", "__pycache__")
     for path in Path(sysconfig.get_path("purelib")).iterdir():
         if not path.name.startswith(own):
             (library / path.name).symlink_to(path)
-    index = tmp_path_factory.mktemp("index") / "pdeloop"
-    index.mkdir()
+    index = prefix / "index" / "pdeloop"
+    index.mkdir(parents=True)
     shutil.copy(wheel, index)
     (index / "index.html").write_text(f'<a href="{wheel.name}">{wheel.name}</a>')
     pip = (sys.executable, "-m", "pip", "--python", prefix / "bin" / "python")
@@ -66,6 +64,16 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     run(*pip, "--isolated", "--disable-pip-version-check", *asked, cwd=prefix)
     add_compiled(library)
     return prefix
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made_once(tmp_path_factory, "wheel", build_wheel)
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made_once(tmp_path_factory, "installed-wheel", partial(install, wheel))
 
 
 def test_it_holds_the_packages_their_files_and_the_configuration(wheel: Path) -> None:
