@@ -47,7 +47,7 @@ def told(plant: Plant, costs: Array) -> dict[str, Array]:
     """What `info` says of each environment.
 
     cost (M,): the stage cost of the step that ended; distance (M,): root mean square over the grid of
-    z - z_r, of the field itself; target (M, state_size): z_r as it is observed.
+    z - z_r, of the field itself; target (M, state_size), read-only: z_r as it is observed.
     """
     error = plant.states - plant.field_target
     distance = np.sqrt(np.einsum("mi,mi->m", error, error) / plant.n_z)
@@ -68,8 +68,8 @@ def masked(info: Mapping[str, Array], mask: NDArray[np.bool_]) -> dict[str, Any]
     Zeros elsewhere, and with each entry `name` its mask `_name`.
     """
     found: dict[str, Any] = {}
+    whole = mask.all()
     for name, value in info.items():
-        kept = np.zeros(value.shape)
-        kept[mask] = value[mask]
-        found |= {name: kept, f"_{name}": mask.copy()}
+        kept = value if whole else np.where(mask if value.ndim == 1 else mask[:, None], value, 0.0)
+        found[name], found[f"_{name}"] = kept, mask.copy()
     return found

@@ -75,6 +75,7 @@ class VectorEnvironment(VectorEnv[Array, Array, NDArray[Any]]):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._generators = [np_random()[0] for _ in range(self.num_envs)]
         self._ended = np.zeros(self.num_envs, dtype=np.bool_)
+        self._everybody = np.ones(self.num_envs, dtype=np.bool_)
         self._pictures = [Picture() for _ in range(self.num_envs)]
 
     def reset(
@@ -144,7 +145,6 @@ class VectorEnvironment(VectorEnv[Array, Array, NDArray[Any]]):
             Environments have ended and begin again only with `reset`.
         """
         plant, again = self.plant, self._ended.copy()
-        everybody = np.ones(self.num_envs, dtype=np.bool_)
         if self._mode is AutoresetMode.DISABLED and again.any():
             raise RuntimeError(
                 f"environments {np.flatnonzero(again).tolist()} have ended: call "
@@ -152,7 +152,8 @@ class VectorEnvironment(VectorEnv[Array, Array, NDArray[Any]]):
             )
         if again.all():
             states, info = self.reset()
-            return states, np.zeros(self.num_envs), ~everybody, ~everybody, info
+            nobody = np.zeros(self.num_envs, dtype=np.bool_)
+            return states, np.zeros(self.num_envs), nobody, nobody.copy(), info
         plant.totals.fill(0.0)
         states = plant.step(actions)
         if again.any():
@@ -165,7 +166,7 @@ class VectorEnvironment(VectorEnv[Array, Array, NDArray[Any]]):
         found = told(plant, plant.totals.copy())
         self._ended = terminated | truncated
         if self._mode is not AutoresetMode.SAME_STEP or not self._ended.any():
-            return states.copy(), rewards, terminated, truncated, masked(found, everybody)
+            return states.copy(), rewards, terminated, truncated, masked(found, self._everybody)
         return self._begun_again(states.copy(), found, rewards, terminated, truncated)
 
     def _begun_again(
@@ -190,7 +191,7 @@ class VectorEnvironment(VectorEnv[Array, Array, NDArray[Any]]):
             "final_info": masked(found, ended),
             "_final_info": ended.copy(),
         }
-        info = {**masked(now, np.ones(self.num_envs, dtype=np.bool_)), **finals}
+        info = {**masked(now, self._everybody), **finals}
         return states, rewards, terminated, truncated, info
 
     def _begin(self, mask: Flags, seeds: Sequence[int | None], fields: Array | None) -> Array:
