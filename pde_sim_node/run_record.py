@@ -5,11 +5,12 @@ A plant that was paused must not run on, whatever run it is to serve, and one wh
 must not take actions of that run that are not signed.
 """
 
+import contextlib
 import os
 import tempfile
 from pathlib import Path
 
-from loop_interfaces.files import open_ordinary, private_folder, write_atomically
+from loop_interfaces.files import is_private, open_ordinary, private_folder, write_atomically
 
 FOLDER = Path(tempfile.gettempdir()) / f"pdeloop-plants-{os.getuid()}"
 
@@ -43,6 +44,12 @@ class RunRecord:
 
 
 def forget(domain: int, folder: Path = FOLDER) -> None:
-    """Remove the records of a domain in which no plant is."""
-    for path in folder.glob(f"{domain}+*"):
-        path.unlink(missing_ok=True)
+    """Remove the records of a domain in which no plant is.
+
+    Nothing where the folder is not this user's own: a link may lead to other files of these names.
+    """
+    with contextlib.suppress(OSError):
+        records = list(folder.glob(f"{domain}+*")) if is_private(folder) else []
+        for path in records:
+            with contextlib.suppress(IsADirectoryError, PermissionError):  # no record of ours
+                path.unlink(missing_ok=True)

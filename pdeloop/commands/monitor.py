@@ -78,9 +78,9 @@ def _monitor(options: argparse.Namespace) -> int:
             "choose another with --port N, or a free one with --port 0"
         ) from error
     server.start()
-    print(f"monitor at {server.url}  (Ctrl-C ends it)", flush=True)
+    print(f"monitor at {server.address}  (Ctrl-C ends it)", flush=True)
     if options.open:
-        webbrowser.open(server.url)
+        webbrowser.open(server.address)
     try:
         given = options.namespace
         namespace = None if given is None else f"/{given.strip('/')}"

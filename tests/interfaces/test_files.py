@@ -29,6 +29,7 @@ from loop_interfaces.files import (
     write_atomically,
 )
 from loop_interfaces.spec import ParameterError, read_document
+from pde_sim_node import run_record
 from pdeloop import domain, live
 from pdeloop.cli import FAILED, main
 from pdeloop.commands import new
@@ -485,3 +486,18 @@ def test_a_line_after_one_that_a_full_disk_cut_off_is_whole(tmp_path):
     path.write_bytes(b'{"event": "a"}\n{"event": "cut')
     RunFolder(tmp_path).note({"event": "b"})
     assert path.read_bytes() == b'{"event": "a"}\n{"event": "cut\n{"event": "b"}\n'
+
+
+def test_records_of_plants_are_removed_in_this_users_own_folder_alone(tmp_path):
+    """A link of somebody else in the temporary folder may lead to files of the same names."""
+    other = tmp_path / "other"
+    other.mkdir(mode=0o700)
+    (other / "7+pde_sim_node").write_text("theirs")
+    link = tmp_path / "link"
+    link.symlink_to(other)
+    run_record.forget(7, link)
+    assert (other / "7+pde_sim_node").exists()
+    run_record.forget(7, tmp_path / "none")
+    (other / "7+folder").mkdir()
+    run_record.forget(7, other)
+    assert not (other / "7+pde_sim_node").exists()

@@ -6,6 +6,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import socket
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -43,7 +44,8 @@ async def ask(server: Server, path: str, **headers: str) -> tuple[int, str]:
 
 
 async def refusal(server: Server, said: Any, **headers: str) -> str:
-    """Why a page is refused what it says over its WebSocket."""
+    """Why a page is refused what it says over its WebSocket, with the token."""
+    said = {"token": server.token, **said}
     async with aiohttp.ClientSession() as session:
         url = f"http://127.0.0.1:{server.port}/ws"
         async with session.ws_connect(url, headers=headers) as page:
@@ -110,11 +112,108 @@ def test_a_page_of_ours_reaches_the_nodes_and_nothing_but_what_they_offer():
             ({"component": "u"}, False),
             ({"environment": 1}, False),
         ):
+            said = {"token": server.token, **said} if isinstance(said, dict) else said
             assert (server.take(json.dumps(said)) == "") == done, said
-        assert "expected a component" in server.take("[" * 100_000)
+        assert "may only look" in server.take("[" * 100_000)
         # Confirmed at once, whatever the node is doing.
         assert page.requests.get(timeout=600) == Call("/p", "pause")
         assert page.requests.get(timeout=600) == ShowLoop("/lab") and page.requests.empty()
+
+
+@pytest.mark.parametrize("token", [None, "", "x", 0, True, [], {}, "é\ud800", "first", "longer"])
+def test_a_page_without_the_token_may_only_look(token):
+    with served() as (server, page):
+        page.place["namespaces"] = ["/", "/lab"]
+        known = {"first": server.token[:-1], "longer": server.token + "="}
+        given = {} if token is None else {"token": known.get(str(token), token)}
+        for said in ({"node": "/p", "verb": "pause"}, {"namespace": "/lab"}, {"component": 1}):
+            assert "may only look: open the address" in server.take(json.dumps(given | said))
+        assert page.requests.empty()
+        assert asyncio.run(ask(server, "/"))[0] == 200
+
+
+def test_the_address_has_a_token_of_its_own_that_the_pages_script_sends():
+    tokens = set()
+    for _ in range(3):
+        with served() as (server, _):
+            assert server.address == f"{server.url}?token={server.token}"
+            assert asyncio.run(ask(server, f"/?token={server.token}"))[0] == 200
+            tokens.add(server.token)
+    assert len(tokens) == 3 and min(map(len, tokens)) >= 32
+    link = (STATIC / "link.js").read_text()
+    assert 'new URLSearchParams(location.search).get("token")' in link and "token: TOKEN" in link
+
+
+def raw(server: Server, request: bytes) -> bytes:
+    """The first line of the answer to what may not be HTTP; empty if there is none."""
+    with (
+        socket.create_connection(("127.0.0.1", server.port), timeout=20.0) as connection,
+        contextlib.suppress(ConnectionError),
+    ):
+        connection.sendall(request)
+        return connection.recv(1000).split(b"\r\n")[0]
+    return b""
+
+
+@pytest.mark.parametrize("name", ["Origin", "Host"])
+@pytest.mark.parametrize("foreign_first", [False, True])
+def test_a_request_that_names_two_pages_or_two_hosts_is_refused(name, foreign_first):
+    with served() as (server, page):
+        own = {"Host": f"127.0.0.1:{server.port}", "Origin": f"http://127.0.0.1:{server.port}"}
+        lines = [f"{key}: {value}" for key, value in own.items()]
+        other = [f"{name}: {'http://' * (name == 'Origin')}evil.example"]
+        asked = [*(other + lines if foreign_first else lines + other)]
+        upgrade = ["Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13"]
+        key = "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA=="
+        for path, more in (("/", []), ("/ws", [*upgrade, key])):
+            head = "\r\n".join([f"GET {path} HTTP/1.1", *asked, *more, "", ""]).encode()
+            assert raw(server, head).split()[1:2] in ([b"403"], [b"400"]), path
+        assert page.requests.empty()
+
+
+MALFORMED = [
+    b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(200),
+    b"GET\r\n\r\n",
+    b"GET / HTTP/9.9\r\n\r\n",
+    b"GET / HTTP/1.1\r\nHost\r\n\r\n",
+    b"GET / HTTP/1.1\r\n: x\r\n\r\n",
+    b"GET / HTTP/1.1\r\nHost: a\r\nContent-Length: -1\r\n\r\n",
+    b"GET / HTTP/1.1\r\nHost: a\r\nContent-Length: 1, 2\r\n\r\n",
+    b"POST / HTTP/1.1\r\nHost: a\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n\r\n",
+    b"POST / HTTP/1.1\r\nHost: a\r\nTransfer-Encoding: x, chunked\r\n\r\n0\r\n\r\n",
+    b"GET /" + b"a" * 100_000 + b" HTTP/1.1\r\n\r\n",
+    b"GET / HTTP/1.1\r\nX: " + b"a" * 100_000 + b"\r\n\r\n",
+    b"GET http://[::1 HTTP/1.1\r\nHost: a\r\n\r\n",
+    b"GET /%ff%fe HTTP/1.1\r\nHost: a\r\n\r\n",
+    b"GET / HTTP/1.1\r\nHost: a\r\nExpect: x\r\n\r\n",
+    b"CONNECT a:1 HTTP/1.1\r\nHost: a\r\n\r\n",
+    b"OPTIONS * HTTP/1.1\r\nHost: a\r\n\r\n",
+    b"GET /ws HTTP/1.1\r\nHost: a\r\nUpgrade: websocket\r\n\r\n",
+    b"\x00" * 1000,
+    b"\xff\r\n\r\n",
+]
+
+
+def test_what_is_not_http_is_answered_or_closed_and_nothing_is_printed(capfd, monkeypatch):
+    monkeypatch.setattr("viewer_node.web.server.LINGER", 0.5)
+    with served() as (server, _):
+        for request in MALFORMED:
+            answer = raw(server, request)
+            assert answer == b"" or answer.split()[1][:1] in (b"4", b"5"), request[:60]
+        own = f"Host: 127.0.0.1:{server.port}\r\n".encode()
+        for request in MALFORMED:
+            raw(server, request.replace(b"Host: a\r\n", own))
+        assert asyncio.run(ask(server, "/"))[0] == 200
+    told = capfd.readouterr()
+    assert told.out + told.err == ""
+
+
+def test_an_error_of_the_server_is_one_line(capfd, monkeypatch):
+    with served() as (server, _):
+        monkeypatch.setattr("viewer_node.web.server.FILES", None)
+        assert asyncio.run(ask(server, "/"))[0] == 500
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith("pdeloop: the page's server: ") and "TypeError" in line
 
 
 def test_the_headers_allow_nothing_from_elsewhere_and_no_inline_script():
@@ -165,7 +264,7 @@ def test_the_page_tells_what_a_node_computes_and_what_became_of_a_request(tmp_pa
             tab.until(f"document.querySelector('#notice').textContent === {notice!r}", 30.0)
 
         view.nodes.diagnosis("t: training", 0, "", busy, now)
-        tab.go(server.url)
+        tab.go(server.address)
         shows("fitting models, 7 s", "")
         tab.click("#tuner-pause")
         asked = page.requests.get(timeout=600)

@@ -10,6 +10,7 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -50,7 +51,7 @@ def page(tmp_path: Path) -> Iterator[Browser]:
 
 def address(loop: Processes, monitor: subprocess.Popen[bytes]) -> str:
     """Where the monitor serves its page."""
-    found = lambda: re.search(r"http://127\.0\.0\.1:\d+/", loop.output(monitor))  # noqa: E731
+    found = lambda: re.search(r"http://127\.0\.0\.1:\d+/\?token=[\w-]+", loop.output(monitor))  # noqa: E731
     until(found, LIMIT, "address of the page")
     match = found()
     assert match is not None
@@ -110,7 +111,9 @@ def test_the_page_shows_a_running_loop_and_survives_a_restart_of_the_plant(loop,
     page.until(f"{FIELD} !== {episode!r}", LIMIT)
     page.until(f"{STATE} === 'running'", LIMIT)
     assert page.console == []
-    assert all(request.split("://")[1].startswith(url[7:]) for request in page.requested)
+    assert all(
+        request.split("://")[1].startswith(url[7:].split("?")[0]) for request in page.requested
+    )
     monitor.send_signal(signal.SIGINT)
     loop.wait(monitor, LIMIT)
 
@@ -172,8 +175,8 @@ def test_the_monitor_finds_a_training_that_starts_after_it_and_the_page_a_new_mo
         monitor.send_signal(signal.SIGKILL)
         page.until(f"{STATE} === 'no connection to the monitor'", LIMIT)
         before = page.ask(ROLLOUTS)
-        port = url.rstrip("/").rpartition(":")[2]
-        again = loop.pdeloop("monitor", "--port", port)
+        port = urlsplit(url).port
+        again = loop.pdeloop("monitor", "--port", str(port))
         page.until(f"{STATE} === 'running' && {ROLLOUTS} > {before}", LIMIT)
         assert [text for text in page.console if REFUSED not in text] == []
 
@@ -214,7 +217,7 @@ def test_a_pair_is_chosen_on_the_page_and_an_environment_by_its_flag(loop, page,
 
 def test_a_port_in_use_and_a_folder_without_a_loop_are_told_in_one_line(loop, recorded, tmp_path):
     first = loop.pdeloop("monitor", "--port", "0")
-    port = address(loop, first).rstrip("/").rpartition(":")[2]
+    port = str(urlsplit(address(loop, first)).port)
     text = loop.wait(loop.pdeloop("monitor", "--port", port), LIMIT, code=1)
     (line,) = text.strip().splitlines()
     assert f"port {port}" in line and "--port" in line

@@ -3,19 +3,25 @@
 
 GET /, /NAME    the page and its files, all of them from this package
 GET /ws         a WebSocket: what is new (viewer_node.web.page), at most FRAMES times a second; and
-                from the page {"node", "verb"}, to call a service, or what to show: {"namespace"}
-                or {"component"}
+                from the page, with the token, {"node", "verb"}, to call a service, or what to
+                show: {"namespace"} or {"component"}
 
 Any page of the web that is open in a browser can send requests to 127.0.0.1. So a request must name
 this server as its host (a foreign name that was made to resolve to 127.0.0.1 does not), one from a
-page must come from ours, and the WebSocket always: a browser says which page opens it.
+page must come from ours, and the WebSocket always: a browser says which page opens it. Other users of
+the machine can send whatever they like; what they do not know is the token, which only the address
+that `pdeloop monitor` prints has, and without which nothing that a page asks for is done.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import hmac
+import logging
+import secrets
 import socket
+import sys
 import threading
 import time
 from collections.abc import Awaitable, Callable
@@ -23,9 +29,11 @@ from functools import partial
 from pathlib import Path
 
 from aiohttp import WSMsgType, web
+from aiohttp.http_exceptions import HttpProcessingError
 
 from loop_interfaces.controllers import CONTROLLERS
 from loop_interfaces.documents import parse_json
+from loop_interfaces.text import printable
 from viewer_node.operation import VERBS
 from viewer_node.web.page import Page
 
@@ -72,15 +80,23 @@ class Server:
         self.port: int = self._socket.getsockname()[1]
         self._sockets: dict[object, web.WebSocketResponse] = {}
         """The WebSockets of pages, by their connections."""
-        self._loop = asyncio.new_event_loop()
+        self.token = secrets.token_urlsafe(24)
+        """What a page has to know to ask for anything."""
         self._thread = threading.Thread(target=self._serve, name="page", daemon=True)
-        self._ended = asyncio.Event()
 
     @property
     def url(self) -> str:
+        """Of the page that may look; see `address`."""
         return f"http://{HOST}:{self.port}/"
 
+    @property
+    def address(self) -> str:
+        """Of the page that may ask for what it offers, too."""
+        return f"{self.url}?token={self.token}"
+
     def start(self) -> None:
+        """Begin to serve."""
+        self._loop, self._ended = asyncio.new_event_loop(), asyncio.Event()
         self._thread.start()
 
     def stop(self) -> None:
@@ -90,13 +106,16 @@ class Server:
 
     def _serve(self) -> None:
         asyncio.set_event_loop(self._loop)
-        self._loop.run_until_complete(self._main())
+        try:
+            self._loop.run_until_complete(self._main())
+        finally:
+            self._loop.close()
 
     async def _main(self) -> None:
         app = web.Application(middlewares=[self._guard], client_max_size=MAX_BODY)
         app.router.add_get("/ws", self._on_page)
         app.router.add_get("/{name:[A-Za-z.]*}", _on_file)
-        runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
+        runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0, logger=_log())
         await runner.setup()
         try:
             assert runner.server is not None
@@ -127,10 +146,12 @@ class Server:
         """Refuse what no page of ours sends."""
         names = [f"{name}:{self.port}" for name in (HOST, "localhost")]
         own = [f"http://{name}" for name in names]
-        origin = request.headers.get("Origin")
-        if request.headers.get("Host") not in names:
+        hosts, origins = (request.headers.getall(name, []) for name in ("Host", "Origin"))
+        if len(hosts) != 1 or hosts[0] not in names:
             raise web.HTTPForbidden(text=f"expected a request to {names[0]}")
-        if origin not in own and (origin is not None or request.path == "/ws"):
+        if len(origins) > 1 or any(origin not in own for origin in origins):
+            raise web.HTTPForbidden(text="expected a request from the monitor's own page")
+        if not origins and request.path == "/ws":
             raise web.HTTPForbidden(text="expected a request from the monitor's own page")
         response = await handler(request)
         if not response.prepared:
@@ -178,6 +199,8 @@ class Server:
             wanted = parse_json(text)
         except ValueError:
             wanted = None
+        if not isinstance(wanted, dict) or not self._knows_token(wanted.pop("token", "")):
+            return "this page may only look: open the address that pdeloop monitor printed"
         match wanted:
             case {"node": node, "verb": verb}:
                 done = self._page.request_call(node, verb)
@@ -186,6 +209,30 @@ class Server:
             case dict() if self._page.choose(wanted):
                 return ""
         return "expected a component or a known namespace"
+
+    def _knows_token(self, given: object) -> bool:
+        """Whether this is the token; that takes as long whatever it is."""
+        text = given if isinstance(given, str) else ""
+        return hmac.compare_digest(text.encode(errors="replace"), self.token.encode())
+
+
+class _ToldInALine(logging.Handler):
+    """Tells of an error in one line, and of a request that is not HTTP nothing: anybody can send it."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        error = record.exc_info[1] if record.exc_info else None
+        if record.levelno < logging.WARNING or isinstance(error, HttpProcessingError):
+            return
+        what = f": {type(error).__name__}: {error}" if error is not None else ""
+        text = printable(f"{record.getMessage()}{what}").replace("\n", " ")
+        print(f"pdeloop: the page's server: {text[:500]}", file=sys.stderr)
+
+
+def _log() -> logging.Logger:
+    """Where the server's library writes, which by itself prints tracebacks."""
+    log = logging.getLogger("pdeloop.page")
+    log.propagate, log.handlers = False, [_ToldInALine()]
+    return log
 
 
 async def _on_file(request: web.Request) -> web.FileResponse:

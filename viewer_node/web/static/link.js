@@ -4,6 +4,8 @@
 const FIRST = 500; // ms before the first attempt to come back, doubled up to LAST
 const LAST = 4000;
 const JSON_START = 4;
+// From the address that the monitor prints: without it the page may only look.
+const TOKEN = new URLSearchParams(location.search).get("token") ?? "";
 
 export class Link {
   constructor(take, tell) {
@@ -54,6 +56,6 @@ export class Link {
   }
 
   send(content) {
-    if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(content));
+    if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify({ ...content, token: TOKEN }));
   }
 }
