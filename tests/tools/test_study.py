@@ -9,11 +9,12 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from importlib import metadata
 from pathlib import Path
@@ -304,6 +305,16 @@ def installed_before(name: str, folder: Path, *others: str) -> str:
     return str(folder)
 
 
+def address_in(file: Path) -> str:
+    """The scheduler's address, once it stands in its file: that is made first, and then written."""
+    deadline = time.monotonic() + LIMIT
+    while time.monotonic() < deadline:
+        with suppress(OSError, ValueError):
+            return str(json.loads(file.read_text())["address"])
+        time.sleep(0.05)
+    raise AssertionError("no scheduler")
+
+
 @contextmanager
 def dask_cluster(
     folder: Path, workers: int, *, scheduler: str = "", worker: str = ""
@@ -324,10 +335,7 @@ def dask_cluster(
             return process
 
         started("dask_scheduler", "--port", "0", packages=scheduler)
-        deadline = time.monotonic() + LIMIT
-        while not file.exists():
-            assert time.monotonic() < deadline, "no scheduler"
-            time.sleep(0.05)
+        address = address_in(file)
         known = [
             started(
                 *("dask_worker", "--no-nanny", "--nthreads", "1", "--local-directory", str(folder)),
@@ -335,7 +343,6 @@ def dask_cluster(
             )
             for _ in range(workers)
         ]
-        address = json.loads(file.read_text())["address"]
         if workers:
             from distributed import Client
 
@@ -401,3 +408,17 @@ def test_a_scheduler_and_a_worker_with_another_dask_are_refused(tmp_path: Path):
     other = dask_cluster(tmp_path / "other", 1, worker=older)
     with other as (address, _), pytest.raises(StudyError, match=f"the worker at tcp://.* {words}"):
         run(study, tmp_path / "out", partial(cluster, address))
+
+
+def test_a_schedulers_file_is_awaited_until_it_is_written(tmp_path: Path):
+    file = tmp_path / "scheduler.json"
+
+    def write() -> None:
+        for content in ("", '{"type": "Sched', '{"address": "tcp://127.0.0.1:8786"}'):
+            file.write_text(content)
+            time.sleep(0.1)
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    assert address_in(file) == "tcp://127.0.0.1:8786"
+    writer.join()
