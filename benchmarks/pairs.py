@@ -29,7 +29,7 @@ from benchmarks.processes import (
     progress,
     table,
 )
-from loop_interfaces.spec import yaml_text
+from loop_interfaces.parameter_file import yaml_text
 from pdeloop.in_process import LocalPair, train
 from pdeloop.pairs import namespaces
 from pdeloop.training_run import resolve

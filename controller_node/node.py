@@ -44,7 +44,9 @@ class ControllerNode:
     """Moves messages between the topics and the responder."""
 
     def __init__(self, node: Node, loop: NodeLoop) -> None:
-        values = declare(node, taken_by("controller_node"), given_parameters(node))
+        values = declare(
+            node, taken_by("controller_node"), given_parameters(node, "controller_node")
+        )
         settings = {k: v for k, v in values.items() if k not in ("problem", "pin")}
         pin_process(values["pin"])
         responder = Responder(DesignSettings(**settings))

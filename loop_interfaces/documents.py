@@ -45,6 +45,22 @@ def parse_yaml(text: str | bytes, most: int = MAX_YAML_NODES) -> Any:
         raise ValueError("it has a value that is not of the type it is tagged as") from error
 
 
+class _TaggedLoader(_Loader):  # type: ignore[misc, valid-type]
+    """Gives no scalar a type: only tags that stand in the text are seen."""
+
+    def resolve(self, kind: Any, value: Any, implicit: Any) -> str:
+        return ""
+
+
+def compose_yaml(text: str | bytes, most: int = MAX_YAML_NODES) -> list[yaml.Node]:
+    """The documents of a text as YAML's nodes, for a reader with rules of its own; see `parse_yaml`."""
+    try:
+        _check_yaml(text, most)
+        return list(yaml.compose_all(text, _TaggedLoader))
+    except yaml.YAMLError as error:
+        raise ValueError(_yaml_problem(error)) from error
+
+
 def _check_yaml(text: str | bytes, most: int) -> None:
     """ValueError for a document that would be larger than its text suggests."""
     depth = nodes = 0

@@ -7,14 +7,21 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from loop_interfaces.parameters import OF_THE_PLANT, POINTS, table, with_budget, with_names
+from loop_interfaces.loop_parameters import read_problem
+from loop_interfaces.parameters import (
+    OF_THE_PLANT,
+    POINTS,
+    PROBLEM,
+    table,
+    with_budget,
+    with_names,
+)
 from loop_interfaces.spec import (
     OPTIMIZER_SETTINGS,
     ParameterError,
     check,
     check_names,
     exponent_hint,
-    read_yaml,
 )
 from loop_interfaces.text import shown
 
@@ -65,7 +72,8 @@ def load_parameters(
     itself (OF_THE_PLANT) is left out where nothing else is given.
     """
     path = find_problem(name) if name or not options.get("plant") else None
-    given = with_names({**(read_yaml(path) if path else {}), **options})
+    given = with_names({**(read_problem(path) if path else {}), **options})
+    given = completed(given, "pde_sim_node")
     check_names(given, [spec.name for spec in table()])
     folder = path.resolve().parent if path else Path.cwd()
     for code in ("equation", "plant"):
@@ -82,6 +90,28 @@ def load_parameters(
         values = check(table(), given)
     settings = {k: value for k, value in given.items() if k.startswith(OPTIMIZER_SETTINGS)}
     return with_budget(values) | _physical(given) | settings
+
+
+def completed(given: Mapping[str, Any], package: str) -> dict[str, Any]:
+    """What a node is given, on top of the shipped problem it names without an equation or a plant.
+
+    ParameterError for a problem that nobody knows: of a plant without an equation, and of another node
+    without anything else. Their defaults would be another problem's.
+    """
+    name = given.get("problem")
+    own = given.get("equation") or given.get("plant")
+    if name is None or own or package == "recorder_node":
+        return dict(given)
+    shipped = shipped_problems()
+    if name in shipped:
+        return {**read_problem(shipped[name]), **given}
+    others = {spec.name for spec in PROBLEM if spec.name in given} - {"problem"}
+    if package != "pde_sim_node" and others:  # of a plant that somebody else has made
+        return dict(given)
+    raise ParameterError(
+        f"unknown problem {shown(name)} without an 'equation'; expected one of {', '.join(shipped)}, "
+        "or the parameters of a problem of your own"
+    )
 
 
 def own_values(given: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:

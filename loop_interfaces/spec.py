@@ -1,8 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A parameter as data, what values are good for it, and the files that hold them. No ROS import.
-
-A file is YAML in ROS parameter-file form (`/**: ros__parameters: ...`).
-"""
+"""A parameter as data, and what values are good for it. No ROS import."""
 
 from __future__ import annotations
 
@@ -14,8 +11,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-
-import yaml
 
 from loop_interfaces.documents import parse_yaml
 from loop_interfaces.files import FileError, read_bounded
@@ -216,24 +211,6 @@ def check(specs: Iterable[Spec], given: Mapping[str, Any]) -> dict[str, Any]:
     return {spec.name: spec.check(given.get(spec.name, spec.default)) for spec in specs}
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
-    """The parameters of a ROS parameter file, flattened with dots.
-
-    Raises ParameterError when the file cannot be read or is not in that form.
-    """
-    document = read_document(path)
-    flat: dict[str, Any] = {}
-    sections = document.values() if isinstance(document, dict) else [None]
-    for section in sections:
-        body = section.get("ros__parameters") if isinstance(section, dict) else None
-        if not isinstance(body, dict):
-            raise ParameterError(
-                f"{path} is not a ROS parameter file; expected '/**:' with 'ros__parameters:' in it"
-            )
-        flat.update(flatten(body))
-    return flat
-
-
 def read_document(path: Path) -> Any:
     """The content of a YAML file of bounded size. ParameterError when it cannot be read."""
     try:
@@ -262,16 +239,3 @@ def flatten(body: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
         if len(flat) > MAX_PARAMETERS:
             raise ParameterError(f"more than {MAX_PARAMETERS} parameters in one file")
     return flat
-
-
-def yaml_text(values: Mapping[str, Any], comment: str = "") -> str:
-    """`values` as a ROS parameter file; dotted names become nested maps."""
-    nested: dict[str, Any] = {}
-    for name, value in values.items():
-        *groups, last = name.split(".")
-        place = nested
-        for group in groups:
-            place = place.setdefault(group, {})
-        place[last] = value
-    text = yaml.safe_dump({"/**": {"ros__parameters": nested}}, sort_keys=False)
-    return "".join(f"# {line}\n" for line in comment.splitlines()) + text

@@ -45,7 +45,7 @@ FAST_PATH = import_module("pde_sim_node.fast_path") if find_spec("fast_path") el
 
 def declare_parameters(node: Node) -> tuple[Plant, dict[str, Any]]:
     """The plant, and its parameters, with those of the equation or plant itself under `physical.`."""
-    given = given_parameters(node)
+    given = given_parameters(node, "pde_sim_node")
     physical = {name: value for name, value in given.items() if name.startswith("physical.")}
     said = [spec for spec in taken_by("pde_sim_node") if spec.name == "grid"]  # by the plant
     specs = [spec for spec in taken_by("pde_sim_node") if spec not in said]

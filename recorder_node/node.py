@@ -57,7 +57,7 @@ class RecorderNode:
     """Moves serialised messages from the topics into the recording."""
 
     def __init__(self, node: Node, loop: Observer) -> None:
-        values = declare(node, taken_by("recorder_node"), given_parameters(node))
+        values = declare(node, taken_by("recorder_node"), given_parameters(node, "recorder_node"))
         self._namespaces = [
             node.resolve_topic_name(scoped(name, "state")).removesuffix("state")
             for name in values["pairs"]

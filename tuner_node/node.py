@@ -58,7 +58,7 @@ ABSENCE_REPORT = 5.0
 
 def declare_parameters(node: Node) -> dict[str, Any]:
     """The tuner's parameters, and the problem's, which together define the training."""
-    given = given_parameters(node)
+    given = given_parameters(node, "tuner_node")
     values = with_budget(declare(node, taken_by("tuner_node"), given))
     # Those of the equation are the plant's to check; here they only identify the run.
     values |= {name: value for name, value in given.items() if name.startswith(FREE)}

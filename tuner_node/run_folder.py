@@ -39,6 +39,8 @@ from loop_interfaces.files import (
     write_atomically,
 )
 from loop_interfaces.frames import MAX_ID
+from loop_interfaces.loop_parameters import read_problem
+from loop_interfaces.parameter_file import yaml_text
 from loop_interfaces.parameters import (
     EXECUTION,
     PLANT,
@@ -48,7 +50,7 @@ from loop_interfaces.parameters import (
     recorded_values,
     table,
 )
-from loop_interfaces.spec import ParameterError, read_yaml, yaml_text
+from loop_interfaces.spec import ParameterError
 from loop_interfaces.text import shown
 from tuner_node.results import check_result, policy_arrays, summarise, versions
 from tuner_node.training import Training
@@ -193,7 +195,7 @@ class RunFolder:
         if not path.is_file():
             raise RunFolderError(f"no run in {self.path}: there is no parameters.yaml")
         try:
-            return read_yaml(path)
+            return read_problem(path)
         except ParameterError as error:
             raise RunFolderError(str(error)) from error
 

@@ -47,7 +47,7 @@ class ViewerNode:
     """Reads the loop's topics into the view, and publishes what it shows."""
 
     def __init__(self, node: Node, loop: Observer) -> None:
-        values = declare(node, taken_by("viewer_node"), given_parameters(node))
+        values = declare(node, taken_by("viewer_node"), given_parameters(node, "viewer_node"))
         self._length = float(values["length"])
         self._grid = Grid.parse(values["grid"]) if values["grid"] else None
         weights = float(values["state_weight"]), float(values["action_weight"])

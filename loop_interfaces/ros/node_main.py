@@ -5,7 +5,8 @@ import contextlib
 import os
 import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, Protocol
 
 import rclpy
@@ -15,8 +16,10 @@ from rclpy.utilities import remove_ros_args, try_shutdown
 
 from loop_interfaces.isolation import PROFILE, check_profile, is_confined, outside_sockets
 from loop_interfaces.own_code import OwnCodeError
+from loop_interfaces.parameter_file import read_parameter_file
 from loop_interfaces.ros.node_loop import NodeLoop
-from loop_interfaces.ros.parameters import take_over
+from loop_interfaces.ros.parameters import require_parameters, take_over
+from loop_interfaces.spec import ParameterError
 from loop_interfaces.start import on_signals
 
 CRASHED = 70
@@ -94,6 +97,7 @@ def node_main(
     code of the user's own fails.
     """
     try:
+        files = [read_parameter_file(path) for path in parameter_files(args)]
         _refuse_other_words(name, args)
         body: NodeBody | None = None
         former: Node | None = None
@@ -101,6 +105,7 @@ def node_main(
             with ros_node(name, args, make_loop) as (node, loop):
                 try:
                     if body is None or former is None:
+                        require_parameters(node, files)
                         body = make(node, loop)
                     else:
                         take_over(node, former)
@@ -112,12 +117,26 @@ def node_main(
                 if not loop.suspended:
                     return code
                 former = node
-    except (ConfigurationError, OwnCodeError) as error:
+    except (ConfigurationError, OwnCodeError, ParameterError) as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 1
     except Exception:  # a bug: say where, and let a supervisor start the node again
         traceback.print_exc()
         return CRASHED
+
+
+def parameter_files(args: Sequence[str] | None) -> list[Path]:
+    """The parameter files among the arguments of a node, None: of the process.
+
+    >>> parameter_files(["--ros-args", "--params-file", "a.yaml", "--", "--params-file"])
+    [PosixPath('a.yaml')]
+    """
+    words, found, of_ros = iter(sys.argv[1:] if args is None else args), [], False
+    for word in words:
+        of_ros = word == "--ros-args" or (of_ros and word != "--")
+        if of_ros and word == "--params-file":
+            found += [Path(file) for file in [next(words, "")] if file]
+    return found
 
 
 def _refuse_other_words(name: str, args: list[str] | None) -> None:

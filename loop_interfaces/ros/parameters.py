@@ -5,7 +5,7 @@ All are read-only but the live ones, which no result depends on.
 """
 
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from typing import Any
 
 from rcl_interfaces.msg import (
@@ -18,7 +18,10 @@ from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 
+from loop_interfaces.loop_parameters import nothing_for, of_ros
+from loop_interfaces.parameter_file import ParameterFile
 from loop_interfaces.parameters import table, with_names
+from loop_interfaces.problem import completed
 from loop_interfaces.spec import ParameterError, Spec, check_names
 
 UNANSWERED = 1.0
@@ -26,16 +29,30 @@ UNANSWERED = 1.0
 _LARGEST = 1.7976931348623157e308
 
 
-def given_parameters(node: Node) -> dict[str, Any]:
-    """What the command line and parameter files give this node. ParameterError for unknown names."""
-    given = {name: parameter.value for name, parameter in node._parameter_overrides.items()}
-    # rcl knows no type of an empty list, and gives it no value.
-    given = {name: [] if value is None else value for name, value in given.items()}
+def given_parameters(node: Node, package: str) -> dict[str, Any]:
+    """What the command line and parameter files give a node, on top of the problem they name.
+
+    ParameterError for unknown names, and for a problem that nobody knows.
+    """
+    given = {
+        # rcl knows no type of an empty list, and gives it no value.
+        name: [] if parameter.value is None else parameter.value
+        for name, parameter in node._parameter_overrides.items()
+        if not of_ros(name)
+    }
     given = with_names(given)
-    known = [spec.name for spec in table()]
-    ros_own = [name for name in given if name.split(".")[0] in ("use_sim_time", "qos_overrides")]
-    check_names(set(given) - set(ros_own), known)
-    return given
+    check_names(given, [spec.name for spec in table()])
+    return completed(given, package)
+
+
+def require_parameters(node: Node, files: Sequence[ParameterFile]) -> None:
+    """ParameterError where parameter files were given that have nothing for this node.
+
+    It would run with its defaults, which are another problem's.
+    """
+    name = node.get_fully_qualified_name()
+    if files and all(of_ros(parameter) for file in files for parameter in file.of(name)):
+        raise ParameterError(nothing_for(name, files))
 
 
 def declare(node: Node, specs: Iterable[Spec], given: dict[str, Any]) -> dict[str, Any]:

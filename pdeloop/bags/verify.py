@@ -17,8 +17,9 @@ from typing import Any
 
 from loop_interfaces.documents import parse_json
 from loop_interfaces.files import FileError, read_bounded
+from loop_interfaces.loop_parameters import read_problem
 from loop_interfaces.parameters import PLANT
-from loop_interfaces.spec import MAX_YAML_BYTES, ParameterError, read_yaml
+from loop_interfaces.spec import MAX_YAML_BYTES, ParameterError
 from pdeloop.bags.reader import Bag, bags_of
 from pdeloop.bags.recorded_run import RecordedRun
 from pdeloop.bags.report import Report
@@ -106,7 +107,7 @@ def _given(path: Path) -> tuple[Parameters, Mapping[str, Any] | None]:
             raise
         except ValueError as error:
             raise ParameterError(f"{path} is not the parameters.json of a bag: {error}") from error
-    return {}, read_yaml(path)
+    return {}, read_problem(path)
 
 
 def _whole_runs(bags: Sequence[Bag]) -> list[Path]:

@@ -6,8 +6,8 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from loop_interfaces.loop_parameters import read_problem
 from loop_interfaces.problem import shipped_problems
-from loop_interfaces.spec import read_yaml
 from pdeloop.commands.common import Commands, add_json, command
 from pdeloop.output import print_json
 
@@ -41,7 +41,7 @@ def _problems(options: argparse.Namespace) -> int:
 
 def _described(name: str) -> dict[str, Any]:
     path = shipped_problems()[name]
-    values = read_yaml(path)
+    values = read_problem(path)
     first = path.read_text().splitlines()[0].removeprefix("# ").split("   ")[0]
     numbers = {key: values[key] for key in ("n_z", "n_a", "horizon", "sample_time")}
     return {"name": name, "description": first, "file": str(path), **numbers}

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from loop_interfaces.loop_parameters import read_problem
 from loop_interfaces.problem import find_problem
-from loop_interfaces.spec import read_yaml
 from loop_interfaces.text import shown
 from pdeloop.training_run import resolve
 from tuner_node.build import build_training
@@ -105,7 +105,7 @@ class Study:
         for word in problems:
             beside = folder / word
             file = str(beside.resolve()) if beside.is_file() else word
-            name = str(read_yaml(find_problem(file)).get("problem", Path(file).stem))
+            name = str(read_problem(find_problem(file)).get("problem", Path(file).stem))
             if not _NAME.fullmatch(name) or name in files:
                 raise StudyError(f"problem '{name}' of {file}; expected names that differ")
             files[name] = file

@@ -21,8 +21,8 @@ from typing import Any
 import pytest
 
 from loop_interfaces.isolation import NETWORK
+from loop_interfaces.loop_parameters import read_problem
 from loop_interfaces.parameters import flags, table
-from loop_interfaces.spec import read_yaml
 from pde_sim_node.build import fingerprint
 from pde_sim_node.equations import ALLOWED
 from pdeloop import cli
@@ -203,7 +203,7 @@ def test_a_launched_training_has_the_nodes_and_parameters_that_exist(launched, t
         assert importlib.util.find_spec(f"{node['executable']}.node") is not None
         assert set(given_to(node)) <= known
         assert node["parameters"][0] == str(run / "parameters.yaml")
-    values = read_yaml(run / "parameters.yaml")
+    values = read_problem(run / "parameters.yaml")
     assert (values["iterations"], values["real_time_factor"], values["n_z"]) == (3, 50.0, 32)
     assert (values["physical.viscosity"], values["horizon"]) == (2e-2, 20)
     by_name = {node["executable"]: given_to(node) for node in nodes}

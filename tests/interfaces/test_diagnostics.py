@@ -118,7 +118,7 @@ def test_a_node_is_not_there_before_it_can_answer(module, monkeypatch):
     known = {name: value for name, value in parameters().items() if name in own}
     monkeypatch.setattr(module, declaring, lambda *given: known)
     monkeypatch.setattr(module.FAST_PATH, "load_compiled", MagicMock(side_effect=CompilingError))
-    monkeypatch.setattr(module, "given_parameters", lambda node: {})
+    monkeypatch.setattr(module, "given_parameters", lambda node, package: {})
     with pytest.raises(CompilingError):
         kind(MagicMock(), loop)
     assert not loop.sender.called and not loop.receive.called

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from loop_interfaces.parameters import NODES, table, taken_by, with_names
-from loop_interfaces.problem import load_parameters, shipped_problems
+from loop_interfaces.problem import completed, load_parameters, shipped_problems
 from loop_interfaces.spec import ParameterError as Refused
 from loop_interfaces.spec import Spec, check_names
 from pde_sim_node.build import build_plant, fingerprint
@@ -101,13 +101,15 @@ def test_shipped_problems_load_and_build(name):
         ("n_z: 3", "not a ROS parameter file"),
         ("/**: {ros__parameters: [1]}", "not a ROS parameter file"),
         ("a: [", "not valid YAML"),
-        ("a: 1\nb: 2: 3\n", "not valid YAML: mapping values are not allowed here, in line 2"),
-        ("", "not a ROS parameter file"),
+        ("a: 1\nb: 2: 3\n", "not valid YAML: mapping values are not allowed"),
+        ("", "has no parameters; expected '/**:' with 'ros__parameters:' in it"),
+        ("/**: {ros__parameters: {use_sim_time: true}}", "no parameters for the nodes of a loop"),
+        ("/camera: {ros__parameters: {gain: 3}}", "only for /camera"),
+        ("/**: {ros__parameters: {problem: stokes, n_z: 64}}", "unknown problem 'stokes'"),
         ("/**: {ros__parameters: {n_zz: 3}}", "unknown parameter 'n_zz'; did you mean 'n_z'"),
         ("/**: {ros__parameters: {n_z: odd}}", "'n_z' is 'odd'"),
         ("/**: {ros__parameters: {physical: {viscosity: thick}}}", "'physical.viscosity'"),
-        ("/**: {ros__parameters: {physical: {viscosity: 1e-3}}}", "point and sign, like 1.0e+12"),
-        ("x: !!python/object/apply:os.system ['true']", "not valid YAML"),
+        ("x: !!python/object/apply:os.system ['true']", "not a ROS parameter file"),
     ],
 )
 def test_a_bad_problem_file_is_one_clear_sentence(tmp_path, text, words):
@@ -192,3 +194,98 @@ def test_every_parameter_says_which_nodes_take_it():
     assert {spec.name for spec in table()} == {
         spec.name for node in NODES.values() for spec in taken_by(node)
     }
+
+
+SYSTEM = """
+/camera_node:
+  ros__parameters: {gain: 3, tiles: [[1, 2]]}
+/**:
+  ros__parameters: {use_sim_time: true}
+"""
+PLANT = "{problem: own, equation: burgers, n_z: 64, physical: {viscosity: 1e-2}}"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"/**: {{ros__parameters: {PLANT}}}",
+        f"/*: {{ros__parameters: {PLANT}}}",
+        f"/pde_sim_node: {{ros__parameters: {PLANT}}}",
+        f"pde_sim_node: {{ros__parameters: {PLANT}}}",
+        f"/lab: {{pde_sim_node: {{ros__parameters: {PLANT}}}}}",
+        f"/lab/pde_sim_node: {{ros__parameters: {PLANT}}}",
+        f"/lab/**: {{ros__parameters: {PLANT}}}",
+        f"/*/pde_sim_node: {{ros__parameters: {PLANT}}}",
+        f"/a/lab: {{'*': {{ros__parameters: {PLANT}}}}}",
+        f"/left: {{'**': {{ros__parameters: {PLANT}}}}}\n/right/**: {{ros__parameters: {PLANT}}}",
+        # What a node does not take is not for it; a later block is taken over an earlier one.
+        f"/tuner_node: {{ros__parameters: {{pin: 3}}}}\n/**: {{ros__parameters: {PLANT}}}",
+        f"/**: {{ros__parameters: {{n_z: 32}}}}\n/*: {{ros__parameters: {PLANT}}}",
+    ],
+)
+def test_a_file_for_a_whole_system_is_read_as_the_nodes_read_it(tmp_path, text):
+    path = tmp_path / "system.yaml"
+    path.write_text(SYSTEM + text)
+    values = load_parameters(str(path), {})
+    assert (values["problem"], values["n_z"], values["pin"]) == ("own", 64, -1)
+    assert values["physical.viscosity"] == 0.01
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            "/pde_sim_node: {ros__parameters: {n_z: 64}}\n/tuner_node: {ros__parameters: {n_z: 32}}",
+            "'n_z' as 64 for pde_sim_node and as 32 for tuner_node; expected one value",
+        ),
+        (
+            "/left/**: {ros__parameters: {n_z: 64}}\n/right/**: {ros__parameters: {n_z: 32}}",
+            "different parameters for the nodes in /left and in /right",
+        ),
+        ("/**: {ros__parameters: {a: 1}, camera: {ros__parameters: {b: 2}}}", "put them before it"),
+        ("/**: {ros__parameters: {horizon: 3, horizon: 3.5}}", "'horizon' as 3 and as 3.5"),
+        ("/**: {ros__parameters: {pairs: [[a]]}}", "has lists within the list 'pairs'"),
+        ("/**: {ros__parameters: {pairs: [a, 1]}}", "several types"),
+        ("/**: {ros__parameters: {physical: {}}}", "empty group 'physical'"),
+        ("/**: {ros__parameters: {a: {b.c: {d: 1}}}}", "dots in the name of a group"),
+        ("/**: {ros__parameters: {n_z: }}", "'n_z' has no value in line 1"),
+        ("/my-plant: {ros__parameters: {n_z: 64}}", "'/my-plant' is no name of a node"),
+    ],
+)
+def test_a_file_that_ros_misreads_or_that_contradicts_itself_is_refused(tmp_path, text, words):
+    path = tmp_path / "system.yaml"
+    path.write_text(text)
+    with pytest.raises(Refused) as refused:
+        load_parameters(str(path), {})
+    assert words in str(refused.value) and str(path) in str(refused.value)
+
+
+def test_a_problem_that_names_a_shipped_one_is_that_one_with_changes(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("/**: {ros__parameters: {problem: kdv, horizon: 20}}")
+    values, shipped = load_parameters(str(path), {}), load_parameters("kdv", {})
+    assert values == {**shipped, "horizon": 20}
+
+
+@pytest.mark.parametrize(
+    ("package", "given", "known"),
+    [
+        ("pde_sim_node", {"problem": "stokes"}, False),
+        ("pde_sim_node", {"problem": "stokes", "n_z": 64}, False),
+        ("pde_sim_node", {"problem": "stokes", "equation": "burgers"}, True),
+        ("controller_node", {"problem": "stokes"}, False),
+        ("tuner_node", {"problem": "stokes", "out": "run"}, False),
+        ("viewer_node", {"problem": "stokes"}, False),
+        # Of a plant that is not this project's, which has no equation here.
+        ("controller_node", {"problem": "rig", "n_a": 2}, True),
+        ("tuner_node", {"problem": "rig", "n_z": 8}, True),
+        ("recorder_node", {"problem": "rig"}, True),
+        ("tuner_node", {"n_z": 8}, True),
+    ],
+)
+def test_a_node_refuses_a_problem_that_nobody_knows(package, given, known):
+    if known:
+        assert completed(given, package) == given
+    else:
+        with pytest.raises(Refused, match=r"unknown problem 'stokes'.*burgers, .*kdv"):
+            completed(given, package)

@@ -21,7 +21,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from loop_interfaces.spec import read_yaml
+from loop_interfaces.loop_parameters import read_problem
 from tests.support.small import parameters
 from tuner_node.build import build_training
 from tuner_node.run_folder import RunFolder, RunFolderError
@@ -115,7 +115,7 @@ def judged(folder: Path, codes: tuple[int, int]) -> str:
         return f"exit codes {codes}, expected one process to begin: {texts}"
     winner = codes.index(0)
     known = json.loads((folder / "run.json").read_text())
-    seeds = known["parameters"]["seed"], read_yaml(folder / "parameters.yaml")["seed"]
+    seeds = known["parameters"]["seed"], read_problem(folder / "parameters.yaml")["seed"]
     if seeds != (winner, winner):
         return f"run.json and parameters.yaml are of the seeds {seeds}, that of {winner} has begun"
     if str(known["run"]) != told[winner].read_text():

@@ -28,7 +28,7 @@ def _no_compiler(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "taken" / "parameters.yaml").write_text("")
     (tmp_path / "file").write_text("")
     (tmp_path / "study.yaml").write_text(
-        f"{{problems: [{SMALL}], variants: {{good: {{}}, bad: {{optimizer: adam}}}}}}"
+        f"{{problems: [{SMALL}], variants: {{good: {{}}, bad: {{n_a: 0}}}}}}"
     )
 
 
@@ -57,7 +57,7 @@ def _no_compiler(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         (("reproduce", str(SMALL), "--iterations", "1"), "expected at least 9"),
         (("check", str(SMALL), "--equation", "stokes"), "unknown equation"),
         (("check", "nowhere.yaml"), "no problem file"),
-        (("study", "study.yaml"), "small, variant 'bad': parameter 'optimizer' is 'adam'"),
+        (("study", "study.yaml"), "small, variant 'bad': parameter 'n_a' is 0"),
     ],
 )
 def test_a_mistake_is_refused_first(

@@ -26,7 +26,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from loop_interfaces.spec import read_yaml
+from loop_interfaces.loop_parameters import read_problem
 from pdeloop import cli, training_run
 from pdeloop.cli import main
 from pdeloop.commands import problems
@@ -111,7 +111,7 @@ def test_problems_are_data_too(capsys) -> None:
     assert main(["problems", "--json"]) == 0
     found = {one["name"]: one for one in json.loads(capsys.readouterr().out)}
     assert Path(found["burgers"]["file"]).is_file()
-    values = read_yaml(Path(found["kdv"]["file"]))
+    values = read_problem(Path(found["kdv"]["file"]))
     assert all(found["kdv"][name] == values[name] for name in ("n_z", "n_a", "horizon"))
 
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from loop_interfaces.problem import shipped_problems
-from loop_interfaces.spec import ParameterError, read_yaml
+from loop_interfaces.problem import read_problem, shipped_problems
+from loop_interfaces.spec import ParameterError
 from pdeloop.cli import FAILED, main
 from pdeloop.commands.new import write
 
@@ -172,7 +172,7 @@ def test_new_refuses_a_name(
 )
 def test_new_takes_a_name_that_is_a_word_of_python_or_yaml(folder: Path, name: str) -> None:
     files, equation = write(name, folder)
-    assert read_yaml(files[1])["problem"] == name
+    assert read_problem(files[1])["problem"] == name
     kind = equation.rpartition(":")[2]
     assert runpy.run_path(str(files[0]))[kind].name == name
 

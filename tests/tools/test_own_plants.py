@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 import pdeloop
+from loop_interfaces.loop_parameters import read_problem
 from loop_interfaces.own_code import OwnCodeError
 from loop_interfaces.problem import load_parameters
-from loop_interfaces.spec import read_yaml
 from pde_sim_node.build import build_plant, complete
 from pde_sim_node.plants import DynamicsPlant, loading
 from pde_sim_node.plants.loading import OWN_PLANTS
@@ -200,7 +200,7 @@ def test_python_and_the_command_line_train_to_the_same_bits(
     assert by_object.costs["adapted"].mean() < by_object.costs["none"].mean()
     there = [json.loads((tmp_path / run / "result.json").read_text())["plant"] for run in "ab"]
     assert there[0] == there[1] > 0
-    assert read_yaml(tmp_path / "a" / "parameters.yaml")["plant"] == name
+    assert read_problem(tmp_path / "a" / "parameters.yaml")["plant"] == name
 
     # What a run is followed by.
     for command in (["evaluate"], ["report"]):

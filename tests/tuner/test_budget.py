@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loop_interfaces.spec import ParameterError, yaml_text
+from loop_interfaces.parameter_file import yaml_text
+from loop_interfaces.spec import ParameterError
 from loop_interfaces.topics import CostColumn, StartColumn
 from pdeloop.cli import main
 from pdeloop.in_process import LocalPair
