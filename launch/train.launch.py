@@ -81,7 +81,7 @@ def training(context: LaunchContext) -> list[Any]:
         pairs=PAIRS.parse(given["pairs"]),
         view="view" in on,
     )
-    folder = run_folder(given)
+    folder = run_folder(given, transport)
     given["problem"] = str(folder / "parameters.yaml")
     actions: list[Any] = [LogInfo(msg=f"training in {folder}")]
     if given["optimizer"]:
@@ -110,7 +110,7 @@ def training(context: LaunchContext) -> list[Any]:
     return [*actions, RegisterEventHandler(ended), loop]
 
 
-def run_folder(given: dict[str, str]) -> Path:
+def run_folder(given: dict[str, str], transport: Transport) -> Path:
     """The folder of the run: a new one, or that of the run to continue."""
     own: dict[str, Any] = {s.name: s.parse(given[s.name]) for s in FLAGS if given[s.name]}
     own |= dict(assignment(text) for text in filter(None, given["set"].split(",")))
@@ -129,7 +129,7 @@ def run_folder(given: dict[str, str]) -> Path:
         reopen(Path(given["resume"]))
         return Path(given["resume"]).resolve()
     out = Path(given["out"]) if given["out"] else None
-    return begin(given["problem"], {**own, **code}, out)[0].resolve()
+    return begin(given["problem"], {**own, **code}, out, transport)[0].resolve()
 
 
 def end_with_tuner(event: ProcessExited, context: LaunchContext) -> list[Any]:

@@ -328,7 +328,7 @@ def train(
         )
         parameters |= {} if plant is None else {"plant": plant}
         where = Path(temporary) / "run" if out is None else Path(out)
-        folder, values = begin(source, {**given, **named(source, parameters)}, where)
+        folder, values = begin(source, {**given, **named(source, parameters)}, where, transport)
         display = Display(values["seed"], values["seeds"], progress or StringIO())
         try:
             carry_out(folder, values, transport, display, lambda: None)

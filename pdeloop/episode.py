@@ -103,6 +103,13 @@ def rollout(
     plant = as_plant(plant)
     if not callable(law):
         raise ValueError(f"law is {law!r}; expected a function of k and the states")
+    if noise is not None:
+        given = np.asarray(noise)
+        if given.dtype.kind not in "iu" or given.shape != np.shape(seeds)[:1]:
+            raise ValueError(
+                f"noise is {noise!r}; expected {len(np.atleast_1d(seeds))} whole numbers, a seed for "
+                "each environment"
+            )
     z = plant.reset(seeds, noise)
     batch, kept = len(z), plant.horizon if keep else -1
     states = np.empty((kept + 1, *z.shape))

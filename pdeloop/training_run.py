@@ -30,6 +30,7 @@ from pdeloop.live import announced
 from pdeloop.output import print_json
 from pdeloop.pairs import LoopNode, Transport
 from pdeloop.supervisor import Child, NodeError, Supervisor, node_command
+from pdeloop.unused import refuse_unused
 from tuner_node import narration
 from tuner_node.build import build_training
 from tuner_node.optimizer_parameters import kind_of, training_parameters
@@ -79,13 +80,16 @@ def load_compiled(values: Mapping[str, Any]) -> None:
 
 
 def begin(
-    problem: str, options: Mapping[str, Any], out: Path | None
+    problem: str, options: Mapping[str, Any], out: Path | None, transport: Transport | None = None
 ) -> tuple[Path, dict[str, Any]]:
     """Folder and parameters of a new training, of which nothing has been done yet.
 
-    What can be refused without a compiler is refused before anything is compiled.
+    What can be refused without a compiler is refused before anything is compiled, as are options
+    that change nothing. transport: over topics, if not given.
     """
     values = resolve(problem, options)
+    transport = transport or Transport()
+    refuse_unused(options, values, in_process=transport.in_process, viewed=transport.view)
     build_training(values)
     folder = out or Path("runs") / f"{values['problem']}-{timestamp()}"
     RunFolder(folder).refuse_another()

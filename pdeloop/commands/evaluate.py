@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import sys
 
+from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import (
     DEFAULTS,
     Commands,
@@ -31,9 +32,7 @@ def add(commands: Commands) -> None:
         example="pdeloop evaluate runs/burgers-20260101-120000-1 --fields 60 --seed 7",
     )
     evaluate.add_argument("folder", type=a_path, metavar="DIR", help="folder of a finished run")
-    evaluate.add_argument(
-        "--fields", type=int, default=10, metavar="N", help="sampled initial fields [10]"
-    )
+    evaluate.add_argument("--fields", type=int, metavar="N", help="sampled initial fields [10]")
     evaluate.add_argument(
         "--seed", type=int, default=0, metavar="S", help="seed of those fields [0]"
     )
@@ -53,14 +52,17 @@ def _evaluate(options: argparse.Namespace) -> int:
     from tuner_node import narration
 
     allow_own_code(options)
-    DEFAULTS["evaluation_fields"].check(options.fields, "--fields")
+    if options.mean_field and options.fields is not None:
+        raise ParameterError("--mean-field is one field: leave out --fields")
+    fields = 10 if options.fields is None else options.fields
+    DEFAULTS["evaluation_fields"].check(fields, "--fields")
     DEFAULTS["evaluation_seed"].check(options.seed, "--seed")
     changes = read_settings(options.set)
     run = load_run(options.folder)
     refuse_other_code(options, run.values)
     costs = evaluate(
         run,
-        fields=options.fields,
+        fields=fields,
         seed=options.seed,
         mean_field=options.mean_field,
         changes=changes,

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import argparse
 
-from loop_interfaces.parameters import PROBLEM, VIEWER
 from loop_interfaces.problem import shipped_problems
 from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import (
@@ -97,9 +96,6 @@ def _train(options: argparse.Namespace) -> int:
     )
     transport.require()
     settings = read_settings(options.set)
-    own_viewer = {spec.name for spec in VIEWER if spec.name not in {s.name for s in PROBLEM}}
-    if not options.view and (unused := sorted(own_viewer & {*settings})):
-        raise ParameterError(f"--set {unused[0]} is of the viewer: add --view")
     given = joined(given_flags(options), settings)
     for name in ("rollouts", "iterations"):
         if given.get(name) == 0:
@@ -127,5 +123,5 @@ def _train(options: argparse.Namespace) -> int:
     problem = options.problem or ""
     if options.sensor_delays is not None and not resolve(problem, given)["sensors"]:
         raise ParameterError("--sensor-delays goes with --sensors N, or a problem with sensors")
-    folder, values = begin(problem, given, options.out)
+    folder, values = begin(problem, given, options.out, transport)
     return run(folder, values, transport, options.json)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
+import pdeloop
 from loop_interfaces.parameters import table
 from loop_interfaces.spec import ParameterError
 from pdeloop.cli import FAILED, main
@@ -139,3 +140,56 @@ def test_study_and_reproduce_set_a_parameter_of_all_trainings(
     ):
         refused(capsys, told, "reproduce", str(SMALL), "--out", fresh, *words)
     assert not Path(fresh).exists()
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("dmdc_rank=5", "of the identification dmdc, and this one is regression"),
+        ("dmdc_order=5", "of the identification dmdc"),
+        ("sensor_delays=2", "there are no sensors"),
+        ("real_time_factor=1", "about nodes"),
+        ("pin=1", "about nodes"),
+        ("action_timeout=0.1", "about nodes"),
+        ("max_attempts=3", "about nodes"),
+        ("plant_fingerprint=3", "how the training is started"),
+    ],
+)
+def test_train_refuses_what_would_change_nothing(
+    setting: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = ("--in-process", "--out", str(tmp_path / "run"))
+    refused(capsys, words, "train", str(SMALL), "--set", setting, *out)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        {"resume": True},
+        {"recorder": "required"},
+        {"pairs": ["a"]},
+        {"bag": "x"},
+        {"view_rate": 3.0},
+        {"real_time_factor": 1.0},
+        {"optimizer": "gauss_newton", "learning_rate": 0.1, "rollouts": 20},
+        {"optimizer": "gauss_newton", "smoothing_radius": 0.1, "rollouts": 20},
+    ],
+)
+def test_the_python_interface_refuses_what_would_change_nothing(
+    parameters: dict[str, object],
+) -> None:
+    with pytest.raises(ValueError, match="changes nothing here: "):
+        pdeloop.train(str(SMALL), **parameters)
+
+
+def test_what_is_of_one_field_or_of_noise_is_refused_elsewhere(
+    trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("--mean-field", "--fields", "3")
+    refused(capsys, "--mean-field is one field", "evaluate", str(trained), *words)
+    plant = pdeloop.problem(str(SMALL), horizon=2).plant()
+    none = np.zeros((2, plant.n_a))
+    for noise in ("x", [1], [0.5, 1.5]):
+        with pytest.raises(ValueError, match="expected 2 whole numbers, a seed for each"):
+            pdeloop.rollout(plant, lambda k, z: none, [0, 1], noise)
