@@ -90,6 +90,8 @@ class TrainingSettings:
     """Point sensors whose readings the states are; 0: the states are whole."""
     actuator_positions: Sequence[float] = ()
     """Centres of the actuators as shares of the domain; none: equally spaced."""
+    periodic: bool = True
+    """Whether the states are fields on one periodic axis."""
     model: Array | None = None
     """Rows of a reduced model to start from instead of identifying one."""
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.array_files import read_arrays
+from loop_interfaces.grid import Grid
 from loop_interfaces.model_rows import unpack
 from loop_interfaces.parameters import model_order, noisy
 from loop_interfaces.signature import design_digest
@@ -121,6 +122,7 @@ def build_training(values: Mapping[str, Any]) -> Training:
     given |= {
         "exploration_variance": max(values["exploration_variance"], variance),
         "sensors": sensors,
+        "periodic": not values["grid"] or Grid.parse(values["grid"]).is_circle,
         "measurement_noise": values["measurement_noise"] * scale,
         "model": read_model(Path(values["model"]), values["n_a"]) if values["model"] else None,
     }

@@ -321,6 +321,7 @@ class Training:
             noise=self.settings.measurement_noise,
             sensors=self.settings.sensors,
             actuator_positions=self.settings.actuator_positions,
+            periodic=self.settings.periodic,
         )
 
     def _asked(self) -> list[list[Rollout]]:

@@ -126,6 +126,8 @@ class Context:
         consist; 0: the states are whole.
     actuator_positions : sequence of float
         Centres of the actuators as shares of the domain; none: equally spaced.
+    periodic : bool
+        Whether the states are fields on one periodic axis, which models of the whole field assume.
     """
 
     U: Array
@@ -139,6 +141,7 @@ class Context:
     noise: float = 0.0
     sensors: int = 0
     actuator_positions: Sequence[float] = ()
+    periodic: bool = True
 
     def actuator_centres(self, n_a: int) -> Array:
         """Centres of the n_a actuators as shares of the domain, (n_a,)."""

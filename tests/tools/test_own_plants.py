@@ -18,6 +18,7 @@ import pdeloop
 from loop_interfaces.loop_parameters import read_problem
 from loop_interfaces.own_code import OwnCodeError
 from loop_interfaces.problem import load_parameters
+from loop_method.adapt.proposals import proposer
 from pde_sim_node.build import build_plant, complete
 from pde_sim_node.plants import DynamicsPlant, loading
 from pde_sim_node.plants.loading import OWN_PLANTS
@@ -294,3 +295,12 @@ def test_the_page_shows_the_example_as_it_is() -> None:
     page = (ROOT / "docs" / "bring-your-own.md").read_text()
     (code,) = re.findall(r"```python\n(import numpy.*?)```", page, flags=re.DOTALL)
     assert code.strip() in (PLANTS / "random_linear.py").read_text()
+
+
+def test_no_model_of_a_periodic_field_is_fitted_to_another_plant(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A convolution fits a walled plate passably, and leads to worse laws than local models."""
+    monkeypatch.setattr(proposer, "reproducing_model", lambda *_: pytest.fail("was fitted"))
+    run = pdeloop.train(plant=PLATE, rollouts=12, evaluation_fields=2, **{"physical.nx": 6})
+    assert run.costs["adapted"].mean() < run.costs["lqt"].mean()

@@ -72,9 +72,10 @@ class Proposer:
         self._cleaned: WeakKeyDictionary[Record, Record] = WeakKeyDictionary()
         exploration = Record(np.zeros_like(policy), np.inf, states, actions)
         self._before = [self._clean(record) for record in (exploration, *context.measured)]
+        self._periodic = context.periodic
         self.sensed: SensedProposals | None = None
         # One component, of which each sensor's last reading is the state.
-        if context.sensors == target.size and target.size <= MOST_SENSORS:
+        if self._periodic and context.sensors == target.size and target.size <= MOST_SENSORS:
             centres = context.actuator_centres(n_a)
             largest_cost = LOCAL * self.loop.cost_of(self._before[0])
             self.sensed = SensedProposals(self.loop, centres, context.noise, largest_cost)
@@ -119,6 +120,10 @@ class Proposer:
         # A rollout counts less in a fit, the more it costs above the incumbent's.
         level = loop.mean_cost_of(incumbents)
         shares = [min(1.0, level / max(loop.cost_of(record), 1e-300)) ** 2 for record in data]
+        if not self._periodic:  # what the models of the whole field do not describe
+            return local.propose(
+                *(loop, data, shares, incumbents, others), damping=damping, accepted=accepted
+            )
         model, error, whole = reproducing_model(
             loop,
             steps_of(data, [max(share, _LEAST_WEIGHT) for share in shares]),
