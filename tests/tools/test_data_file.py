@@ -161,3 +161,35 @@ def test_the_command_line_says_it_in_one_line(
     assert "the inputs a1 and a2 never moved (constant at 0)" in capsys.readouterr().err
     assert main(["identify", "--data", str(EXAMPLE), "--episode", "1"]) == FAILED
     assert "choose from a bag" in capsys.readouterr().err
+
+
+BAG = Path(__file__).parents[1] / "data" / "bag_0_1"
+
+
+def test_episodes_under_one_law_say_nothing_of_its_inputs_and_the_exploration_does(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """A recorded training: 1.1 explores, 1.3 has two policies that differ by little on one field."""
+    assert main(["identify", "--bag", str(BAG)]) == 0
+    assert "rank 8 of 8" in capsys.readouterr().out
+    assert main(["identify", "--bag", str(BAG), "--episode", "1.3"]) == FAILED
+    told = capsys.readouterr().err
+    assert "always followed from the state (feedback without excitation" in told
+    assert all(f"a{j}" in told for j in range(1, 5)) and told.count("\n") == 1
+
+
+def test_a_bag_whose_inputs_always_moved_together_is_refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from pdeloop.bags.episodes import RecordedEpisode
+
+    recorded = RecordedEpisode.trajectory
+
+    def coupled(episode: RecordedEpisode) -> tuple[Array, Array]:
+        states, actions = recorded(episode)
+        actions[..., 2] = -3.0 * actions[..., 0]
+        return states, actions
+
+    monkeypatch.setattr(RecordedEpisode, "trajectory", coupled)
+    assert main(["identify", "--bag", str(BAG)]) == FAILED
+    assert "a1 and a3 always moved together (a3 = -3 a1)" in capsys.readouterr().err
