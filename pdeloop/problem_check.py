@@ -100,10 +100,11 @@ def _halving(plant: Plant, values: Mapping[str, Any], explored: EpisodeRecord) -
     whole, half = (which.evaluate(states, actions)[0] for which in (plant, finer))
     change = linalg.norm(half - states, axis=1)
     error = float(np.max(linalg.norm(whole - half, axis=1) / np.maximum(change, 1e-300), initial=0))
-    step = values["integration_time"]
-    text = f"halving {step:g} s changes a sample by at most {100 * error:.2g} % of its own change"
+    step = "its internal step" if values["plant"] else f"{values['integration_time']:g} s"
+    text = f"halving {step} changes a sample by at most {100 * error:.2g} % of its own change"
     if error > STEP_ERROR:
-        return Finding("integration step", False, f"{text}: take {step / 2:g} s or less")
+        less = "half of it" if values["plant"] else f"{values['integration_time'] / 2:g} s"
+        return Finding("integration step", False, f"{text}: take {less} or less")
     return Finding("integration step", True, text)
 
 

@@ -10,6 +10,7 @@ import inspect
 import json
 import sys
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,8 +22,11 @@ from pde_sim_node.definition import described
 from pde_sim_node.dynamics import Dynamics, arguments_of, signature_of
 from pde_sim_node.plant import Plant
 from pde_sim_node.plants.dynamics_plant import DynamicsPlant
+from pde_sim_node.plants.interval import Interval
 
-OWN_PLANTS = OwnCode("plant", "PDELOOP_PLANTS", {})
+PLANTS: Mapping[str, type[Dynamics]] = MappingProxyType({"interval": Interval})
+"""Those that are shipped, by name."""
+OWN_PLANTS = OwnCode("plant", "PDELOOP_PLANTS", PLANTS)
 OBJECT = "object of a Python program:"
 """How a parameter begins that no file can hold."""
 PHYSICAL = "physical."
