@@ -12,6 +12,7 @@ from pde_sim_node.plants.loading import as_plant
 from pdeloop.monitor.node import component_names
 from pdeloop.report import planes
 from viewer_node.picture import plane_of
+from viewer_node.web.page import Page
 
 GRID = pdeloop.Grid(
     (pdeloop.Axis("y", 1.0, 3, periodic=False), pdeloop.Axis("x", 2.0, 4)), ("u", "v")
@@ -63,6 +64,13 @@ def test_an_episode_and_the_check_are_drawn_as_pictures() -> None:
     assert np.array_equal(last, first / 16)
     assert np.array_equal(drawn[1][0], STATE[:12].reshape(3, 4))
     assert drawn[1][3].sum() == 2.0  # where two actuators act
+
+
+def test_the_live_page_says_grid_point_where_a_row_is_no_place() -> None:
+    for grid, length in ((pdeloop.Grid.interval(2.0, 24), 2.0), (GRID, 0.0), (GRID.vector(4), 0.0)):
+        page = Page()
+        page.take_parameters({"grid": grid.text, "length": 2.0, "horizon": 5})
+        assert page.parameters["length"] == length
 
 
 def test_the_live_page_names_the_components_of_a_grid() -> None:

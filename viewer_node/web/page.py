@@ -10,6 +10,7 @@ any monotonic time in s.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import queue
 import struct
@@ -24,6 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from loop_interfaces.grid import Grid
 from viewer_node.episode_samples import MAX_COMPONENTS, EpisodeSamples, rows_of
 from viewer_node.loop_view import SILENT, LoopView
 from viewer_node.operation import Call
@@ -93,6 +95,11 @@ class Page:
     def take_parameters(self, values: Mapping[str, Any]) -> None:
         """Take parameters of a node."""
         self.parameters |= {name: values[name] for name in PARAMETERS if name in values}
+        if values.get("grid"):
+            with contextlib.suppress(ValueError):
+                axes = Grid.parse(str(values["grid"])).axes
+                if len(axes) != 1:  # the rows of a picture are numbers of the state, not places
+                    self.parameters["length"] = 0.0
         self.view.horizon = int(self.parameters.get("horizon", 0))
 
     def request_call(self, node: object, verb: object) -> bool:
