@@ -94,14 +94,17 @@ def build_training(values: Mapping[str, Any]) -> Training:
         )
     kind = kind_of(values)
     chosen = settings_of(kind, values)
+    # One at every point measures the whole state.
+    sensors = values["sensors"] if values["sensors"] < values["n_z"] else 0
+    if sensors and kind.with_sensors:
+        kind = kind_of({"optimizer": kind.with_sensors})
+        chosen = kind.Settings()
 
     def make_optimizer(
         policy: NDArray[np.float64], seed: int, context: Context | None, rollouts: int
     ) -> Optimizer:
         return kind(policy, seed=seed, rollouts=rollouts, settings=chosen, context=context)
 
-    # One at every point measures the whole state.
-    sensors = values["sensors"] if values["sensors"] < values["n_z"] else 0
     if sensors and kind.compares_first_law:
         values = {**values, "identification_attempts": 1}
     step = kind.first_step(chosen)

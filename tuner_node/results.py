@@ -14,7 +14,7 @@ from tuner_node.budget import PURPOSES
 from tuner_node.rollouts import EVALUATED
 from tuner_node.training import Training
 
-WORDS = ("event", "role", "model")
+WORDS = ("event", "role", "model", "chosen", "reason")
 """Entries of a row of the history that are no numbers."""
 
 

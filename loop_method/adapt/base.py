@@ -128,6 +128,8 @@ class Context:
         Centres of the actuators as shares of the domain; none: equally spaced.
     periodic : bool
         Whether the states are fields on one periodic axis, which models of the whole field assume.
+    further : sequence of Trajectory
+        Other explorations, from other initial fields.
     """
 
     U: Array
@@ -142,6 +144,12 @@ class Context:
     sensors: int = 0
     actuator_positions: Sequence[float] = ()
     periodic: bool = True
+    further: Sequence[Trajectory] = ()
+
+    @property
+    def every_exploration(self) -> Sequence[Trajectory]:
+        """The exploration of the reduced model first."""
+        return (self.exploration, *self.further)
 
     def actuator_centres(self, n_a: int) -> Array:
         """Centres of the n_a actuators as shares of the domain, (n_a,)."""
@@ -178,6 +186,8 @@ class Optimizer(Protocol):
     compares_first_law: ClassVar[bool] = False
     """Whether it compares the first law with no control itself where the state is that of few sensors,
     so that the plant is explored once and no law is checked before."""
+    with_sensors: ClassVar[str] = ""
+    """The optimiser in its place where the state is that of few sensors; empty: none."""
     iteration_rollouts: ClassVar[int] = 0
     """Rollouts of an iteration, for a budget that is counted in them; 0: it counts none."""
     preferences: ClassVar[Mapping[str, Any]] = {}

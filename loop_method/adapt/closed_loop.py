@@ -47,6 +47,9 @@ class ClosedLoop:
         T, the steps of an episode.
     action_limit : float
         Magnitude at which actions saturate; 0 for none.
+    noise : float
+        Standard deviation of the noise on every number of the state that the law sees; 0 for none. It
+        is the same in every simulation of as many fields.
     """
 
     model: FieldModel
@@ -56,6 +59,7 @@ class ClosedLoop:
     action_weight: float
     horizon: int
     action_limit: float = 0.0
+    noise: float = 0.0
 
     @cached_property
     def one(self) -> float:
@@ -69,10 +73,11 @@ class ClosedLoop:
         states = np.empty((self.horizon + 1, *fields.shape))
         actions = np.empty((self.horizon, len(fields), len(theta)))
         costs, finite = np.zeros(len(fields)), np.ones(len(fields), dtype=bool)
+        noise = self._noise_of(len(fields))
         states[0] = fields
         with np.errstate(all="ignore"):
             for k in range(self.horizon):
-                a = states[k] @ self.U @ K.T + b
+                a = (states[k] @ self.U + noise[k]) @ K.T + b
                 if self.action_limit:
                     np.clip(a, -self.action_limit, self.action_limit, out=a)
                 error = states[k] - self.target
@@ -105,6 +110,7 @@ class ClosedLoop:
             return np.inf, gradient
         states, actions = simulation.states, simulation.actions
         K, eta = theta[:, :-1], np.zeros_like(fields)
+        noise = self._noise_of(len(fields))
         share = 2.0 / self.horizon * weights[:, None]
         for k in reversed(range(self.horizon)):
             z, a = states[k], actions[k]
@@ -113,10 +119,17 @@ class ClosedLoop:
             if self.action_limit:
                 g = g * (np.abs(a) < self.action_limit)
             eta = eta + self.state_weight * share * (z - self.target) + g @ K @ self.U.T
-            gradient[:, :-1] += g.T @ (z @ self.U)
+            gradient[:, :-1] += g.T @ (z @ self.U + noise[k])
             gradient[:, -1] += self.one * g.sum(axis=0)
         counted = weights > 0.0
         return float(weights[counted] @ simulation.costs[counted]), gradient
+
+    def _noise_of(self, count: int) -> Array:
+        """What is added to U^T z, whose columns are orthonormal, (T, count, n_s) or (T, 1, 1)."""
+        if not self.noise:
+            return np.zeros((self.horizon, 1, 1))
+        size = self.horizon, count, self.U.shape[1]
+        return self.noise * np.random.default_rng(0).standard_normal(size)
 
     def theta(self, policy: Array) -> Array:
         """[K_a b] of a policy [K_a K_b], (n_a, n_s + 1)."""

@@ -99,10 +99,10 @@ class SearchState:
     tells: int = 0
 
     @classmethod
-    def begin(cls, policy: Array, count: int) -> SearchState:
-        """Before the first rollout, with so many fields."""
+    def begin(cls, policy: Array, count: int, first: int) -> SearchState:
+        """Before the first rollout, with so many fields from the number `first` on."""
         incumbents, trials, others = np.full((3, count), _NONE, dtype=np.int64)
-        numbers = np.arange(count, dtype=np.int64)
+        numbers = first + np.arange(count, dtype=np.int64)
         return cls(policy.copy(), policy.copy(), numbers, incumbents, trials, others)
 
     def arrays(self) -> State:
@@ -152,6 +152,8 @@ class GaussNewton(Optimizer):
     settings : GaussNewtonSettings
         `fields`: more fit the distribution better, at M rollouts a step. One is added after each
         accepted step that gains less than 2 % of the cost: a short step needs more to be judged.
+    first_field : int
+        Number of the first of these fields: a law can have been made on those before.
     """
 
     name = "gauss_newton"
@@ -167,12 +169,14 @@ class GaussNewton(Optimizer):
         rollouts: int,
         settings: GaussNewtonSettings | None = None,
         context: Context | None = None,
+        first_field: int = 0,
     ) -> None:
         require_positive(rollouts=rollouts)
         if context is None:
             raise ValueError("Gauss-Newton needs the context: trajectories were not asked for")
         settings = settings or GaussNewtonSettings()
-        self._now = SearchState.begin(checked_policy(policy0), settings.fields)
+        policy = checked_policy(policy0)
+        self._now = SearchState.begin(policy, settings.fields, first_field)
         self._proposer = Proposer(context, self._now.policy)
         self._sensors = context.sensors
         # One field says little with few sensors: the law has to beat no control on all of them.

@@ -34,7 +34,14 @@ KEPT = 0.999
 """Share of the variance whose directions are drawn from."""
 
 
-def mixtures(fields: Array, count: int, rng: np.random.Generator, components: int = 1) -> Array:
+def mixtures(
+    fields: Array,
+    count: int,
+    rng: np.random.Generator,
+    components: int = 1,
+    *,
+    periodic: bool = True,
+) -> Array:
     """Draws (count, n_z) of the distribution above; none from fewer than two fields.
 
     Parameters
@@ -47,13 +54,15 @@ def mixtures(fields: Array, count: int, rng: np.random.Generator, components: in
         Of the draws.
     components : int
         Fields that stand one after the other in a state.
+    periodic : bool
+        Whether they are on a ring; else rho is 0.
     """
     n, n_z = fields.shape
     mean = fields.mean(axis=0)
     deviations = fields - mean
     if n < 2 or not deviations.any():
         return np.empty((0, n_z))
-    rho = invariant_share(fields, components)
+    rho = invariant_share(fields, components) if periodic else 0.0
     covariance = (1.0 - rho) * deviations.T @ deviations / (n - 1)
     if rho > 0.0:
         covariance += rho * averaged_over_shifts(deviations, components) / (n - 1)

@@ -13,8 +13,7 @@ They come first in U, and POD modes of what is left fill the other columns.
 
 References
 ----------
-Anderson, Moore, "Optimal Control: Linear Quadratic Methods", chapter 4; "Optimal Filtering",
-section 6.7 (doubling).
+Anderson, Moore, "Optimal Control: Linear Quadratic Methods", chapter 4.
 """
 
 from __future__ import annotations
@@ -26,6 +25,7 @@ from scipy import linalg
 
 from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import ModelRows
+from loop_method.design.finite_horizon import finite_horizon
 from loop_method.field_models import FieldModel
 from loop_method.field_models.convolution import fit_convolutions
 from loop_method.field_models.differential import fit_differential
@@ -134,39 +134,3 @@ def field_law(
         return float(total)
 
     return law if cost(law) < np.nan_to_num(cost(other), nan=np.inf) else None
-
-
-def finite_horizon(
-    A: Array, B: Array, drift: Array, state_weight: float, action_weight: float, horizon: int
-) -> tuple[Array, Array]:
-    """The law a = K e + b that is optimal over a horizon, in its first step.
-
-        e_{k+1} = A e_k + B a_k + d,        J = sum_k q |e_k|^2 + r |a_k|^2
-
-    The Riccati recursion of [e; 1] is doubled until it covers the horizon (`horizon` rounded up to a
-    power of two). Unlike the algebraic equation it needs no stabilisable model.
-
-    Returns
-    -------
-    K (n_a, n), b (n_a,)
-
-    Examples
-    --------
-    >>> K, b = finite_horizon(np.eye(1), np.eye(1), np.zeros(1), 1.0, 1.0, 64)
-    >>> K.round(6), b
-    (array([[-0.618034]]), array([-0.]))
-    """
-    n, n_a = B.shape
-    whole = np.block([[A, drift[:, None]], [np.zeros((1, n)), np.ones((1, 1))]])
-    inputs = np.vstack([B, np.zeros((1, n_a))])
-    P = np.diag(np.append(np.full(n, state_weight), 0.0))
-    G, power, eye = inputs @ inputs.T / action_weight, whole, np.eye(n + 1)
-    for _ in range(int(np.ceil(np.log2(horizon)))):
-        solved = linalg.solve(eye + G @ P, np.hstack([power, G]))
-        own, reach = solved[:, : n + 1], solved[:, n + 1 :]
-        G, P = G + power @ reach @ power.T, P + power.T @ P @ own
-        power = power @ own
-    gains = -linalg.solve(
-        action_weight * np.eye(n_a) + inputs.T @ P @ inputs, inputs.T @ P @ whole, assume_a="pos"
-    )
-    return gains[:, :n], gains[:, n]

@@ -10,7 +10,8 @@ import pytest
 
 from controller_node.identification import DesignSettings, design
 from loop_interfaces.model_rows import ModelRows
-from loop_method.design.field_law import field_law, finite_horizon, reproducing
+from loop_method.design.field_law import field_law, reproducing
+from loop_method.design.finite_horizon import finite_horizon
 from loop_method.field_models.convolution import ConvolutionModel
 
 Array = np.ndarray

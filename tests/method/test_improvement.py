@@ -45,9 +45,10 @@ def fields(count: int) -> np.ndarray:
     return np.random.default_rng(2).normal(size=(count, N_Z))
 
 
-@pytest.mark.parametrize("limit", [0.0, 0.4])
-def test_the_gradient_is_that_of_finite_differences(limit: float) -> None:
-    closed, start, weights = loop(limit), fields(3), np.array([0.5, 0.2, 0.3])
+@pytest.mark.parametrize(("limit", "noise"), [(0.0, 0.0), (0.4, 0.0), (0.0, 0.3)])
+def test_the_gradient_is_that_of_finite_differences(limit: float, noise: float) -> None:
+    closed = replace(loop(limit), noise=noise)
+    start, weights = fields(3), np.array([0.5, 0.2, 0.3])
     theta = 0.3 * np.random.default_rng(3).normal(size=(N_A, N_S + 1))
     cost, gradient = closed.gradient(theta, start, weights)
     assert cost == pytest.approx(weights @ closed.costs(theta, start), rel=1e-14)
@@ -205,6 +206,14 @@ def test_mixtures_have_the_mean_and_covariance_they_claim() -> None:
     assert np.trace(found) == pytest.approx(np.trace(covariance), rel=2e-3)
     np.testing.assert_allclose(found, covariance, atol=2e-3 * np.trace(covariance))
     assert 0.0 < rho < 1.0
+
+
+def test_fields_between_walls_are_not_shifted() -> None:
+    rng = np.random.default_rng(12)
+    measured = np.zeros((5, 20))
+    measured[:, :4] = rng.normal(size=(5, 4))
+    assert mixtures(measured, 30, rng)[:, 4:].any()
+    assert not mixtures(measured, 30, rng, periodic=False)[:, 4:].round(12).any()
 
 
 def test_one_field_or_equal_fields_have_no_mixtures() -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from loop_interfaces.spec import ParameterError
-from loop_method.adapt import GaussNewton, Optimizer, TwoPoint
+from loop_method.adapt import GaussNewton, ModelBased, Optimizer, TwoPoint
 from loop_method.adapt.gauss_newton import GaussNewtonSettings
 from loop_method.adapt.registry import OWN_OPTIMIZERS, offered, optimizer_kind
 from loop_method.settings import Settings, setting
@@ -74,7 +74,10 @@ def test_an_installed_package_offers_its_optimisers_by_name(installed: Path) -> 
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("adam", "unknown optimizer 'adam': give one of gauss_newton, two_point, halved, .*"),
+        (
+            "adam",
+            "unknown optimizer 'adam': give one of gauss_newton, model_based, two_point, halved, .*",
+        ),
         ("lost", "'lost': foreign:Lost cannot be loaded: .*Lost"),
         ("number", "'number': 3 must be a class"),
         ("partial", "'partial': Partial does not define ask, tell, .*needs_trajectories"),
@@ -152,7 +155,7 @@ def test_the_documents_table_of_settings_is_that_of_the_classes() -> None:
     section = text.partition("## Settings\n")[2].partition("\n## ")[0]
     rows = [[cell.strip(" `") for cell in line.split("|")[1:-1]] for line in section.splitlines()]
     documented = [tuple(row) for row in rows if len(row) == 5][2:]
-    ours = [GaussNewton, TwoPoint]
+    ours = [GaussNewton, ModelBased, TwoPoint]
     assert {kind.name for kind in ours} == set(OWN_OPTIMIZERS.shipped)
     assert documented == [
         (

@@ -1,0 +1,93 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The model of the whole field that measured rollouts speak for, and how well it predicts them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from loop_interfaces.arrays import Array
+from loop_method.adapt.base import Context, Record
+from loop_method.adapt.closed_loop import ClosedLoop
+from loop_method.models import FieldModel, FittedModel, Measured, fit_field_model
+
+MOST_COMPONENTS = 2
+"""Fields one after the other in a state, as many as are tried."""
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """A model, its error E on rollouts that it was not fitted to, and its components."""
+
+    model: FieldModel
+    error: float
+    components: int
+
+    def loop(self, context: Context) -> ClosedLoop:
+        """The model under laws on the context's basis."""
+        return ClosedLoop(
+            self.model,
+            context.U,
+            context.target,
+            context.state_weight,
+            context.action_weight,
+            context.horizon,
+            context.action_limit,
+            context.noise,
+        )
+
+
+def believe(
+    context: Context, records: Sequence[Record], last: Belief | None, enough: float
+) -> Belief | None:
+    """The model that predicts the rollouts best, or None where none can be fitted.
+
+    Parameters
+    ----------
+    context : Context
+        The law's basis and target.
+    records : sequence of Record
+        Explorations, whose policy is zero and whose cost is infinite, and rollouts of laws.
+    last : Belief or None
+        What was believed before, of whose kind the first model is.
+    enough : float
+        E above which a state of several components is tried.
+    """
+    rollouts = [_measured(context, record) for record in records if len(record.actions)]
+
+    def fitted(components: int) -> FittedModel | None:
+        first = last.model.kind if last and last.components == components else None
+        return fit_field_model(rollouts, context.target, components=components, first=first)
+
+    counts = list(range(1, MOST_COMPONENTS + 1))
+    if last is not None:
+        counts.sort(key=lambda count: count != last.components)
+    best: Belief | None = None
+    for components in counts:
+        if context.target.size % components:
+            continue
+        found = fitted(components)
+        if found is not None and (best is None or found.error < best.error):
+            best = Belief(found.model, found.error, components)
+        if best is not None and best.error <= enough:
+            break
+    return best
+
+
+def _measured(context: Context, record: Record) -> Measured:
+    """With the law, where the rollout was under one whose states are known without noise."""
+    explored = not record.policy.any()  # of no control too the actions say everything
+    if explored or context.noise:
+        return Measured(record.states, record.actions)
+    n_s, limit = context.U.shape[1], context.action_limit
+    K = record.policy[:, :n_s] @ context.U.T
+    b = record.policy[:, n_s:] @ (context.U.T @ context.target)
+
+    def law(_: int, states: Array) -> Array:
+        # einsum: of each row by itself, where a matrix product rounds by the number of rows.
+        actions: Array = np.einsum("mi,ji->mj", states, K) + b
+        return np.clip(actions, -limit, limit) if limit else actions
+
+    return Measured(record.states, record.actions, law)

@@ -1,0 +1,194 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""What `model_based` does where no model of the whole field predicts the rollouts: local steps.
+
+    stage       rollouts                                      afterwards
+    comparing   no control, on fields of the first law        searching, from the better one
+    searching   what `gauss_newton` asks for                  confirming
+    confirming  the law found, on fields of the one before    the better one, beyond chance
+
+`gauss_newton` judges its steps on a few fields that it also makes them on. So the law that it found is
+compared with the one it began with on others, on which that one was measured before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loop_interfaces.array_files import taken
+from loop_interfaces.arrays import Array
+from loop_method.adapt.base import Context, Record, Rollout, RolloutResult, Row, State
+from loop_method.adapt.gauss_newton import GaussNewton, GaussNewtonSettings
+from loop_method.adapt.renewal import mean_and_error
+from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.adapt.verdict import ADAPTED, FIRST, NONE
+from loop_method.seeds import field_seed
+
+COMPARING, SEARCHING, CONFIRMING, ENDED = "comparing", "searching", "confirming", "ended"
+_STAGES = (COMPARING, SEARCHING, CONFIRMING, ENDED)
+_COMPARED = 2
+"""Rollouts without control, where it is not known whether the first law is better."""
+_SEARCH = "search."
+
+
+class LocalSearch:
+    """Local steps from the better of the first law and no control, and their verdict.
+
+    Parameters
+    ----------
+    context : Context
+        Of the optimisation.
+    first : (n_a, 2 n_s) array
+        The first law.
+    records : sequence of Record
+        Rollouts of the first law, on the fields 0, 1, ..
+    seed : int
+        Determines the initial fields.
+    rollouts : int
+        The budget that is left.
+    settings : ModelBasedSettings
+        Constants.
+    """
+
+    def __init__(
+        self,
+        context: Context,
+        first: Array,
+        records: Sequence[Record],
+        *,
+        seed: int,
+        rollouts: int,
+        settings: ModelBasedSettings,
+    ) -> None:
+        self._context, self._first, self._seed = context, first, seed
+        self._records, self._budget, self._settings = list(records), rollouts, settings
+        known = any(record.usable and not record.policy.any() for record in context.measured)
+        self._compared = 0 if known else min(_COMPARED, len(records))
+        self._from_none = False
+        self._none_costs = np.zeros(0)
+        self._search: GaussNewton | None = None
+        self.policy = first.copy()
+        """The best law so far."""
+        self.stage = COMPARING
+        step = GaussNewton.first_step(GaussNewtonSettings())
+        if rollouts < self._compared + settings.judging + step:
+            self.stage = ENDED
+        elif not self._compared:
+            self._begin_search()
+
+    def ask(self) -> list[Rollout]:
+        """The rollouts of the present stage."""
+        if self.stage == COMPARING:
+            none = np.zeros_like(self._first)
+            return [self._rollout(none, i) for i in range(self._compared)]
+        if self.stage == SEARCHING:
+            assert self._search is not None
+            return self._search.ask()
+        if self.stage == CONFIRMING:
+            return [self._rollout(self.policy, i) for i in range(len(self._costs_before))]
+        return []
+
+    def tell(self, results: Sequence[RolloutResult]) -> Row:
+        """Take the results of `ask` in."""
+        row: Row = {"role": self.stage}
+        costs = np.array([r.cost if r.usable else np.inf for r in results])
+        if self.stage != SEARCHING and np.isfinite(costs).all():
+            row["cost"] = float(np.mean(costs))
+        if self.stage == COMPARING:
+            self._none_costs = costs
+            first = np.array([record.cost for record in self._records[: len(costs)]])
+            if not np.mean(first) < np.mean(costs):
+                self._from_none = True
+                self.policy = np.zeros_like(self._first)
+                row["reason"] = "the first law is no better than no control, which is the start"
+            self._begin_search()
+        elif self.stage == SEARCHING:
+            assert self._search is not None
+            row |= self._search.tell(results)
+            self.policy = self._search.policy
+            if self._search.done:
+                unchanged = np.array_equal(self.policy, self._start)
+                self.stage = ENDED if unchanged else CONFIRMING
+                if unchanged:
+                    row["reason"] = "no local step was better than the law that they began with"
+                    row["chosen"] = NONE if self._from_none else FIRST
+        else:
+            self._confirm(costs, row)
+        return row
+
+    def state(self) -> State:
+        """The stage, the laws, and the state of the steps."""
+        arrays: State = {
+            "stage": np.array(self.stage),
+            "policy": self.policy.copy(),
+            "from_none": np.array(self._from_none),
+            "none_costs": self._none_costs.copy(),
+        }
+        if self._search is not None:
+            arrays |= {_SEARCH + name: value for name, value in self._search.state().items()}
+        return arrays
+
+    def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
+        """Continue from a `state`; a ValueError if it is none."""
+        stage = str(taken(state, "stage", "U", ()))
+        if stage not in _STAGES:
+            raise ValueError(f"its stage is {stage!r}; expected one of {', '.join(_STAGES)}")
+        policy = taken(state, "policy", "f", self._first.shape).copy()
+        self._from_none = bool(taken(state, "from_none", "b", ()))
+        self._none_costs = taken(state, "none_costs", "f", (None,), finite=False).copy()
+        self._search = None
+        if own := part_of(state, _SEARCH):
+            self._begin_search()
+            assert self._search is not None
+            self._search.restore(own)
+        self.stage, self.policy = stage, policy
+
+    @property
+    def _start(self) -> Array:
+        return np.zeros_like(self._first) if self._from_none else self._first
+
+    @property
+    def _costs_before(self) -> Array:
+        """Of the law that the steps began with, on the fields from 0 on."""
+        first = np.array([record.cost for record in self._records])
+        return (self._none_costs if self._from_none else first)[: self._settings.judging]
+
+    def _begin_search(self) -> None:
+        known = [*self._context.measured, *self._records]
+        self._search = GaussNewton(
+            self._start,
+            seed=self._seed,
+            rollouts=self._budget - self._compared - self._settings.judging,
+            context=replace(self._context, measured=known),
+            first_field=len(self._records),
+        )
+        self.stage = SEARCHING
+
+    def _rollout(self, policy: Array, number: int) -> Rollout:
+        return Rollout(policy.copy(), field_seed(self._seed, number))
+
+    def _confirm(self, after: Array, row: Row) -> None:
+        """Keep what the steps found where it is better by more than chance."""
+        before = self._costs_before
+        if not np.isfinite(after).all():
+            better, row["reason"] = False, "a rollout of the adapted law diverged"
+        elif not np.isfinite(before).all():
+            better, row["reason"] = True, "a rollout of the law before diverged"
+        else:
+            change, deviation = mean_and_error(after - before)
+            row["predicted_change"], row["deviation"] = change, deviation
+            better = change + self._settings.confidence * deviation < 0.0
+            row["reason"] = f"{'better' if better else 'not better'} by more than chance"
+        row["chosen"] = ADAPTED if better else NONE if self._from_none else FIRST
+        if not better:
+            self.policy = self._start.copy()
+        self.stage = ENDED
+
+
+def part_of(state: Mapping[str, NDArray[np.generic]], prefix: str) -> State:
+    """The arrays with a prefix, without it."""
+    names = [name for name in state if name.startswith(prefix)]
+    return {name.removeprefix(prefix): state[name] for name in names}

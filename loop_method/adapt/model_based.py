@@ -1,0 +1,395 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The optimiser `model_based`: a law is improved on a model of the whole field, and judged by rollouts.
+
+    stage       rollouts                                    afterwards
+    renewing    the present law, each on a fresh field      a model is fitted to all rollouts and the
+                                                            law improved on it (`renewal`); at last
+                                                            judging, or a search without such a model
+    judging     the final law, each on a fresh field        first law, final law or none (`verdict`)
+    searching   local steps (`local_search`)                the better one
+
+Sources and equations: docs/optimizers.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from threadpoolctl import threadpool_limits
+
+from loop_interfaces.array_files import taken
+from loop_interfaces.arrays import Array
+from loop_method.adapt.base import (
+    Context,
+    Optimizer,
+    Record,
+    Rollout,
+    RolloutResult,
+    Row,
+    State,
+    checked_policy,
+    require_positive,
+    require_results,
+)
+from loop_method.adapt.belief import Belief, believe
+from loop_method.adapt.closed_loop import ClosedLoop
+from loop_method.adapt.local_search import ENDED as LOCAL_ENDED
+from loop_method.adapt.local_search import LocalSearch, part_of
+from loop_method.adapt.renewal import renew
+from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.adapt.trajectories import Records, denoised
+from loop_method.adapt.verdict import ADAPTED, FIRST, NONE, choose, evidence_of
+from loop_method.models.files import model_of
+from loop_method.seeds import field_seed
+
+__all__ = ["ModelBased"]
+
+RENEWING, JUDGING, SEARCHING, ENDED = "renewing", "judging", "searching", "ended"
+_STAGES = (RENEWING, JUDGING, SEARCHING, ENDED)
+_REMEMBERED = 10**6
+"""Rollouts, more than there ever are: the law is not renewed any more once it knows enough fields."""
+_LOCAL, _MODEL = "local.", "model."
+_MIXTURE_STREAM = 0x4D4958  # "MIX"
+
+
+class ModelBased(Optimizer):
+    """Policy optimisation on a model of the whole field.
+
+    Parameters
+    ----------
+    policy0 : (n_a, 2 n_s) array
+        Where to start, [K_a K_b]; the first law.
+    seed : int
+        Determines the initial fields.
+    rollouts : int
+        The budget, without what the context knows already.
+    settings : ModelBasedSettings, optional
+        Constants.
+    context : Context
+        Basis, target, weights, horizon, the explorations and what else was measured.
+    """
+
+    name = "model_based"
+    Settings = ModelBasedSettings
+    needs_trajectories = True
+    with_sensors = "gauss_newton"
+
+    def __init__(
+        self,
+        policy0: ArrayLike,
+        *,
+        seed: int,
+        rollouts: int,
+        settings: ModelBasedSettings | None = None,
+        context: Context | None = None,
+    ) -> None:
+        require_positive(rollouts=rollouts)
+        if context is None:
+            raise ValueError("this optimiser needs the context: trajectories were not asked for")
+        self._settings = settings or ModelBasedSettings()
+        self._context, self._seed, self._budget = context, seed, rollouts
+        self._first = checked_policy(policy0)
+        self._none = np.zeros_like(self._first)
+        self._before = [
+            *(
+                Record(self._none, np.inf, known.states, known.actions)
+                for known in context.every_exploration
+            ),
+            *context.measured,
+        ]
+        largest = max(float(np.abs(record.states).max()) for record in self._before)
+        self._records = Records(_REMEMBERED, 3.0 * largest)
+        self._stage, self._tells = RENEWING, 0
+        self._policy = self._first.copy()
+        """The present law, and at the end the chosen one."""
+        self._belief: Belief | None = None
+        self._improved: Array | None = None
+        self._parts: list[Array] = []
+        self._held_out = np.zeros(3)
+        """Fraction, change and deviation of the last renewal."""
+        self._local: LocalSearch | None = None
+        self._begun = 0
+        """Own rollouts before the search."""
+        self._none_is_close = False
+        """Whether no control is judged, too."""
+        self._safe = True
+        """Whether the first law is better than no control on the model."""
+
+    @classmethod
+    def first_step(cls, settings: ModelBasedSettings) -> int:
+        """A rollout of the first law, and those that judge the next one."""
+        return 1 + settings.judging
+
+    @property
+    def policy(self) -> Array:
+        """The present law, and at the end the chosen one."""
+        return self._policy.copy()
+
+    @property
+    def tells(self) -> int:
+        """How many times `tell` was called."""
+        return self._tells
+
+    @property
+    def done(self) -> bool:
+        """Whether there is nothing more to ask."""
+        return self._stage == ENDED
+
+    def ask(self) -> list[Rollout]:
+        """The rollouts of the present stage, at once as far as they do not depend on each other."""
+        own = self._records.count
+        if self._stage == RENEWING:
+            laws = [self._policy] * (self._next_renewal() - own)
+        elif self._stage == JUDGING:
+            laws = [self._policy] * (self._judging - self._none_is_close)
+            laws += [self._none] * self._none_is_close
+        elif self._stage == SEARCHING:
+            assert self._local is not None
+            return self._local.ask()
+        else:
+            return []
+        return [self._rollout(law, own + i) for i, law in enumerate(laws)]
+
+    def tell(self, results: Sequence[RolloutResult]) -> Row:
+        """Take the rollouts in, and do what comes after them."""
+        asked = self.ask()
+        require_results(results, len(asked))
+        for result in results:
+            self._records.sound(result)
+        self._tells += 1
+        # One thread: a threaded LAPACK rounds differently for another number of threads.
+        with threadpool_limits(limits=1):
+            if self._stage == SEARCHING:
+                row = self._search(results)
+            added = [
+                self._records.add(rollout.policy, result, set())
+                for rollout, result in zip(asked, results, strict=True)
+            ]
+            if self._stage == RENEWING:
+                row = self._measured(added)
+                self._renew(row)
+            elif self._stage == JUDGING:
+                row = self._measured(added)
+                self._judge(row)
+        row["rollouts"] = self._records.count
+        row["diverged"] = sum(not result.usable for result in results)
+        return row
+
+    @property
+    def _judging(self) -> int:
+        """Rollouts that judge the final law."""
+        return max(1, min(self._settings.judging, self._budget // 2))
+
+    @property
+    def _left(self) -> int:
+        return self._budget - self._records.count
+
+    def _next_renewal(self) -> int:
+        """Own rollouts after which the law is renewed next."""
+        known, last = len(self._before), self._last_renewal()
+        at = self._settings.first_renewal
+        while at - known <= self._records.count:
+            at *= 2
+        # Two renewals with next to nothing between them are one.
+        return at - known if at - known + self._settings.judging <= last else last
+
+    def _last_renewal(self) -> int:
+        """Own rollouts after which the law is renewed for the last time."""
+        enough = max(self._settings.enough_fields - len(self._before), 1)
+        return min(self._budget - self._judging, enough)
+
+    def _rollout(self, policy: Array, number: int) -> Rollout:
+        return Rollout(policy.copy(), field_seed(self._seed, number))
+
+    def _measured(self, added: Sequence[Record]) -> Row:
+        """The mean cost of some rollouts, and what the model said of them before."""
+        row: Row = {"role": self._stage}
+        if all(record.usable for record in added):
+            row["cost"] = float(np.mean([record.cost for record in added]))
+        if self._belief is not None:
+            loop = self._belief.loop(self._context)
+            predicted = [self._model_cost(loop, record) for record in added]
+            if np.isfinite(predicted).all():
+                row["predicted"] = float(np.mean(predicted))
+        return row
+
+    def _data(self) -> list[Record]:
+        """All rollouts, without what of their noise can be told from the fields."""
+        every = [r for r in (*self._before, *self._records.all()) if len(r.states)]
+        noise = self._context.noise
+        return [replace(r, states=denoised(r.states, noise)) for r in every] if noise else every
+
+    def _model_cost(self, loop: ClosedLoop, record: Record) -> float:
+        return float(loop.costs(loop.theta(record.policy), record.states[:1])[0])
+
+    def _begin_judging(self) -> None:
+        """Also without control, if that may be as good as the law."""
+        self._stage = JUDGING
+        if self._belief is not None and self._judging > 1 and self._policy.any():
+            loop, fields = self._belief.loop(self._context), self._fields()
+            none, own = (
+                loop.costs(loop.theta(law), fields).mean() for law in (self._none, self._policy)
+            )
+            self._none_is_close = bool(none <= (1.0 + self._settings.close) * own)
+
+    def _fields(self) -> Array:
+        """The measured initial fields, each once, (n, n_z)."""
+        fields = [record.states[0] for record in self._data()]
+        return np.stack(list({field.tobytes(): field for field in fields}.values()))
+
+    def _renew(self, row: Row) -> None:
+        """Improve the law on the model that predicts the rollouts, or search for one without."""
+        settings, data = self._settings, self._data()
+        final = self._records.count >= self._last_renewal()
+        noisy = bool(self._context.noise)
+        most = settings.believed_noisy if noisy else settings.believed
+        belief = believe(self._context, data, self._belief, most)
+        if belief is not None:
+            row["model"], row["mismatch"] = belief.model.kind, belief.error
+        if belief is None or not belief.error <= most:
+            reason = "no model of the whole field predicts the rollouts"
+            if self._belief is None:
+                row["reason"] = f"{reason}: local steps"
+                self._begin_search(row)
+                return
+            row["reason"] = f"{reason} any more; the law stays"
+        else:
+            self._belief = belief
+            self._improve(belief, row)
+        if final:
+            self._begin_judging()
+
+    def _improve(self, belief: Belief, row: Row) -> None:
+        loop, fields = belief.loop(self._context), self._fields()
+        first, none = loop.theta(self._first), loop.theta(self._none)
+        # A first law that is worse than no control is nothing to stay near to.
+        self._safe = bool(loop.costs(first, fields).mean() < loop.costs(none, fields).mean())
+        base, near = (first, self._first) if self._safe else (none, self._none)
+        rng = np.random.default_rng([self._seed, _MIXTURE_STREAM, self._records.count])
+        found = renew(
+            loop,
+            base,
+            base if self._improved is None else self._improved,
+            self._parts,
+            fields,
+            rng,
+            self._settings,
+            components=belief.components,
+            periodic=self._context.periodic,
+        )
+        if found is None:
+            row["reason"] = "no law is finite on the model; the law stays"
+            return
+        self._improved, self._parts = found.improved, found.parts
+        self._held_out = np.array([found.fraction, found.change, found.deviation])
+        self._policy = loop.policy(found.theta, near) if found.fraction else near.copy()
+        row["fraction"], row["steps"] = found.fraction, found.steps
+        if np.isfinite(found.change):
+            row["predicted_change"], row["deviation"] = found.change, found.deviation
+
+    def _judge(self, row: Row) -> None:
+        """Choose between the first law, the final one and no control."""
+        if self._belief is None:
+            self._end(row, "no model of the whole field predicts the rollouts")
+            return
+        laws = {FIRST: self._first, NONE: self._none, ADAPTED: self._policy}
+        base = FIRST if self._safe else NONE
+        _, change, deviation = self._held_out.tolist()
+        evidence = evidence_of(
+            self._belief.loop(self._context),
+            laws,
+            base,
+            self._data()[len(self._context.every_exploration) :],
+            self._fields(),
+            (change, deviation),
+        )
+        verdict = choose(evidence, base, self._settings.confidence)
+        self._policy = laws[verdict.chosen].copy()
+        row["chosen"] = verdict.chosen
+        row["predicted_change"], row["deviation"] = verdict.change, verdict.deviation
+        early = self._left > 0
+        known = len(self._fields())
+        self._end(row, verdict.reason + f"; more than {known} fields would not change it" * early)
+
+    def _end(self, row: Row, reason: str) -> None:
+        row["reason"], self._stage = reason, ENDED
+
+    def _begin_search(self, row: Row) -> None:
+        self._begun = self._records.count
+        self._local = self._search_from(self._begun)
+        self._stage = SEARCHING
+        if not self._local.ask():
+            self._end(row, f"{row['reason']}, for which too few rollouts are left")
+
+    def _search_from(self, begun: int) -> LocalSearch:
+        """Local steps after so many own rollouts."""
+        return LocalSearch(
+            self._context,
+            self._first,
+            self._records.all()[:begun],
+            seed=self._seed,
+            rollouts=self._budget - begun,
+            settings=self._settings,
+        )
+
+    def _search(self, results: Sequence[RolloutResult]) -> Row:
+        assert self._local is not None
+        row = self._local.tell(results)
+        self._policy = self._local.policy.copy()
+        if self._local.stage == LOCAL_ENDED:
+            self._stage = ENDED
+        return row
+
+    def state(self) -> State:
+        """The stage, the laws, the model, and all rollouts."""
+        arrays: State = {
+            "stage": np.array(self._stage),
+            "tells": np.array(self._tells),
+            "policy": self._policy.copy(),
+            "held_out": self._held_out.copy(),
+            "begun": np.array(self._begun),
+            "none_is_close": np.array(self._none_is_close),
+            "safe": np.array(self._safe),
+            **self._records.state(),
+        }
+        if self._improved is not None:
+            arrays["laws"] = np.stack([self._improved, *self._parts])
+        if (belief := self._belief) is not None:
+            arrays["error"] = np.array(belief.error)
+            arrays["components"] = np.array(belief.components)
+            arrays |= {_MODEL + name: value for name, value in belief.model.arrays().items()}
+        if self._local is not None:
+            arrays |= {_LOCAL + name: value for name, value in self._local.state().items()}
+        return arrays
+
+    def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
+        """Continue from a checkpoint of an optimiser with the same arguments."""
+        n_z, shape = len(self._context.U), self._first.shape
+        stage = str(taken(state, "stage", "U", ()))
+        if stage not in _STAGES:
+            raise ValueError(f"its stage is {stage!r}; expected one of {', '.join(_STAGES)}")
+        self._records.restore(state, n_z, shape)
+        self._stage, self._tells = stage, int(taken(state, "tells", "i", ()))
+        self._policy = taken(state, "policy", "f", shape).copy()
+        self._held_out = taken(state, "held_out", "f", (3,), finite=False).copy()
+        self._begun = int(taken(state, "begun", "i", ()))
+        self._none_is_close = bool(taken(state, "none_is_close", "b", ()))
+        self._safe = bool(taken(state, "safe", "b", ()))
+        self._improved, self._parts = None, []
+        if "laws" in state:
+            theta = (shape[0], shape[1] // 2 + 1)
+            self._improved, *self._parts = (
+                a.copy() for a in taken(state, "laws", "f", (None, *theta))
+            )
+        self._belief = None
+        if "error" in state:
+            model = model_of(part_of(state, _MODEL))
+            error = float(taken(state, "error", "f", ()))
+            self._belief = Belief(model, error, int(taken(state, "components", "i", ())))
+        self._local = None
+        if local := part_of(state, _LOCAL):
+            self._local = self._search_from(self._begun)
+            self._local.restore(local)

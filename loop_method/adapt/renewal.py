@@ -1,0 +1,200 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A new law from what was measured: a model of the whole field, and a descent on it.
+
+How far the law may move from the first one is chosen on measured fields that did not make it. The
+fields are dealt out to a few parts; a law is made for each part from the fields of the others, and the
+shares of the way from the first law to that one are compared by what they cost on the model from the
+fields that were left out. That costs no rollout. Of the shares that are as good as the best one, up to
+the standard error of their difference, the smallest is taken: without evidence the first law stays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from loop_interfaces.arrays import Array
+from loop_method.adapt.closed_loop import ClosedLoop
+from loop_method.adapt.improve import improve
+from loop_method.adapt.mixtures import mixtures
+from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.design.finite_horizon import action_curvature
+
+LARGEST = 512
+"""Numbers of a state up to which R + B^T P B is worked out; its work grows with their third power."""
+
+
+@dataclass(frozen=True, eq=False)
+class Renewal:
+    """A law made on a model.
+
+    Attributes
+    ----------
+    theta : (n_a, n_s + 1) array
+        The law: the fraction of the way from the first one to the improved one.
+    improved : (n_a, n_s + 1) array
+        The law after the descent, with which the next one begins.
+    parts : list of (n_a, n_s + 1) array
+        The laws that each part of the fields did not make.
+    fraction : float
+        How far the law moved; 0: it is the first one.
+    change, deviation : float
+        The mean change of the cost against the first law on fields that were left out, and its standard
+        error. 0 where the law is the first one.
+    steps : int
+        Of L-BFGS, all together.
+    """
+
+    theta: Array
+    improved: Array
+    parts: list[Array]
+    fraction: float
+    change: float
+    deviation: float
+    steps: int
+
+
+def renew(
+    loop: ClosedLoop,
+    first: Array,
+    improved: Array,
+    parts: Sequence[Array],
+    fields: Array,
+    rng: np.random.Generator,
+    settings: ModelBasedSettings,
+    *,
+    components: int = 1,
+    periodic: bool = True,
+) -> Renewal | None:
+    """The law that costs least on the model, as far as fields that were left out agree.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+        The model and the cost.
+    first, improved : (n_a, n_s + 1) arrays
+        The law that the optimisation began with, and the one after the last descent.
+    parts : sequence of (n_a, n_s + 1) array
+        The same for each part of the fields; none: the first law.
+    fields : (n, n_z) array
+        Measured initial fields. Field i is of part i modulo the number of parts, whatever comes later,
+        so that no law of a part ever sees its fields.
+    rng : numpy.random.Generator
+        Of the fields that are drawn.
+    settings : ModelBasedSettings
+        Constants.
+    components : int
+        Fields that stand one after the other in a state.
+    periodic : bool
+        Whether they are on a ring.
+
+    Returns
+    -------
+    Renewal or None
+        None where no law is finite on the model.
+    """
+    curvature = _curvature(loop)
+    part_of = np.arange(len(fields)) % settings.folds
+    steps, made = 0, []
+    for part, start in enumerate(parts or [first] * settings.folds):
+        others = fields[part_of != part]
+        found = _improved(
+            loop, [first, start], others, curvature, rng, settings, components, periodic
+        )
+        made.append(start if found is None else found[0])
+        steps += 0 if found is None else found[1]
+    found = _improved(
+        loop, [first, improved], fields, curvature, rng, settings, components, periodic
+    )
+    if found is None:
+        return None
+    fraction, change, deviation = held_out_fraction(loop, first, made, fields, settings)
+    theta = first + fraction * (found[0] - first)
+    return Renewal(theta, found[0], made, fraction, change, deviation, steps + found[1])
+
+
+def held_out_fraction(
+    loop: ClosedLoop,
+    first: Array,
+    parts: Sequence[Array],
+    fields: Array,
+    settings: ModelBasedSettings,
+) -> tuple[float, float, float]:
+    """How far to go from the first law, and `change` and `deviation` of a `Renewal`.
+
+    parts: for each part of the fields the law that the others made.
+    """
+    fractions = np.linspace(0.0, 1.0, settings.fractions + 1)
+    costs = np.full((len(fractions), len(fields)), np.inf)
+    for part, law in enumerate(parts):
+        own = np.arange(len(fields)) % len(parts) == part
+        for i, fraction in enumerate(fractions):
+            costs[i, own] = loop.costs(first + fraction * (law - first), fields[own])
+    # From where the first law is not finite, a law that is tells nothing of the size of a gain.
+    known = np.isfinite(costs[0])
+    costs = costs[:, known]
+    if not costs.shape[1]:
+        return float(fractions[-1]), 0.0, 0.0
+    means = costs.mean(axis=1)
+    best = int(np.argmin(means))
+    for i in range(best + 1):
+        if np.isfinite(means[i]):
+            rise, error = mean_and_error(costs[i] - costs[best])
+            if rise <= settings.confidence * error or i == best:
+                break
+    change, deviation = mean_and_error(costs[i] - costs[0]) if i else (0.0, 0.0)
+    return float(fractions[i]), change, deviation
+
+
+def mean_and_error(values: Array) -> tuple[float, float]:
+    """The mean of some numbers and its standard error; of one number as large as itself."""
+    mean = float(np.mean(values))
+    if len(values) < 2:
+        return mean, abs(mean)
+    return mean, float(np.std(values, ddof=1) / np.sqrt(len(values)))
+
+
+def _improved(
+    loop: ClosedLoop,
+    starts: Sequence[Array],
+    fields: Array,
+    curvature: Array,
+    rng: np.random.Generator,
+    settings: ModelBasedSettings,
+    components: int,
+    periodic: bool,
+) -> tuple[Array, int] | None:
+    """The law after a descent from the cheapest start, and its steps."""
+    drawn = mixtures(fields, settings.mixtures, rng, components, periodic=periodic)
+    share = settings.measured_share if len(drawn) else 1.0
+    every = np.concatenate([fields, drawn])
+    weights = np.append(
+        np.full(len(fields), share / len(fields)),
+        np.full(len(drawn), (1.0 - share) / max(len(drawn), 1)),
+    )
+    costs = np.array([loop.costs(theta, every) for theta in starts])
+    # First the start that is finite from more of the fields, then the cheaper one.
+    lost = (~np.isfinite(costs)) @ weights
+    common = np.isfinite(costs).all(axis=0)
+    total = np.where(common, costs, 0.0) @ weights
+    start = starts[int(np.lexsort((total, lost))[0])]
+    found = improve(loop, start, every, weights, curvature, settings)
+    return None if found is None else (found.theta, found.steps)
+
+
+def _curvature(loop: ClosedLoop) -> Array:
+    """R + B^T P B of the model linearised at the target; R where that is not to be had."""
+    n_a, r = loop.model.n_a, loop.action_weight
+    if loop.model.n_z <= LARGEST:
+        A, B = loop.model.linearise(loop.target, np.zeros(n_a))
+        if np.isfinite(A).all() and np.isfinite(B).all():
+            try:
+                found = action_curvature(A, B, loop.state_weight, r, loop.horizon)
+            except np.linalg.LinAlgError:
+                found = np.full((n_a, n_a), np.nan)
+            found = 0.5 * (found + found.T)
+            if np.isfinite(found).all() and np.linalg.eigvalsh(found)[0] > 0.0:
+                return found
+    return r * np.eye(n_a)

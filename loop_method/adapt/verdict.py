@@ -1,0 +1,131 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Which of the laws to return: the first one, unless the others are better by more than chance.
+
+Costs of different initial fields are compared through the model. A law costs, in the mean over the
+distribution,
+
+    m + mean over its own rollouts of (measured - model),
+
+with m the mean of its model costs over all measured fields: the model is a control variate, so that one
+rollout tells what many would without it. The mean over the fields is the same for all laws, so that
+their difference has little chance in it; for the final law, which these fields made, it is that of
+fields that were left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from loop_interfaces.arrays import Array
+from loop_method.adapt.base import Record
+from loop_method.adapt.closed_loop import ClosedLoop
+from loop_method.adapt.renewal import mean_and_error
+
+FIRST, ADAPTED, NONE = "first", "adapted", "none"
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What is known of a law.
+
+    Attributes
+    ----------
+    change, deviation : float
+        Its model cost against that of the law to stay with, in the mean over measured fields that did
+        not make it, and the standard error of that.
+    excess : (k,) array
+        Measured less model cost of its own rollouts; infinite where one diverged.
+    """
+
+    change: float
+    deviation: float
+    excess: Array
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The law that is returned, its change against the one to stay with, the error of that, and why."""
+
+    chosen: str
+    change: float
+    deviation: float
+    reason: str
+
+
+def choose(evidence: Mapping[str, Evidence], base: str, confidence: float) -> Verdict:
+    """The law with the least cost, and `base` where the difference may be chance.
+
+    confidence: standard errors by which another law has to be better.
+    """
+    stays = Verdict(base, 0.0, 0.0, "no other law is better by more than chance")
+    lost = bool(np.isinf(evidence[base].excess).any())
+    own_value, own_error = _corrected(evidence[base])
+    found: list[Verdict] = []
+    for name, own in evidence.items():
+        if name == base or not np.isfinite(own.change):
+            continue
+        if np.isinf(own.excess).any():
+            if name == ADAPTED:
+                stays = Verdict(base, 0.0, 0.0, "a rollout of the adapted law diverged")
+            continue
+        value, error = _corrected(own)
+        change = own.change + value - own_value
+        deviation = float(np.sqrt(own.deviation**2 + error**2 + own_error**2))
+        if lost:
+            found.append(
+                Verdict(name, own.change, own.deviation, f"a rollout of '{base}' diverged")
+            )
+        elif change + confidence * deviation < 0.0:
+            found.append(Verdict(name, change, deviation, "better by more than chance"))
+    return min(found, key=lambda verdict: verdict.change, default=stays)
+
+
+def evidence_of(
+    loop: ClosedLoop,
+    laws: Mapping[str, Array],
+    base: str,
+    records: Sequence[Record],
+    fields: Array,
+    held_out: tuple[float, float],
+) -> dict[str, Evidence]:
+    """What the model and the measured rollouts say of laws, the others only where they were measured.
+
+    base: the law to stay with; records: rollouts of laws; fields (n, n_z): all measured initial fields;
+    held_out: change and deviation of the adapted law on fields that did not make it.
+    """
+    stay = loop.costs(loop.theta(laws[base]), fields)
+    evidence = {}
+    for name, law in laws.items():
+        excess = _excess(loop, law, [r for r in records if np.array_equal(r.policy, law)])
+        same = name != base and np.array_equal(law, laws[base])
+        if same or not (len(excess) or name == base):
+            continue
+        change, deviation = held_out
+        if name != ADAPTED:
+            with np.errstate(invalid="ignore"):
+                differences = loop.costs(loop.theta(law), fields) - stay
+            known = bool(np.isfinite(differences).all())
+            change, deviation = mean_and_error(differences) if known else (np.inf, 0.0)
+        evidence[name] = Evidence(change, deviation, excess)
+    return evidence
+
+
+def _excess(loop: ClosedLoop, law: Array, own: Sequence[Record]) -> Array:
+    """Measured less model cost of the rollouts of a law; infinite where one diverged."""
+    excess = []
+    for record in own:
+        model = loop.costs(loop.theta(law), record.states[:1])[0]
+        if not record.usable:
+            excess.append(np.inf)
+        elif np.isfinite(model):  # where the model overflows, it says nothing of the rollout
+            excess.append(record.cost - float(model))
+    return np.array(excess)
+
+
+def _corrected(own: Evidence) -> tuple[float, float]:
+    """The mean of measured less model cost, and its standard error; 0 where nothing was measured."""
+    finite = own.excess[np.isfinite(own.excess)]
+    return mean_and_error(finite) if len(finite) else (0.0, 0.0)

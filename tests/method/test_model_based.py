@@ -1,0 +1,287 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The optimiser model_based: a known optimum, what it returns and why, its checkpoints."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from loop_method.adapt import Context, ModelBased, RolloutResult, Trajectory
+from loop_method.adapt.renewal import held_out_fraction, mean_and_error
+from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.adapt.verdict import ADAPTED, FIRST, NONE, Evidence, choose
+from loop_method.design.lqt import track
+from loop_method.reduce.reduced_model import ReducedModel
+from tests.support.small import same_bits
+
+N_Z, N_S, N_A, T = 7, 4, 2, 30
+Q, R = 1.0, 0.2
+Bend = Callable[[np.ndarray, np.random.Generator], np.ndarray]
+
+
+class Plant:
+    """s' = A s + B a, lifted to N_Z dimensions, and what `bend` adds to it."""
+
+    def __init__(self, bend: Bend | None = None, radius: float = 1.02) -> None:
+        rng = np.random.default_rng(0)
+        A = rng.standard_normal((N_S, N_S))
+        self.A = radius * A / np.abs(np.linalg.eigvals(A)).max()
+        self.B = rng.standard_normal((N_S, N_A))
+        self.U = np.linalg.qr(rng.standard_normal((N_Z, N_S)))[0]
+        self.target = self.U @ np.array([0.5, -0.2, 0.3, 0.1])
+        self.bend = bend or (lambda s, rng: np.zeros(N_S))
+        model = ReducedModel(A=self.A, B=self.B, U=self.U)
+        self.best = track(model, state_weight=Q, action_weight=R).policy
+
+    def run(self, policy: np.ndarray, seed: int, noise: np.ndarray | None = None) -> RolloutResult:
+        rng = np.random.default_rng(seed)
+        s = rng.standard_normal(N_S)
+        b = policy[:, N_S:] @ self.U.T @ self.target
+        states, actions, cost = [self.U @ s], [], 0.0
+        for k in range(T):
+            a = policy[:, :N_S] @ s + b if noise is None else noise[k]
+            cost += Q * float(np.sum((states[-1] - self.target) ** 2)) + R * float(a @ a)
+            s = self.A @ s + self.B @ a + self.bend(s, rng)
+            actions.append(a)
+            if not np.abs(s).max() < 1e3:
+                done = Trajectory(np.array(states), np.array(actions)[:-1])
+                return RolloutResult(1e9, True, done)
+            states.append(self.U @ s)
+        return RolloutResult(cost / T, False, Trajectory(np.array(states), np.array(actions)))
+
+    def context(self) -> Context:
+        explored = []
+        for seed in (77, 78):
+            noise = 0.3 * np.random.default_rng(seed).standard_normal((T, N_A))
+            trajectory = self.run(np.zeros((N_A, 2 * N_S)), seed, noise).trajectory
+            assert trajectory is not None
+            explored.append(trajectory)
+        return Context(self.U, self.target, Q, R, T, explored[0], further=explored[1:])
+
+    def cost(self, policy: np.ndarray) -> float:
+        return float(np.mean([self.run(policy, 10**6 + i).cost for i in range(40)]))
+
+
+def make(plant: Plant, share: float = 0.6, **changes: Any) -> ModelBased:
+    settings: dict[str, Any] = {"seed": 5, "rollouts": 18, "context": plant.context()}
+    return ModelBased(share * plant.best, **(settings | changes))
+
+
+def measured(plant: Plant, optimizer: ModelBased) -> list[RolloutResult]:
+    return [plant.run(rollout.policy, rollout.field_seed) for rollout in optimizer.ask()]
+
+
+def finished(plant: Plant, optimizer: ModelBased) -> list[dict[str, Any]]:
+    rows = []
+    while not optimizer.done:
+        rows.append(optimizer.tell(measured(plant, optimizer)))
+    return rows
+
+
+def chaotic(s: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """What no model of the state predicts, and less than a law can do."""
+    return 0.4 * rng.standard_normal(N_S)
+
+
+def test_the_known_optimum_of_a_linear_quadratic_plant_is_reached() -> None:
+    plant = Plant()
+    optimizer = make(plant)
+    start, best = plant.cost(optimizer.policy), plant.cost(plant.best)
+    rows = finished(plant, optimizer)
+    assert start > 1.05 * best
+    # Over the horizon the law of the algebraic equation is optimal but for its last steps.
+    assert plant.cost(optimizer.policy) <= 1.005 * best
+    assert rows[-1]["chosen"] == ADAPTED and rows[-1]["predicted_change"] < 0.0
+    assert [row["rollouts"] for row in rows] == [4, 10, 15, 18]
+    assert all(row["mismatch"] < 1e-6 for row in rows[:-1])
+    for row in rows[1:]:  # said before the rollouts were fitted
+        assert row["predicted"] == pytest.approx(row["cost"], rel=1e-3)
+
+
+def test_the_best_law_is_kept() -> None:
+    plant = Plant()
+    optimizer = make(plant, share=1.0)
+    rows = finished(plant, optimizer)
+    assert plant.cost(optimizer.policy) <= 1.001 * plant.cost(plant.best)
+    assert rows[-1]["reason"]
+
+
+def test_every_rollout_of_a_law_is_on_a_field_of_its_own_and_asking_is_pure() -> None:
+    plant = Plant()
+    optimizer = make(plant)
+    seeds: list[int] = []
+    while not optimizer.done:
+        first, second = optimizer.ask(), optimizer.ask()
+        for one, other in zip(first, second, strict=True):
+            assert same_bits(one.policy, other.policy) and one.field_seed == other.field_seed
+            one.policy[:] = np.nan
+        assert all(np.isfinite(rollout.policy).all() for rollout in optimizer.ask())
+        seeds += [rollout.field_seed for rollout in second]
+        row = optimizer.tell(measured(plant, optimizer))
+        assert row == json.loads(json.dumps(row, allow_nan=False))
+    assert len(set(seeds)) == len(seeds) == 18
+    assert optimizer.ask() == []
+
+
+@pytest.mark.parametrize("bend", [None, chaotic])
+def test_an_optimiser_restored_before_any_tell_goes_on_with_the_same_bits(
+    bend: Bend | None,
+) -> None:
+    plant = Plant(bend)
+    whole = make(plant, rollouts=26)
+    while not whole.done:
+        file = io.BytesIO()
+        np.savez(file, **whole.state())  # type: ignore[arg-type]
+        file.seek(0)
+        again = make(plant, rollouts=26)
+        with np.load(file, allow_pickle=False) as arrays:
+            again.restore(dict(arrays))
+        results = measured(plant, again)
+        rows = whole.tell(results), again.tell(results)
+        assert rows[0] == rows[1]
+        one, other = whole.state(), again.state()
+        assert one.keys() == other.keys()
+        assert all(one[name].tobytes() == other[name].tobytes() for name in one)
+    assert whole.tells == again.tells
+
+
+def test_a_plant_that_no_model_predicts_gets_local_steps_and_says_so() -> None:
+    plant = Plant(chaotic)
+    optimizer = make(plant, rollouts=26)
+    rows = finished(plant, optimizer)
+    assert "no model" in rows[0]["reason"] and "local steps" in rows[0]["reason"]
+    roles = [row["role"] for row in rows]
+    assert roles[:2] == ["renewing", "comparing"] and "candidate" in roles
+    assert rows[-1]["reason"] and rows[-1]["chosen"] in (FIRST, ADAPTED, NONE)
+    assert rows[-1]["rollouts"] <= 26
+    assert plant.cost(optimizer.policy) <= 1.02 * plant.cost(0.6 * plant.best)
+
+
+def test_too_few_rollouts_for_local_steps_end_with_a_reason() -> None:
+    plant = Plant(chaotic)
+    optimizer = make(plant, rollouts=8)
+    rows = finished(plant, optimizer)
+    assert "too few rollouts" in rows[-1]["reason"]
+    assert same_bits(optimizer.policy, 0.6 * plant.best)
+
+
+def test_a_first_law_that_is_worse_than_no_control_is_not_returned() -> None:
+    plant = Plant(radius=0.9)
+    optimizer = make(plant, share=-0.3)
+    rows = finished(plant, optimizer)
+    none = np.zeros_like(plant.best)
+    assert plant.cost(-0.3 * plant.best) > 1.2 * plant.cost(none)
+    assert plant.cost(optimizer.policy) < plant.cost(none)
+    assert rows[-1]["chosen"] != FIRST
+
+
+def test_a_first_law_under_which_the_plant_diverges_is_improved_on_the_model() -> None:
+    plant = Plant()
+    optimizer = make(plant, share=-2.0)
+    assert plant.run(optimizer.policy, 1).diverged
+    rows = finished(plant, optimizer)
+    assert rows[0]["diverged"] == 4 and "cost" not in rows[0]
+    assert rows[-1]["chosen"] == ADAPTED
+    assert plant.cost(optimizer.policy) <= 1.01 * plant.cost(plant.best)
+    for row in rows:
+        json.dumps(row, allow_nan=False)
+
+
+def test_a_large_budget_ends_once_the_fields_are_known() -> None:
+    plant = Plant()
+    settings = ModelBasedSettings(enough_fields=12)
+    optimizer = make(plant, rollouts=100, settings=settings)
+    rows = finished(plant, optimizer)
+    assert [row["rollouts"] for row in rows] == [4, 10, 13]
+    assert "would not change it" in rows[-1]["reason"]
+
+
+class Costs:
+    """A loop whose costs from field i under the law theta are given by a function."""
+
+    def __init__(self, cost: Callable[[float, int], float]) -> None:
+        self._cost = cost
+
+    def costs(self, theta: np.ndarray, fields: np.ndarray) -> np.ndarray:
+        return np.array([self._cost(float(theta[0, 0]), int(field[0])) for field in fields])
+
+
+@pytest.mark.parametrize(
+    ("cost", "fraction"),
+    [
+        (lambda x, i: (x - 1.0) ** 2 + i, 1.0),  # all agree on all of it
+        (lambda x, i: (x - 0.5) ** 2 + i, 0.5),  # on half of the way
+        (lambda x, i: x + i, 0.0),  # on none
+        (lambda x, i: 5.0 - x if i == 3 else 5.0 + 0.01 * x, 0.0),  # only one gains: chance
+        (lambda x, i: np.inf if x > 0.6 and i == 2 else 5.0 - x, 0.5),  # one is lost
+    ],
+)
+def test_the_way_from_the_first_law_is_what_fields_that_were_left_out_agree_on(
+    cost: Callable[[float, int], float], fraction: float
+) -> None:
+    fields = np.arange(8.0)[:, None]
+    loop: Any = Costs(cost)
+    found, change, deviation = held_out_fraction(
+        loop, np.zeros((1, 1)), [np.ones((1, 1))] * 2, fields, ModelBasedSettings()
+    )
+    assert found == fraction
+    differences = np.array([cost(fraction, i) - cost(0.0, i) for i in range(8)])
+    assert (change, deviation) == pytest.approx(mean_and_error(differences))
+
+
+def evidence(change: float, deviation: float, *excess: float) -> Evidence:
+    return Evidence(change, deviation, np.array(excess))
+
+
+@pytest.mark.parametrize(
+    ("known", "chosen"),
+    [
+        ({ADAPTED: evidence(-1.0, 0.1, 0.0, 0.1)}, ADAPTED),
+        ({ADAPTED: evidence(-1.0, 1.1, 0.0, 0.1)}, FIRST),  # may be chance
+        ({ADAPTED: evidence(-1.0, 0.1, 1.5, 1.4)}, FIRST),  # the model was wrong about it
+        ({ADAPTED: evidence(-1.0, 0.1, 0.0, np.inf)}, FIRST),  # it diverged
+        ({NONE: evidence(-0.5, 0.1, 0.0)}, NONE),
+        ({ADAPTED: evidence(-1.0, 0.1, 0.0), NONE: evidence(-2.0, 0.1, 0.0)}, NONE),
+        ({ADAPTED: evidence(-3.0, 0.1, 0.0), NONE: evidence(-2.0, 0.1, 0.0)}, ADAPTED),
+        ({NONE: evidence(np.inf, 0.0, 0.0)}, FIRST),
+        ({FIRST: evidence(0.0, 0.0, np.inf), ADAPTED: evidence(0.1, 0.0, 0.0)}, ADAPTED),
+        ({FIRST: evidence(0.0, 0.0, np.inf), ADAPTED: evidence(-1.0, 0.0, np.inf)}, FIRST),
+        ({FIRST: evidence(0.0, 0.0, 0.7, 0.5), ADAPTED: evidence(0.1, 0.01, 0.0)}, ADAPTED),
+    ],
+)
+def test_the_first_law_is_preferred_unless_the_evidence_says_otherwise(
+    known: dict[str, Evidence], chosen: str
+) -> None:
+    verdict = choose({FIRST: evidence(0.0, 0.0, 0.0, 0.0)} | known, FIRST, 1.0)
+    assert verdict.chosen == chosen and verdict.reason
+    assert np.isfinite([verdict.change, verdict.deviation]).all()
+
+
+def test_equal_laws_are_told_apart_by_chance_no_more_often_than_the_confidence_says() -> None:
+    """Two laws of one cost, measured with noise: the other one is taken in one case of six."""
+    rng, wrong = np.random.default_rng(11), 0
+    for _ in range(2000):
+        first = Evidence(0.0, 0.0, rng.standard_normal(12))
+        other = Evidence(0.0, 0.0, rng.standard_normal(12))
+        wrong += choose({FIRST: first, ADAPTED: other}, FIRST, 1.0).chosen == ADAPTED
+    assert wrong / 2000 < 0.2
+
+
+def test_a_checkpoint_of_something_else_is_refused() -> None:
+    plant = Plant()
+    optimizer = make(plant)
+    state = optimizer.state()
+    with pytest.raises(ValueError, match="stage"):
+        optimizer.restore({**state, "stage": np.array("dreaming")})
+    with pytest.raises(ValueError, match="policy"):
+        optimizer.restore({**state, "policy": np.zeros((1, 1))})
+    with pytest.raises(ValueError, match="rollouts"):
+        make(plant, rollouts=0)
+    with pytest.raises(ValueError, match="trajector"):
+        optimizer.tell([replace(result, trajectory=None) for result in measured(plant, optimizer)])
