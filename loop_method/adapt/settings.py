@@ -45,9 +45,11 @@ class ModelBasedSettings(Settings):
     )
     iterations: int = setting(60, "steps of L-BFGS of an improvement, at most", 1, 10_000)
     memory: int = setting(40, "differences of gradients that L-BFGS keeps", 1, 1000)
-    window: int = setting(5, "steps of L-BFGS that together have to gain `least_gain`", 1, 100)
+    window: int = setting(
+        5, "steps of L-BFGS that together have to gain the share least_gain", 1, 100
+    )
     least_gain: float = setting(
-        2e-3, "share of the cost by which `window` steps have to lower it, to go on", 0.0, 1.0
+        2e-3, "share of the cost by which a window of steps has to lower it, to go on", 0.0, 1.0
     )
     isotropy: float = setting(
         1e-3,
