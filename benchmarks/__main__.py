@@ -29,16 +29,13 @@ PROGRAMS = {
     "batch": "environment-steps a second against the batch",
     "train": "a whole training: topics against in-process",
     "realtime": "jitter and missed deadlines at P1's 20 Hz and at 1 kHz",
-    "pairs": "1, 2, 4 pairs on hosts made of network namespaces (needs root)",
     "baselines": "optimisers and methods of others at equal rollouts, with intervals over seeds",
     "general": "held-out plants and initial fields: first law, adapted law and what is possible",
     "optimum": "what the policy class and any controller at all could reach, by exact gradients",
     "overhead": "how much a recorder, a viewer or an open page of pdeloop monitor slows the loop",
     "linearised": "what the LQR law of the exact linearisation at the target costs",
     "environments": "steps a second of the Gymnasium environments",
-    "workers": "wall time of a study against the number of its worker processes",
     "participants": "memory and processor time of many idle nodes that know each other",
-    "services": "how soon a recorded training answers its operator, and Ctrl-C",
     "kernel": "time of a step beside other implementations",
 }
 

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import pairs as bench_pairs
-from benchmarks.hosts import can_make_hosts, hosts
 from benchmarks.processes import bench
 from pdeloop.in_process import LocalPair, train
 from pdeloop.training_run import resolve
+from tests.support.hosts import can_make_hosts, hosts
 from tests.support.interpreter import helps_solver
 from tests.support.loop_harness import Processes, until
+from tests.support.pairs_on_hosts import serve
 from tests.support.small import SMALL, parameters, train_here
 from tests.support.small_loop import LIMIT, adapted, assert_same_training
 from tuner_node.build import build_training
@@ -39,9 +39,7 @@ def test_pairs_on_hosts_with_faults_one_of_them_killed_give_the_same_bits() -> N
     values = resolve(str(SMALL), {"iterations": 12, "seeds": 4, "evaluation_fields": 2})
     training = build_training(values)
     train(training, LocalPair(values), lambda row: None)
-    row = bench_pairs.serve(
-        values, 2, ["loss:=0.01", "delay:=0.001"], kill=True, expected=training.policies()
-    )
+    row = serve(values, 2, ["loss:=0.01", "delay:=0.001"], kill=True, expected=training.policies())
     assert row["identical"]
     assert row["seconds"] < LIMIT
 

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Hosts made of network namespaces on a bridge, for measurements and tests. Needs root.
+"""Hosts made of network namespaces on a bridge. Needs root.
 
 Every host has one interface, `lan0`, with an address in 10.77.0.0/24, and nothing leads outside.
 """

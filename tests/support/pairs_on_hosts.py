@@ -1,10 +1,10 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""`python -m benchmarks pairs`: one training served by pairs on several hosts, some of which fail.
+"""One training served by pairs on several hosts, some of which fail.
 
-The hosts are network namespaces joined by veth (benchmarks.hosts). The tuner is on one, every pair
-of plant and controller on another. With faults a relay sits between plant and controller, and in the
-last run one pair is killed in the middle for good. Each result is compared, bit for bit, with that
-of the training in one process.
+The hosts are network namespaces joined by veth (tests.support.hosts). The tuner is on one, every pair
+of plant and controller on another. With faults a relay sits between plant and controller, and one pair
+can be killed in the middle for good. The result is compared, bit for bit, with that of the training in
+one process.
 """
 
 from __future__ import annotations
@@ -18,56 +18,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.hosts import environment, hosts, on
 from benchmarks.processes import (
     Bench,
     BenchError,
     BenchProcess,
     bench,
     ended_well,
-    machine,
     progress,
-    table,
 )
 from loop_interfaces.parameter_file import yaml_text
-from pdeloop.in_process import LocalPair, train
 from pdeloop.pairs import namespaces
-from pdeloop.training_run import resolve
-from tuner_node.build import build_training
+from tests.support.hosts import environment, hosts, on
+from tests.support.interpreter import ROOT
 
-PROBLEM = "burgers"
-LOSS, DELAY = 0.01, 0.002
-"""Share of lost messages, and largest delay in s."""
-SEEDS = 4
-"""Trainings side by side, so that there is an episode for each of four pairs."""
 LIMIT = 600.0
 """Seconds after which a run is given up."""
-
-
-def run(*, pairs: Sequence[int] = (1, 2, 4), iterations: int = 20) -> dict[str, Any]:
-    """A row for each number of pairs, without and with faults, and one with a pair killed."""
-    budget = {"iterations": iterations, "optimizer": "two_point"}
-    values = resolve(PROBLEM, {**budget, "seeds": SEEDS, "evaluation_fields": 4})
-    training = build_training(values)
-    began = time.monotonic()
-    train(training, LocalPair(values), lambda row: None)
-    alone = time.monotonic() - began
-    expected = training.policies()
-    rows = []
-    line = [f"loss:={LOSS}", f"delay:={DELAY}"]
-    plans: list[tuple[int, list[str], bool]] = [(k, [], False) for k in pairs]
-    plans += [(k, line, False) for k in pairs]
-    if max(pairs) > 1:
-        plans.append((max(pairs), line, True))
-    for count, faults, kill in plans:
-        row = serve(values, count, faults, kill, expected)
-        rows.append({"pairs": count, "faults": bool(faults), "killed": kill, **row})
-    return {
-        "iterations": iterations,
-        "in_process_seconds": alone,
-        "machine": machine(),
-        "rows": rows,
-    }
 
 
 def serve(
@@ -127,7 +92,8 @@ def _pair(
             problem=None if package == "tests.support.relay" else str(problem),
             namespace=namespace,
             prefix=on(host),
-            environment=environment(),
+            # A node leaves the working directory out of its path, in which the relay is.
+            environment=environment() | {"PYTHONPATH": str(ROOT)},
             remaps=[remap] if faults and remap else [],
         )
 
@@ -139,20 +105,3 @@ def _pair(
     if faults:
         start("tests.support.relay", "", *faults, f"seed:={seed}")
     return nodes
-
-
-def text(result: dict[str, Any]) -> str:
-    """A table of `result`."""
-    columns = {
-        "pairs": "pairs",
-        "faults": "faults",
-        "killed": "a pair killed",
-        "seconds": "s",
-        "repeated_episodes": "episodes repeated",
-        "identical": "same bits",
-    }
-    return (
-        f"{PROBLEM}, {result['iterations']} iterations of {SEEDS} seeds; faults: {LOSS:.0%} of the "
-        f"messages lost, delayed by up to {1e3 * DELAY:g} ms; "
-        f"in one process {result['in_process_seconds']:.1f} s\n{table(result['rows'], columns)}"
-    )
