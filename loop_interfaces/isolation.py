@@ -22,7 +22,7 @@ def loopback_environment() -> dict[str, str]:
     """
     if os.environ.get(PROFILE) or os.environ.get(NETWORK) == "1":
         return {}
-    return {PROFILE: str(_loopback_profile())}
+    return {PROFILE: str(loopback_profile())}
 
 
 def keep_on_this_machine() -> None:
@@ -51,7 +51,7 @@ def check_profile() -> None:
 
 def is_confined() -> bool:
     """Whether this process is configured to keep its traffic on this machine."""
-    return os.environ.get(PROFILE) == str(_loopback_profile())
+    return os.environ.get(PROFILE) == str(loopback_profile())
 
 
 def outside_sockets() -> list[str]:
@@ -83,7 +83,8 @@ def outside_sockets() -> list[str]:
     return outside
 
 
-def _loopback_profile() -> Path:
+def loopback_profile() -> Path:
+    """The Fast DDS profile that keeps messages on this machine."""
     return config_folder() / "fastdds_loopback.xml"
 
 

@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from loop_interfaces.affinity import least_busy_cores, usable_cores
-from loop_interfaces.isolation import PROFILE
+from loop_interfaces.isolation import NETWORK, PROFILE
+from loop_interfaces.ros_environment import prepared
 from loop_interfaces.spec import ParameterError, Spec
 from pde_sim_node.build import fingerprint
 from pdeloop.domain import given_domain
@@ -139,6 +140,14 @@ class Transport:
                 "without ROS: --in-process"
             )
         given_domain()
+        self.environment()
+
+    def environment(self) -> tuple[dict[str, str], list[str]]:
+        """The environment of the nodes, and what is left out of this one's, in words.
+
+        RosEnvironmentError where no node could work.
+        """
+        return prepared({**os.environ, **({NETWORK: "1"} if self.network else {})})
 
     @property
     def recorded(self) -> bool:

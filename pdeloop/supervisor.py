@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -32,6 +33,8 @@ REFUSED, CRASHED = 1, 70
 and of one with a bug (loop_interfaces.ros.node_main)."""
 START = "loop_interfaces.start"
 """The module that runs a node."""
+_WARNING = re.compile(r"\[WARN\] \[([\d.]+)\] (\[.*)")
+"""A warning in a node's log."""
 _KILLED = range(-64, 0)
 """Exit codes by signals."""
 
@@ -59,6 +62,11 @@ class Child:
     optional: bool = False
     cores: Sequence[int] = ()
     ended: bool = False
+
+    def warning(self, since: float) -> str:
+        """The last warning of the node's log since a time: what it waits for, if it does."""
+        found = [match for line in self._logged() if (match := _WARNING.match(line))]
+        return found[-1][2] if found and float(found[-1][1]) >= since else ""
 
     def last_line(self) -> str:
         """The last line of the node's log."""
@@ -90,19 +98,20 @@ class Supervisor:
     domain: int
     log_folder: Path
     tell: Callable[[str], None]
-    isolation: Mapping[str, str]
-    """Environment variables that say where messages may go (loop_interfaces.isolation)."""
+    environment: Mapping[str, str]
+    """Of the nodes (loop_interfaces.ros_environment)."""
     stopped: bool = False
     """Whether the main node ended because an operator asked it to, through its service."""
     _environment: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._environment = {
-            **safe_environment(os.environ),
-            **self.isolation,
+            **safe_environment(self.environment),
             "ROS_DOMAIN_ID": str(self.domain),
             "ROS_LOG_DIR": str(self.log_folder),
             "PYTHONUNBUFFERED": "1",
+            "RCUTILS_CONSOLE_OUTPUT_FORMAT": "[{severity}] [{time}] [{name}]: {message}",
+            "RCUTILS_COLORIZED_OUTPUT": "0",
         }
 
     def poll(self) -> bool:

@@ -7,10 +7,11 @@ import importlib
 import importlib.util
 import itertools
 import os
+import re
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,6 @@ from typing import Any
 import controller_node.law
 from controller_node.identification import DesignSettings, check_sizes
 from loop_interfaces.files import FileError, make_own_folder
-from loop_interfaces.isolation import NETWORK, loopback_environment
 from loop_interfaces.own_code import OwnCodeError
 from loop_interfaces.spec import ParameterError
 from pde_sim_node.build import build_plant, complete
@@ -41,6 +41,8 @@ BUILT_IN = {"nodes": [], "law": "affine"}
 """The controller of a training in this process, as result.json has it."""
 POLL = 0.05
 """Seconds between two looks at the nodes."""
+QUIET = 5.0
+"""Seconds without news of the training after which it is said what the nodes wait for."""
 
 
 def resolve(problem: str, options: Mapping[str, Any]) -> dict[str, Any]:
@@ -222,20 +224,26 @@ def _train_over_topics(
     begun = False
     with own_domain() as domain, announced(domain, folder, network=transport.network):
         display.line(f"start (ROS_DOMAIN_ID={domain}{', on the network' * transport.network})")
+        environment, remarks = transport.environment()
+        for remark in remarks:
+            display.line(f"  {remark}")
+        waiting = Waiting(list(children.values()), display.line)
         supervisor = Supervisor(
             list(children.values()),
             "tuner_node",
             domain,
             logs,
             display.line,
-            {NETWORK: "1"} if transport.network else loopback_environment(),
+            environment,
         )
         try:
             done = False
             while not done:
                 check()
                 done = supervisor.poll()
-                for row in progress.rows():
+                rows = progress.rows()
+                waiting.look(time.monotonic(), bool(rows))
+                for row in rows:
                     display.row(row)
                     begun |= row.get("event") != "phase"
                 if recorder is not None and recorder.ended and not (done or begun):
@@ -252,6 +260,29 @@ def _train_over_topics(
     if recorder is not None:
         names_of_bags = ", ".join(str(bag) for bag in bags)
         display.line(f"  recorded in {names_of_bags}" + ", not to the end" * recorder.ended)
+
+
+class Waiting:
+    """Says on the terminal what the nodes wait for, where nothing happens for some seconds."""
+
+    def __init__(self, children: Sequence[Child], tell: Callable[[str], None]) -> None:
+        self._children, self._tell = children, tell
+        self._since = self._looked = time.monotonic()
+        self._said = ""
+
+    def look(self, now: float, happened: bool) -> None:
+        """To be called often; happened: whether the training has gone on since the last call."""
+        if happened:
+            self._since, self._said = now, ""
+        if now - self._since < QUIET or now - self._looked < 1.0:
+            return
+        self._looked = now
+        warnings = [child.warning(time.time() - 2 * QUIET) for child in self._children]
+        text = "; ".join(dict.fromkeys(filter(None, warnings)))
+        words = re.sub(r"\d+", "", text)  # but for the seconds
+        if words != self._said:
+            self._said = words
+            self._tell(f"  {text}")
 
 
 def unused(path: Path) -> Path:

@@ -19,6 +19,7 @@ from loop_interfaces.own_code import OwnCodeError
 from loop_interfaces.parameter_file import read_parameter_file
 from loop_interfaces.ros.node_loop import NodeLoop
 from loop_interfaces.ros.parameters import require_parameters, take_over
+from loop_interfaces.ros_environment import prepared, with_log_folder
 from loop_interfaces.spec import ParameterError
 from loop_interfaces.start import on_signals
 
@@ -48,6 +49,7 @@ def ros_node(
 
     on_signals(stop)
     try:
+        prepare_process(name)
         check_profile()
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rcl raises bare RuntimeErrors and its own types
@@ -71,6 +73,20 @@ def ros_node(
         if node is not None:
             node.destroy_node()
         try_shutdown()
+
+
+def prepare_process(name: str) -> None:
+    """Make this process's environment one in which a node works; say what is left out of it.
+
+    RosEnvironmentError where none does.
+    """
+    found, remarks = prepared(os.environ)
+    found, more = with_log_folder(found)
+    for variable in set(os.environ) - set(found):
+        del os.environ[variable]
+    os.environ.update(found)
+    for remark in (*remarks, *more):
+        print(f"{name}: {remark}", file=sys.stderr)
 
 
 class NodeBody(Protocol):
