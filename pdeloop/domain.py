@@ -41,12 +41,15 @@ def given_domain() -> int | None:
 def own_domain() -> Iterator[int]:
     """ROS_DOMAIN_ID if the user set it, else a free domain, held until the end of the block.
 
+    DomainError where another training was given the same, as by a shell's start-up file: each would
+    take the other's nodes for its own.
     A domain is free when no other run holds its lock and nobody is bound to a discovery port of its
     first participants (7410 + 250 d + 2 i on loopback): the first of them may have left.
     """
     chosen = given_domain()
     if chosen is not None:
-        yield chosen
+        with _held(chosen):
+            yield chosen
         return
     try:
         private_folder(DOMAINS_FOLDER)
@@ -66,6 +69,23 @@ def own_domain() -> Iterator[int]:
                 yield domain
                 return
     raise DomainError(f"all ROS domains from {DOMAINS[0]} to {DOMAINS[-1]} are in use")
+
+
+@contextlib.contextmanager
+def _held(chosen: int) -> Iterator[None]:
+    """A domain that the user gave, for this block; without a place for locks nobody is noticed."""
+    with contextlib.ExitStack() as held:
+        free = True
+        with contextlib.suppress(OSError, FileError):
+            private_folder(DOMAINS_FOLDER)
+            lock = held.enter_context(open_own(DOMAINS_FOLDER / f"given-{chosen}", 0))
+            free = try_lock(lock)
+        if not free:
+            raise DomainError(
+                f"another training runs in ROS_DOMAIN_ID={chosen}; unset the variable to take a free "
+                "domain, or wait until it has ended"
+            )
+        yield
 
 
 def _unused(domain: int) -> bool:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,8 @@ import pytest
 from loop_interfaces import ros_environment
 from loop_interfaces.isolation import NETWORK, PROFILE, loopback_profile
 from loop_interfaces.ros_environment import RosEnvironmentError, prepared, with_log_folder
+from pdeloop.supervisor import Child
+from pdeloop.training_run import Waiting
 
 OWN = {"HOME": "/home/me", "ROS_DOMAIN_ID": "7"}
 
@@ -117,3 +120,26 @@ def test_logs_have_a_folder_where_the_home_cannot_be_written(
     assert "cannot be written: logs go to" in remark and "ROS_LOG_DIR" in remark
     with pytest.raises(RosEnvironmentError, match=r"ROS_LOG_DIR=.*file cannot be written"):
         with_log_folder({"HOME": str(tmp_path), "ROS_LOG_DIR": str(blocked)})
+
+
+def test_what_the_nodes_wait_for_is_said_once_where_a_training_stands_still(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log, told = tmp_path / "tuner_node.log", list[str]()
+    monkeypatch.setattr(time, "time", lambda: 1000.0)
+    waiting = Waiting([Child("tuner_node", lambda: [], log)], told.append)
+    begin = time.monotonic()
+    waiting.look(begin + 6.0, False)
+    log.write_text("[WARN] [900.5] [tuner_node]: waiting for the recorder for 3 s\n")
+    waiting.look(begin + 8.0, False)
+    assert told == []  # there was no warning, or one of long ago
+    for seconds in (5, 10):
+        with log.open("a") as file:
+            file.write(
+                f"[WARN] [998.5] [tuner_node]: waiting for plant for {seconds} s\n[INFO] ...\n"
+            )
+        waiting.look(begin + 10.0 + seconds, False)
+    assert told == ["  [tuner_node]: waiting for plant for 5 s"]
+    waiting.look(begin + 30.0, True)
+    waiting.look(begin + 34.0, False)
+    assert len(told) == 1

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.loop_harness import Processes, without_domain
+from tests.support.loop_harness import Processes, until, without_domain
 from tests.support.small import SMALL
 
 pytestmark = pytest.mark.topics
@@ -55,3 +55,14 @@ def test_two_trainings_at_once_do_not_end_each_other(loop: Processes, tmp_path: 
             loop.wait(training, LIMIT)
     results = [(tmp_path / name / "policy.npz").read_bytes() for name in ("a", "b")]
     assert results[0] == results[1]
+
+
+def test_a_second_training_in_a_domain_that_is_given_ends_at_once_and_the_first_goes_on(
+    loop: Processes, tmp_path: Path
+) -> None:
+    first = loop.pdeloop("train", str(SMALL), "--iterations", "400", "--out", str(tmp_path / "a"))
+    until(lambda: "adapt" in loop.output(first), LIMIT, "first training")
+    second = loop.pdeloop(*TRAIN, "--out", str(tmp_path / "b"))
+    said = loop.wait(second, LIMIT, code=1)
+    assert "another training runs in ROS_DOMAIN_ID=" in said.splitlines()[-1]
+    loop.wait(first, LIMIT)
