@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Whether a cost came before the end of its episode, from somebody else than the plant. Pure.
+"""Detects episode costs that the plant cannot have sent. Pure.
 
 A controller knows how far it has answered the states of an episode. A cost that says that the episode
 went further, and the plant that gives it up before that step, together are a contradiction. One of the

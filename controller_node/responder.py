@@ -269,7 +269,7 @@ class Responder:
             models, policies = run.models_of(start.step), run.policies_of(pending.episode)
             lacking += [] if models else ["model"]
             lacking += [] if policies else ["policy"]
-            if models and policies and run.named(start, self._settings.action_limit) is None:
+            if models and policies and run.inputs_for(start, self._settings.action_limit) is None:
                 lacking.append("one tuner (different policies or models came)")
         return lacking
 
@@ -318,14 +318,14 @@ class Responder:
             return known
         if target is None:
             return None
-        law, named = None, None
+        law, inputs = None, None
         if run.exploration is None:
-            if (named := run.named(start, self._settings.action_limit)) is None:
+            if (inputs := run.inputs_for(start, self._settings.action_limit)) is None:
                 return None
-            law = self._law(start, *named, target)
+            law = self._law(start, *inputs, target)
         signed = NOT_SIGNED
         if start.plant:
-            digest = digest_of_start(start, named, self._settings.action_limit)
+            digest = digest_of_start(start, inputs, self._settings.action_limit)
             signed = signature(digest, target)
         run.answering = Answering(frame.plant, frame.episode, law, signed)
         return run.answering

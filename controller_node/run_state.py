@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What a controller keeps of a run: what came in its name, and what answers its episode. Pure."""
+"""Per-run state of the controller: messages received, and the law in use. Pure."""
 
 from collections import deque
 from dataclasses import dataclass, field
@@ -38,7 +38,7 @@ class Models:
     rows: list[model_rows.ModelRows]
 
 
-Named: TypeAlias = tuple[Frame, Models]
+EpisodeInputs: TypeAlias = tuple[Frame, Models]
 """Policies and models that answer an episode."""
 
 
@@ -79,7 +79,7 @@ class RunState:
         start = self.start
         return start if start is not None and start.episode == frame.episode else None
 
-    def named(self, start: Frame, action_limit: float) -> Named | None:
+    def inputs_for(self, start: Frame, action_limit: float) -> EpisodeInputs | None:
         """Policies and models of the run's episode, None while they have not arrived.
 
         Of several those that the start signs, or the newest if it signs none of them; None if it
@@ -101,10 +101,10 @@ class RunState:
         return next(iter(fitting or found), None)
 
 
-def digest_of_start(start: Frame, named: Named | None, action_limit: float) -> int:
-    """D of an episode, see loop_interfaces.signature. named: None where it explores."""
+def digest_of_start(start: Frame, inputs: EpisodeInputs | None, action_limit: float) -> int:
+    """D of an episode, see loop_interfaces.signature. inputs: None where it explores."""
     published: list[Any] = [start.values, action_limit]
-    if named is not None:
-        policy, models = named
+    if inputs is not None:
+        policy, models = inputs
         published += [policy.values, models.digest]
     return digest_of(*published)

@@ -8,7 +8,7 @@ MAX_SHOWN = 200
 
 
 def printable(text: str) -> str:
-    r"""A text with what is no character to be seen, such as a terminal's escape sequences, in words.
+    r"""A text with its non-printable characters, such as a terminal's escape sequences, escaped.
 
     Examples
     --------

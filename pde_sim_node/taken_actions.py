@@ -1,10 +1,10 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Which starts and actions a plant has taken in a run, and which further ones contradict them. Pure.
 
-Whoever is asked twice answers the same to the bit. So another answer to a state that was answered
-already comes from somebody else, or from a controller that cannot be relied on: which of the two was
-taken is chance, and the episode is void. The same holds for two starts of an episode. When the other
-one comes after the end of one of the last episodes, the cost of that episode is sent again, void.
+Answers are deterministic: two different ones to a state come from a second or a faulty controller.
+Which of them was taken is chance, and the episode is void. The same holds for two starts of an
+episode. When the other one comes after the end of one of the last episodes, the cost of that episode is
+sent again, void.
 
 Where the tuner asks for it (loop_interfaces.signature), the first action of a run says whether its
 controller signs. If so, only actions with the signature of their episode are taken; if not, a signed

@@ -9,7 +9,7 @@ from typing import Any
 
 from pdeloop.finished_run import FinishedRun, load_run, merged
 from pdeloop.study.description import Study
-from pdeloop.study.run import ASKED, kept
+from pdeloop.study.run import STUDY_FILE, read_study
 
 LEARNED = {
     "lqt_po": {"start": "lqt", "optimizer": "two_point"},
@@ -50,9 +50,9 @@ def study_of(problems: Sequence[str], options: Mapping[str, Any]) -> Study:
 
 def reproduction_in(folder: Path) -> Study | None:
     """The reproduction in `folder`; None if it holds something else."""
-    if not (folder / ASKED).exists():
+    if not (folder / STUDY_FILE).exists():
         return None
-    study = kept(folder)
+    study = read_study(folder)
     return study if study.curves and set(study.variants) == set(LEARNED) else None
 
 

@@ -131,7 +131,7 @@ class Constants:
 
 
 def lay_out(plan: Any, sizes: Mapping[str, int]) -> int:
-    """Give areas of the scratch, by name, their offsets in the plan; returns the size of a plane."""
+    """Assign scratch offsets to the named areas; returns the size of a plane."""
     # In front, and behind each plane: room for what whole lanes read and write beyond a transform.
     offset = WIDTH
     for name, size in sizes.items():

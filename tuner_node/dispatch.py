@@ -214,8 +214,8 @@ class Dispatcher:
     def state(self, pair: int, frame: Frame) -> bool:
         """Take a sample z_k of a pair's episode.
 
-        True if `tick` has to follow at once: it is the last one and the cost is there, or samples that
-        were used are contradicted. Raises FrameError for a sample of another shape.
+        True if `tick` must run now: the trajectory is complete, or a used sample was contradicted.
+        Raises FrameError for a sample of another shape.
         """
         known, target = self.pairs[pair], self._targets.get(frame.plant)
         known.sample("states", frame, frame.values.shape[1] if target is None else len(target))

@@ -44,7 +44,7 @@ from tuner_node.run_store import open_run
 from tuner_node.session import Session
 
 SETTLE = 0.3
-"""Seconds after the last episode in which what contradicts it still counts."""
+"""Grace period (s) for contradictions after the last episode."""
 LINGER = 0.5
 """Seconds after an early end in which the last messages, and the answer to a request to stop, are
 taken: when a writer is gone, its readers lose what they have not taken yet."""

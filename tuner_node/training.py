@@ -33,7 +33,7 @@ from tuner_node import rollouts
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, TrainingSettings, batch_of
 from tuner_node.budget import Budget
 from tuner_node.errors import ContradictionError
-from tuner_node.published_law import check_law
+from tuner_node.law_check import check_law
 from tuner_node.rollouts import CHECK, EVALUATED, EXPLORATION
 
 OptimizerFactory = Callable[[Array, int, Context | None, int], Optimizer]

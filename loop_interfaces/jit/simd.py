@@ -72,7 +72,7 @@ def shuffle(builder: Any, a: Any, b: Any, order: Sequence[int]) -> Any:
 
 
 def reader(kind: Any, result: Any, align: int) -> Any:
-    """Of what is at an offset."""
+    """Intrinsic that loads `kind` at an offset."""
 
     @intrinsic
     def read_at(typing_context: Any, address: Any, offset: Any) -> Any:
@@ -85,7 +85,7 @@ def reader(kind: Any, result: Any, align: int) -> Any:
 
 
 def writer(kind: Any, value: Any, align: int) -> Any:
-    """To an offset."""
+    """Intrinsic that stores `kind` at an offset."""
 
     @intrinsic
     def write_at(typing_context: Any, address: Any, offset: Any, given: Any) -> Any:

@@ -114,7 +114,7 @@ def node_main(
     """
     try:
         files = [read_parameter_file(path) for path in parameter_files(args)]
-        _refuse_other_words(name, args)
+        _reject_unknown_arguments(name, args)
         body: NodeBody | None = None
         former: Node | None = None
         while True:
@@ -155,8 +155,8 @@ def parameter_files(args: Sequence[str] | None) -> list[Path]:
     return found
 
 
-def _refuse_other_words(name: str, args: list[str] | None) -> None:
-    """Words that are not ROS arguments would be ignored in silence; `--help` among them."""
+def _reject_unknown_arguments(name: str, args: list[str] | None) -> None:
+    """Reject words that are not ROS arguments, which rclpy ignores silently; `--help` among them."""
     try:
         words = remove_ros_args(args)[1:] if args is None else remove_ros_args(args)
     except Exception as error:  # a parameter file that is not there, a rule that cannot be read

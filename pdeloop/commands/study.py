@@ -137,7 +137,7 @@ def carry_out(
 def _study(options: argparse.Namespace) -> int:
     from loop_interfaces.spec import read_document
     from pdeloop.study.description import Study
-    from pdeloop.study.run import kept
+    from pdeloop.study.run import read_study
 
     allow_own_code(options)
     if options.file is None and options.out is None:
@@ -151,7 +151,7 @@ def _study(options: argparse.Namespace) -> int:
 
     def study_in(folder: Path) -> Study:
         if options.file is None:
-            return kept(folder)
+            return read_study(folder)
         return Study.of(read_document(options.file), options.file.parent).having(settings)
 
     return carry_out("study", options, study_in)

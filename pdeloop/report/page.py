@@ -23,7 +23,7 @@ from pdeloop.report import figures, learning
 from pdeloop.report.data import ProblemData, ReportData
 from pdeloop.report.style import COLOURS, NAMES, STYLE
 from pdeloop.reproduction import PAPER, beside_the_paper
-from pdeloop.study.run import ASKED
+from pdeloop.study.run import STUDY_FILE
 from pdeloop.study.table import AVERAGES, CAVEAT, beside_no_control, cost_text, reduction_texts
 from pdeloop.study.table import figures as figures_of
 from tuner_node.budget import PURPOSES
@@ -199,7 +199,7 @@ def _facts(data: ReportData) -> list[tuple[str, str]]:
     first = data.problems[0]
     seeds, values = first.first.seeds, first.first.values
     if data.study is not None:
-        command = f"pdeloop study {data.folder / ASKED}"
+        command = f"pdeloop study {data.folder / STUDY_FILE}"
     else:
         command = f"pdeloop train {data.folder}/parameters.yaml"
     facts = [("Command", command)]

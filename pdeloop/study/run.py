@@ -32,7 +32,7 @@ from pdeloop.study.executors import no_worker
 from pdeloop.study.training import EnvironmentMismatchError, environment, train_one
 from pdeloop.training_run import load_compiled
 
-ASKED = "study.json"
+STUDY_FILE = "study.json"
 ATTEMPTS = 3
 """Executors that may break, as when the system kills a process for its memory."""
 POLL, WORKER_CHECK = 0.1, 2.0
@@ -51,30 +51,30 @@ class Failure(NamedTuple):
     reason: str
 
 
-def keep(folder: Path, study: Study) -> None:
+def write_study(folder: Path, study: Study) -> None:
     """Begin a study in `folder`. StudyError if there is another one, or it cannot be written."""
     if (folder / "parameters.yaml").exists():
         raise StudyError(f"{folder} holds a run; choose another folder")
     try:
-        if (folder / ASKED).exists():
-            if kept(folder) != study:
+        if (folder / STUDY_FILE).exists():
+            if read_study(folder) != study:
                 raise StudyError(
                     f"{folder} holds another study; choose another folder, or give "
                     f"--out {shlex.quote(str(folder))} alone to continue the one there"
                 )
             return
         make_folder(folder)
-        write_atomically(folder / ASKED, json.dumps(study.content(), indent=1).encode())
+        write_atomically(folder / STUDY_FILE, json.dumps(study.content(), indent=1).encode())
     except OSError as error:
         raise StudyError(f"cannot write to {folder}: {error.strerror}") from error
 
 
-def kept(folder: Path) -> Study:
+def read_study(folder: Path) -> Study:
     """The study in `folder`. StudyError if there is none."""
     try:
-        return Study.of(read_json(folder / ASKED))
+        return Study.of(read_json(folder / STUDY_FILE))
     except (OSError, ValueError, AttributeError) as error:
-        raise StudyError(f"no study in {folder}: {ASKED} cannot be used ({error})") from error
+        raise StudyError(f"no study in {folder}: {STUDY_FILE} cannot be used ({error})") from error
 
 
 def run(
@@ -131,7 +131,7 @@ def run(
                 if isinstance(pool, ProcessPoolExecutor):  # of this machine: once for all of them
                     for values in {v["equation"]: v for v in todo.values()}.values():
                         load_compiled(values)
-                keep(folder, study)  # not before there is somebody to train
+                write_study(folder, study)  # not before there is somebody to train
                 waiting = {
                     pool.submit(tasks.get(n.split("/")[1], train), v, expected): n
                     for n, v in todo.items()
