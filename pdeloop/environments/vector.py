@@ -214,13 +214,25 @@ class VectorEnvironment(VectorEnv[Array, Array, NDArray[Any]]):
         return told(self.plant, np.zeros(self.num_envs))
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """A frame of each environment, as `Environment.render` draws it; None without a mode."""
+        """A frame of each environment, as `Environment.render` draws it.
+
+        Returns
+        -------
+        tuple of (height, width, 3) uint8 arrays, or None
+            None without a `render_mode`.
+        """
         if self.render_mode is None:
             return None
         return tuple(picture.frame(self.plant, m) for m, picture in enumerate(self._pictures))
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Drop what `render` has kept."""
+        """Drop what `render` has kept.
+
+        Parameters
+        ----------
+        kwargs
+            Not used; Gymnasium's interface has it.
+        """
         self._pictures = [Picture() for _ in range(self.num_envs)]
 
 

@@ -87,5 +87,5 @@ def _nothing() -> None:
 def _is_record(thing: Any) -> bool:
     """A class whose constructor takes its attributes."""
     return inspect.isclass(thing) and (
-        hasattr(thing, "__dataclass_fields__") or hasattr(thing, "_fields")
+        hasattr(thing, "__dataclass_fields__") or issubclass(thing, tuple)
     )
