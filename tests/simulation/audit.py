@@ -10,7 +10,7 @@ import re
 from functools import cache
 
 from tests.simulation.history import History
-from tests.simulation.plan import Plan, draw
+from tests.simulation.plan import Plan, aimed, draw
 from tests.simulation.processes import remembering, values
 from tests.support.small import same_bits, train_here
 from tuner_node.errors import DispatchError
@@ -40,7 +40,8 @@ def audit(plan: Plan) -> str:
     Raises
     ------
     AssertionError
-        Other bits, an error that names no cause, or one although only the network was bad.
+        Other bits, an error that names no cause, or one although only the network was bad; or the end
+        of a training that used an episode of which another action or start came later.
     """
     expected = undisturbed(plan.iterations, plan.own_plant)
     with remembering():
@@ -48,8 +49,13 @@ def audit(plan: Plan) -> str:
         end = history.run()
     if isinstance(end, DispatchError):
         assert CAUSES.search(str(end)), f"names no cause: {end}"
+        assert not plan.harmless, f"messages for nobody ended it: {end}"
         assert plan.hostile or str(end).startswith(GAVE_UP), f"nobody else was there: {end}"
         return f"error: {end}"
+    if plan.harmless:
+        again = [row["reason"] for row in history.rows if row["event"] == "repeated"]
+        assert not again, f"something followed from messages for nobody: {again[0]}"
+    assert not history.overlooked, "a contradicted episode was used"
     assert end.evaluation is not None and expected.evaluation is not None
     for what, found, wanted in (
         ("another policy", end.policies(), expected.policies()),
@@ -75,6 +81,13 @@ def shrunk(plan: Plan) -> Plan:
         if verdict(smaller)[1]:
             return shrunk(smaller)
     return plan
+
+
+def judged_aimed(seed: int) -> tuple[str, str]:
+    """As `judge`, on the plan that `aimed` gives a seed."""
+    plan = aimed(seed)
+    end, reason = verdict(plan)
+    return end, f"seed {seed}, aimed: {reason}\n  {shrunk(plan)}" if reason else ""
 
 
 def judge(seed: int) -> tuple[str, str]:

@@ -32,7 +32,7 @@ from loop_interfaces.topics import (
     Topic,
 )
 from tests.simulation.disk import Disk
-from tests.simulation.plan import MAIN, Fault, Plan
+from tests.simulation.plan import MAIN, STALE, Fault, Plan
 from tests.simulation.processes import (
     EVERY_PAIR,
     RUN,
@@ -41,6 +41,7 @@ from tests.simulation.processes import (
     Process,
     Stranger,
     TunerProcess,
+    UnsignedController,
     values,
 )
 from tuner_node.errors import DispatchError
@@ -98,6 +99,14 @@ class History:
         """Episodes of the first pair of which a cost was forged before their end."""
         self._begun = 0
         """The last episode that its tuner began there."""
+        self.contradicted: list[tuple[float, int]] = []
+        """When the plant was handed what contradicts an episode whose cost the tuner has, and which."""
+        self._beside: dict[tuple[str, str], float] = {}
+        """Kinds of stale messages and the topics beside whose messages they come, and until when."""
+        self._past: dict[tuple[Topic, int], deque[Frame]] = {}
+        """What was sent before, by topic and pair."""
+        self._costs: list[int] = []
+        """Episodes of the first pair whose completed costs the tuner has heard."""
         self._answers_forged = False
         """Whether what a controller sends now answers a forged state."""
         self._cut: set[tuple[str, str]] = set()
@@ -136,6 +145,17 @@ class History:
         early = [number for number in self._early if self.plan.hides or number == self._begun]
         return bool(self._taken_back or early) or not self._forgeries <= self._heard
 
+    @property
+    def overlooked(self) -> bool:
+        """Whether the plant was handed what contradicts an episode, and nothing has followed.
+
+        The tuner is given the time in which the plant's void cost comes to it. It ends with an error,
+        or starts an episode again of which it still waited for something.
+        """
+        waited = [self.time - when for when, _ in self.contradicted]
+        again = any(row["event"] == "repeated" for row in self.rows)
+        return max(waited, default=0.0) > 20 * self.plan.delay and not again
+
     def send(self, writer: Process, sent: Publication | ModelFailure, pair: int) -> None:
         """Bring a message to who reads its topic in the namespace of a pair, as the network at that
         moment does.
@@ -157,12 +177,59 @@ class History:
             forgery = self._codecs[topic].encode(self._forgery(sent.frame))
             for process in self._reading(topic, pair):
                 self._carry("stranger", process, topic, forgery, pair)
+        self._send_beside(topic, sent.frame, pair)
         for process in self._reading(topic, pair):
             copies = 1
             if not topic.latched:  # the others are reliable
                 copies = (self.rng.random() >= plan.loss) + (self.rng.random() < plan.duplicates)
             for _ in range(copies):
                 self._carry(writer.name, process, topic, self._damaged(raw, sent.frame), pair)
+
+    def _send_beside(self, topic: Topic, frame: Frame, pair: int) -> None:
+        """Bring what comes beside a message because it is stale, or meant for others."""
+        past = self._past.setdefault((topic, pair), deque(maxlen=RECALLED))
+        samples = topic in (STATE, ACTION)
+        earlier = [
+            known
+            for known in past
+            if (known.episode, known.step) != (frame.episode, frame.step)
+            and known.episode <= frame.episode
+            and (known.step == frame.step or not samples)
+        ]
+        past.append(replace(frame, values=frame.values.copy()))
+        for kind in ("stale", "another run", "another plant"):
+            if self.time >= self._beside.get((kind, topic.name), 0.0):
+                continue
+            if kind == "stale":
+                others = [self.rng.choice(earlier)] if earlier else []
+            else:
+                ids = {"run": RUN + 1} if kind == "another run" else {"plant": frame.plant + 1}
+                others = [replace(self._forgery(frame), **ids)]
+            for other in others:
+                raw = self._codecs[topic].encode(other)
+                for process in self._reading(topic, pair):
+                    self._carry("", process, topic, raw, pair)
+
+    def _contradict(self, topic: Topic) -> None:
+        """Hand the plant another action or start of the last episode whose cost the tuner has."""
+        plant = self._processes.get("plant")
+        last = self._costs[-1] if self._costs else 0
+        if not isinstance(plant, PlantProcess):
+            return
+        horizon = plant.lockstep.plant.horizon  # the last action only says that the state has come
+        sent = self._past.get((topic, 0), ())
+        known = [f for f in sent if f.episode == last and (topic is START or f.step < horizon)]
+        if not known:
+            return
+        frame = self._forgery(self.rng.choice(known))
+
+        def arrive() -> None:
+            refused = len(self.refused)
+            self._handing(plant, partial(plant.take, topic, frame, 0))
+            if len(self.refused) == refused:
+                self.contradicted.append((self.time, last))
+
+        self._later(arrive)
 
     def show(self, plant: Process, samples: list[tuple[Topic, Frame]]) -> None:
         """Bring the samples of an episode to the tuners, if they read them."""
@@ -246,6 +313,8 @@ class History:
                 (self._forgeries if forged else self._heard).add((process, *header))
                 if topic is COST and process.name == "tuner" and _is_void(frame):
                     self._taken_back.discard((pair, frame.episode))
+            if topic is COST and process.name == "tuner" and not (pair or _is_void(frame)):
+                self._costs.append(frame.episode)
             self._answers_forged = forged and topic is STATE
             try:
                 process.take(topic, frame, pair)
@@ -277,7 +346,8 @@ class History:
         if role == "plant":
             self._join(PlantProcess(self, name, rate, pair))
         elif role == "controller":
-            self._join(ControllerProcess(self, name, rate, pair))
+            make = ControllerProcess if self.plan.signs else UnsignedController
+            self._join(make(self, name, rate, pair))
         else:
             how: dict[str, Any] = {"incarnation": self._starts, "power": power, "rot": rot}
             self._starts += 1
@@ -356,6 +426,10 @@ class History:
                 self._carry("", process, topic, raw, pair)
         elif kind == "forgery":
             self._forged[who] = end
+        elif kind in ("late action", "late start"):
+            self._contradict(ACTION if kind == "late action" else START)
+        elif kind in STALE:
+            self._beside[kind, who] = end
         elif kind == "second controller":
             if who == "signs":  # with another limit of the actions
                 rival: Process = ControllerProcess(self, "rival", action_limit=0.1)

@@ -32,7 +32,22 @@ FORGED = (
     *("model/identified", "samples"),
 )
 """Topics on which messages are forged."""
-HOSTILE = ("second controller", "second tuner", "early cost", "episode ahead", "forgery")
+STALE = {
+    "stale": (
+        *("episode/start", "policy", "model", "state", "action", "episode/cost"),
+        "model/identified",
+    ),
+    "another run": ("policy", "model", "state", "action", "episode/cost", "model/identified"),
+    "another plant": ("state", "action", "episode/cost", "model/identified"),
+    "late action": ("",),
+    "late start": ("",),
+}
+"""Faults of `aimed`, and the topics that each is on: beside each message comes one of an earlier
+episode, of another run or of another plant, with the same step; or an action or a start of an episode
+that has ended comes once more, with its header and other values."""
+OTHERS = ("another plant", "late action", "late start")
+"""Those of them that somebody else causes who takes part in the run."""
+HOSTILE = ("second controller", "second tuner", "early cost", "episode ahead", "forgery", *OTHERS)
 """Faults after which a training may also end with an error that names the cause."""
 HIDING = ("crash", "power cut", "bit rot", "cut", "stop tuner", "second controller")
 """Faults by which plant, controller or tuner may miss what contradicts a cost that came too early."""
@@ -56,7 +71,7 @@ class Plan:
     comes twice, or has a bit changed in what is in front of its values; delay: mean (s); rates: of
     the clocks of the processes; iterations: of the two-point method, 0 for Gauss-Newton, for which
     the tuner reads states and actions; pairs: of plant and controller; own_plant: instead of the small
-    problem's one of a user's own.
+    problem's one of a user's own; signs: whether the controller signs its actions.
     """
 
     seed: int
@@ -68,11 +83,19 @@ class Plan:
     iterations: int = 1
     pairs: int = 1
     own_plant: bool = False
+    signs: bool = True
     faults: tuple[Fault, ...] = ()
 
     @property
     def hostile(self) -> bool:
         return self.damage > 0.0 or any(fault.kind in HOSTILE for fault in self.faults)
+
+    @property
+    def harmless(self) -> bool:
+        """Whether nothing happens but that messages come which are for nobody there."""
+        return bool(self.faults) and all(
+            fault.kind in ("stale", "another run") for fault in self.faults
+        )
 
     @property
     def hides(self) -> bool:
@@ -128,5 +151,29 @@ def draw(seed: int) -> Plan:
         iterations=iterations,
         pairs=pairs,
         own_plant=seed % 5 == 4,
+        faults=tuple(sorted(faults, key=lambda fault: fault.time)),
+    )
+
+
+def aimed(seed: int) -> Plan:
+    """A plan with one of the faults that a check of a header is there for, on a good network.
+
+    Those of `draw` seldom come at the moment at which a check that was removed would be missed.
+    """
+    rng = random.Random(seed)
+    delay, iterations = rng.choice([1e-3, 1e-2]), rng.choice([0, 1])
+    length = 0.1 + (70 + 20 * iterations) * delay
+    kind = rng.choice(list(STALE))
+    late = kind.startswith("late")
+    begin = rng.uniform(0.2, 1.0) * length if late else 0.0
+    faults = [Fault(begin, kind, rng.choice(STALE[kind]), 0.0 if late else 100.0)]
+    if not late and rng.random() < 0.3:
+        who = rng.choice(MAIN[:2])
+        faults.append(Fault(rng.uniform(0.0, length), "crash", who, 0.1))
+    return Plan(
+        seed,
+        delay=delay,
+        iterations=iterations,
+        signs=rng.random() < 0.5,
         faults=tuple(sorted(faults, key=lambda fault: fault.time)),
     )

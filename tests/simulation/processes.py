@@ -230,6 +230,16 @@ class ControllerProcess(Process):
         self.publish(self._handlers[topic](frame))
 
 
+class UnsignedController(ControllerProcess):
+    """One that does not sign its actions, as stand-ins may."""
+
+    def publish(self, publications: Iterable[Publication | ModelFailure]) -> None:
+        for sent in publications:
+            if isinstance(sent, Publication) and sent.topic is ACTION:
+                sent = Publication(ACTION, replace(sent.frame, time=0.0))
+            super().publish([sent])
+
+
 class Stranger(Process):
     """Answers every state with zeros and, as stand-ins may, without a signature."""
 

@@ -15,7 +15,8 @@ from pde_sim_node.taken_actions import Episode, TakenActions
 from tests.simulation.audit import audit, shrunk, verdict
 from tests.simulation.disk import Disk
 from tests.simulation.history import History
-from tests.simulation.plan import KINDS, Fault, Plan, draw
+from tests.simulation.plan import KINDS, Fault, Plan, aimed, draw
+from tests.simulation.planted import BUGS, OPEN, found, planted
 
 SEEDS = 100
 
@@ -25,6 +26,34 @@ def test_a_training_with_faults_ends_with_the_same_bits_or_names_the_cause():
     assert {fault.kind for plan in plans for fault in plan.faults} == set(KINDS)
     ends = Counter(audit(plan).split(":")[0] for plan in plans)
     assert ends["same bits"] >= 0.9 * SEEDS
+
+
+def test_messages_for_nobody_change_nothing_and_late_contradictions_are_never_overlooked():
+    plans = [aimed(seed) for seed in range(30)]
+    ends = Counter(audit(plan).split(":")[0] for plan in plans)
+    assert set(ends) == {"same bits", "error"}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "plant: late actions",
+        "plant: late actions, if signed",
+        "plant: late starts",
+        "tuner: costs that are taken back",
+        "controller: states of another episode",
+    ],
+)
+def test_a_check_that_is_gone_is_found(name: str):
+    _, seed, reason = found(name, 15)
+    assert seed is not None and reason
+
+
+def test_each_planted_bug_is_still_in_the_source_once():
+    for bug in BUGS.values():
+        with planted(bug):
+            pass
+    assert set(OPEN) < set(BUGS)
 
 
 def test_a_history_is_a_function_of_its_plan():
