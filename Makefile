@@ -2,6 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 SHELL := /bin/bash
+.SHELLFLAGS := -o pipefail -c
 # Python is not to import what lies in this folder (loop_interfaces/module_path.py).
 export PYTHONSAFEPATH := 1
 
@@ -9,15 +10,27 @@ export PYTHONSAFEPATH := 1
 
 setup: .venv/ready
 
-# A fresh virtual environment with pinned versions; made again when the pins change.
-.venv/ready: pyproject.toml constraints.txt
+# A fresh virtual environment with pinned versions, made again when the pins change: what running
+# needs, and then what the tests need. What is imported first is compiled to bytecode then.
+install = $(BIN)/python -m pip install --no-compile --disable-pip-version-check -c constraints.txt -e '.[$(1)]' \
+	| sed -un 's/^Collecting \([^ ]*\).*/  \1/p; s/^Installing collected.*/  installing/p'
+
+.venv/runs: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 		|| { echo "pdeloop needs Python 3.11 or newer; set PYTHON=/path/to/python3" >&2; exit 1; }
-	test -d .venv || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[ros,dev]'
-	touch $@
+	@test -d .venv || echo "setting up .venv, once: Python packages and ROS 2"
+	@test -d .venv || $(PYTHON) -m venv .venv
+	@$(call install,ros)
+	@touch $@
 
-run: setup
+.venv/ready: .venv/runs
+	@echo "setting up .venv for tests, once"
+	@$(call install,ros$(comma)dev)
+	@touch $@
+
+comma := ,
+
+run: .venv/runs
 	$(BIN)/pdeloop train burgers
 
 # Four workers for two cores: tests over topics wait a part of their time. Each has a ROS domain of its own.
