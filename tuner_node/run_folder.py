@@ -105,9 +105,12 @@ class RunFolder:
     def refuse_another(self) -> None:
         """RunFolderError where no new training can begin: the folder holds one, or is none."""
         if (self.path / "parameters.yaml").exists():
+            begun = f"{self.path} already holds a run; choose another folder, delete this one, or "
+            if (self.path / "result.json").exists():  # there is nothing to continue
+                report = f"pdeloop report {shlex.quote(str(self.path))}"
+                raise RunFolderError(f"{begun}see what it came to: {report}")
             raise RunFolderError(
-                f"{self.path} already holds a run; choose another folder, delete this one, "
-                f"or continue it with: {resuming(self.path)} "
+                f"{begun}continue it with: {resuming(self.path)} "
                 "(a tuner_node with -p resume:=true)"
             )
         there = next(path for path in (self.path, *self.path.absolute().parents) if path.exists())

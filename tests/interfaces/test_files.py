@@ -501,3 +501,15 @@ def test_records_of_plants_are_removed_in_this_users_own_folder_alone(tmp_path):
     (other / "7+folder").mkdir()
     run_record.forget(7, other)
     assert not (other / "7+pde_sim_node").exists()
+
+
+def test_a_folder_with_a_run_is_refused_with_what_can_be_done_with_that(finished, tmp_path, capsys):
+    """A run that is complete cannot be continued: each advice is one that works."""
+    words = ["train", str(SMALL), "--in-process", "--out"]
+    assert main([*words, str(finished)]) == FAILED
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith(f"see what it came to: pdeloop report {finished}")
+    RunFolder(tmp_path / "begun").create(parameters())
+    assert main([*words, str(tmp_path / "begun")]) == FAILED
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"continue it with: pdeloop train --resume {tmp_path / 'begun'}" in line
