@@ -15,7 +15,7 @@ from typing import Any
 from loop_interfaces.spec import Spec, check
 
 MAX_SEED = 2**53 - 1
-ROLLOUTS = 80
+ROLLOUTS = 20
 """The budget of a seed that is given neither rollouts nor iterations."""
 NODES = {
     "P": "pde_sim_node",

@@ -138,11 +138,11 @@ def test_a_budget_that_cannot_be_kept_is_refused(options, words):
         build_training(parameters(**options))
 
 
-def test_the_default_is_80_rollouts_in_all():
-    assert parameters()["rollouts"] == 80
+def test_the_default_is_20_rollouts_in_all():
+    assert parameters()["rollouts"] == 20
     assert parameters(iterations=3)["rollouts"] == 0
     training = build_training(parameters())
-    assert training.progress == {"rollouts": [0], "budget": [80]}
+    assert training.progress == {"rollouts": [0], "budget": [20]}
 
 
 def test_the_smallest_budgets_make_a_step():
