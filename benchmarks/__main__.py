@@ -25,6 +25,7 @@ from pdeloop.cli import run
 from pdeloop.output import print_json
 
 PROGRAMS = {
+    "first_run": "where the time of the first `make run` in a fresh clone goes",
     "rtt": "rounds a second of the loop beside a bare ping-pong",
     "batch": "environment-steps a second against the batch",
     "train": "a whole training: topics against in-process",
