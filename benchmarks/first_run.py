@@ -26,6 +26,7 @@ def run(*, python: str = "python3") -> dict[str, Any]:
         Interpreter that the virtual environment is made with.
     """
     clean = {k: v for k, v in os.environ.items() if k not in ("VIRTUAL_ENV", "NUMBA_CACHE_DIR")}
+    clean["PYTHONUNBUFFERED"] = "1"
     with tempfile.TemporaryDirectory() as folder:
         clone = Path(folder) / "clone"
         subprocess.run(["git", "clone", "--quiet", str(PROJECT), str(clone)], check=True)
