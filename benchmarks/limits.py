@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from loop_interfaces.files import read_json
 from loop_interfaces.parameters import PROBLEM
+from loop_interfaces.spec import Spec
 from pde_sim_node.build import build_equation, build_plant
 from pdeloop.episode import mean_field_cost
 
@@ -51,16 +52,22 @@ def find(values: Mapping[str, Any], folder: Path = FOLDER) -> NDArray[np.float64
         return None
     known = read_json(path)
     costs = known["open_loop"].get(str(values["evaluation_seed"]), ())
-    if len(costs) != values["evaluation_fields"] or known["parameters"] != _parameters(values):
+    # A parameter that was not known when the limit was kept has its default.
+    kept = {spec.name: spec.default for spec in _plant_parameters()} | known["parameters"]
+    if len(costs) != values["evaluation_fields"] or kept != _parameters(values):
         return None
     now = mean_field_cost(build_plant(values))
     same = abs(now / known["no_control_cost"] - 1) <= AGREEMENT
     return np.array(costs, dtype=np.float64) if same else None
 
 
+def _plant_parameters() -> list[Spec]:
+    return [spec for spec in PROBLEM if "P" in spec.nodes and spec.name != "problem"]
+
+
 def _parameters(values: Mapping[str, Any]) -> dict[str, Any]:
     """The parameters of the plant."""
-    own = {s.name: values[s.name] for s in PROBLEM if "P" in s.nodes and s.name != "problem"}
+    own = {spec.name: values[spec.name] for spec in _plant_parameters()}
     own["equation"] = str(values["equation"]).rpartition("/")[2]  # a file may stand elsewhere
     physical = asdict(build_equation(values))
     del physical["length"]

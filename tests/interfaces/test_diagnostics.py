@@ -23,6 +23,7 @@ from loop_interfaces.ros import introspection
 from loop_interfaces.ros.endpoints import reader_qos, writer_qos
 from loop_interfaces.ros.introspection import Introspection
 from loop_interfaces.topics import COST, STATE, TARGET, VOID
+from pde_sim_node.build import build_plant
 from pde_sim_node.diagnostics import PlantDiagnostics
 from pde_sim_node.lockstep import Timing
 from tests.plant.test_lockstep import RUN, answer, plant_protocol, run_episode, start
@@ -109,14 +110,14 @@ def test_a_node_is_not_there_before_it_can_answer(module, monkeypatch):
         pass
 
     loop = MagicMock()
-    kind, declaring = (
-        (module.ControllerNode, "declare")
-        if module is controller_node.node
-        else (module.PlantNode, "declare_parameters")
-    )
     own = {spec.name for spec in taken_by(module.__name__.split(".")[0])} | {"problem"}
     known = {name: value for name, value in parameters().items() if name in own}
-    monkeypatch.setattr(module, declaring, lambda *given: known)
+    if module is controller_node.node:
+        kind = module.ControllerNode
+        monkeypatch.setattr(module, "declare", lambda *given: known)
+    else:
+        kind, declared = module.PlantNode, (build_plant(parameters()), known)
+        monkeypatch.setattr(module, "declare_parameters", lambda *given: declared)
     monkeypatch.setattr(module.FAST_PATH, "load_compiled", MagicMock(side_effect=CompilingError))
     monkeypatch.setattr(module, "given_parameters", lambda node, package: {})
     with pytest.raises(CompilingError):

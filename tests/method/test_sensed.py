@@ -83,7 +83,7 @@ def test_the_kdv_equation_is_found_from_eight_sensors() -> None:
     assert quadratic * _scale(problem) == pytest.approx(3 / 20, rel=0.02)
     assert abs(transport) < 1e-3 and abs(diffusion) < 5e-5
     plant.reset([FIELD])
-    true = _scale(problem) * plant.states[0, :: plant.x.size // fields.shape[1]]
+    true = _scale(problem) * plant.states[0, :: plant.n_z // fields.shape[1]]
     assert np.linalg.norm(fields[1] - true) < 0.01 * np.linalg.norm(true)
 
 

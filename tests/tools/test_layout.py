@@ -139,7 +139,7 @@ def test_bench_lists_its_programs(capsys) -> None:
         benchmarks_parser().parse_args(["--help"])
     assert left.value.code == 0
     said = capsys.readouterr().out
-    for program in ("rtt", "batch", "train", "realtime", "pairs", "kernel"):
+    for program in ("rtt", "batch", "train", "realtime", "general", "kernel"):
         assert program in said
 
 
