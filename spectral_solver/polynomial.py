@@ -58,11 +58,11 @@ PLAN = np.dtype(
                 *("multipliers", "polynomials", "slopes"),
                 *("analysis", "synthesis"),  # unused
                 # Of the integrals of powers along a path.
-                *("weight_before", "weight_now"),
+                *("weight_begin", "weight_middle", "weight_end"),
                 # Offsets in w.
                 *("x", "z1", "z2", "next", "b", "c", "qf", "ff"),
                 *("part", "sum", "tape", "covector", "on_b", "on_c", "on_force"),
-                *("path", "power", "now", "before", "total"),
+                *("path", "power", "now", "total"),
             )
         ),
     ]
@@ -288,11 +288,37 @@ def powers(w: int, d: int, plan: Any, c: int, e: int) -> None:
             put(w, plan.now + p * modes + k, d, (scale * own[0], scale * own[1]))
 
 
+@jit
+def accumulate(weight: int, w: int, d: int, plan: Any, c: int, e: int) -> None:
+    """Add weights, spectra at an offset in c, times the powers to the integrals."""
+    modes = plan.modes
+    for p in range(plan.degree):
+        for k in range(0, modes, 8):
+            at = p * modes + k
+            total, now = get(w, plan.total + at, d), get(w, plan.now + at, d)
+            put(w, plan.total + at, d, plus_product(total, c, weight + k, e, now))
+
+
+@jit
+def propagate(w: int, d: int, plan: Any, c: int, e: int) -> None:
+    """The integrals so far, as they contribute two internal steps later."""
+    modes = plan.modes
+    for p in range(plan.degree):
+        for k in range(0, modes, 8):
+            at = plan.total + p * modes + k
+            half = product(c, plan.e + k, e, get(w, at, d))
+            put(w, at, d, product(c, plan.e + k, e, half))
+
+
 @cached_njit(*SOURCES)
 def integrals(
     spectra: Array, actions: Array, ends: Array, found: Array, plans: NDArray[np.void]
 ) -> None:
-    """Write the integrals of powers over a sampling time, on paths bent to `ends`, (P, M, 2, modes)."""
+    """Write the integrals of powers over a sampling time, on paths bent to `ends`, (P, M, 2, modes).
+
+    By Simpson's rule, exponentially weighted, over an even number of internal steps. Turns `ends` into
+    what the paths miss them by.
+    """
     plan = plans[0]
     w, d, c, e = plan.scratch, plan.scratch_apart, plan.constants, plan.constants_apart
     modes, steps = plan.modes, plan.steps
@@ -303,22 +329,22 @@ def integrals(
         for k in range(0, modes, 8):  # by how much the end is missed
             end, reached = get(w, plan.covector + k, d), get(w, plan.x + k, d)
             put(w, plan.covector + k, d, minus(end, reached))
+        for at in range(0, plan.degree * modes, 8):
+            put(w, plan.total + at, d, (splat(0.0), splat(0.0)))
         for n in range(steps + 1):
             share, path = splat(n / steps), plan.path + n * modes
             for k in range(0, modes, 8):
                 x, miss = get(w, path + k, d), get(w, plan.covector + k, d)
                 put(w, plan.x + k, d, (fma(share, miss[0], x[0]), fma(share, miss[1], x[1])))
             powers(w, d, plan, c, e)
-            for p in range(plan.degree):
-                for k in range(0, modes, 8):
-                    at = p * modes + k
-                    now, total = get(w, plan.now + at, d), (splat(0.0), splat(0.0))
-                    if n:  # the exponential trapezoidal rule
-                        total = product(c, plan.e + k, e, get(w, plan.total + at, d))
-                        total = plus_product(total, c, plan.weight_now + k, e, now)
-                        before = get(w, plan.before + at, d)
-                        total = plus_product(total, c, plan.weight_before + k, e, before)
-                    put(w, plan.total + at, d, total)
-                    put(w, plan.before + at, d, now)
+            if n % 2:
+                accumulate(plan.weight_middle, w, d, plan, c, e)
+            else:
+                if n:
+                    accumulate(plan.weight_end, w, d, plan, c, e)
+                if n < steps:
+                    propagate(w, d, plan, c, e)
+                    accumulate(plan.weight_begin, w, d, plan, c, e)
+        from_scratch(ends[i], plan.covector, w, d)
         for p in range(plan.degree):
             from_scratch(found[p, i], plan.total + p * modes, w, d)

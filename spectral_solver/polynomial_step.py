@@ -80,8 +80,11 @@ class PolynomialStep:
         plan["multipliers"] = rows(equation.multipliers)
         plan["polynomials"] = constants.add(equation.polynomials)
         plan["slopes"] = constants.add(equation.polynomials * np.arange(2, degree + 1))
-        phi1, phi2 = phi_functions(equation.linear * h)
-        plan["weight_before"], plan["weight_now"] = rows(h * (phi1 - phi2)), rows(h * phi2)
+        # Of the parabola through what is integrated at the ends and in the middle of two steps.
+        phi1, phi2, phi3 = phi_functions(equation.linear * 2 * h)
+        plan["weight_begin"] = rows(2 * h * (phi1 - 3 * phi2 + 4 * phi3))
+        plan["weight_middle"] = rows(2 * h * (4 * phi2 - 8 * phi3))
+        plan["weight_end"] = rows(2 * h * (4 * phi3 - phi2))
         own = int(plan["modes"])
         size = lay_out(
             plan,
@@ -91,7 +94,7 @@ class PolynomialStep:
                 **dict.fromkeys(("next", "b", "c", "qf", "ff", "sum"), own),
                 **dict.fromkeys(("covector", "on_b", "on_c", "on_force"), own),
                 "power": fine,
-                **dict.fromkeys(("now", "before", "total"), degree * own),
+                **dict.fromkeys(("now", "total"), degree * own),
                 "path": (equation.steps + 1) * own,
                 "tape": 4 * equation.steps * fine,
             },
@@ -123,16 +126,25 @@ class PolynomialStep:
             own[:, 0, self._last] *= 2.0
         return self.states(own), on_actions[:, :-1]
 
-    def integrals(self, states: Array, actions: Array, after: Array) -> NDArray[np.complex128]:
-        """int_0^1 exp(L (1 - s)) F[u(s)^p] ds, p = 1 .. P, (P, M, modes), F the mean of `spectra`.
+    def integrals(
+        self, states: Array, actions: Array, after: Array
+    ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+        """Integrals of exp(L (1 - s)) F[u(s)^p] over 0 < s < 1 along bent paths, and F of the bends.
 
-        u(s) is the path from the states under the actions, bent linearly in time so that it ends in
-        `after` (M, n_x).
+        u(s) is the path from the states (M, n_x) under the actions, bent linearly in time so that it
+        ends in `after` (M, n_x); p = 1 .. P; F is that of `spectra`. ValueError for an odd number of
+        internal steps.
+
+        Returns
+        -------
+        (P, M, modes), (M, modes)
         """
+        if self._equation.steps % 2:
+            raise ValueError(f"expected an even number of steps, got {self._equation.steps}")
         begin, end = self.spectra(states), self.spectra(after)
         found = np.empty((self._degree, *begin.shape))
         integrals(begin, _with_constant(actions), end, found, self._plans)
-        return _complex(found)
+        return _complex(found), _complex(end)
 
     def spectra(self, states: Array) -> Array:
         """Spectra (M, 2, modes), real and imaginary parts: the real FFT over the number of points."""
@@ -176,10 +188,12 @@ def fine_length(n_x: int, degree: int) -> int:
     return length
 
 
-def phi_functions(x: Spectrum) -> tuple[Spectrum, Spectrum]:
-    """phi_1 = (e^x - 1)/x and phi_2 = (e^x - 1 - x)/x^2, as means on a circle around x."""
+def phi_functions(x: Spectrum) -> tuple[Spectrum, Spectrum, Spectrum]:
+    """phi_j(x) = (e^x - sum_{i < j} x^i/i!)/x^j, j = 1, 2, 3, as means on a circle around x."""
     angles = 2 * np.pi * (np.arange(32) + 0.5) / 32
     radius = np.where(np.abs(x) < 1, 2.0, 0.5)
     r = x[:, None] + radius[:, None] * np.exp(1j * angles)
     e = np.exp(r)
-    return np.mean((e - 1) / r, axis=1), np.mean((e - 1 - r) / r**2, axis=1)
+    values = (e - 1) / r, (e - 1 - r) / r**2, (e - 1 - r - r**2 / 2) / r**3
+    phi1, phi2, phi3 = (np.mean(value, axis=1) for value in values)
+    return phi1, phi2, phi3

@@ -1,44 +1,27 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Which model of the whole field to believe.
 
-Kinds are tried in the order of their unknowns. Each is fitted to every second rollout and judged by the
-error E of its prediction of the others, from their initial states. The first one with E of at most
-`reproduced` is taken, and else the best one, where a kind of more unknowns has to be `better` times
-better. The one that is taken is fitted to all rollouts.
+Each kind is fitted to some of the rollouts and judged by the error E of its prediction of the others,
+from their initial states, in turns. Of a single rollout these are pieces; where all points share their
+coefficients, it is the rollout that the kind was fitted to. The first kind with E of at most
+`reproduced` is taken; where there is none, the one of the fewest unknowns that is not `better` times
+worse than the best. It is then fitted to all rollouts.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from loop_interfaces.arrays import Array
-from loop_method.models.base import FieldModel, Measured, Samples
-from loop_method.models.finite_difference_fit import fit_finite_difference
-from loop_method.models.linear import fit_linear
-from loop_method.models.prediction import errors
+from loop_method.models.base import FieldModel, Law, Measured, Samples
+from loop_method.models.kinds import Kind, kinds_of
+from loop_method.models.prediction import errors, pieces
 from loop_method.models.settings import FieldModelSettings
-from loop_method.models.spectral_fit import Form, fit_spectral
 
-Fit = Callable[[Samples], FieldModel | None]
-
-FORMS = (
-    Form(name="poly3", degree=3),
-    Form(name="front2", degree=2, linear_order=2, shares=(8,)),
-    Form(name="poly2", degree=2),
-    Form(name="poly7", degree=7),
-    Form(name="semi2", degree=2, free="linear"),
-    Form(name="semi3", degree=3, free="linear"),
-    Form(name="free3", degree=3, free="all"),
-    Form(name="free2", degree=2, free="all"),
-)
-POINT_RIDGES = {"x-shared": None, "x1e-5": 1e-5, "x1e-7": 1e-7, "x1e-3": 1e-3}
-LINEAR_RIDGES = {"linear": 1e-6, "linear-r": 1e-4}
 FEWEST_SAMPLES = 4
 
 
@@ -50,16 +33,14 @@ class FittedModel:
     ----------
     model : FieldModel
     error : float
-        E of its kind, on rollouts that it was not fitted to where `held_out`.
+        E of its kind, the mean over rollouts that it was not fitted to.
     candidates : list of (kind, E)
         Those that were tried, in that order.
-    held_out : bool
     """
 
     model: FieldModel
     error: float
     candidates: list[tuple[str, float]]
-    held_out: bool
 
 
 def fit_field_model(
@@ -69,6 +50,7 @@ def fit_field_model(
     settings: FieldModelSettings | None = None,
     components: int = 1,
     noise: float = 0.0,
+    action_limit: float = 0.0,
     first: str | None = None,
 ) -> FittedModel | None:
     """The model of the whole field that predicts measured rollouts, or None where none can be fitted.
@@ -85,66 +67,89 @@ def fit_field_model(
         Fields that stand one after the other in a state.
     noise : float
         Standard deviation of the noise on every number of the states; 0 for none, or unknown.
+    action_limit : float
+        Magnitude at which actions saturate; 0 for none.
     first : str, optional
         Kind to be tried first, that of the last choice.
     """
     settings = settings or FieldModelSettings()
-    few = len(rollouts) < 2
-    fitted, judged = (rollouts, rollouts) if few else (rollouts[::2], rollouts[1::2])
-    kinds = _kinds(len(target), components, settings, few)
-    order = [k for k in kinds if k == first] + [k for k in kinds if k != first]
-    some, every = Samples.of(fitted), Samples.of(rollouts)
-    if len(every) < FEWEST_SAMPLES:
+    rollouts = [_limited(rollout, action_limit) for rollout in rollouts]
+    if len(Samples.of(rollouts)) < FEWEST_SAMPLES:
         return None
-    seen: list[tuple[str, float]] = []
+    kinds = kinds_of(len(target), components, settings)
+    kinds.sort(key=lambda kind: kind.name != first)
+    judged: dict[Kind, float] = {}
     with threadpool_limits(limits=1):  # a rounding must not depend on the machine's load
-        for kind in order:
-            model = _tried(kinds[kind], some)
-            found = errors(model, judged, target, settings.worst) if model else np.empty(0)
-            if found.size:
-                seen.append((kind, float(found.mean())))
-                if seen[-1][1] <= settings.reproduced:
+        for kind in kinds:
+            error = _error(kind, rollouts, target, settings, min(judged.values(), default=np.inf))
+            if error is not None:
+                judged[kind] = error
+                if error <= settings.reproduced:
                     break
-        if not seen:
+        if not judged:
             return None
-        least = min(error for _, error in seen)
-        enough = max(settings.reproduced, settings.better * least)
-        kind, error = next(pair for pair in seen if pair[1] <= enough)
-        model = _tried(kinds[kind], every)
-    return FittedModel(model, error, seen, not few) if model else None
+        enough = max(settings.reproduced, settings.better * min(judged.values()))
+        good = [kind for kind, error in judged.items() if error <= enough]
+        for kind in sorted(good, key=lambda kind: kind.unknowns):
+            model = _fitted(kind, rollouts)
+            if model is not None:
+                seen = [(kind.name, error) for kind, error in judged.items()]
+                return FittedModel(model, judged[kind], seen)
+    return None
 
 
-def _tried(fit: Fit, samples: Samples) -> FieldModel | None:
+def _error(
+    kind: Kind,
+    rollouts: Sequence[Measured],
+    target: Array,
+    settings: FieldModelSettings,
+    least: float,
+) -> float | None:
+    """E of a kind, its mean over the rollouts; None where there is nothing to fit or to judge.
+
+    least: that of the best kind so far. One that is far from it after the first turn gets no other.
+    """
+    # Coefficients that all points share are hardly fitted to a single rollout's accidents.
+    if len(rollouts) == 1 and kind.unknowns[0] > 0:
+        rollouts = pieces(rollouts[0], settings.folds)
+    folds = min(len(rollouts), settings.folds)
+    found: list[float] = []
+    for fold in range(folds):
+        others = [rollout for i, rollout in enumerate(rollouts) if i % folds != fold]
+        model = _fitted(kind, others or rollouts)
+        own = rollouts[fold::folds]
+        if model is None:
+            return None
+        found += errors(model, own, target, settings.worst).tolist()
+        if found and np.mean(found) > settings.hopeless * max(least, settings.reproduced):
+            break
+    return float(np.mean(found)) if found else None
+
+
+def _fitted(kind: Kind, rollouts: Sequence[Measured]) -> FieldModel | None:
     """A fit, or None where the data overflow it."""
+    samples = Samples.of(rollouts)
     if len(samples) < FEWEST_SAMPLES:
         return None
     try:
         with np.errstate(all="ignore"):
-            return fit(samples)
+            return kind.fit(samples)
     except (np.linalg.LinAlgError, ValueError, FloatingPointError):
         return None
 
 
-def _kinds(n_z: int, components: int, settings: FieldModelSettings, few: bool) -> dict[str, Fit]:
-    """The fits by kind, the fewest unknowns first."""
-    kinds: dict[str, Fit] = {}
-    if components == 1 and n_z >= 8:
-        for form in FORMS:
-            kinds[form.name] = partial(fit_spectral, form=form, settings=settings)
-    if n_z % components == 0 and n_z // components >= 3:
-        for kind, ridge in POINT_RIDGES.items():
-            own: dict[str, Any] = {
-                "kind": kind,
-                "settings": settings,
-                "components": components,
-                "ridge": ridge,
-            }
-            kinds[kind] = partial(fit_finite_difference, **own)
-        own = {"kind": "x5-shared", "settings": settings, "components": components, "degree": 5}
-        kinds["x5-shared"] = partial(fit_finite_difference, **own)
-    if n_z <= settings.dense:
-        for kind, ridge in LINEAR_RIDGES.items():
-            kinds[kind] = partial(fit_linear, kind=kind, ridge=ridge)
-    if few:  # a model of many unknowns reproduces what it is fitted to, whatever it is worth
-        kinds = {k: fit for k, fit in kinds.items() if k[:2] != "x1" and k[:6] != "linear"}
-    return kinds
+def _limited(rollout: Measured, limit: float) -> Measured:
+    """With the actions that act where they saturate."""
+    if not limit:
+        return rollout
+    law = rollout.law
+    return replace(
+        rollout,
+        actions=np.clip(rollout.actions, -limit, limit),
+        law=None if law is None else _saturated(law, limit),
+    )
+
+
+def _saturated(law: Law, limit: float) -> Law:
+    wrapped: Callable[[int, Array], Array] = lambda k, z: np.clip(law(k, z), -limit, limit)  # noqa: E731
+    return wrapped

@@ -23,9 +23,9 @@ LARGEST_RATE = (1.0, 1.0, 4.0)
 
 def fit_finite_difference(
     samples: Samples,
+    *,
     kind: str,
     settings: FieldModelSettings,
-    *,
     components: int = 1,
     ridge: float | None = None,
     degree: int = 3,

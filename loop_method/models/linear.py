@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from loop_interfaces.arrays import Array
 from loop_interfaces.jit.cache import cached_njit
@@ -80,7 +81,7 @@ def add_products(rows: Array, matrix: Array, totals: Array) -> None:
                 totals[m, j] += value * matrix[i, j]
 
 
-def fit_linear(samples: Samples, kind: str, ridge: float) -> LinearModel | None:
+def fit_linear(samples: Samples, *, kind: str, ridge: float) -> LinearModel | None:
     """Least squares on the change of the state.
 
     ridge: of normalised columns; those of the state have one unit, each input its own.
@@ -98,3 +99,42 @@ def fit_linear(samples: Samples, kind: str, ridge: float) -> LinearModel | None:
         return None
     A, B = np.eye(n_z) + found[:n_z].T, found[n_z : n_z + n_a].T
     return LinearModel(kind, *(np.ascontiguousarray(x) for x in (A, B, found[-1])))
+
+
+def fit_convolution(
+    samples: Samples, *, kind: str, ridge: float, components: int
+) -> LinearModel | None:
+    """Least squares where A is the same at every place of a ring: circulant blocks.
+
+    Each wavenumber has a regression of its own, of `components` unknowns beside the inputs.
+
+    ridge: of normalised columns.
+    """
+    count, n_z = samples.before.shape
+    n_x, n_a = n_z // components, samples.actions.shape[1]
+
+    def transformed(states: Array) -> NDArray[np.complex128]:
+        """(wavenumbers, N, components)"""
+        spectrum = np.fft.rfft(states.reshape(count, components, n_x))
+        return np.ascontiguousarray(spectrum.transpose(2, 0, 1))
+
+    columns, change = transformed(samples.before), transformed(samples.after - samples.before)
+    inputs = np.hstack([samples.actions, np.ones((count, 1))]).astype(complex)
+    columns = np.concatenate([columns, np.broadcast_to(inputs, (len(columns), *inputs.shape))], 2)
+    scale = np.sqrt(np.sum(np.abs(columns) ** 2, axis=1))
+    # Fields have one unit at all wavenumbers, as else each would be fitted to its rounding.
+    scale[:, :components] = np.sqrt(np.mean(scale[:, :components] ** 2, axis=0))
+    scale = np.where(scale > 0.0, scale, 1.0)[:, None]
+    columns = columns / scale
+    gram = columns.conj().transpose(0, 2, 1) @ columns + ridge * np.eye(columns.shape[2])
+    found = np.linalg.solve(gram, columns.conj().transpose(0, 2, 1) @ change)
+    found = found / scale.transpose(0, 2, 1)  # (wavenumbers, unknowns, components)
+    rows = np.fft.irfft(found, n_x, axis=0).transpose(2, 1, 0)  # (components, unknowns, n_x)
+    if not np.isfinite(rows).all():
+        return None
+    places = (np.arange(n_x)[:, None] - np.arange(n_x)) % n_x
+    A = np.block([[rows[i, j][places] for j in range(components)] for i in range(components)])
+    B = rows[:, components : components + n_a].transpose(0, 2, 1).reshape(n_z, n_a)
+    constant = rows[:, -1].ravel()
+    A = np.eye(n_z) + A
+    return LinearModel(kind, *(np.ascontiguousarray(x) for x in (A, B, constant)))

@@ -4,46 +4,81 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
 from loop_interfaces.arrays import Array
-from loop_method.models.base import FieldModel, Measured
+from loop_method.models.base import FieldModel, Law, Measured
 
 
-def predicted(model: FieldModel, rollout: Measured, steps: int) -> Array:
-    """z_0 .. z_steps from the measured z_0, under its law or else its actions.
+def predicted(model: FieldModel, rollouts: Sequence[Measured]) -> list[Array]:
+    """z_0 .. z_L of each rollout from its measured z_0, under its law or else its actions.
 
-    They may end in values that are not finite.
+    They end before the first state that is not finite.
     """
-    z = np.asarray(rollout.states[:1], dtype=np.float64)
-    states = np.full((steps + 1, z.shape[1]), np.inf)
-    states[0] = z[0]
+    z = np.array([rollout.states[0] for rollout in rollouts], dtype=np.float64)
+    steps = np.array([len(rollout.actions) for rollout in rollouts])
+    alive, found = steps > 0, [[state.copy()] for state in z]
     with np.errstate(all="ignore"):
-        for k in range(steps):
-            a = rollout.law(k, z) if rollout.law else rollout.actions[k : k + 1]
-            z = model.step(z, a)
-            if not np.isfinite(z).all():
+        for k in range(steps.max(initial=0)):
+            rows = np.flatnonzero(alive)
+            a = np.vstack([_action(rollouts[i], k, z[i : i + 1]) for i in rows])
+            z[rows] = model.step(z[rows], a)
+            for i in rows:
+                alive[i] = np.isfinite(z[i]).all() and k + 1 < steps[i]
+                if np.isfinite(z[i]).all():
+                    found[i].append(z[i].copy())
+            if not alive.any():
                 break
-            states[k + 1] = z[0]
-    return states
+    return [np.array(states) for states in found]
+
+
+def _action(rollout: Measured, k: int, z: Array) -> Array:
+    return rollout.actions[k : k + 1] if rollout.law is None else rollout.law(k, z)
 
 
 def errors(model: FieldModel, rollouts: Sequence[Measured], target: Array, worst: float) -> Array:
     """E = sum |error|^2 / sum |z - z_r|^2 of each rollout, at most `worst`.
 
-    Of a rollout that ends in values that are not finite, those before count.
+    Of a rollout that ends in values that are not finite, those before count; one without two states
+    that are finite is left out.
     """
-    found = []
-    for rollout in rollouts:
-        measured = np.asarray(rollout.states)
-        finite = np.append(np.isfinite(measured).all(axis=1), False)
-        steps = min(len(rollout.actions), int(np.argmin(finite)) - 1)
-        if steps < 1:
-            continue
-        measured = measured[: steps + 1]
-        with np.errstate(all="ignore"):
-            error = np.sum((predicted(model, rollout, steps) - measured) ** 2)
-            error = error / np.sum((measured - target) ** 2)
-        found.append(min(worst, float(np.nan_to_num(error, nan=worst, posinf=worst))))
-    return np.array(found)
+    kept = [short for rollout in rollouts if len((short := finite(rollout)).actions)]
+    found = np.full(len(kept), float(worst))
+    for i, (rollout, states) in enumerate(zip(kept, predicted(model, kept), strict=True)):
+        if len(states) == len(rollout.states):
+            with np.errstate(all="ignore"):
+                error = np.sum((states - rollout.states) ** 2)
+                relative = error / np.sum((rollout.states - target) ** 2)
+            found[i] = min(worst, float(np.nan_to_num(relative, nan=worst)))
+    return found
+
+
+def finite(rollout: Measured) -> Measured:
+    """The rollout up to the first value that is not finite, with one state more than actions."""
+    states, actions = np.asarray(rollout.states), np.asarray(rollout.actions)
+    good = int(np.argmin([*np.isfinite(states).all(axis=1), False]))
+    steps = min(int(np.argmin([*np.isfinite(actions).all(axis=1), False])), max(good - 1, 0))
+    return Measured(states[: steps + 1], actions[:steps], rollout.law)
+
+
+def pieces(rollout: Measured, count: int) -> list[Measured]:
+    """A rollout cut into so many parts of equal length, or fewer, each with the state at its end."""
+    steps = min(len(rollout.actions), len(rollout.states) - 1)
+    edges = [steps * part // count for part in range(count + 1)]
+    return [
+        Measured(
+            rollout.states[begin : end + 1], rollout.actions[begin:end], _later(rollout.law, begin)
+        )
+        for begin, end in pairwise(edges)
+        if end > begin
+    ]
+
+
+def _later(law: Law | None, steps: int) -> Law | None:
+    """The law from a step of its episode on."""
+    if law is None:
+        return None
+    whole = law
+    return lambda k, z: whole(k + steps, z)

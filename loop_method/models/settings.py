@@ -15,8 +15,10 @@ class FieldModelSettings:
     Attributes
     ----------
     passes : int
-        Times that an equation with shared coefficients is fitted, each along the paths of the last,
-        1 to 20.
+        Times that an equation is fitted along the paths of the last one, 1 to 20.
+    settled : float
+        Passes end where the error of a step of the plant changes by no more than this share, 0 to
+        0.1.
     samples : int
         Steps of the plant that it is fitted to, at most, at least 50.
     substeps : int
@@ -43,15 +45,21 @@ class FieldModelSettings:
         simulated rollout over the sum of |z - z_r|^2.
     better : float
         How many times smaller the E of a richer kind must be, 1 to 100.
+    folds : int
+        Turns in which rollouts are fitted and judged, at most, at least 2.
+    hopeless : float
+        How many times worse than the best one, or than `reproduced`, a kind gets no other turn, at
+        least 1.
     worst : float
         The E that counts for a model that diverges, at least 1.
     dense : int
         Largest state of models whose work grows with its square, at least 2.
     """
 
-    passes: int = 6
+    passes: int = 12
+    settled: float = 1e-3
     samples: int = 500
-    substeps: int = 24
+    substeps: int = 64
     first_substeps: int = 6
     reach: float = 1.5
     coefficient_ridge: float = 1e-9
@@ -62,6 +70,8 @@ class FieldModelSettings:
     point_substeps: int = 32
     point_reach: float = 2.5
     reproduced: float = 2e-3
-    better: float = 10.0
+    better: float = 3.0
+    folds: int = 3
+    hopeless: float = 20.0
     worst: float = 2.0
     dense: int = 512

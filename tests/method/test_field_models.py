@@ -14,7 +14,7 @@ from loop_method.models import Measured, affine_law
 from loop_method.models.files import model_of
 from loop_method.models.finite_difference import FiniteDifferenceModel, features_of
 from loop_method.models.linear import LinearModel
-from loop_method.models.prediction import errors, predicted
+from loop_method.models.prediction import errors, pieces, predicted
 from loop_method.models.spectral import SpectralModel
 
 
@@ -163,8 +163,19 @@ def test_a_model_predicts_itself_under_actions_and_under_a_law():
         z = model.step(z, actions[-1][None])
     whole = Measured(np.array([*states, z[0]]), np.array(actions))
     closed = Measured(np.array(states), np.array(actions), law)
-    assert np.array_equal(predicted(model, whole, 7), whole.states)
+    assert np.array_equal(predicted(model, [whole])[0], whole.states)
     assert errors(model, [whole, closed], np.zeros(10), 2.0).tolist() == [0.0, 0.0]
+
+
+def test_a_rollout_is_cut_into_pieces_that_keep_their_law():
+    def law(k, z):
+        return np.full((len(z), 1), float(k))
+
+    states, actions = np.arange(8.0)[:, None], np.arange(7.0)[:, None]
+    parts = pieces(Measured(states, actions, law), 3)
+    assert [part.states.ravel().tolist() for part in parts] == [[0, 1, 2], [2, 3, 4], [4, 5, 6, 7]]
+    for part in parts:
+        assert part.law(1, np.zeros((1, 1)))[0] == part.actions[1]
 
 
 def test_a_model_that_overflows_counts_as_the_worst():

@@ -1,0 +1,93 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""The kinds of models that are tried, in this order, and how many unknowns each has."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+from loop_method.models.base import FieldModel, Samples
+from loop_method.models.finite_difference import features_of
+from loop_method.models.finite_difference_fit import fit_finite_difference
+from loop_method.models.linear import fit_convolution, fit_linear
+from loop_method.models.settings import FieldModelSettings
+from loop_method.models.spectral_fit import fit_spectral
+from loop_method.models.symbols import Form
+
+FORMS = (
+    Form(name="poly3", degree=3),
+    Form(name="front2", degree=2, linear_order=2, shares=(8,)),
+    Form(name="poly2", degree=2),
+    Form(name="poly7", degree=7),
+    Form(name="nonlocal2", degree=2, hilbert=True),
+    Form(name="nonlocal3", degree=3, hilbert=True),
+    Form(name="semi2", degree=2, hilbert=True, free="linear"),
+    Form(name="semi3", degree=3, hilbert=True, free="linear"),
+    Form(name="free2", degree=2, free="all"),
+    Form(name="free3", degree=3, free="all"),
+)
+POINT_RIDGES = {"x-shared": None, "x1e-3": 1e-3, "x1e-5": 1e-5, "x1e-7": 1e-7}
+LINEAR_RIDGES = {"linear": 1e-6, "linear1e-4": 1e-4}
+FEWEST_POINTS = 8
+"""Of a spectral model."""
+
+
+@dataclass(frozen=True, eq=False)
+class Kind:
+    """A kind of model.
+
+    Attributes
+    ----------
+    name : str
+    fit : callable
+        The model of samples, or None.
+    unknowns : (float, int)
+        Those of each point or wavenumber, by which kinds are compared first, and those that all share.
+    """
+
+    name: str
+    fit: Callable[[Samples], FieldModel | None]
+    unknowns: tuple[float, int]
+
+
+def kinds_of(n_z: int, components: int, settings: FieldModelSettings) -> list[Kind]:
+    """The kinds for states of that size."""
+    kinds: list[Kind] = []
+    if components == 1 and n_z >= FEWEST_POINTS:
+        for form in FORMS:
+            fit = partial(fit_spectral, form=form, settings=settings)
+            kinds.append(Kind(form.name, fit, form.unknowns))
+    if components > 1 and n_z % components == 0 and n_z <= settings.dense:
+        fit = partial(fit_convolution, kind="convolution", ridge=1e-9, components=components)
+        kinds.append(Kind("convolution", fit, (float(components), 0)))
+    kinds += _finite_differences(n_z, components, settings)
+    if components == 1 and n_z % 2 == 0:  # two fields, of which nobody has told
+        kinds += _finite_differences(n_z, 2, settings, "two-")
+    if n_z <= settings.dense:
+        for name, ridge in LINEAR_RIDGES.items():
+            kinds.append(Kind(name, partial(fit_linear, kind=name, ridge=ridge), (n_z, 0)))
+    return kinds
+
+
+def _finite_differences(
+    n_z: int, components: int, settings: FieldModelSettings, prefix: str = ""
+) -> list[Kind]:
+    if n_z % components or n_z // components < 3:
+        return []
+    kinds = []
+    for degree, ridges in ((3, POINT_RIDGES), (5, {"x5-shared": None})):
+        count = components * len(features_of(components, degree))
+        for name, ridge in ridges.items():
+            fit = partial(
+                fit_finite_difference,
+                kind=prefix + name,
+                settings=settings,
+                components=components,
+                ridge=ridge,
+                degree=degree,
+            )
+            # What a ridge holds at zero counts as a part of an unknown; the order is what matters.
+            own = 0.0 if ridge is None else count * (0.5 if ridge > 1e-4 else 1.0)
+            kinds.append(Kind(prefix + name, fit, (own, count)))
+    return kinds
