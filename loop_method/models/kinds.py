@@ -55,9 +55,10 @@ def kinds_of(n_z: int, components: int, settings: FieldModelSettings) -> list[Ki
     """The kinds for states of that size."""
     kinds: list[Kind] = []
     if components == 1 and n_z >= FEWEST_POINTS:
-        for form in FORMS:
-            fit = partial(fit_spectral, form=form, settings=settings)
-            kinds.append(Kind(form.name, fit, form.unknowns))
+        kinds += [
+            Kind(form.name, partial(fit_spectral, form=form, settings=settings), form.unknowns)
+            for form in FORMS
+        ]
     if components > 1 and n_z % components == 0 and n_z <= settings.dense:
         fit = partial(fit_convolution, kind="convolution", ridge=1e-9, components=components)
         kinds.append(Kind("convolution", fit, (float(components), 0)))

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from loop_interfaces.arrays import Array
 from loop_method.models.base import FieldModel, Law, Measured
@@ -22,7 +23,7 @@ def predicted(model: FieldModel, rollouts: Sequence[Measured]) -> list[Array]:
     alive, found = steps > 0, [[state.copy()] for state in z]
     with np.errstate(all="ignore"):
         for k in range(steps.max(initial=0)):
-            rows = np.flatnonzero(alive)
+            rows = np.flatnonzero(alive).tolist()
             a = np.vstack([_action(rollouts[i], k, z[i : i + 1]) for i in rows])
             z[rows] = model.step(z[rows], a)
             for i in rows:
@@ -58,9 +59,13 @@ def errors(model: FieldModel, rollouts: Sequence[Measured], target: Array, worst
 def finite(rollout: Measured) -> Measured:
     """The rollout up to the first value that is not finite, with one state more than actions."""
     states, actions = np.asarray(rollout.states), np.asarray(rollout.actions)
-    good = int(np.argmin([*np.isfinite(states).all(axis=1), False]))
-    steps = min(int(np.argmin([*np.isfinite(actions).all(axis=1), False])), max(good - 1, 0))
+    steps = min(_leading(np.isfinite(actions)), max(_leading(np.isfinite(states)) - 1, 0))
     return Measured(states[: steps + 1], actions[:steps], rollout.law)
+
+
+def _leading(good: NDArray[np.bool_]) -> int:
+    """Rows that are good from the first on."""
+    return int(np.argmin(np.append(good.all(axis=1), False)))
 
 
 def pieces(rollout: Measured, count: int) -> list[Measured]:

@@ -140,7 +140,7 @@ def _regression(model: SpectralModel, samples: Samples, form: Form) -> Regressio
         symbols=model.symbols,
         y=(root * y)[ok],
         W=(root * W)[:, ok],
-        phi=phi,
+        phi=phi.astype(complex),
         common=common,
         free_of_common=orthonormal(common),
         miss=float(np.sqrt(np.mean(np.sum(np.abs(missed) ** 2, axis=1)))),

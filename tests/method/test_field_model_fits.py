@@ -16,7 +16,7 @@ from loop_method.models import FieldModelSettings, Measured, fit_field_model
 from loop_method.models.kinds import kinds_of
 from loop_method.models.prediction import errors
 from pde_sim_node.equations.random_modes import AllenCahnModes, BurgersModes, KortewegDeVriesModes
-from tests.plants import plant_of
+from tests.support.plants import plant_of
 
 N_Z, N_A = 64, 4
 WAVES = np.arange(N_Z // 2 + 1)
