@@ -28,6 +28,7 @@ import numpy as np
 
 from pdeloop.in_process import LocalPair, train
 from pdeloop.training_run import resolve
+from tests.support.interpreter import ROOT
 from tests.support.relay.train import FAULTS
 from tuner_node.build import build_training
 
@@ -164,7 +165,8 @@ class _Training:
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                env={**os.environ, MARK: str(self._out)},
+                # Nodes do not look for modules in the working directory; the relay is one of them.
+                env={**os.environ, MARK: str(self._out), "PYTHONPATH": str(ROOT)},
                 start_new_session=True,
                 preexec_fn=_hear_interruptions,
             )
