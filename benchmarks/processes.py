@@ -19,7 +19,7 @@ from typing import Any
 from loop_interfaces.isolation import loopback_environment
 from loop_interfaces.module_path import PROJECT, safe_environment
 from loop_interfaces.problem import find_problem
-from pdeloop.domain import own_domain
+from pdeloop.domain import given_domain, own_domain
 from pdeloop.supervisor import START, die_with, node_arguments
 
 ANSWER = 300.0
@@ -168,7 +168,10 @@ class Bench:
 @contextlib.contextmanager
 def bench() -> Iterator[Bench]:
     """Processes in a domain and a temporary folder of their own."""
-    with tempfile.TemporaryDirectory() as folder, own_domain() as domain:
+    given = given_domain()
+    # One that the user gave is reserved by the training that is measured, if one is.
+    held = own_domain() if given is None else contextlib.nullcontext(given)
+    with tempfile.TemporaryDirectory() as folder, held as domain:
         running = Bench(Path(folder), domain)
         try:
             yield running

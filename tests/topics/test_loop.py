@@ -135,7 +135,7 @@ def test_gains_beyond_what_the_topics_take_end_the_same_as_in_one_process(loop, 
 @pytest.mark.parametrize(
     ("node", "parameter", "words"),
     [
-        ("pde_sim_node", "n_z:=many", "'n_z' is 'many'; expected an even whole number"),
+        ("pde_sim_node", "n_z:=many", "'n_z' is 'many'; expected a whole number"),
         (
             "controller_node",
             "reduced_order:=-1",

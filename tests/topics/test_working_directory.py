@@ -45,6 +45,8 @@ WORDS: dict[str, tuple[str, ...]] = {
     "monitor": ("monitor", "--port", "0"),
     "reproduce": ("reproduce", str(SMALL), "--seeds", "1", "--iterations", "5", "--out", "paper"),
     "report": ("report", "run"),
+    "compare": ("compare", "run", "run"),
+    "export": ("export", "run", "--out", "law.npz"),
     "study": ("study", "study.yaml", "--out", "study"),
     "problems": ("problems",),
     "new": ("new", "my-pde"),
