@@ -11,7 +11,7 @@ from loop_interfaces.arrays import Array
 from loop_interfaces.frames import KEPT_ARRAY, Frame
 from loop_interfaces.protocol import ModelFailure, Publication
 from loop_interfaces.signature import design_digest, digest_of, signature
-from loop_interfaces.topics import COMPLETED, MODEL_IDENTIFIED, VOID, CostColumn
+from loop_interfaces.topics import COMPLETED, MODEL_IDENTIFIED, VOID, CostColumn, StartColumn
 
 
 class Exploration:
@@ -78,7 +78,8 @@ class Exploration:
         states = np.stack([known[k] for k in range(cost.step + 1)])
         actions = np.stack([self.actions(k) for k in range(cost.step)])
         try:
-            rows = design_each(states, actions, target, self._settings)
+            numbers = self._start.values[:, StartColumn.MODEL].astype(int).tolist()
+            rows = design_each(states, actions, numbers, target, self._settings)
         except ValueError as error:
             return self._failure(
                 f"{error} (The exploratory episode ended at step {cost.step}: if the horizon is "

@@ -132,6 +132,7 @@ def design(
     target: NDArray[np.float64],
     settings: DesignSettings,
     channels: Channels = NUMBERED,
+    further: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]] = (),
 ) -> ModelRows:
     """Reduce and design: a model from the trajectories, then the LQ-tracking gains.
 
@@ -145,6 +146,9 @@ def design(
         Method, order, which is lowered to the size of the state where that is smaller, and weights.
     channels : Channels
         Names of states and inputs in what is refused.
+    further : sequence of (states (N + 1, n_z), actions (N, n_a))
+        Other trajectories, for a model of the whole field alone: POD modes of several fields together
+        are those of none.
 
     Raises
     ------
@@ -166,20 +170,27 @@ def design(
     if settings.identification != "field":
         return rows
     with threadpool_limits(limits=1):  # as in the identification itself
-        return field_law(trajectories, target, rows, **weights) or rows
+        return field_law([*trajectories, *further], target, rows, **weights) or rows
 
 
 def design_each(
     states: NDArray[np.float64],
     actions: NDArray[np.float64],
+    numbers: Sequence[int],
     target: NDArray[np.float64],
     settings: DesignSettings,
 ) -> NDArray[np.float64]:
     """A design for each environment of an exploratory episode, as rows (M, rows, n_s); see `design`.
 
-    states (T + 1, M, n_z), actions (T, M, n_a), target (n_z,).
+    Environments of one model have one design in common.
+
+    states (T + 1, M, n_z), actions (T, M, n_a), target (n_z,); numbers (M,): which model each belongs
+    to.
     """
-    environments = range(actions.shape[1])
-    return np.stack(
-        [pack(design([(states[:, m], actions[:, m])], target, settings)) for m in environments]
-    )
+    found: dict[int, NDArray[np.float64]] = {}
+    for number in numbers:
+        if number not in found:
+            own = [m for m, other in enumerate(numbers) if other == number]
+            first, *further = [(states[:, m], actions[:, m]) for m in own]
+            found[number] = pack(design([first], target, settings, further=further))
+    return np.stack([found[number] for number in numbers])

@@ -51,15 +51,16 @@ class LocalPair:
 
     def run(self, batch: Batch, max_batch: int = 1024) -> BatchResult:
         """Roll the batch out. ValueError if exploration gives no model."""
+        most = max(max_batch // batch.together, 1) * batch.together
         parts = [
             self._episode(
                 Batch(
-                    batch.rows[i : i + max_batch],
-                    None if batch.policies is None else batch.policies[i : i + max_batch],
+                    batch.rows[i : i + most],
+                    None if batch.policies is None else batch.policies[i : i + most],
                     batch.trajectories,
                 )
             )
-            for i in range(0, len(batch.rows), max_batch)
+            for i in range(0, len(batch.rows), most)
         ]
         models = [part.models for part in parts if part.models is not None]
         return BatchResult(
@@ -91,7 +92,10 @@ class LocalPair:
             seen = cut(episode.states, episode.actions, table[:, CostColumn.ENDED])
         if not batch.exploratory:
             return BatchResult(table, trajectories=seen)
-        models = design_each(episode.states, episode.actions, self.plant.target, self._settings)
+        numbers = batch.rows[:, StartColumn.MODEL].astype(int).tolist()
+        models = design_each(
+            *(episode.states, episode.actions, numbers, self.plant.target, self._settings)
+        )
         return BatchResult(table, models, trajectories=seen)
 
     def law(self, batch: Batch) -> Law:

@@ -27,6 +27,8 @@ class Batch:
     rows: Array
     policies: Array | None
     trajectories: bool = False
+    together: int = 1
+    """Rows one after the other that one episode has to have."""
 
     @property
     def exploratory(self) -> bool:
@@ -81,6 +83,8 @@ class TrainingSettings:
     state_weight: float
     action_weight: float
     trajectories: bool
+    explorations: int = 1
+    """Rollouts of an exploration, from as many initial fields."""
     noise: bool = False
     """Whether rollouts get seeds of the plant's noise."""
     action_limit: float = 0.0

@@ -21,7 +21,7 @@ from tuner_node.batch import UNKNOWN_PLANT, TrainingSettings
 from tuner_node.dispatch import Dispatcher
 from tuner_node.exploration import least_variance
 from tuner_node.optimizer_parameters import kind_of, settings_of
-from tuner_node.rollouts import CHECK, EXPLORATION
+from tuner_node.rollouts import CHECK
 from tuner_node.run_folder import RunIdentity
 from tuner_node.training import Training
 
@@ -57,7 +57,9 @@ def read_model(path: Path, n_a: int) -> NDArray[np.float64]:
     return model
 
 
-def check_budget(values: Mapping[str, Any], kind: type[Optimizer], step: int) -> None:
+def check_budget(
+    values: Mapping[str, Any], kind: type[Optimizer], step: int, explorations: int = 1
+) -> None:
     """ParameterError unless the budget is given in one way and allows one step of the optimiser."""
     name, rollouts = values["optimizer"], values["rollouts"]
     if values["iterations"]:
@@ -73,7 +75,7 @@ def check_budget(values: Mapping[str, Any], kind: type[Optimizer], step: int) ->
         return
     parts = {}
     if kind.needs_trajectories or not values["model"]:
-        parts["for the exploration"] = EXPLORATION
+        parts["for the exploration"] = explorations
     if not values["model"] and values["identification_attempts"] > 1:
         parts["to check the first law"] = CHECK
     parts[f"for a step of the optimizer '{name}'"] = step
@@ -105,10 +107,11 @@ def build_training(values: Mapping[str, Any]) -> Training:
     ) -> Optimizer:
         return kind(policy, seed=seed, rollouts=rollouts, settings=chosen, context=context)
 
-    if sensors and kind.compares_first_law:
+    explorations = 1 if sensors else kind.explorations
+    if kind.judges_first_law or (sensors and kind.compares_first_law):
         values = {**values, "identification_attempts": 1}
     step = kind.first_step(chosen)
-    check_budget(values, kind, step)
+    check_budget(values, kind, step, explorations)
     given = {
         item.name: values[item.name] for item in fields(TrainingSettings) if item.name in values
     }
@@ -133,6 +136,7 @@ def build_training(values: Mapping[str, Any]) -> Training:
         **given,
         adaptation=kind.iteration_rollouts * values["iterations"],
         step=step,
+        explorations=explorations,
         trajectories=kind.needs_trajectories,
         noise=noisy(values),
     )

@@ -96,9 +96,9 @@ class Dispatcher:
 
     def assign(self, batch: Batch, now: float) -> list[PairPublication]:
         """Begin a batch; the previous one must be complete."""
-        count = len(batch.rows)
-        parts = max(-(-count // self.max_batch), min(len(self._present()), count), 1)
-        edges = np.linspace(0, count, parts + 1).astype(int).tolist()
+        count, most = len(batch.rows) // batch.together, max(self.max_batch // batch.together, 1)
+        parts = max(-(-count // most), min(len(self._present()), count), 1)
+        edges = (batch.together * np.linspace(0, count, parts + 1).astype(int)).tolist()
         self._batch = batch
         self._chunks = [Chunk(slice(a, b)) for a, b in itertools.pairwise(edges)]
         self._waiting = list(self._chunks)

@@ -15,8 +15,6 @@ from loop_method.adapt import Rollout
 from loop_method.seeds import Purpose, derive, evaluation_noise
 from tuner_node.batch import TrainingSettings
 
-EXPLORATION = 1
-"""Rollouts of an exploration."""
 CHECK = 2
 """Rollouts of a check: no control and the warm start, on one sampled field."""
 EVALUATED = ("none", "lqt", "adapted")
@@ -32,18 +30,20 @@ NOISE = {
 def explorations(
     settings: TrainingSettings, pending: Sequence[int], attempts: Sequence[int]
 ) -> Array:
-    """The rows of `episode/start` of an exploration for each of the m pending seeds, (m, 4).
+    """The rows of `episode/start` of the explorations of each of the m pending seeds, (m E, 4).
 
     pending: their indices; attempts: how often each of all seeds has explored before.
     """
+    E = settings.explorations
     rows = [
         (
-            derive(settings.all_seeds[m], Purpose.EXPLORATORY_FIELD, attempts[m]),
-            derive(settings.all_seeds[m], Purpose.EXCITATION, attempts[m]),
+            derive(settings.all_seeds[m], Purpose.EXPLORATORY_FIELD, number),
+            derive(settings.all_seeds[m], Purpose.EXCITATION, number),
             settings.exploration_variance,
             m,
         )
         for m in pending
+        for number in range(E * attempts[m], E * (attempts[m] + 1))
     ]
     return np.array(rows, dtype=np.float64)
 

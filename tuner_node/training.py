@@ -34,7 +34,7 @@ from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, TrainingSettings
 from tuner_node.budget import Budget
 from tuner_node.errors import ContradictionError
 from tuner_node.law_check import check_law
-from tuner_node.rollouts import CHECK, EVALUATED, EXPLORATION
+from tuner_node.rollouts import CHECK, EVALUATED
 
 OptimizerFactory = Callable[[Array, int, Context | None, int], Optimizer]
 """(warm-start policy, seed, context where trajectories are asked for, rollouts) -> optimiser."""
@@ -69,6 +69,8 @@ class Training:
     explorations: list[Trajectory | None] = field(default_factory=list)
     """The exploratory trajectory of every seed, where the optimiser wants trajectories."""
     target: Array | None = None
+    further: list[list[Trajectory]] = field(default_factory=list)
+    """The others, where an exploration has several rollouts."""
     measured: list[list[Record]] = field(default_factory=list)
     """The rollouts of every seed's checks, where the optimiser wants trajectories."""
     worse: list[bool] = field(default_factory=list)
@@ -79,6 +81,7 @@ class Training:
         self.pending = list(range(seeds))
         self.attempts = [0] * seeds
         self.explorations = [None] * seeds
+        self.further = [[] for _ in range(seeds)]
         self.measured = [[] for _ in range(seeds)]
         self.worse = [False] * seeds
         self.budget = Budget(seeds, settings.rollouts, settings.adaptation)
@@ -89,7 +92,8 @@ class Training:
         """The rollouts wanted now; the same at every call until `finish`. None: all is done."""
         if self.phase == "identify":
             rows = rollouts.explorations(self.settings, self.pending, self.attempts)
-            batch = Batch(rows, None, self.settings.trajectories)
+            together = self.settings.explorations
+            batch = Batch(rows, None, self.settings.trajectories, together)
         elif self.phase == "check":
             batch = batch_of(self._check_rollouts(), self.settings.trajectories)
         elif self.phase == "adapt":
@@ -120,13 +124,17 @@ class Training:
             assert result.models is not None
             remarks: list[dict[str, Any]] = []
             if result.trajectories is not None:
-                for m, trajectory in zip(self.pending, result.trajectories, strict=True):
-                    remarks += self._excitation(m, trajectory)
-                    self.explorations[m] = trajectory
+                seen = iter(result.trajectories)
+                for m in self.pending:
+                    first, *further = islice(seen, self.settings.explorations)
+                    remarks += self._excitation(m, first)
+                    self.explorations[m], self.further[m] = first, further
                 self.target = result.target
+            # A controller that knows no common exploration gives a model of each: the first is taken.
+            models = result.models[:: self.settings.explorations]
             if self.settings.model is not None:  # explored for the optimiser's sake
-                return remarks + self._given(result.models)
-            return remarks + self._identified(result.models)
+                return remarks + self._given(models)
+            return remarks + self._identified(models)
         if self.phase == "check":
             return self._checked(result)
         if self.phase == "adapt":
@@ -191,7 +199,7 @@ class Training:
             raise ValueError(f"expected {self.settings.seeds} models, got {len(models)}")
         else:
             self.models[self.pending] = models
-        self.budget.count("identify", self.pending)
+        self.budget.count("identify", np.repeat(self.pending, self.settings.explorations))
         rows = []
         for m, own in zip(self.pending, models, strict=True):
             model = model_rows.unpack(own, self.settings.n_a)
@@ -235,7 +243,7 @@ class Training:
                 f"the given model is of a state of {own} numbers, the plant's has {size}; "
                 "identify one of this plant"
             )
-        self.budget.count("identify", self.pending)
+        self.budget.count("identify", np.repeat(self.pending, self.settings.explorations))
         self._take_given_model(self.settings.model)
         return []
 
@@ -287,7 +295,7 @@ class Training:
         """Whether there are attempts left, and rollouts for another one and a step afterwards."""
         settings = self.settings
         return self.attempts[m] + 1 < settings.identification_attempts and self.budget.allows(
-            m, EXPLORATION + CHECK + settings.step
+            m, settings.explorations + CHECK + settings.step
         )
 
     def _start_adapting(self) -> None:
@@ -322,6 +330,7 @@ class Training:
             sensors=self.settings.sensors,
             actuator_positions=self.settings.actuator_positions,
             periodic=self.settings.periodic,
+            further=self.further[m],
         )
 
     def _asked(self) -> list[list[Rollout]]:

@@ -46,6 +46,8 @@ def arrays_of(training: Training) -> Arrays:
     for m, exploration in enumerate(training.explorations):
         if exploration is not None:
             arrays |= trajectory_arrays(f"exploration{m}", exploration)
+        for i, other in enumerate(training.further[m]):
+            arrays |= trajectory_arrays(f"further{m}.{i}", other)
     for name in ("models", "target", "evaluation", "ended"):
         if (array := getattr(training, name)) is not None:
             arrays[name] = array
@@ -89,6 +91,8 @@ def _fill(training: Training, arrays: Arrays) -> None:
     for m in range(seeds):
         if f"exploration{m}.states" in arrays:
             training.explorations[m] = taken_trajectory(arrays, f"exploration{m}", n_z, n_a)
+        while (name := f"further{m}.{len(training.further[m])}") + ".states" in arrays:
+            training.further[m].append(taken_trajectory(arrays, name, n_z, n_a))
         while (name := f"measured{m}.{len(training.measured[m])}") + ".policy" in arrays:
             training.measured[m].append(taken_record(arrays, name, n_z, (n_a, None)))
     _check(training)

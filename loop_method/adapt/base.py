@@ -186,6 +186,10 @@ class Optimizer(Protocol):
     compares_first_law: ClassVar[bool] = False
     """Whether it compares the first law with no control itself where the state is that of few sensors,
     so that the plant is explored once and no law is checked before."""
+    judges_first_law: ClassVar[bool] = False
+    """Whether it does so always."""
+    explorations: ClassVar[int] = 1
+    """Rollouts of an exploration, from as many initial fields."""
     with_sensors: ClassVar[str] = ""
     """The optimiser in its place where the state is that of few sensors; empty: none."""
     iteration_rollouts: ClassVar[int] = 0

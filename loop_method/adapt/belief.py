@@ -6,12 +6,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Context, Record
 from loop_method.adapt.closed_loop import ClosedLoop
-from loop_method.models import FieldModel, FittedModel, Measured, fit_field_model
+from loop_method.models import FieldModel, FittedModel, Measured, affine_law, fit_field_model
 
 MOST_COMPONENTS = 2
 """Fields one after the other in a state, as many as are tried."""
@@ -58,8 +56,14 @@ def believe(
     rollouts = [_measured(context, record) for record in records if len(record.actions)]
 
     def fitted(components: int) -> FittedModel | None:
-        first = last.model.kind if last and last.components == components else None
-        return fit_field_model(rollouts, context.target, components=components, first=first)
+        return fit_field_model(
+            rollouts,
+            context.target,
+            components=components,
+            noise=context.noise,
+            action_limit=context.action_limit,
+            first=last.model.kind if last else None,
+        )
 
     counts = list(range(1, MOST_COMPONENTS + 1))
     if last is not None:
@@ -70,7 +74,8 @@ def believe(
             continue
         found = fitted(components)
         if found is not None and (best is None or found.error < best.error):
-            best = Belief(found.model, found.error, components)
+            two = found.model.kind.startswith("two-")
+            best = Belief(found.model, found.error, 2 if two else components)
         if best is not None and best.error <= enough:
             break
     return best
@@ -81,13 +86,7 @@ def _measured(context: Context, record: Record) -> Measured:
     explored = not record.policy.any()  # of no control too the actions say everything
     if explored or context.noise:
         return Measured(record.states, record.actions)
-    n_s, limit = context.U.shape[1], context.action_limit
+    n_s = context.U.shape[1]
     K = record.policy[:, :n_s] @ context.U.T
     b = record.policy[:, n_s:] @ (context.U.T @ context.target)
-
-    def law(_: int, states: Array) -> Array:
-        # einsum: of each row by itself, where a matrix product rounds by the number of rows.
-        actions: Array = np.einsum("mi,ji->mj", states, K) + b
-        return np.clip(actions, -limit, limit) if limit else actions
-
-    return Measured(record.states, record.actions, law)
+    return Measured(record.states, record.actions, affine_law(K, b))

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -75,7 +76,10 @@ class ModelBased(Optimizer):
     name = "model_based"
     Settings = ModelBasedSettings
     needs_trajectories = True
+    judges_first_law = True
+    explorations = 2
     with_sensors = "gauss_newton"
+    preferences: ClassVar[Mapping[str, Any]] = {"identification": "field"}
 
     def __init__(
         self,

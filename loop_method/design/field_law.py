@@ -1,15 +1,16 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A first law from a model of the whole field, linearised at the target.
 
-POD modes of an exploratory episode are the directions in which the fields are large, and a law needs
-those that it senses: for an unstable plant these differ, as by the end of the episode the field is
-saturated. A model of the whole field (`loop_method.field_models`) that reproduces the episode is
-linearised at the target, with e = z - z_r,
+POD modes of an exploratory episode are the directions in which its fields are large, and a law needs
+those that it senses and those that other fields have: a plant that is unstable at its target is
+saturated by the end of the episode, and an episode begins with one field of many. A model of the whole
+field (`loop_method.models`) that predicts the episodes is linearised at the target, with e = z - z_r,
 
     e_{k+1} = A e_k + B a_k + d,        d = f(z_r, 0) - z_r,
 
 and the law a = K e + b that minimises the cost over the horizon senses no more than the n_a rows of K.
-They come first in U, and POD modes of what is left fill the other columns.
+They come first in U, and POD modes of what is left of simulated states, with that law and without
+control, fill the other columns. Where there is no room for more modes than rows, all are POD modes.
 
 References
 ----------
@@ -26,51 +27,43 @@ from scipy import linalg
 from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import ModelRows
 from loop_method.design.finite_horizon import finite_horizon
-from loop_method.field_models import FieldModel
-from loop_method.field_models.convolution import fit_convolutions
-from loop_method.field_models.differential import fit_differential
-from loop_method.reduce.reduced_model import Trajectory, leading_modes, pieces, steps_of
+from loop_method.models import FieldModel, FittedModel, Measured, affine_law, fit_field_model
+from loop_method.models.base import Law
+from loop_method.models.prediction import predicted
+from loop_method.reduce.reduced_model import Trajectory, pieces
 
 LARGEST = 512
 """Points of a field, at most: the work grows with their third power."""
 PIECES, REPRODUCED = 8, 0.05
-"""A model reproduces that many pieces of a trajectory, up to this share of sum |z - z_r|^2."""
-DEGREE, RIDGE = 3, 1e-5
-"""Of the convolution model."""
+"""A model predicts that many pieces of a trajectory, up to this share of sum |z - z_r|^2."""
+THINNING = 5
+"""One of so many simulated states is enough for the modes."""
+ROOM = 2
+"""Modes per actuator from which on the rows of K come first."""
 
 
-def reproducing(trajectories: Sequence[Trajectory], target: Array) -> FieldModel | None:
-    """The model of the whole field that reproduces pieces of the trajectories best, if well enough.
+def believed(
+    trajectories: Sequence[Trajectory], target: Array, components: int = 1
+) -> FittedModel | None:
+    """The model of the whole field that predicts the trajectories, if one does.
 
-    Each step counts relative to how much changes in it: saturated fields say little about the plant
-    near its target. Pieces, as a chaotic plant forgets where it began.
+    It is judged on every second piece of them, as a chaotic plant forgets where it began.
     """
-    data = steps_of(trajectories)
-    z, a, after = data.before, data.inputs, data.after
-    change = np.sum((after - z) ** 2, axis=1)
-    weights = 1.0 / np.maximum(change, 1e-12 * change.max())
-    forms = [(DEGREE, 1), (1, 2)] if len(target) % 2 == 0 else [(DEGREE, 1)]
-    models: list[FieldModel] = [fit_differential(z, a, after)]
-    for degree, components in forms:
-        models += fit_convolutions(
-            *(z, a, after, weights), degrees=[degree], ridges=[RIDGE], components=components
+    if len(target) > LARGEST:
+        return None
+    rollouts = [Measured(z, a) for z, a in pieces(trajectories, PIECES) if len(a)]
+    best: FittedModel | None = None
+    for count in (1, 2):
+        found = (
+            fit_field_model(rollouts, target, components=count)
+            if len(target) % count == 0
+            else None
         )
-    size = sum(float(np.sum((states - target) ** 2)) for states, _ in trajectories)
-    errors = np.zeros(len(models))
-    with np.errstate(over="ignore", invalid="ignore"):
-        for i, model in enumerate(models):
-            for states, actions in pieces(trajectories, PIECES):
-                errors[i] += np.sum((simulated(model, states[0], actions) - states) ** 2)
-    best = int(np.argmin(np.nan_to_num(errors, nan=np.inf)))  # a model may overflow
-    return models[best] if errors[best] <= REPRODUCED * size else None
-
-
-def simulated(model: FieldModel, z: Array, actions: Array) -> Array:
-    """z_0 .. z_N under given actions."""
-    states = [z]
-    for a in actions:
-        states.append(model.step(states[-1], a))
-    return np.array(states)
+        if found is not None and (best is None or found.error < best.error):
+            best = found
+        if best is not None and best.error <= REPRODUCED:
+            return best
+    return None
 
 
 def field_law(
@@ -97,40 +90,64 @@ def field_law(
     Returns
     -------
     ModelRows or None
-        With the linearised model on U. None where no model reproduces the trajectories, or where on the
+        With the linearised model on U. None where no model predicts the trajectories, or where on the
         one that does the other law costs no more, simulated from their initial fields.
     """
-    n_z, n_s = other.U.shape
-    model = reproducing(trajectories, target) if n_z <= LARGEST else None
-    if model is None:
+    fitted = believed(trajectories, target)
+    if fitted is None:
         return None
-    A = model.jacobians(target[None], np.eye(n_z))[0]
-    B = model.B
-    drift = model.step(target, np.zeros(B.shape[1])) - target
+    model, n_s = fitted.model, other.U.shape[1]
+    A, B = model.linearise(target, np.zeros(model.n_a))
+    drift = model.step(target[None], np.zeros((1, model.n_a)))[0] - target
+    if not all(np.isfinite(part).all() for part in (A, B, drift)):
+        return None
     horizon = max(len(actions) for _, actions in trajectories)
     K, b = finite_horizon(A, B, drift, state_weight, action_weight, horizon)
-    sensed = linalg.svd(K, full_matrices=False)[2][:n_s].T
-    U = sensed
-    if (rest := n_s - sensed.shape[1]) > 0:
-        after = steps_of(trajectories).after
-        U = np.hstack([sensed, leading_modes(after - after @ sensed @ sensed.T, rest)[0]])
+    if not (np.isfinite(K).all() and np.isfinite(b).all()):
+        return None
+    fields = [states[0] for states, _ in trajectories]
+    best = affine_law(K, b - K @ target)
+    none = affine_law(np.zeros_like(K), np.zeros_like(b))
+    visited = [states_under(model, law, z, horizon) for law in (best, none) for z in fields]
+    U = _basis(K, np.concatenate(visited)[::THINNING], target, n_s)
     K_a, s_r = K @ U, U.T @ target
     # Of the K_b with the wanted constant part the least; none where the target is outside of U.
     size = float(s_r @ s_r)
-    constant = b - K_a @ s_r
+    constant = b - K @ target
     K_b = np.outer(constant, s_r) / size if size > 0.0 else np.zeros_like(K_a)
-    law = ModelRows(A=U.T @ A @ U, B=U.T @ B, U=U, K_a=K_a, K_b=K_b, s_r=s_r)
+    rows = ModelRows(A=U.T @ A @ U, B=U.T @ B, U=U, K_a=K_a, K_b=K_b, s_r=s_r)
 
     def cost(rows: ModelRows) -> float:
+        law = affine_law(rows.K_a @ rows.U.T, rows.K_b @ rows.s_r)
         total = 0.0
-        with np.errstate(over="ignore", invalid="ignore"):
-            for states, actions in trajectories:
-                z = states[0]
-                for _ in actions:
-                    a = rows.K_a @ (z @ rows.U) + rows.K_b @ rows.s_r
-                    total += state_weight * np.sum((z - target) ** 2)
-                    total += action_weight * np.sum(a**2)
-                    z = model.step(z, a)
-        return float(total)
+        for z in fields:
+            states = states_under(model, law, z, horizon)
+            if len(states) < horizon:
+                return np.inf
+            total += state_weight * float(np.sum((states[:horizon] - target) ** 2))
+            total += action_weight * float(np.sum(law(0, states[:horizon]) ** 2))
+        return total
 
-    return law if cost(law) < np.nan_to_num(cost(other), nan=np.inf) else None
+    return rows if cost(rows) < cost(other) else None
+
+
+def states_under(model: FieldModel, law: Law, z: Array, horizon: int) -> Array:
+    """z_0 .. z_T of the model under a law, as long as they are finite."""
+    states = predicted(model, Measured(z[None], np.zeros((horizon, model.n_a)), law), horizon)
+    finite = np.append(np.isfinite(states).all(axis=1), False)
+    return states[: int(np.argmin(finite))]
+
+
+def _basis(K: Array, states: Array, target: Array, n_s: int) -> Array:
+    """U (n_z, n_s): the rows of K, and POD modes of the states and the target, so that there is a b."""
+    n_a, n_z = K.shape
+    weighted = np.vstack([states, np.sqrt(len(states)) * target])
+    sensed = np.empty((n_z, 0))
+    if n_s >= ROOM * n_a:
+        _, values, rows = linalg.svd(K, full_matrices=False)
+        sensed = rows[values > 1e-12 * max(values[0], 1e-300)].T
+    left = weighted - weighted @ sensed @ sensed.T
+    modes = linalg.svd(left.T, full_matrices=True)[0][:, : n_s - sensed.shape[1]]
+    basis, triangle = linalg.qr(np.hstack([sensed, modes]), mode="economic")
+    signed: Array = basis * np.where(np.diag(triangle) < 0.0, -1.0, 1.0)
+    return signed

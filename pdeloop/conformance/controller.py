@@ -136,7 +136,8 @@ class ControllerCheck(Check):
         """An exploratory episode. seeds: each row's excitation; lost: steps that are not published."""
         plant = plant or self.plant
         self.publish(TARGET, _target(plant))
-        start = self.new_start([(1, seed, variance(seed), 0) for seed in seeds])
+        # Each row has a model of its own: a controller may identify one from several rows of one model.
+        start = self.new_start([(1, seed, variance(seed), m) for m, seed in enumerate(seeds)])
         self.publish(START, start)
         z = [np.random.default_rng(seed).uniform(0.5, 1.5, plant.n_z) for seed in seeds]
         states, actions = [], []

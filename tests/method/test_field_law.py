@@ -8,32 +8,33 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from controller_node.identification import DesignSettings, design
-from loop_interfaces.model_rows import ModelRows
-from loop_method.design.field_law import field_law, reproducing
+from controller_node.identification import DesignSettings, design, design_each
+from loop_interfaces.model_rows import ModelRows, unpack
+from loop_method.design.field_law import believed, field_law, states_under
 from loop_method.design.finite_horizon import finite_horizon
-from loop_method.field_models.convolution import ConvolutionModel
+from loop_method.models import affine_law
+from loop_method.models.spectral import SpectralModel
 
 Array = np.ndarray
 N_Z, N_A, STEPS = 24, 3, 64
 Q, R = 1.0, 2.0
 
 
-def plant() -> ConvolutionModel:
+def plant() -> SpectralModel:
     """Waves up to the third grow until a cubic holds them; the actuators are blocks of the domain."""
     waves = np.arange(N_Z // 2 + 1)
-    linear = 1.1 * np.exp(-0.02 * waves**2)
-    symbols = np.stack([linear, 0.0 * linear, -0.1 + 0.0 * linear]).astype(complex)
+    linear = (0.1 - 0.02 * waves**2).astype(complex)
     B = 0.1 * np.kron(np.eye(N_A), np.ones((N_Z // N_A, 1))) * (np.arange(N_Z) % 3 > 0)[:, None]
-    return ConvolutionModel(symbols[:, None, None], B, np.zeros(N_Z))
+    one = np.ones((1, len(waves)), complex)
+    return SpectralModel("true", linear, one, np.array([[0.0, -0.1]]), B, np.zeros(N_Z), 2)
 
 
-def episode(model: ConvolutionModel, noise: float = 0.0) -> tuple[Array, Array]:
+def episode(model: SpectralModel, noise: float = 0.0) -> tuple[Array, Array]:
     rng = np.random.default_rng(3)
     states = [0.01 * rng.standard_normal(N_Z)]
     actions = 0.1 * rng.standard_normal((STEPS, N_A))
     for a in actions:
-        states.append(model.step(states[-1], a))
+        states.append(model.step(states[-1][None], a[None])[0])
     return np.array(states) + noise * rng.standard_normal((STEPS + 1, N_Z)), actions
 
 
@@ -41,7 +42,7 @@ def settings(identification: str) -> DesignSettings:
     return DesignSettings(N_A, 6, Q, R, identification=identification)
 
 
-def law(true: ConvolutionModel, target: Array) -> ModelRows:
+def law(true: SpectralModel, target: Array) -> ModelRows:
     """The field law, compared with no control."""
     trajectories = [episode(true)]
     other = design(trajectories, target, settings("regression"))
@@ -70,13 +71,13 @@ def test_is_the_recursion_of_riccati_over_the_horizon() -> None:
 def test_is_the_law_of_the_true_plant_linearised_at_the_target(size: float) -> None:
     true = plant()
     target = size * np.cos(2.0 * np.pi * np.arange(N_Z) / N_Z)
-    A = true.jacobians(target[None], np.eye(N_Z))[0]
-    drift = true.step(target, np.zeros(N_A)) - target
-    K, b = finite_horizon(A, true.B, drift, Q, R, STEPS)
+    A, B = true.linearise(target, np.zeros(N_A))
+    drift = true.step(target[None], np.zeros((1, N_A)))[0] - target
+    K, b = finite_horizon(A, B, drift, Q, R, STEPS)
     rows = law(true, target)
     np.testing.assert_allclose(rows.U.T @ rows.U, np.eye(6), atol=1e-12)
     assert np.linalg.norm(rows.K_a @ rows.U.T - K) < 0.01 * np.linalg.norm(K)
-    constant = (rows.K_a + rows.K_b) @ rows.s_r
+    constant = K @ target + rows.K_b @ rows.s_r
     np.testing.assert_allclose(constant, b if size else 0.0 * b, atol=0.01)
     np.testing.assert_allclose(rows.A, rows.U.T @ A @ rows.U, atol=0.01)
 
@@ -91,6 +92,42 @@ def test_gives_way_to_a_law_that_costs_no_more() -> None:
 def test_takes_the_regression_where_no_model_reproduces_the_episode() -> None:
     target = np.zeros(N_Z)
     noisy = [episode(plant(), noise=1.0)]
-    assert reproducing(noisy, target) is None
+    assert believed(noisy, target) is None
     rows, plain = (design(noisy, target, settings(name)) for name in ("field", "regression"))
     assert np.array_equal(rows.U, plain.U) and np.array_equal(rows.policy, plain.policy)
+
+
+def test_two_explorations_give_one_law_for_the_fields_of_both() -> None:
+    """Each begins with a wave that the other does not have; the law of both senses both."""
+    true, target = plant(), np.zeros(N_Z)
+    x = 2.0 * np.pi * np.arange(N_Z) / N_Z
+    trajectories = []
+    for wave in (1, 2):
+        states = [0.5 * np.cos(wave * x)]
+        actions = 0.02 * np.random.default_rng(wave).standard_normal((STEPS, N_A))
+        for a in actions:
+            states.append(true.step(states[-1][None], a[None])[0])
+        trajectories.append((np.array(states), actions))
+    states, actions = (np.stack(parts, axis=1) for parts in zip(*trajectories, strict=True))
+    one, same = design_each(states, actions, [4, 4], target, settings("field"))
+    assert np.array_equal(one, same)
+    rows = unpack(one, N_A)
+    ours = affine_law(rows.K_a @ rows.U.T, rows.K_b @ rows.s_r)
+    single = unpack(design_each(states, actions, [4, 5], target, settings("regression"))[0], N_A)
+    other = affine_law(single.K_a @ single.U.T, single.K_b @ single.s_r)
+    for z, _ in trajectories:
+        ends = [states_under(true, own, z[0], STEPS)[-1] for own in (ours, other)]
+        assert np.linalg.norm(ends[0]) < 0.5 * np.linalg.norm(z[-1])
+    assert np.linalg.norm(ends[0]) < np.linalg.norm(ends[1])
+
+
+def test_the_regression_is_that_of_the_first_exploration() -> None:
+    """Pooled, it is worse: the modes of one field are not those of another."""
+    true, target = plant(), np.zeros(N_Z)
+    parts = zip(episode(true), episode(true, noise=0.01), strict=True)
+    states, actions = (np.stack(part, axis=1) for part in parts)
+    one, both = (
+        design_each(states, actions, numbers, target, settings("regression"))[0]
+        for numbers in ([0, 1], [0, 0])
+    )
+    assert np.array_equal(one, both)

@@ -267,4 +267,4 @@ def test_the_controller_refuses_an_exploration_that_excites_nothing() -> None:
     for identification in ("regression", "field", "dmdc"):
         own = DesignSettings(**{**vars(settings), "identification": identification})
         with pytest.raises(ValueError, match="the input a2 never moved"):
-            design_each(states[:, None], actions[:, None], np.zeros(N_Z), own)
+            design_each(states[:, None], actions[:, None], [0], np.zeros(N_Z), own)

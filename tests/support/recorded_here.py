@@ -111,7 +111,10 @@ def _send_episode(
             sent(ACTION, episode, k, record.actions[k])
     sent(COST, episode, len(record.actions), record.costs.rows())
     if batch.exploratory:
-        models = design_each(record.states, record.actions, pair.plant.target, pair._settings)
+        numbers = batch.rows[:, 3].astype(int).tolist()
+        models = design_each(
+            *(record.states, record.actions, numbers, pair.plant.target, pair._settings)
+        )
         sent(MODEL_IDENTIFIED, episode, len(record.actions), models)
 
 

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Gauss-Newton over topics: a stranger on the topic of its trajectories' actions."""
+"""Optimisers that want trajectories, over topics; a stranger on the topic of their actions."""
 
 from __future__ import annotations
 
@@ -25,6 +25,17 @@ def test_actions_of_a_wrong_shape_with_the_right_ids_change_nothing(loop: Proces
     until(lambda: "expected an action of shape" in loop.output(plant), LIMIT, "refusal")
     assert int(loop.output(stranger).split()[-1]) > 100  # it had its say
     stranger.kill()
+
+
+def test_a_law_from_two_explorations_and_fresh_fields_is_that_of_one_process(
+    loop: Processes, tmp_path
+):
+    """Although at most one environment fits into an episode otherwise."""
+    out = tmp_path / "run"
+    start_pair(loop)
+    options = {"rollouts": 10, "optimizer": "model_based"}
+    loop.wait(start_tuner(loop, out, **options, max_batch=1), LIMIT)
+    assert_same_training(out, train_here(parameters(**options)))
 
 
 WRONG_SHAPES = """

@@ -10,11 +10,12 @@ import pytest
 
 from loop_interfaces.model_rows import unpack
 from loop_interfaces.topics import COMPLETED, CostColumn, StartColumn
+from loop_method.adapt import GaussNewton
 from loop_method.reduce.order import study_orders
 from pdeloop.in_process import LocalPair, train
 from tests.support.small import parameters, same_bits, train_here
 from tuner_node import checkpoint, training_state
-from tuner_node.batch import BatchResult
+from tuner_node.batch import Batch, BatchResult
 from tuner_node.build import build_training
 from tuner_node.errors import ContradictionError
 from tuner_node.narration import Narration
@@ -313,3 +314,66 @@ def test_an_exploration_whose_inputs_cannot_be_told_apart_is_refused_whoever_dre
     assert remark["event"] == "excitation" and "a1 and a2" in remark["remark"]
     assert rows[0]["event"] == "designed"
     assert Narration(0, 1).lines(remark) == [f"  seed 0: {remark['remark']}"]
+
+
+def test_model_based_explores_from_two_fields_for_one_model():
+    values = parameters(optimizer="model_based", rollouts=10, seeds=2, identification="field")
+    training = build_training(values)
+    batch = training.next_batch()
+    assert batch.exploratory and batch.together == 2
+    assert batch.rows[:, StartColumn.MODEL].tolist() == [0.0, 0.0, 1.0, 1.0]
+    for column in (StartColumn.SEED, StartColumn.EXCITATION):
+        assert len(set(batch.rows[:, column])) == 4
+    result = LocalPair(values).run(batch, max_batch=1)
+    assert same_bits(result.models[0], result.models[1]), "they are of both explorations"
+    assert not same_bits(result.models[0], result.models[2])
+    alone = LocalPair(values).run(Batch(batch.rows[:2], None, True, 2))
+    assert same_bits(alone.models[0], result.models[0]), "whatever else is in the batch"
+    training.finish(result)
+    assert training.phase == "adapt", "it judges the first law itself"
+    assert training.budget.paid.tolist() == [2, 2]
+    assert [len(further) for further in training.further] == [1, 1]
+    again = build_training(values)
+    training_state.restore(again, training_state.arrays_of(training))
+    for one, other in zip(training.further, again.further, strict=True):
+        assert same_bits(one[0].states, other[0].states)
+
+
+def test_a_controller_that_gives_each_exploration_a_model_of_its_own_goes_on_working():
+    """As one does that was written before there were several: the first one is taken."""
+    values = parameters(optimizer="model_based", rollouts=10)
+    training = build_training(values)
+    batch = training.next_batch()
+    own = [LocalPair(values).run(Batch(batch.rows[i : i + 1], None, True)) for i in range(2)]
+    models = np.concatenate([result.models for result in own])
+    assert not same_bits(models[0], models[1])
+    together = LocalPair(values).run(batch)
+    training.finish(replace(together, models=models))
+    assert same_bits(training.models, models[:1])
+
+
+def test_model_based_continues_with_the_same_bits_from_any_batch():
+    values = parameters(optimizer="model_based", rollouts=10, identification="field")
+    whole = build_training(values)
+    pair, states = LocalPair(values), []
+    train(
+        whole,
+        pair,
+        lambda row: None,
+        after_batch=lambda: states.append(training_state.arrays_of(whole)),
+    )
+    assert whole.budget.paid.tolist() == [10]
+    for state in states[:-1]:
+        again = build_training(values)
+        training_state.restore(again, state)
+        train(again, LocalPair(values), lambda row: None)
+        assert same_bits(again.policies(), whole.policies())
+        assert again.history == whole.history
+    assert whole.history[-1]["reason"]
+
+
+def test_model_based_with_few_sensors_is_gauss_newton():
+    values = parameters(optimizer="model_based", rollouts=10, sensors=8)
+    assert build_training(values).next_batch().together == 1
+    (kind,) = {type(optimizer) for optimizer in train_here(values).optimizers}
+    assert kind is GaussNewton
