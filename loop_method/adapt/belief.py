@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Context, Record
 from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.models import FieldModel, FittedModel, Measured, affine_law, fit_field_model

@@ -108,7 +108,7 @@ def field_law(
     fields = [states[0] for states, _ in trajectories]
     best = affine_law(K, b - K @ target)
     none = affine_law(np.zeros_like(K), np.zeros_like(b))
-    visited = [states_under(model, law, z, horizon) for law in (best, none) for z in fields]
+    visited = [z for law in (best, none) for z in states_under(model, law, fields, horizon)]
     U = _basis(K, np.concatenate(visited)[::THINNING], target, n_s)
     K_a, s_r = K @ U, U.T @ target
     # Of the K_b with the wanted constant part the least; none where the target is outside of U.
@@ -120,8 +120,7 @@ def field_law(
     def cost(rows: ModelRows) -> float:
         law = affine_law(rows.K_a @ rows.U.T, rows.K_b @ rows.s_r)
         total = 0.0
-        for z in fields:
-            states = states_under(model, law, z, horizon)
+        for states in states_under(model, law, fields, horizon):
             if len(states) < horizon:
                 return np.inf
             total += state_weight * float(np.sum((states[:horizon] - target) ** 2))
@@ -131,11 +130,10 @@ def field_law(
     return rows if cost(rows) < cost(other) else None
 
 
-def states_under(model: FieldModel, law: Law, z: Array, horizon: int) -> Array:
-    """z_0 .. z_T of the model under a law, as long as they are finite."""
-    states = predicted(model, Measured(z[None], np.zeros((horizon, model.n_a)), law), horizon)
-    finite = np.append(np.isfinite(states).all(axis=1), False)
-    return states[: int(np.argmin(finite))]
+def states_under(model: FieldModel, law: Law, fields: Sequence[Array], horizon: int) -> list[Array]:
+    """z_0 .. z_T of the model under a law from each field, as long as they are finite."""
+    nothing = np.zeros((horizon, model.n_a))
+    return predicted(model, [Measured(z[None], nothing, law) for z in fields])
 
 
 def _basis(K: Array, states: Array, target: Array, n_s: int) -> Array:

@@ -116,7 +116,7 @@ def test_two_explorations_give_one_law_for_the_fields_of_both() -> None:
     single = unpack(design_each(states, actions, [4, 5], target, settings("regression"))[0], N_A)
     other = affine_law(single.K_a @ single.U.T, single.K_b @ single.s_r)
     for z, _ in trajectories:
-        ends = [states_under(true, own, z[0], STEPS)[-1] for own in (ours, other)]
+        ends = [states_under(true, own, [z[0]], STEPS)[0][-1] for own in (ours, other)]
         assert np.linalg.norm(ends[0]) < 0.5 * np.linalg.norm(z[-1])
     assert np.linalg.norm(ends[0]) < np.linalg.norm(ends[1])
 
