@@ -31,6 +31,7 @@ PROGRAMS = {
     "train": "a whole training: topics against in-process",
     "realtime": "jitter and missed deadlines at P1's 20 Hz and at 1 kHz",
     "baselines": "optimisers and methods of others at equal rollouts, with intervals over seeds",
+    "field_models": "which model of the whole field is believed, and how well it predicts",
     "general": "held-out plants and initial fields: first law, adapted law and what is possible",
     "optimum": "what the policy class and any controller at all could reach, by exact gradients",
     "overhead": "how much a recorder, a viewer or an open page of pdeloop monitor slows the loop",

@@ -15,7 +15,7 @@ from controller_node.policy import ProjectedLaw
 from loop_interfaces.model_rows import ModelRows, pack
 from loop_interfaces.parameters import model_order
 from loop_method.design import lqt
-from loop_method.design.field_law import field_law
+from loop_method.design.field_law import FieldLaw, field_law
 from loop_method.reduce import dmdc, regression
 from loop_method.reduce.channels import NUMBERED, Channels
 from loop_method.reduce.identifiability import Identifiability, examine
@@ -127,6 +127,14 @@ def check_sizes(settings: DesignSettings, state_size: int, steps: int) -> None:
         regression.check_sizes(n_s, n_a, steps)
 
 
+@dataclass(frozen=True, eq=False)
+class Designed:
+    """A law, and of the identification "field" what came of a model of the whole field."""
+
+    rows: ModelRows
+    field: FieldLaw | None = None
+
+
 def design(
     trajectories: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]],
     target: NDArray[np.float64],
@@ -134,6 +142,17 @@ def design(
     channels: Channels = NUMBERED,
     further: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]] = (),
 ) -> ModelRows:
+    """The law of `designed`."""
+    return designed(trajectories, target, settings, channels, further).rows
+
+
+def designed(
+    trajectories: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]],
+    target: NDArray[np.float64],
+    settings: DesignSettings,
+    channels: Channels = NUMBERED,
+    further: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]] = (),
+) -> Designed:
     """Reduce and design: a model from the trajectories, then the LQ-tracking gains.
 
     Parameters
@@ -168,9 +187,10 @@ def design(
     s_r = ProjectedLaw([model.U], target).reduced_targets[0]
     rows = ModelRows(A=model.A, B=model.B, U=model.U, K_a=gains.K_a, K_b=gains.K_b, s_r=s_r)
     if settings.identification != "field":
-        return rows
+        return Designed(rows)
     with threadpool_limits(limits=1):  # as in the identification itself
-        return field_law([*trajectories, *further], target, rows, **weights) or rows
+        found = field_law([*trajectories, *further], target, rows, **weights)
+    return Designed(found.rows if found.better and found.rows else rows, found)
 
 
 def design_each(

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from controller_node.identification import DesignSettings, design, examined, identify
+from controller_node.identification import DesignSettings, designed, examined, identify
 from loop_interfaces.arrays import Array
 from loop_interfaces.episodes import episode_name
 from loop_interfaces.files import write_atomically
@@ -31,6 +31,7 @@ from pdeloop.data_file import Measurements
 from pdeloop.identified_law import ClosedLoop, closed_loop
 
 if TYPE_CHECKING:
+    from loop_method.design.field_law import FieldLaw
     from pdeloop.bags.episodes import RecordedEpisode
 
 Trajectories = Sequence[tuple[Array, Array]]
@@ -44,7 +45,8 @@ class Identified:
 
     sources: which trajectories, by episode and environment or by file and number; study: the orders on
     held-out data, None where these are too few; determined: how well the data determine the model;
-    trajectory: the longest one; sample_time in s, None where it is not known; remarks: on the data.
+    trajectory: the longest one; sample_time in s, None where it is not known; remarks: on the data;
+    field: what came of a model of the whole field, of the identification "field".
     """
 
     model: ModelRows | ReducedModel
@@ -57,6 +59,7 @@ class Identified:
     sample_time: float | None = None
     channels: Channels = NUMBERED
     remarks: tuple[str, ...] = ()
+    field: FieldLaw | None = None
 
     @cached_property
     def closed_loop(self) -> ClosedLoop | None:
@@ -95,6 +98,7 @@ class Identified:
             "singular_values": [] if study is None else study.singular_values.tolist(),
             "orders": [] if study is None else study.rows(),
             "closed_loop": loop and loop.summary(),
+            "field_model": self.field and self.field.summary(),
         }
 
     def text(self) -> str:
@@ -124,6 +128,8 @@ class Identified:
             lines.append("  too few steps to hold some out: no order is suggested")
         else:
             lines += ["", self.study.text()]
+        if self.field is not None:
+            lines += ["", *self.field.text()]
         return "\n".join([*lines, "", *self._law_lines()])
 
     def _law_lines(self) -> list[str]:
@@ -258,8 +264,10 @@ def _identified(
     if target is None and given.get("identification") == "field":
         raise ParameterError("--identification field designs a law for a target: give --target too")
     model: ModelRows | ReducedModel
+    field: FieldLaw | None = None
     if target is not None:
-        model = design(trajectories, target, settings, channels)
+        found = designed(trajectories, target, settings, channels)
+        model, field = found.rows, found.field
     else:
         truncated = method == "dmdc"
         model = identify(
@@ -280,6 +288,7 @@ def _identified(
         values.get("sample_time"),
         channels,
         remarks,
+        field,
     )
 
 
@@ -287,7 +296,8 @@ def save(found: Identified, path: Path) -> None:
     """Write the model as an .npz archive.
 
     A, B, U, with a target also K_a, K_b, s_r and `model`, the rows of the topic; sample_time and the
-    names of the channels where they are known.
+    names of the channels where they are known; the arrays of a model of the whole field, with `field_`
+    in front of their names.
     """
     model = found.model
     arrays: dict[str, Any] = {name: getattr(model, name) for name in model.__dataclass_fields__}
@@ -298,6 +308,9 @@ def save(found: Identified, path: Path) -> None:
     for name in ("states", "inputs"):
         if names := getattr(found.channels, name):
             arrays[name] = np.array(names)
+    if found.field is not None and found.field.fitted is not None:
+        own = found.field.fitted.model.arrays()
+        arrays |= {f"field_{name}": values for name, values in own.items()}
     content = BytesIO()
     np.savez(content, **arrays)
     try:

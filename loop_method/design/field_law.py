@@ -20,6 +20,8 @@ Anderson, Moore, "Optimal Control: Linear Quadratic Methods", chapter 4.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import linalg
@@ -42,28 +44,80 @@ ROOM = 2
 """Modes per actuator from which on the rows of K come first."""
 
 
-def believed(
-    trajectories: Sequence[Trajectory], target: Array, components: int = 1
-) -> FittedModel | None:
-    """The model of the whole field that predicts the trajectories, if one does.
+@dataclass(frozen=True, eq=False)
+class FieldLaw:
+    """What came of a model of the whole field.
 
-    It is judged on every second piece of them, as a chaotic plant forgets where it began.
+    Attributes
+    ----------
+    fitted : FittedModel or None
+        The model with its error, and the errors of all kinds; None where none can be fitted.
+    rows : ModelRows or None
+        Its law, with the linearised model on U; None where the model is not believed.
+    cost, other_cost : float
+        Mean stage costs that the model predicts from the initial fields of the trajectories, of its
+        law and of the law to compare with; infinite where there is none, or it runs away.
+    """
+
+    fitted: FittedModel | None
+    rows: ModelRows | None = None
+    cost: float = np.inf
+    other_cost: float = np.inf
+
+    @property
+    def better(self) -> bool:
+        """Whether its law is cheaper on the model than the other one."""
+        return self.rows is not None and self.cost < self.other_cost
+
+    def summary(self) -> dict[str, Any]:
+        """As data."""
+        fitted = self.fitted
+        return {
+            "kind": fitted and fitted.model.kind,
+            "error": fitted and fitted.error,
+            "candidates": [list(pair) for pair in fitted.candidates] if fitted else [],
+            "believed": self.rows is not None,
+            "predicted_cost": _number(self.cost),
+            "predicted_cost_of_regression": _number(self.other_cost),
+            "law": "field" if self.better else "regression",
+        }
+
+    def text(self) -> list[str]:
+        """For people."""
+        fitted = self.fitted
+        if fitted is None:
+            return ["no model of the whole field can be fitted: the law is that of the regression"]
+        lines = [
+            f"model of the whole field: {fitted.model.kind}, error {fitted.error:.2g} on pieces that it "
+            "was not fitted to",
+            f"  tried: {', '.join(f'{kind} {error:.2g}' for kind, error in fitted.candidates)}",
+        ]
+        if self.rows is None:
+            return [*lines, "  it is not believed: the law is that of the regression"]
+        taken = "its law is taken" if self.better else "the law of the regression is taken"
+        costs = (
+            f"{_cost(self.cost)} for its law, {_cost(self.other_cost)} for that of the regression"
+        )
+        return [*lines, f"  predicted mean stage cost {costs}: {taken}"]
+
+
+def _number(cost: float) -> float | None:
+    return cost if np.isfinite(cost) else None
+
+
+def _cost(cost: float) -> str:
+    return f"{cost:.4g}" if np.isfinite(cost) else "none, as it runs away,"
+
+
+def best_model(trajectories: Sequence[Trajectory], target: Array) -> FittedModel | None:
+    """The model of the whole field that predicts pieces of the trajectories best.
+
+    Pieces, as a chaotic plant forgets where it began.
     """
     if len(target) > LARGEST:
         return None
     rollouts = [Measured(z, a) for z, a in pieces(trajectories, PIECES) if len(a)]
-    best: FittedModel | None = None
-    for count in (1, 2):
-        found = (
-            fit_field_model(rollouts, target, components=count)
-            if len(target) % count == 0
-            else None
-        )
-        if found is not None and (best is None or found.error < best.error):
-            best = found
-        if best is not None and best.error <= REPRODUCED:
-            return best
-    return None
+    return fit_field_model(rollouts, target)
 
 
 def field_law(
@@ -73,8 +127,8 @@ def field_law(
     *,
     state_weight: float,
     action_weight: float,
-) -> ModelRows | None:
-    """A law from a model of the whole field, with as many modes as another has, if it is better.
+) -> FieldLaw:
+    """A law from a model of the whole field, with as many modes as another has.
 
     Parameters
     ----------
@@ -86,25 +140,22 @@ def field_law(
         The law to compare with.
     state_weight, action_weight : float
         q and r.
-
-    Returns
-    -------
-    ModelRows or None
-        With the linearised model on U. None where no model predicts the trajectories, or where on the
-        one that does the other law costs no more, simulated from their initial fields.
     """
-    fitted = believed(trajectories, target)
-    if fitted is None:
-        return None
+    fitted = best_model(trajectories, target)
+    if fitted is None or fitted.error > REPRODUCED:
+        return FieldLaw(fitted)
     model, n_s = fitted.model, other.U.shape[1]
     A, B = model.linearise(target, np.zeros(model.n_a))
     drift = model.step(target[None], np.zeros((1, model.n_a)))[0] - target
     if not all(np.isfinite(part).all() for part in (A, B, drift)):
-        return None
+        return FieldLaw(fitted)
     horizon = max(len(actions) for _, actions in trajectories)
-    K, b = finite_horizon(A, B, drift, state_weight, action_weight, horizon)
+    try:
+        K, b = finite_horizon(A, B, drift, state_weight, action_weight, horizon)
+    except (linalg.LinAlgError, ValueError):  # it grows beyond all bounds within the horizon
+        return FieldLaw(fitted)
     if not (np.isfinite(K).all() and np.isfinite(b).all()):
-        return None
+        return FieldLaw(fitted)
     fields = [states[0] for states, _ in trajectories]
     best = affine_law(K, b - K @ target)
     none = affine_law(np.zeros_like(K), np.zeros_like(b))
@@ -125,9 +176,9 @@ def field_law(
                 return np.inf
             total += state_weight * float(np.sum((states[:horizon] - target) ** 2))
             total += action_weight * float(np.sum(law(0, states[:horizon]) ** 2))
-        return total
+        return total / (horizon * len(fields))
 
-    return rows if cost(rows) < cost(other) else None
+    return FieldLaw(fitted, rows, cost(rows), cost(other))
 
 
 def states_under(model: FieldModel, law: Law, fields: Sequence[Array], horizon: int) -> list[Array]:

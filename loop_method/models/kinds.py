@@ -29,6 +29,8 @@ FORMS = (
 )
 POINT_RIDGES = {"x-shared": None, "x1e-3": 1e-3, "x1e-5": 1e-5, "x1e-7": 1e-7}
 LINEAR_RIDGES = {"linear": 1e-6, "linear1e-4": 1e-4}
+SIMPLEST = 4
+"""Forms of the fewest unknowns, the first ones."""
 FEWEST_POINTS = 8
 """Of a spectral model."""
 
@@ -59,24 +61,29 @@ def kinds_of(n_z: int, components: int, settings: FieldModelSettings) -> list[Ki
             Kind(form.name, partial(fit_spectral, form=form, settings=settings), form.unknowns)
             for form in FORMS
         ]
-    if components > 1 and n_z % components == 0 and n_z <= settings.dense:
-        fit = partial(fit_convolution, kind="convolution", ridge=1e-9, components=components)
-        kinds.append(Kind("convolution", fit, (float(components), 0)))
-    kinds += _finite_differences(n_z, components, settings)
-    if components == 1 and n_z % 2 == 0:  # two fields, of which nobody has told
-        kinds += _finite_differences(n_z, 2, settings, "two-")
+    kinds += _several_fields(n_z, components, settings)
+    if components == 1:  # two fields, of which nobody has told
+        two = _several_fields(n_z, 2, settings, "two-")
+        # Linear ones are tried early, as that is quick.
+        kinds[SIMPLEST:SIMPLEST] = [kind for kind in two if kind.name == "two-convolution"]
+        kinds += [kind for kind in two if kind.name != "two-convolution"]
     if n_z <= settings.dense:
         for name, ridge in LINEAR_RIDGES.items():
             kinds.append(Kind(name, partial(fit_linear, kind=name, ridge=ridge), (n_z, 0)))
     return kinds
 
 
-def _finite_differences(
+def _several_fields(
     n_z: int, components: int, settings: FieldModelSettings, prefix: str = ""
 ) -> list[Kind]:
+    """Kinds of fields that stand one after the other; `prefix` is that of their names."""
     if n_z % components or n_z // components < 3:
         return []
-    kinds = []
+    kinds: list[Kind] = []
+    if components > 1 and n_z <= settings.dense:
+        name = f"{prefix}convolution"
+        convolution = partial(fit_convolution, kind=name, ridge=1e-9, components=components)
+        kinds.append(Kind(name, convolution, (float(components), 0)))
     for degree, ridges in ((3, POINT_RIDGES), (5, {"x5-shared": None})):
         count = components * len(features_of(components, degree))
         for name, ridge in ridges.items():

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from controller_node.identification import DesignSettings, design, design_each
+from controller_node.identification import DesignSettings, design, design_each, designed
 from loop_interfaces.model_rows import ModelRows, unpack
-from loop_method.design.field_law import believed, field_law, states_under
+from loop_method.design.field_law import REPRODUCED, FieldLaw, field_law, states_under
 from loop_method.design.finite_horizon import finite_horizon
 from loop_method.models import affine_law
 from loop_method.models.spectral import SpectralModel
@@ -47,9 +47,9 @@ def law(true: SpectralModel, target: Array) -> ModelRows:
     trajectories = [episode(true)]
     other = design(trajectories, target, settings("regression"))
     none = replace(other, K_a=0.0 * other.K_a, K_b=0.0 * other.K_b)
-    rows = field_law(trajectories, target, none, state_weight=Q, action_weight=R)
-    assert rows is not None
-    return rows
+    found = field_law(trajectories, target, none, state_weight=Q, action_weight=R)
+    assert found.better and found.rows is not None
+    return found.rows
 
 
 def test_is_the_recursion_of_riccati_over_the_horizon() -> None:
@@ -86,13 +86,15 @@ def test_gives_way_to_a_law_that_costs_no_more() -> None:
     true, target = plant(), np.zeros(N_Z)
     best = law(true, target)
     again = field_law([episode(true)], target, best, state_weight=Q, action_weight=R)
-    assert again is None
+    assert again.rows is not None and not again.better
 
 
 def test_takes_the_regression_where_no_model_reproduces_the_episode() -> None:
     target = np.zeros(N_Z)
     noisy = [episode(plant(), noise=1.0)]
-    assert believed(noisy, target) is None
+    found = designed(noisy, target, settings("field")).field
+    assert found is not None and found.fitted is not None and found.rows is None
+    assert found.fitted.error > REPRODUCED and "not believed" in found.text()[-1]
     rows, plain = (design(noisy, target, settings(name)) for name in ("field", "regression"))
     assert np.array_equal(rows.U, plain.U) and np.array_equal(rows.policy, plain.policy)
 
@@ -131,3 +133,22 @@ def test_the_regression_is_that_of_the_first_exploration() -> None:
         for numbers in ([0, 1], [0, 0])
     )
     assert np.array_equal(one, both)
+
+
+def test_predicts_what_the_laws_cost_and_tells_of_the_choice() -> None:
+    true, target = plant(), np.zeros(N_Z)
+    regression = design([episode(true)], target, settings("regression"))
+    found = field_law([episode(true)], target, regression, state_weight=Q, action_weight=R)
+    assert found.rows is not None and found.fitted is not None
+    for rows, predicted in ((found.rows, found.cost), (regression, found.other_cost)):
+        z, total = episode(true)[0][:1], 0.0
+        for _ in range(STEPS):
+            a = z @ rows.U @ rows.K_a.T
+            total += Q * np.sum(z**2) + R * np.sum(a**2)
+            z = true.step(z, a)
+        assert predicted == pytest.approx(total / STEPS, rel=1e-2)
+    told, known = "\n".join(found.text()), found.summary()
+    assert all(kind in told for kind, _ in found.fitted.candidates)
+    assert ("its law is taken" in told) is found.better is (known["law"] == "field")
+    nothing = FieldLaw(None)
+    assert "regression" in nothing.text()[0] and nothing.summary()["predicted_cost"] is None
