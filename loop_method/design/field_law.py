@@ -37,7 +37,7 @@ from loop_method.reduce.reduced_model import Trajectory, pieces
 LARGEST = 512
 """Points of a field, at most: the work grows with their third power."""
 PIECES, REPRODUCED = 8, 0.05
-"""A model predicts that many pieces of a trajectory, up to this share of sum |z - z_r|^2."""
+"""A model predicts trajectories, or so many pieces of each, up to this share of sum |z - z_r|^2."""
 THINNING = 5
 """One of so many simulated states is enough for the modes."""
 ROOM = 2
@@ -88,8 +88,8 @@ class FieldLaw:
         if fitted is None:
             return ["no model of the whole field can be fitted: the law is that of the regression"]
         lines = [
-            f"model of the whole field: {fitted.model.kind}, error {fitted.error:.2g} on pieces that it "
-            "was not fitted to",
+            f"model of the whole field: {fitted.model.kind}, error {fitted.error:.2g} in "
+            "predicting the data",
             f"  tried: {', '.join(f'{kind} {error:.2g}' for kind, error in fitted.candidates)}",
         ]
         if self.rows is None:
@@ -110,14 +110,20 @@ def _cost(cost: float) -> str:
 
 
 def best_model(trajectories: Sequence[Trajectory], target: Array) -> FittedModel | None:
-    """The model of the whole field that predicts pieces of the trajectories best.
+    """The model of the whole field that predicts the trajectories best, or pieces of them.
 
     Pieces, as a chaotic plant forgets where it began.
     """
     if len(target) > LARGEST:
         return None
-    rollouts = [Measured(z, a) for z, a in pieces(trajectories, PIECES) if len(a)]
-    return fit_field_model(rollouts, target)
+    best: FittedModel | None = None
+    for parts in (trajectories, pieces(trajectories, PIECES)):
+        found = fit_field_model([Measured(z, a) for z, a in parts if len(a)], target)
+        if found is not None and (best is None or found.error < best.error):
+            best = found
+        if best is not None and best.error <= REPRODUCED:
+            break
+    return best
 
 
 def field_law(
