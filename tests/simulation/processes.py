@@ -86,8 +86,8 @@ def remembering() -> Iterator[None]:
     own_begin, own_propose = Proposer.__init__, Proposer.propose
     begun: WeakKeyDictionary[Proposer, Any] = WeakKeyDictionary()
 
-    def design(*args: Any) -> Any:
-        return _once(lambda: own_design(*args), args)
+    def design(*args: Any, **how: Any) -> Any:
+        return _once(lambda: own_design(*args, **how), (args, how))
 
     def begin(self: Proposer, *args: Any) -> None:
         own_begin(self, *args)
