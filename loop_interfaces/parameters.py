@@ -183,7 +183,7 @@ EXECUTION = _section(
 )
 """How plant and controller use the machine."""
 
-OPTIMIZER = Spec("optimizer", "gauss_newton", nodes="T", group="budget and method").means(
+OPTIMIZER = Spec("optimizer", "model_based", nodes="T", group="budget and method").means(
     "method of the adapt phase: a shipped or installed name; or code that the user has to allow, "
     "'package.module:Class' or 'path/to/file.py:Class'; its settings are 'optimizer_settings.*'"
 )

@@ -39,7 +39,7 @@ class ModelBasedSettings(Settings):
         0.0,
         1.0,
     )
-    mixtures: int = setting(24, "initial fields drawn around the measured ones", 2, 1000)
+    mixtures: int = setting(16, "initial fields drawn around the measured ones", 2, 1000)
     measured_share: float = setting(
         0.5, "weight of the measured fields against the drawn ones", 0.0, 1.0
     )
@@ -49,7 +49,7 @@ class ModelBasedSettings(Settings):
         5, "steps of L-BFGS that together have to gain the share least_gain", 1, 100
     )
     least_gain: float = setting(
-        2e-3, "share of the cost by which a window of steps has to lower it, to go on", 0.0, 1.0
+        0.01, "share of the cost by which a window of steps has to lower it, to go on", 0.0, 1.0
     )
     isotropy: float = setting(
         1e-3,

@@ -102,17 +102,20 @@ def test_an_optimiser_prefers_defaults_and_overrides_nothing() -> None:
     assert training_parameters("burgers", {"optimizer": "two-point"})["identification"] == "dmdc"
     given = {"optimizer": "two_point", "identification": "regression"}
     assert training_parameters("burgers", given)["identification"] == "regression"
-    assert training_parameters("burgers", {})["identification"] == "regression"
+    assert training_parameters("burgers", {})["identification"] == "field"
+    none = {"optimizer": "gauss_newton"}
+    assert training_parameters("burgers", none)["identification"] == "regression"
 
 
 def test_settings_are_parameters_of_the_training() -> None:
-    values = training_parameters("burgers", {"optimizer_settings": {"fields": 5}})
+    chosen = {"optimizer": "gauss_newton"}
+    values = training_parameters("burgers", {**chosen, "optimizer_settings": {"fields": 5}})
     assert values["optimizer_settings.fields"] == 5
     assert settings_of(GaussNewton, values) == GaussNewtonSettings(fields=5)
     assert build_training({**values, "rollouts": 13}).settings.step == 10
     with pytest.raises(ParameterError, match=r"at least 13: .*10 for a step"):
         build_training({**values, "rollouts": 12})
-    assert training_parameters("burgers", {})["optimizer_settings.fields"] == 3
+    assert training_parameters("burgers", chosen)["optimizer_settings.fields"] == 3
 
 
 @pytest.mark.parametrize(
@@ -128,7 +131,7 @@ def test_settings_are_parameters_of_the_training() -> None:
 )
 def test_settings_are_checked_before_anything_runs(options, words) -> None:
     with pytest.raises(ParameterError, match=words):
-        training_parameters("burgers", {"optimizer_settings": options})
+        training_parameters("burgers", {"optimizer": "gauss_newton", "optimizer_settings": options})
 
 
 def test_an_optimiser_without_settings_says_so() -> None:
