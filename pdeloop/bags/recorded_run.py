@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from controller_node.identification import DesignSettings, design
-from loop_interfaces import model_rows
+from controller_node.identification import DesignSettings, design_each
 from loop_interfaces.arrays import Array
 from loop_interfaces.episodes import EPISODES_PER_START
 from loop_interfaces.frames import Frame
@@ -213,10 +212,11 @@ class RecordedRun:
         if episode.model is not None and (costs[:, CostColumn.ENDED] == COMPLETED).all():
             assert self._values is not None
             settings = DesignSettings.of(self._values)
-            for env, model in enumerate(episode.model.values):
-                own = design([(states[:, env], actions[:, env])], plant.target, settings)
+            numbers = rows[:, StartColumn.MODEL].astype(int).tolist()
+            designed = design_each(states, actions, numbers, plant.target, settings)
+            for env, (model, own) in enumerate(zip(episode.model.values, designed, strict=True)):
                 text = f"model of {where}, environment {env}"
-                report.compare("rows of models", text, model, model_rows.pack(own))
+                report.compare("rows of models", text, model, own)
 
 
 class _Lost:

@@ -66,7 +66,6 @@ def test_the_readmes_three_terminals_train_and_say_where_the_results_are(
     shown = (tmp_path / "2.log").read_text()
     for words in (
         "seed 0: reduced model of order",
-        "seed 0: a rollout costs",
         "rollouts: cost",
         "mean stage cost after adaptation",
         "results in my_run",

@@ -141,7 +141,7 @@ def test_gains_beyond_what_the_topics_take_end_the_same_as_in_one_process(loop, 
             "reduced_order:=-1",
             "'reduced_order' is -1; expected a whole number from 0",
         ),
-        ("tuner_node", "rollouts:=3", "'rollouts' is 3; expected at least 9: 1 for"),
+        ("tuner_node", "rollouts:=3", "'rollouts' is 3; expected at least 6: 2 for"),
     ],
 )
 def test_a_node_refuses_a_bad_parameter_in_one_line(loop: Processes, node, parameter, words):
