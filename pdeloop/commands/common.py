@@ -58,9 +58,14 @@ def a_path(text: str) -> Path:
 
 _OWN_CODE = {
     "equation": "the problem's PDE",
-    "plant": "a plant in its place",
+    "plant": "a plant instead of an equation",
     "optimizer": "the method of the adapt phase",
 }
+
+
+def spellings(flag: str) -> tuple[str, ...]:
+    """A flag as the code spells it and, where that differs, as British English does."""
+    return tuple(dict.fromkeys((flag, flag.replace("optimizer", "optimiser"))))
 
 
 def add_own_code(
@@ -70,10 +75,10 @@ def add_own_code(
     for word in words:
         what = _OWN_CODE[word]
         parser.add_argument(
-            f"--{word}",
+            *spellings(f"--{word}"),
             metavar="NAME",
-            help=f"{what}; own code, 'file.py:Class' or 'package.module:Class', has to be named here, "
-            "too, as a file alone runs none",
+            help=f"{what}; code of your own, 'file.py:Class' or 'package.module:Class', has to be "
+            "named here as well, because a file alone never gets code executed",
         )
 
 
@@ -122,7 +127,7 @@ def add_flags(parser: argparse._ActionsContainer, group: str) -> None:
     for spec in flags(group):
         own = "the problem's, or " if spec in PROBLEM else ""
         action = parser.add_argument(
-            spec.flag,
+            *spellings(spec.flag),
             type=_word if spec.choices else str if spec.numbers else spec.type,
             choices=spec.choices or None,
             metavar=None if spec.choices else _METAVAR.get(spec.type, "X"),

@@ -83,3 +83,9 @@ def test_every_test_that_the_page_on_security_names_exists():
     named = re.findall(r"`(\w{12,})`\s+in\s+`tests/([\w/]+\.py)`", text)
     assert len(files) > 10 and len(named) >= 5
     assert all(has_test(file, part) for part, file in [*named, *(("", file) for file in files)])
+
+
+@pytest.mark.parametrize("flag", ["--optimizer", "--optimiser"])
+def test_a_flag_is_understood_in_both_spellings(flag: str) -> None:
+    options = pdeloop_parser().parse_args(["train", "burgers", flag, "two-point"])
+    assert options.optimizer == "two-point"
