@@ -4,7 +4,7 @@
 Subscribes  state, target, episode/start, policy, model, episode/cost
             episode/paused (for /diagnostics only)
 Publishes   action, model/identified, model/failed
-Messages, order and parameters: docs/interfaces.md. The protocol is controller_node.responder.
+Messages and their order: docs/protocol.md. The protocol is controller_node.responder.
 """
 
 import sys

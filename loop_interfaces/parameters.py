@@ -3,7 +3,7 @@
 
 A problem is one YAML file (loop_interfaces.spec), read unchanged by the three nodes
 (`--params-file`) and by the command line. The nodes declare from this table, the command line
-validates by it and docs/interfaces.md lists it. A parameter says itself which nodes take it
+validates by it and docs/parameters.md lists it. A parameter says itself which nodes take it
 (`nodes`) and under which heading of `pdeloop train --help` its flag stands (`group`), so that a new
 one is an entry here and its use. No ROS import.
 """
@@ -38,17 +38,17 @@ INSTRUMENTS = _section(
         "standard deviation of the noise on every number of the published state; 0: none"
     ),
     Spec("process_noise", 0.0, 0.0, 1e6, group="problem").means(
-        "intensity sigma of a white noise in space and time that forces the field: N(0, sigma^2 "
+        "intensity sigma of the white noise in space and time that forces the field: N(0, sigma^2 "
         "sample_time / dx) per step and grid point; 0: none"
     ),
     Spec("action_limit", 0.0, 0.0, 1e9, nodes="PCT", group="problem").means(
-        "largest magnitude of an action, which saturates there; 0: no limit"
+        "magnitude at which actions saturate; 0: no limit"
     ),
     Spec("sensors", 0, 0, 65536, group="problem").means(
-        "point sensors n_y, equally spaced, instead of the whole state; 0: the whole state"
+        "number n_y of equally spaced point sensors; 0: the whole state is measured"
     ),
     Spec("sensor_delays", 1, 1, 1024, group="problem").means(
-        "last measurements d of each sensor that the published state holds, if there are sensors"
+        "number d of successive measurements of each sensor in the published state"
     ),
 )
 """What stands between the field and its controller (docs/robustness.md)."""
@@ -56,8 +56,8 @@ INSTRUMENTS = _section(
 ACTUATORS = _section(
     "PT",
     Spec("actuator_positions", [], 0.0, 1.0, group="problem").means(
-        "centres of the n_a actuators as shares of L; none: n_x // n_a points apart, or as the "
-        "equation has them"
+        "centres of the n_a actuators as fractions of L; empty: n_x // n_a points apart, or where "
+        "the equation places them"
     ),
     Spec(
         "actuator_shape",
@@ -65,8 +65,8 @@ ACTUATORS = _section(
         choices=("equation", "indicator", "gaussian"),
         group="problem",
     ).means(
-        "shape of an actuator. indicator: 1 on its width; gaussian: its width is the standard "
-        "deviation; equation: as the equation has it, which is indicator unless it says otherwise"
+        "indicator: 1 on the actuator's width; gaussian: the width is the standard deviation; "
+        "equation: the equation's own shape, by default an indicator"
     ),
 )
 """Where the actuators are and how they act, if not as the equation has it."""
@@ -78,73 +78,72 @@ IDENTIFICATION = Spec(
     nodes="CT",
     group="budget and method",
 ).means(
-    "how the reduced model is identified. regression: least squares in reduced coordinates with the "
-    "inputs whole; field: a linearised model of the whole field, where its law is better; dmdc: the "
-    "paper's truncated DMDc, which the optimizers that learn from costs begin with"
+    "regression: least squares in reduced coordinates; field: a linearised model of the whole field, "
+    "where its law is better; dmdc: the paper's truncated DMDc, the default of optimizers that learn "
+    "from costs"
 )
 
 PROBLEM = _section(
     "PT",
     Spec("problem", "burgers", file_name=True, nodes="PCTV").means(
-        "name of the problem, used in messages and result folders"
+        "name of the problem, used in messages and for result folders"
     ),
     Spec("equation", "burgers").means(
-        "PDE of the plant: a shipped or installed name; or code that the user has to allow, "
+        "PDE of the plant: a shipped or installed name, or code that the user has to allow, "
         "'package.module:Class' or 'path/to/file.py:Class'"
     ),
     Spec("plant", "").means(
-        "plant of a user's own in place of an equation: an installed name; or code that the user has "
-        "to allow, 'path/to/file.py:Name' or 'package.module:Name', a class or function that makes it"
+        "your own plant instead of an equation: an installed name, or a class or function that the "
+        "user has to allow, 'path/to/file.py:Name' or 'package.module:Name'"
     ),
     Spec("grid", "", nodes="PTV").means(
-        "axes and components of the state, as JSON, which the plant says; empty: one periodic axis"
+        "axes and components of the state as JSON, filled in by the plant; empty: one periodic axis"
     ),
     Spec("length", 1.0, positive=True, unit="m", nodes="PTV").means(
         "length L of the periodic domain"
     ),
     Spec("n_z", 128, 1, 2**20).means(
-        "size of the state: the grid points, times the components; of an equation even, 8 or more"
+        "size of the state, grid points times components; for an equation even and at least 8"
     ),
-    Spec("n_a", 6, 1, 1024, nodes="PCT").means("actuators, the size of the action"),
+    Spec("n_a", 6, 1, 1024, nodes="PCT").means("number of actuators, the size of the action"),
     Spec("actuator_width", 0.15, positive=True, maximum=1).means(
-        "width of one actuator as a share of L"
+        "width of one actuator as a fraction of L"
     ),
     *ACTUATORS,
     Spec("sample_time", 0.05, positive=True, unit="s").means(
         "sampling time; the action is held over it"
     ),
     Spec("integration_time", 0.0025, positive=True, unit="s").means(
-        "internal step of the integrator; sample_time is a whole multiple of it"
+        "internal step of the integrator, of which sample_time is a whole multiple"
     ),
     Spec("horizon", 300, 1, 1_000_000, nodes="PTV").means("steps T of an episode"),
     Spec("state_weight", 1.0, positive=True, nodes="PCTV").means("q of Q = q I in the stage cost"),
     Spec("action_weight", 1.0, positive=True, nodes="PCTV").means("r of R = r I in the stage cost"),
     Spec("divergence_bound", 1e3, positive=True, maximum=1e6).means(
-        "an environment whose field exceeds this magnitude has diverged"
+        "magnitude of the field beyond which an environment has diverged"
     ),
     Spec("reduced_order", 4, 0, 1024, nodes="CT", group="budget and method").means(
-        "n_s, order of the reduced model, at most the size of the state; 0: as the exploratory "
-        "episode suggests, of one seed"
+        "order n_s of the reduced model, at most n_z; 0: the order that the exploratory episode "
+        "suggests (one seed only)"
     ),
     IDENTIFICATION,
     Spec("dmdc_rank", 0, 0, 4096, nodes="CT").means(
-        "p of the identification dmdc, rank of [Z; Y]; 0: n_s + n_a"
+        "rank p of [Z; Y] in the identification dmdc; 0: n_s + n_a"
     ),
     Spec("dmdc_order", 0, 0, 1024, nodes="CT").means(
-        "n_s of the identification dmdc; 0: reduced_order"
+        "order n_s in the identification dmdc; 0: reduced_order"
     ),
     Spec("exploration_variance", 0.1, positive=True, nodes="T").means(
-        "least variance of each exploratory action, drawn from N(0, variance); with "
-        "measurement_noise as much as B needs"
+        "variance of each exploratory action, raised as measurement_noise requires"
     ),
     Spec("learning_rate", 1e-4, positive=True, nodes="T").means(
-        "eta of the policy gradient from the LQT warm start"
+        "step size eta of two_point from the LQT warm start"
     ),
     Spec("learning_rate_from_zero", 1e-5, positive=True, nodes="T").means(
-        "eta of the policy gradient from zero"
+        "step size eta of two_point from zero gains"
     ),
     Spec("smoothing_radius", 0.1, positive=True, maximum=1e6, nodes="T").means(
-        "r, size of the two-point perturbation"
+        "radius r of the perturbation of two_point"
     ),
     *INSTRUMENTS,
 )
@@ -160,15 +159,17 @@ OF_THE_PLANT = (
 PLANT = _section(
     "P",
     Spec("action_timeout", 0.05, 0.001, 60.0, unit="s", live=True).means(
-        "silence after which the plant publishes its state again"
+        "time without an action after which the plant publishes its state again"
     ),
     Spec("max_repeats", 600, 1, 1_000_000, live=True).means(
-        "repeats of one state without an answer after which the episode is void"
+        "unanswered repeats of one state after which the episode is void"
     ),
     Spec("run_hold", 10.0, 0.1, 3600.0, unit="s", live=True).means(
-        "silence of a run's tuner after which another run may take the plant"
+        "silence of a run's tuner after which another run may take over the plant"
     ),
-    Spec("publish_clock", True).means("publish simulated time on /clock while somebody listens"),
+    Spec("publish_clock", True).means(
+        "publish simulated time on /clock while there is a subscriber"
+    ),
     Spec("real_time_factor", 0.0, 0.0, 1e6, live=True, group="problem").means(
         "simulated seconds per second of the wall clock; 0: as fast as possible"
     ),
@@ -177,84 +178,84 @@ PLANT = _section(
 EXECUTION = _section(
     "PC",
     Spec("pin", -1, -1, 4095).means(
-        "core on which the node stays, but for the threads that help a plant with a step of many "
-        "environments; -1: any core"
+        "core that the node stays on, except for the plant's worker threads; -1: any core"
     ),
 )
 """How plant and controller use the machine."""
 
 OPTIMIZER = Spec("optimizer", "model_based", nodes="T", group="budget and method").means(
-    "method of the adapt phase: a shipped or installed name; or code that the user has to allow, "
-    "'package.module:Class' or 'path/to/file.py:Class'; its settings are 'optimizer_settings.*'"
+    "method of the adapt phase: a shipped or installed name, or code that the user has to allow, "
+    "'package.module:Class' or 'path/to/file.py:Class'; its settings are optimizer_settings.*"
 )
 
 TUNER = _section(
     "T",
     Spec("seed", 0, 0, MAX_SEED, group="budget and method").means(
-        "seed of everything random in the training"
+        "seed of all random numbers of the training"
     ),
     Spec("seeds", 1, 1, 1024, group="budget and method").means(
-        "trainings side by side in one batch, with seeds seed, seed + 1, ..."
+        "trainings in one batch, with the seeds seed, seed + 1, ..."
     ),
     Spec("rollouts", 0, 0, 2_000_000, group="budget and method").means(
-        "budget of a seed: all rollouts before the closing evaluation, explorations and checks "
-        f"among them; 0: {ROLLOUTS}, unless 'iterations' is given"
+        "budget of a seed: all rollouts before the closing evaluation, including explorations and "
+        f"checks; 0: {ROLLOUTS}, unless 'iterations' is given"
     ),
     Spec("iterations", 0, 0, 1_000_000, group="budget and method").means(
-        "instead of 'rollouts', for an optimizer that counts iterations, after exploration and check, "
-        "as the paper does for its two rollouts each; 0: not given"
+        "budget in iterations after exploration and check, as the paper counts (two rollouts each), "
+        "instead of 'rollouts'; 0: not given"
     ),
     Spec("start", "lqt", choices=("lqt", "zero"), group="budget and method").means(
-        "where the policy starts: the LQT gains of the reduced model, or zero"
+        "initial policy: the LQT gains of the reduced model, or zero"
     ),
     Spec("model", "").means(
-        "file of 'pdeloop identify --out': the reduced model and warm start of every seed instead "
-        "of an identification; empty: identify"
+        "file of 'pdeloop identify --out' with the reduced model and warm start of every seed; empty: "
+        "identify"
     ),
     Spec("identification_attempts", 3, 1, 1000).means(
-        "exploratory episodes a seed may use until its LQT law beats no control on a sampled "
-        "field, which the adaptation begins with if none does; 1: take the first, unchecked, as "
-        "the paper does; an optimizer that compares the law itself where there are few sensors "
-        "explores once there"
+        "exploratory episodes that a seed may use until its LQT law beats no control on a sampled "
+        "field; if none does, the adaptation starts from no control; 1: take the first law "
+        "unchecked, as the paper does"
     ),
     Spec("evaluation_fields", 10, 1, 1000, group="budget and method").means(
         "sampled initial fields of the closing evaluation"
     ),
     Spec("evaluation_seed", 0, 0, MAX_SEED, group="budget and method").means(
-        "seed of those fields: the same for every training seed, so that runs compare"
+        "seed of those fields, the same for every training seed, so that runs are comparable"
     ),
     Spec("out", "").means("folder of the results and the checkpoint; empty: keep nothing"),
     Spec("resume", False).means("continue the run whose checkpoint is in 'out'"),
     Spec("plant_fingerprint", 0, 0, 2**53 - 1).means(
-        "fingerprint of the plant that is to be trained; 0: the first one that answers"
+        "fingerprint of the plant to train; 0: the first one that answers"
     ),
-    Spec("max_batch", 1024, 1, 65536, live=True).means("environments of one episode at the most"),
+    Spec("max_batch", 1024, 1, 65536, live=True).means(
+        "largest number of environments of one episode"
+    ),
     Spec("episode_timeout", 600.0, 1.0, 86400.0, unit="s", live=True).means(
-        "silence of a plant and controller after which an episode is started again"
+        "silence of a pair after which its episode is started again"
     ),
     Spec("max_attempts", 5, 1, 1000, live=True).means(
-        "attempts at one episode after which the run stops with an error"
+        "attempts at one episode before the run stops with an error"
     ),
     OPTIMIZER,
     Spec("recorder", "none", choices=("none", "start", "required")).means(
-        "none: run without one; start: begin when a recorder is ready, go on if it stops; "
-        "required: stop if it stops"
+        "none: run without one; start: wait for a recorder, continue if it stops; required: stop if "
+        "it stops"
     ),
     Spec("pairs", [""], nodes="TR").means(
-        "namespaces of the plant and controller pairs that serve this tuner, relative to its own"
+        "namespaces of the plant and controller pairs of this tuner, relative to its own"
     ),
 )
 
 RECORDER = _section(
     "R",
-    Spec("bag", "").means("new folder of the bag; empty: bags/ and the time"),
+    Spec("bag", "").means("new folder for the bag; empty: bags/TIME"),
 )
 
 VIEWER = _section(
     "V",
-    Spec("view_rate", 10.0, 0.1, 100.0, unit="1/s", live=True).means("views a second"),
+    Spec("view_rate", 10.0, 0.1, 100.0, unit="1/s", live=True).means("views per second"),
     Spec("view_environment", 0, 0, 65535, live=True).means(
-        "environment that is shown; of a smaller episode the last one"
+        "environment shown; in a smaller episode, the last one"
     ),
 )
 

@@ -1,7 +1,7 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The topics of the loop: names, axes, quality of service, and why. No ROS import.
 
-Names are relative, so a namespace makes a second loop. docs/interfaces.md describes them for
+Names are relative, so a namespace makes a second loop. docs/protocol.md describes them for
 somebody who writes a node of their own; this is the same table for our nodes.
 """
 
@@ -120,7 +120,7 @@ STATE = Topic("state", ("env", "x"), latched=False)
 ACTION = Topic("action", ("env", "actuator"), latched=False)
 
 MODEL_FAILED = "model/failed"
-"""std_msgs/String, latched: why an identification gave no model (JSON, see docs/interfaces.md)."""
+"""std_msgs/String, latched: why an identification gave no model (JSON, see docs/protocol.md)."""
 
 SAMPLES = "samples"
 """std_msgs/UInt8MultiArray: the plant's states and actions, many in one message (samples.py)."""

@@ -4,7 +4,7 @@
 Subscribes  episode/start, action
 Publishes   state, episode/cost, target, episode/paused, samples, /clock
 Serves      ~/pause, ~/resume, ~/step (std_srvs/Trigger)
-Messages, order and parameters: docs/interfaces.md. The protocol is pde_sim_node.lockstep.
+Messages and their order: docs/protocol.md. The protocol is pde_sim_node.lockstep.
 """
 
 import sys

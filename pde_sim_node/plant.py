@@ -49,7 +49,7 @@ class EpisodeCosts:
         -------
         (M, 3)
             mean, total, and the step in which the environment diverged, or a number that stands for a
-            completed episode, as in docs/interfaces.md.
+            completed episode, as in docs/protocol.md.
         """
         ended = np.where(self.diverged_step >= 0, self.diverged_step, COMPLETED)
         return np.column_stack([self.mean, self.total, ended.astype(np.float64)])

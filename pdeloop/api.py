@@ -54,7 +54,7 @@ class Problem:
     given : dict
         The parameters that replace those of the file.
     values : dict
-        All parameters, by the names of docs/interfaces.md.
+        All parameters, by the names of docs/parameters.md.
     """
 
     source: str
@@ -140,7 +140,7 @@ def problem(
     physical
         The parameters of the equation itself, like {"viscosity": 1e-3}, or of a plant that is named.
     parameters
-        Any parameter of docs/interfaces.md by name: n_z, n_a, horizon, measurement_noise, ... Code of
+        Any parameter of docs/parameters.md by name: n_z, n_a, horizon, measurement_noise, ... Code of
         one's own ('file.py:Class') is run if it is named here as `equation` or `optimizer`.
 
     Returns

@@ -198,7 +198,7 @@ class Introspection:
                     text = f"{name} publishes {topic} so that it does not arrive (QoS: {reason})"
                     if self._is_due(text, now):
                         self._node.get_logger().error(
-                            f"{text}; expected a publisher as in docs/interfaces.md"
+                            f"{text}; expected a publisher as in docs/protocol.md"
                         )
             found = self._several(topic, Counter(name for name, _ in there), now)
             if found:

@@ -164,7 +164,7 @@ def _reject_unknown_arguments(name: str, args: list[str] | None) -> None:
     if any(word in ("-h", "--help") for word in words):
         print(
             f"usage: {name} [--ros-args -p PARAMETER:=VALUE ... --params-file FILE -r __ns:=/NAME]"
-            "\n\nParameters, topics and what the node does: docs/interfaces.md;"
+            "\n\nParameters: docs/parameters.md; topics: docs/protocol.md;"
             " with ROS tools: ros2 param describe."
         )
         raise SystemExit(0)

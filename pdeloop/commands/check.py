@@ -42,7 +42,7 @@ def add(commands: Commands) -> None:
         "the actuators reach the modes that are unstable at the target, explore once, say which order "
         "the data support and what the first law costs, and draw fields and supports. Exit code "
         "1 if anything is not as it should be. With plant, controller or tuner instead of a FILE: "
-        "whether such a node of yours, alone in this ROS_DOMAIN_ID, keeps to docs/interfaces.md.",
+        "whether such a node of yours, alone in this ROS_DOMAIN_ID, keeps to docs/stand-in.md.",
         example="pdeloop check burgers --picture burgers.png",
     )
     check.add_argument(

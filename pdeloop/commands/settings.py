@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The flag --set NAME=VALUE: any parameter, by its name in docs/interfaces.md."""
+"""The flag --set NAME=VALUE: any parameter, by its name in docs/parameters.md."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def add_set(parser: argparse._ActionsContainer, what: str = "any parameter") -> 
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help=f"{what}, by its name in docs/interfaces.md; {PHYSICAL}NAME of the equation, and "
+        help=f"{what}, by its name in docs/parameters.md; {PHYSICAL}NAME of the equation, and "
         f"{OPTIMIZER_SETTINGS}NAME of the optimizer; may be repeated",
     )
 

@@ -1,7 +1,7 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What the three checks share: messages that are waited for, and a list of probes. Pure.
 
-A probe is a method whose name and docstring are printed: what docs/interfaces.md promises there. It
+A probe is a method whose name and docstring are printed: what docs/protocol.md promises there. It
 raises UnexpectedError where the node does otherwise. Each can be run alone: what several need is made
 by the first of them.
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from loop_interfaces.problem import completed, load_parameters, shipped_problems
 from loop_interfaces.spec import ParameterError as Refused
 from loop_interfaces.spec import Spec, check_names
 from pde_sim_node.build import build_plant, fingerprint
-from pde_sim_node.equations import EQUATIONS
+from pde_sim_node.equations import EQUATIONS, load_equation
 from tests.support.small import parameters
 
 SPECS = {spec.name: spec for spec in table()}
@@ -151,8 +152,8 @@ def test_an_equation_file_is_found_beside_its_yaml(tmp_path):
 
 
 def test_the_documents_table_is_that_of_the_specs():
-    """docs/interfaces.md: name, default, unit, nodes and meaning of every parameter, in any order."""
-    text = (Path(__file__).parents[2] / "docs" / "interfaces.md").read_text()
+    """docs/parameters.md: name, default, unit, nodes and meaning of every parameter, in any order."""
+    text = (Path(__file__).parents[2] / "docs" / "parameters.md").read_text()
     rows = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in text.splitlines()]
     rows = [row for row in rows if len(row) == 6 and row[0][:1] == "`" and "physical" not in row[1]]
     documented = {row[0].strip("`"): row for row in rows}
@@ -166,8 +167,19 @@ def test_the_documents_table_is_that_of_the_specs():
     assert documented == {}
 
 
+def test_the_documents_table_of_equations_is_that_of_the_classes():
+    text = (Path(__file__).parents[2] / "docs" / "parameters.md").read_text()
+    section = text.partition("| equation | constants and defaults |")[2].partition("\n\n")[0]
+    rows = dict(re.findall(r"^\| `([\w-]+)` \| (.*) \|$", section, re.MULTILINE))
+    assert list(rows) == list(EQUATIONS)
+    for name, row in rows.items():
+        own = {field.name: field.default for field in fields(load_equation(name))}
+        del own["length"]  # a parameter of every problem
+        assert {word: float(x) for word, x in re.findall(r"`(\w+)` ([-\d.]+)", row)} == own
+
+
 def test_the_documents_code_prints_the_table(capsys):
-    text = (Path(__file__).parents[2] / "docs" / "interfaces.md").read_text()
+    text = (Path(__file__).parents[2] / "docs" / "parameters.md").read_text()
     (block,) = re.findall(
         r"^```python\n(from loop_interfaces.*?)^```", text, re.MULTILINE | re.DOTALL
     )

@@ -17,7 +17,7 @@ from tests.support.loop_harness import ROOT, Processes
 from tests.support.small_loop import LIMIT
 
 pytestmark = pytest.mark.topics
-INTERFACES = (ROOT / "docs" / "interfaces.md").read_text()
+STAND_IN = (ROOT / "docs" / "stand-in.md").read_text()
 
 
 def code_block(page: str, language: str, mark: str) -> str:
@@ -29,15 +29,15 @@ def code_block(page: str, language: str, mark: str) -> str:
 
 def documented_command(mark: str) -> list[str]:
     """The ROS arguments of the documented shell line that starts with `mark`."""
-    block = code_block(INTERFACES, "sh", "python linear_plant.py").replace("\\\n", " ")
+    block = code_block(STAND_IN, "sh", "python linear_plant.py").replace("\\\n", " ")
     (line,) = [line for line in block.splitlines() if line.startswith(mark)]
     return line.split("--ros-args")[1].split()
 
 
-def test_a_linear_plant_written_from_the_interface_page_is_identified_and_tuned(
+def test_a_linear_plant_written_from_the_page_is_identified_and_tuned(
     loop: Processes, tmp_path: Path
 ) -> None:
-    source = code_block(INTERFACES, "python", "class LinearPlant")
+    source = code_block(STAND_IN, "python", "class LinearPlant")
     assert "pdeloop" not in re.sub(r'"""[^"]*"""', "", source)
     assert not re.search(r"import (loop_interfaces|pde_sim_node|controller_node|pdeloop)", source)
     (tmp_path / "linear_plant.py").write_text(source)
@@ -89,4 +89,4 @@ def test_a_linear_plant_written_from_the_interface_page_is_identified_and_tuned(
     told = json.loads((tmp_path / "run" / "result.json").read_text())["mean_cost"]
     assert np.allclose([told[name] for name in ("none", "lqt", "adapted")], expected, rtol=1e-9)
     assert not np.array_equal(lqt, adapted)
-    assert found in INTERFACES
+    assert found in STAND_IN
