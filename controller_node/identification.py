@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
 from controller_node.policy import ProjectedLaw
+from loop_interfaces.cost import Cost
 from loop_interfaces.model_rows import ModelRows, pack
 from loop_interfaces.parameters import model_order
 from loop_method.design import lqt
@@ -37,6 +38,8 @@ class DesignSettings:
         Of the stage cost.
     action_limit : float
         Magnitude at which actions saturate; 0: none. The gains are designed without it.
+    cost : str
+        The whole cost (`loop_interfaces.cost.Cost.text`) where the weights do not say it.
     identification : {"field", "regression", "dmdc"}
         "field": the regression, or a law from a model of the whole field (`field_law`) that is better.
     dmdc_rank, dmdc_order : int
@@ -48,6 +51,7 @@ class DesignSettings:
     state_weight: float
     action_weight: float
     action_limit: float = 0.0
+    cost: str = ""
     identification: str = "regression"
     dmdc_rank: int = 0
     dmdc_order: int = 0
@@ -182,7 +186,11 @@ def designed(
         p=settings.dmdc_rank if truncated else 0,
         channels=channels,
     )
-    weights = {"state_weight": settings.state_weight, "action_weight": settings.action_weight}
+    weights: dict[str, Any] = {
+        "state_weight": settings.state_weight,
+        "action_weight": settings.action_weight,
+        "cost": Cost.parse(settings.cost) if settings.cost else None,
+    }
     gains = lqt.track(model, **weights)
     s_r = ProjectedLaw([model.U], target).reduced_targets[0]
     rows = ModelRows(A=model.A, B=model.B, U=model.U, K_a=gains.K_a, K_b=gains.K_b, s_r=s_r)

@@ -99,6 +99,9 @@ PROBLEM = _section(
     Spec("grid", "", nodes="PTV").means(
         "axes and components of the state as JSON, filled in by the plant; empty: one periodic axis"
     ),
+    Spec("cost", "", nodes="CT").means(
+        "the cost as packed JSON, filled in by the plant; empty: numbers and a constant target"
+    ),
     Spec("length", 1.0, positive=True, unit="m", nodes="PTV").means(
         "length L of the periodic domain"
     ),
@@ -151,7 +154,7 @@ PROBLEM = _section(
 POINTS = Spec("n_z", 128, 8, 65536, multiple_of=2)
 """The size of the state of an equation."""
 OF_THE_PLANT = (
-    *("grid", "length", "n_z", "n_a", "sample_time", "horizon"),
+    *("grid", "cost", "length", "n_z", "n_a", "sample_time", "horizon"),
     *("state_weight", "action_weight", "divergence_bound", "reduced_order"),
 )
 """What a plant of a user's own says itself where a problem does not."""

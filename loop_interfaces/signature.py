@@ -26,7 +26,7 @@ NOT_SIGNED = 0.0
 DESIGN = (
     "identification", "reduced_order", "dmdc_rank", "dmdc_order", "state_weight", "action_weight",
 )  # fmt: skip
-"""What a model depends on beside the episode that it comes from."""
+"""What a model depends on beside the episode that it comes from, and the cost where it is not empty."""
 
 
 def digest_of(*arrays: ArrayLike) -> int:
@@ -44,6 +44,7 @@ def digest_of(*arrays: ArrayLike) -> int:
 def design_digest(parameters: Mapping[str, Any]) -> int:
     """h of the parameters DESIGN; text as the numbers of its UTF-8 bytes."""
     values = [parameters[name] for name in DESIGN]
+    values += [parameters["cost"]] if parameters.get("cost") else []
     return digest_of(*(list(v.encode()) if isinstance(v, str) else v for v in values))
 
 

@@ -20,7 +20,7 @@ Value = bool | int | float | str | list[str] | list[float]
 OPTIMIZER_SETTINGS = "optimizer_settings."
 FREE = ("physical.", OPTIMIZER_SETTINGS)
 """How the names of parameters begin that an equation or an optimiser declares."""
-MAX_YAML_BYTES = 1_000_000
+MAX_YAML_BYTES = 4_000_000
 MAX_PARAMETERS, MAX_NAME = 10_000, 500
 _FILE_NAME = re.compile(r"[^\W_][\w.-]{,99}")
 _EXPONENT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)[eE][+-]?\d+")

@@ -60,8 +60,11 @@ def complete(values: Mapping[str, Any], *, compiled: bool = True) -> tuple[Plant
     own = {name: getattr(plant, name) for name in (*_FIXED, *SETTABLE)}
     axes = plant.grid.axes
     own |= {"grid": plant.grid.text, "length": axes[-1].length if axes else 1.0, "reduced_order": 0}
+    own["cost"] = plant.cost.text
     given = {**values, **{f"{PHYSICAL}{name}": value for name, value in physical.items()}}
-    return plant, {**own, **given} if values["plant"] else {**given, "grid": own["grid"]}
+    if values["plant"]:
+        return plant, {**own, **given}
+    return plant, {**given, **{name: own[name] for name in ("grid", "cost")}}
 
 
 def _build(values: Mapping[str, Any], compiled: bool) -> tuple[Plant, Mapping[str, Any]]:
@@ -91,4 +94,8 @@ def _own_plant(values: Mapping[str, Any]) -> tuple[Plant, Mapping[str, Any]]:
                 f"parameter '{name}' is {values[name]!r}, and that of {values['plant']} is "
                 f"{getattr(plant, name)!r}; leave it out"
             )
+    if values.get("cost") and values["cost"] != plant.cost.text:
+        raise ParameterError(
+            f"parameter 'cost' is another one than that of {values['plant']}; leave it out"
+        )
     return plant, made.parameters

@@ -29,6 +29,7 @@ import numpy as np
 
 from loop_interfaces.arrays import Array
 from loop_interfaces.grid import Grid
+from pde_sim_node.action_set import ActionSet
 
 MEAN_DRAWS = 100
 """Initial states whose average stands for the mean of their distribution."""
@@ -55,13 +56,23 @@ class Dynamics(ABC):
     grid : Grid or None
         What the numbers of a state are; None: a plain vector.
     target : array of n_z numbers, or number
-        State z_r to be tracked.
+        State z_r to be tracked, or what an output is to be; one row a step: the target of each step.
     horizon : int
         Steps of an episode.
     sample_time : float
         Time (s) of a step.
-    state_weight, action_weight : float
-        Q = state_weight I and R = action_weight I of the stage cost (z - z_r)'Q(z - z_r) + a'R a.
+    state_weight, action_weight : number, diagonal or matrix
+        Q and R of the stage cost (z - z_r)'Q(z - z_r) + (a - a_r)'R(a - a_r); a number q is q I.
+    output : (n_y, n_z) or None
+        C, with which y = C z takes the place of z in the cost.
+    action_target : number or (n_a,)
+        a_r.
+    terminal_weight : number, diagonal or matrix
+        Weight of the state after the last step.
+    action_low, action_high : number or (n_a,)
+        Bounds of the actions. An action outside of them is moved to the nearest one that is allowed.
+    zero_mean : bool
+        Whether the actions of a step are made to have mean zero.
     divergence_bound : float
         A new state that is not finite or exceeds this magnitude anywhere ends the rollout.
     supports : (n_z, n_a) or None
@@ -81,8 +92,14 @@ class Dynamics(ABC):
     target: Any = 0.0
     horizon: int = 100
     sample_time: float = 1.0
-    state_weight: float = 1.0
-    action_weight: float = 1.0
+    state_weight: Any = 1.0
+    action_weight: Any = 1.0
+    output: Any = None
+    action_target: Any = 0.0
+    terminal_weight: Any = 0.0
+    action_low: Any = -np.inf
+    action_high: Any = np.inf
+    zero_mean: bool = False
     divergence_bound: float = 1e3
     supports: Array | None = None
     batched: ClassVar[bool] = False
@@ -124,6 +141,24 @@ class Dynamics(ABC):
         (n_z,), or the grid's shape
             z_{k+1}.
         """
+
+    def actuated(self, a: Array) -> Array:
+        """The action that the actuators take in place of one that is asked for, and that costs.
+
+        Parameters
+        ----------
+        a : (n_a,)
+            An action, a copy.
+
+        Returns
+        -------
+        (n_a,)
+            What `step` is given. Unless a class says otherwise the nearest action that ``action_low``,
+            ``action_high`` and ``zero_mean`` allow.
+        """
+        allowed = ActionSet(self.n_a, self.action_low, self.action_high, self.zero_mean)
+        nearest: Array = allowed.project(a[np.newaxis])[0]
+        return nearest
 
     def mean_state(self) -> Array:
         """The mean initial state, from which reports show the controllers.

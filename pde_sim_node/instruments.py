@@ -98,6 +98,12 @@ class InstrumentedPlant:
             raise ValueError(f"process_noise cannot force {plant!r}: its state cannot be set")
         self.horizon, self.sample_time = plant.horizon, plant.sample_time
         self.state_weight, self.action_weight = plant.state_weight, plant.action_weight
+        self.cost = plant.cost
+        if instruments.sensors and not plant.cost.plain:
+            raise ValueError(
+                "sensors need weights that are numbers and a constant target, and the cost of "
+                f"{plant!r} is another one: measure the whole state, or change the cost"
+            )
         self.divergence_bound, self.field_target = plant.divergence_bound, plant.field_target
         points = self.grid.equally_spaced(instruments.sensors or self.grid.points)
         # A sensor measures every component at its point.

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.cost import Cost
 from loop_interfaces.grid import Grid
 from loop_interfaces.topics import COMPLETED
 from pde_sim_node.definition import Definition
@@ -117,7 +118,10 @@ class Plant(Protocol):
     sample_time : float
         Sampling time, over which an action is held.
     state_weight, action_weight : float
-        Q = state_weight I and R = action_weight I of the stage cost (z - z_r)'Q(z - z_r) + a'R a.
+        Q = state_weight I and R = action_weight I of the stage cost (z - z_r)'Q(z - z_r) + a'R a, or
+        numbers of their size where the cost is another one.
+    cost : Cost
+        The whole cost.
     divergence_bound : float
         An environment whose new state is not finite or exceeds this magnitude anywhere has diverged.
     field_target : (n_z,)
@@ -133,7 +137,7 @@ class Plant(Protocol):
     settable : bool
         Whether its state can be set, so that `evaluate` works and process noise can force it.
     quadratic : bool
-        Whether its stage cost is the one of the weights and the target.
+        Whether its stage cost is ``cost``.
     instruments : Instruments
         What stands between the state and the controller.
     parallel : ParallelStep or None
@@ -160,6 +164,7 @@ class Plant(Protocol):
     sample_time: float
     state_weight: float
     action_weight: float
+    cost: Cost
     divergence_bound: float
     field_target: Array
     target: Array

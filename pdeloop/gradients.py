@@ -207,11 +207,18 @@ class Gradients:
         if not episode.whole:
             return CostGradient(np.inf, gradient, eta)
         q, r = 2 * plant.state_weight / (M * T), 2 * plant.action_weight / (M * T)
+        if not plant.cost.plain:
+            eta += plant.cost.terminal_slope(episode.states[T]) / (M * T)
         for k in range(T - 1, -1, -1):
             z, a = episode.states[k], episode.actions[k]
             eta, g = self._adjoint.pull_back(z, a, eta)
-            g += r * a
-            eta += q * (z - plant.target)
+            if plant.cost.plain:
+                g += r * a
+                eta += q * (z - plant.target)
+            else:
+                on_z, on_a = plant.cost.slopes(z, a, k)
+                g += on_a / (M * T)
+                eta += on_z / (M * T)
             if U is None:
                 gradient[k] = g
             else:

@@ -57,6 +57,11 @@ def resolve(problem: str, options: Mapping[str, Any]) -> dict[str, Any]:
             f"the optimizer '{values['optimizer']}' learns from a quadratic cost about a target, and "
             "this plant has none: take one that needs costs alone, such as two_point, or give a target"
         )
+    if kind.needs_trajectories and not (plant.cost.plain or kind.any_cost):
+        raise ParameterError(
+            f"the optimizer '{values['optimizer']}' needs weights that are numbers and a constant "
+            "target, and the cost of this plant is another one: take model_based or two_point"
+        )
     if not values["model"]:
         check_sizes(DesignSettings.of(values), plant.state_size, plant.horizon)
     return values

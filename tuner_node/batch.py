@@ -94,6 +94,8 @@ class TrainingSettings:
     """Point sensors whose readings the states are; 0: the states are whole."""
     actuator_positions: Sequence[float] = ()
     """Centres of the actuators as shares of the domain; none: equally spaced."""
+    cost: str = ""
+    """The whole cost (`loop_interfaces.cost.Cost.text`) where the weights do not say it."""
     periodic: bool = True
     """Whether the states are fields on one periodic axis."""
     model: Array | None = None

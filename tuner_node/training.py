@@ -26,6 +26,7 @@ import numpy as np
 
 from loop_interfaces import model_rows
 from loop_interfaces.arrays import Array
+from loop_interfaces.cost import Cost
 from loop_interfaces.topics import COMPLETED, CostColumn
 from loop_method.adapt import Context, Optimizer, Record, Rollout, Trajectory
 from loop_method.reduce.identifiability import examine_excitation
@@ -331,6 +332,7 @@ class Training:
             actuator_positions=self.settings.actuator_positions,
             periodic=self.settings.periodic,
             further=self.further[m],
+            cost=Cost.parse(self.settings.cost) if self.settings.cost else None,
         )
 
     def _asked(self) -> list[list[Rollout]]:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.cost import Cost
 from loop_method.settings import Settings as _Settings
 
 Row = dict[str, float | int | bool | str]
@@ -130,6 +131,8 @@ class Context:
         Whether the states are fields on one periodic axis, which models of the whole field assume.
     further : sequence of Trajectory
         Other explorations, from other initial fields.
+    cost : Cost or None
+        The whole cost, where the weights and the target do not say it.
     """
 
     U: Array
@@ -145,6 +148,7 @@ class Context:
     actuator_positions: Sequence[float] = ()
     periodic: bool = True
     further: Sequence[Trajectory] = ()
+    cost: Cost | None = None
 
     @property
     def every_exploration(self) -> Sequence[Trajectory]:
@@ -186,6 +190,9 @@ class Optimizer(Protocol):
     compares_first_law: ClassVar[bool] = False
     """Whether it compares the first law with no control itself where the state is that of few sensors,
     so that the plant is explored once and no law is checked before."""
+    any_cost: ClassVar[bool] = False
+    """Whether it can use any quadratic cost (`loop_interfaces.cost.Cost`), if it needs trajectories;
+    otherwise weights that are numbers and a constant target. One that is told costs alone can."""
     judges_first_law: ClassVar[bool] = False
     """Whether it does so always."""
     explorations: ClassVar[int] = 1

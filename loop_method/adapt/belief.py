@@ -33,6 +33,7 @@ class Belief:
             context.horizon,
             context.action_limit,
             context.noise,
+            context.cost,
         )
 
 

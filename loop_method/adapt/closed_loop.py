@@ -27,6 +27,7 @@ from functools import cached_property
 import numpy as np
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.cost import Cost
 from loop_method.models import FieldModel
 
 
@@ -50,6 +51,8 @@ class ClosedLoop:
     noise : float
         Standard deviation of the noise on every number of the state that the law sees; 0 for none. It
         is the same in every simulation of as many fields.
+    cost : Cost or None
+        Another quadratic cost in place of that of q, r and z_r.
     """
 
     model: FieldModel
@@ -60,6 +63,7 @@ class ClosedLoop:
     horizon: int
     action_limit: float = 0.0
     noise: float = 0.0
+    cost: Cost | None = None
 
     @cached_property
     def one(self) -> float:
@@ -80,9 +84,12 @@ class ClosedLoop:
                 a = (states[k] @ self.U + noise[k]) @ K.T + b
                 if self.action_limit:
                     np.clip(a, -self.action_limit, self.action_limit, out=a)
-                error = states[k] - self.target
-                costs += self.state_weight * np.einsum("fi,fi->f", error, error)
-                costs += self.action_weight * np.einsum("fi,fi->f", a, a)
+                if self.cost is not None:
+                    self.cost.add(costs, states[k], a, k)
+                else:
+                    error = states[k] - self.target
+                    costs += self.state_weight * np.einsum("fi,fi->f", error, error)
+                    costs += self.action_weight * np.einsum("fi,fi->f", a, a)
                 # What is not finite stays so; the others go on from numbers that a model can take.
                 finite &= np.isfinite(costs)
                 a[~finite] = 0.0
@@ -91,6 +98,9 @@ class ClosedLoop:
                 finite &= np.isfinite(after).all(axis=1)
                 after[~finite] = 0.0
                 states[k + 1] = after
+            if self.cost is not None:
+                self.cost.add_terminal(costs, states[-1])
+                finite &= np.isfinite(costs)
         costs /= self.horizon
         costs[~finite] = np.inf
         return Simulation(states, actions, costs)
@@ -110,15 +120,25 @@ class ClosedLoop:
             return np.inf, gradient
         states, actions = simulation.states, simulation.actions
         K, eta = theta[:, :-1], np.zeros_like(fields)
+        weight = weights[:, None] / self.horizon
+        if self.cost is not None:
+            eta = weight * self.cost.terminal_slope(states[-1])
         noise = self._noise_of(len(fields))
         share = 2.0 / self.horizon * weights[:, None]
         for k in reversed(range(self.horizon)):
             z, a = states[k], actions[k]
             eta, g = self.model.pull_back(z, a, eta)
-            g = g + self.action_weight * share * a
+            if self.cost is None:
+                on_z, on_a = (
+                    self.state_weight * share * (z - self.target),
+                    self.action_weight * share * a,
+                )
+            else:
+                on_z, on_a = (weight * slope for slope in self.cost.slopes(z, a, k))
+            g = g + on_a
             if self.action_limit:
                 g = g * (np.abs(a) < self.action_limit)
-            eta = eta + self.state_weight * share * (z - self.target) + g @ K @ self.U.T
+            eta = eta + on_z + g @ K @ self.U.T
             gradient[:, :-1] += g.T @ (z @ self.U + noise[k])
             gradient[:, -1] += self.one * g.sum(axis=0)
         counted = weights > 0.0

@@ -76,6 +76,7 @@ class ModelBased(Optimizer):
     name = "model_based"
     Settings = ModelBasedSettings
     needs_trajectories = True
+    any_cost = True
     judges_first_law = True
     explorations = 2
     with_sensors = "gauss_newton"
@@ -255,6 +256,11 @@ class ModelBased(Optimizer):
             row["model"], row["mismatch"] = belief.model.kind, belief.error
         if belief is None or not belief.error <= most:
             reason = "no model of the whole field predicts the rollouts"
+            if self._belief is None and self._context.cost is not None:
+                self._end(
+                    row, f"{reason}, and local steps do not know its cost: the first law stays"
+                )
+                return
             if self._belief is None:
                 row["reason"] = f"{reason}: local steps"
                 self._begin_search(row)

@@ -27,8 +27,9 @@ import numpy as np
 from scipy import linalg
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.cost import Cost
 from loop_interfaces.model_rows import ModelRows
-from loop_method.design.finite_horizon import finite_horizon
+from loop_method.design.finite_horizon import finite_horizon, finite_horizon_of
 from loop_method.models import FieldModel, FittedModel, Measured, affine_law, fit_field_model
 from loop_method.models.base import Law
 from loop_method.models.prediction import predicted
@@ -133,6 +134,7 @@ def field_law(
     *,
     state_weight: float,
     action_weight: float,
+    cost: Cost | None = None,
 ) -> FieldLaw:
     """A law from a model of the whole field, with as many modes as another has.
 
@@ -146,6 +148,8 @@ def field_law(
         The law to compare with.
     state_weight, action_weight : float
         q and r.
+    cost : Cost, optional
+        In place of them.
     """
     fitted = best_model(trajectories, target)
     if fitted is None or fitted.error > REPRODUCED:
@@ -157,7 +161,10 @@ def field_law(
         return FieldLaw(fitted)
     horizon = max(len(actions) for _, actions in trajectories)
     try:
-        K, b = finite_horizon(A, B, drift, state_weight, action_weight, horizon)
+        if cost is None:
+            K, b = finite_horizon(A, B, drift, state_weight, action_weight, horizon)
+        else:
+            K, b = finite_horizon_of(A, B, drift, cost, target)
     except (linalg.LinAlgError, ValueError):  # it grows beyond all bounds within the horizon
         return FieldLaw(fitted)
     if not (np.isfinite(K).all() and np.isfinite(b).all()):
@@ -174,17 +181,31 @@ def field_law(
     K_b = np.outer(constant, s_r) / size if size > 0.0 else np.zeros_like(K_a)
     rows = ModelRows(A=U.T @ A @ U, B=U.T @ B, U=U, K_a=K_a, K_b=K_b, s_r=s_r)
 
-    def cost(rows: ModelRows) -> float:
+    def predicted_cost(rows: ModelRows) -> float:
         law = affine_law(rows.K_a @ rows.U.T, rows.K_b @ rows.s_r)
         total = 0.0
         for states in states_under(model, law, fields, horizon):
             if len(states) < horizon:
                 return np.inf
+            actions = law(0, states[:horizon])
+            if cost is not None:
+                total += sum_of(cost, states, actions)
+                continue
             total += state_weight * float(np.sum((states[:horizon] - target) ** 2))
-            total += action_weight * float(np.sum(law(0, states[:horizon]) ** 2))
+            total += action_weight * float(np.sum(actions**2))
         return total / (horizon * len(fields))
 
-    return FieldLaw(fitted, rows, cost(rows), cost(other))
+    return FieldLaw(fitted, rows, predicted_cost(rows), predicted_cost(other))
+
+
+def sum_of(cost: Cost, states: Array, actions: Array) -> float:
+    """The stage costs of an episode, z_0 .. z_T and a_0 .. a_{T-1}, and the cost of its last state."""
+    total = np.zeros(1)
+    for k, a in enumerate(actions):
+        cost.add(total, states[k][None], a[None], k)
+    if len(states) > len(actions):
+        cost.add_terminal(total, states[-1][None])
+    return float(total[0])
 
 
 def states_under(model: FieldModel, law: Law, fields: Sequence[Array], horizon: int) -> list[Array]:

@@ -17,6 +17,7 @@ import numpy as np
 from scipy import linalg
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.cost import Cost
 
 
 def finite_horizon(
@@ -41,6 +42,24 @@ def finite_horizon(
     curvature = action_weight * np.eye(B.shape[1]) + inputs.T @ P @ inputs
     gains = -linalg.solve(curvature, inputs.T @ P @ whole, assume_a="pos")
     return gains[:, : len(A)], gains[:, len(A)]
+
+
+def finite_horizon_of(
+    A: Array, B: Array, drift: Array, cost: Cost, point: Array
+) -> tuple[Array, Array]:
+    """The same law for any quadratic cost, of the deviation e = z - point; point is (n,).
+
+    A target over time counts with its mean, and the terminal weight does not count.
+    """
+    whole, inputs = _extended(A, B, drift + B @ cost.action_target)
+    E = cost.residual(np.eye(len(A)))
+    offset = E @ point - cost.residual_target().mean(axis=0)
+    rows = np.column_stack([E, offset])
+    R = cost.action_matrix
+    G = inputs @ linalg.solve(R, inputs.T, assume_a="pos")
+    P = _doubled(whole, G, rows.T @ rows, cost.horizon)
+    gains = -linalg.solve(R + inputs.T @ P @ inputs, inputs.T @ P @ whole, assume_a="pos")
+    return gains[:, : len(A)], gains[:, len(A)] + cost.action_target
 
 
 def action_curvature(
@@ -72,7 +91,12 @@ def _cost_to_go(
     """P of [e; 1]^T P [e; 1], the least cost of the horizon."""
     n = len(whole) - 1
     P = np.diag(np.append(np.full(n, state_weight), 0.0))
-    G, power, eye = inputs @ inputs.T / action_weight, whole, np.eye(n + 1)
+    return _doubled(whole, inputs @ inputs.T / action_weight, P, horizon)
+
+
+def _doubled(whole: Array, G: Array, P: Array, horizon: int) -> Array:
+    """P after the horizon, from that of one step."""
+    n, power, eye = len(whole) - 1, whole, np.eye(len(whole))
     for _ in range(int(np.ceil(np.log2(max(horizon, 1))))):
         solved = linalg.solve(eye + G @ P, np.hstack([power, G]))
         own, reach = solved[:, : n + 1], solved[:, n + 1 :]

@@ -30,6 +30,7 @@ from scipy import linalg
 from threadpoolctl import threadpool_limits
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.cost import Cost
 from loop_method.reduce.reduced_model import ReducedModel
 
 # A direction that the inputs move by less than this, relative to what they move at most, counts as out
@@ -79,7 +80,13 @@ class Gains(NamedTuple):
         return np.hstack([self.K_a, self.K_b])
 
 
-def track(model: ReducedModel, *, state_weight: float, action_weight: float) -> Gains:
+def track(
+    model: ReducedModel,
+    *,
+    state_weight: float,
+    action_weight: float,
+    cost: Cost | None = None,
+) -> Gains:
     """Design the tracking gains of a reduced model.
 
     Parameters
@@ -88,6 +95,10 @@ def track(model: ReducedModel, *, state_weight: float, action_weight: float) -> 
         Must be stabilisable; its modes may be unstable as long as the actuators reach them.
     state_weight, action_weight : float
         Positive; Q = state_weight I on the full state and R = action_weight I.
+    cost : Cost, optional
+        In place of them, any quadratic cost. K_b is then the least one with which K_b s_r is the best
+        constant part of the law, s_r = U^T z_r with the cost's ``field_target``; of a target over time
+        that is the one for its mean.
 
     Returns
     -------
@@ -120,37 +131,65 @@ def track(model: ReducedModel, *, state_weight: float, action_weight: float) -> 
     """
     if not isinstance(model, ReducedModel):
         raise ValueError(f"model is {model!r}; expected a ReducedModel")
+    if cost is not None and not cost.plain:
+        return _track_any(model, cost)
     for name, weight in (("state_weight", state_weight), ("action_weight", action_weight)):
         if not (isinstance(weight, Real) and 0.0 < weight < np.inf):
             raise ValueError(f"{name} must be positive and finite, but it is {weight!r}.")
     # One thread: a threaded LAPACK rounds differently for another number of threads.
     with threadpool_limits(limits=1):
-        _require_stabilisable(model.A, model.B)
         unit, level = _units(model, state_weight)
-        A, B = model.A, model.B * unit
+        B = model.B * unit
         Q = state_weight / level * np.eye(model.n_s)
         R = action_weight / level * unit**2 * np.eye(model.n_a)
-        try:
-            P = linalg.solve_discrete_are(A, B, Q, R)
-        except (linalg.LinAlgError, ValueError) as error:
-            raise DesignError(
-                f"the Riccati equation of the reduced model has no stabilising solution ({error}); "
-                f"its spectral radius is {np.abs(linalg.eigvals(A)).max():.6g}, so identify with "
-                "another seed or another n_s."
-            ) from error
-        S = R + B.T @ P @ B
-        K_a = -linalg.solve(S, B.T @ P @ A, assume_a="pos")
-        closed_loop = A + B @ K_a
-        poles = linalg.eigvals(closed_loop)
-        radius = float(np.abs(poles).max())
-        if not radius < 1.0:
-            raise DesignError(
-                f"the closed loop must have a spectral radius below 1, but it is "
-                f"{radius:.17g}; the reduced model is barely stabilisable, "
-                "so identify with another seed or another n_s."
-            )
+        P, S, K_a, poles = _feedback(model, B, Q, R)
+        closed_loop = model.A + B @ K_a
         K_b = linalg.solve(S, B.T @ _steady_state_map(closed_loop) @ Q, assume_a="pos")
     return Gains(K_a=unit * K_a, K_b=unit * K_b, P=level * P, poles=poles)
+
+
+def _track_any(model: ReducedModel, cost: Cost) -> Gains:
+    """The gains of any quadratic cost; see `loop_method.design.tracking` for its terms."""
+    with threadpool_limits(limits=1):
+        E, R = cost.residual(model.U), cost.action_matrix
+        P, S, K_a, poles = _feedback(model, model.B, E.T @ E, R)
+        # The steady state of p and b of the tracking over a horizon.
+        pushed = P @ (model.B @ cost.action_target)
+        closed_loop = model.A + model.B @ K_a
+        w = cost.residual_target().mean(axis=0)
+        p = _steady_state_map(closed_loop) @ (E.T @ w - closed_loop.T @ pushed)
+        b = cost.action_target + linalg.solve(S, model.B.T @ (p - pushed), assume_a="pos")
+        s_r = model.U.T @ cost.field_target
+        size = float(s_r @ s_r)
+        K_b = np.outer(b, s_r) / size if size > 0.0 else np.zeros_like(K_a)
+    return Gains(K_a=K_a, K_b=K_b, P=P, poles=poles)
+
+
+def _feedback(
+    model: ReducedModel, B: Array, Q: Array, R: Array
+) -> tuple[Array, Array, Array, NDArray[np.complex128]]:
+    """P, S, K_a and the poles; DesignError where there is no stabilising feedback."""
+    A = model.A
+    _require_stabilisable(A, model.B)
+    try:
+        P = linalg.solve_discrete_are(A, B, Q, R)
+    except (linalg.LinAlgError, ValueError) as error:
+        raise DesignError(
+            f"the Riccati equation of the reduced model has no stabilising solution ({error}); "
+            f"its spectral radius is {np.abs(linalg.eigvals(A)).max():.6g}, so identify with "
+            "another seed or another n_s."
+        ) from error
+    S = R + B.T @ P @ B
+    K_a = -linalg.solve(S, B.T @ P @ A, assume_a="pos")
+    poles = linalg.eigvals(A + B @ K_a)
+    radius = float(np.abs(poles).max())
+    if not radius < 1.0:
+        raise DesignError(
+            f"the closed loop must have a spectral radius below 1, but it is "
+            f"{radius:.17g}; the reduced model is barely stabilisable, "
+            "so identify with another seed or another n_s."
+        )
+    return P, S, K_a, poles
 
 
 def _units(model: ReducedModel, state_weight: float) -> tuple[float, float]:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.cost import Cost
 from loop_interfaces.grid import Grid
 from pde_sim_node.arguments import positive, whole
 from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD, Adjoint, EpisodeCosts, Instruments, Plant
@@ -24,6 +25,8 @@ class BatchPlant(ABC):
         See `pde_sim_node.plant.Plant`.
     target : (n_z,)
         State z_r to be tracked.
+    cost : Cost, optional
+        In place of one of the weights and the target.
 
     Raises
     ------
@@ -49,6 +52,7 @@ class BatchPlant(ABC):
         action_weight: float,
         divergence_bound: float,
         target: Array,
+        cost: Cost | None = None,
     ) -> None:
         self.grid, self.n_z = grid, grid.size
         self.n_a = whole("n_a", n_a, 1)
@@ -58,6 +62,14 @@ class BatchPlant(ABC):
         self.action_weight = positive("action_weight", action_weight)
         self.divergence_bound = positive("divergence_bound", divergence_bound)
         self.field_target = self.target = target
+        self.cost = cost or Cost(
+            self.n_z,
+            self.n_a,
+            self.horizon,
+            state_weight=self.state_weight,
+            action_weight=self.action_weight,
+            target=target,
+        )
         self._allocate(0)
         all_finite(self.actions)  # now, and not in the first step: load or compile it
 

@@ -4,21 +4,26 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from loop_interfaces.arrays import Array, float_array
+from loop_interfaces.cost import Cost
 from loop_interfaces.grid import Grid
 from loop_interfaces.own_code import OwnCodeError, located
+from pde_sim_node.action_set import ActionSet
+from pde_sim_node.arguments import positive, whole
 from pde_sim_node.definition import Definition, described, sources_of
 from pde_sim_node.dynamics import Dynamics, arguments_of
 from pde_sim_node.plant import MEAN_FIELD, Adjoint, Plant
 from pde_sim_node.plants.batch import BatchPlant
 
 SETTABLE = ("horizon", "state_weight", "action_weight", "divergence_bound")
-"""What a problem may set in place of the class."""
+"""What a problem may set in place of the class; weights only where they are numbers."""
+WEIGHTS = ("state_weight", "action_weight")
 
 
 class DynamicsPlant(BatchPlant):
@@ -42,14 +47,18 @@ class DynamicsPlant(BatchPlant):
         if not hasattr(dynamics, "n_a"):
             raise ValueError(f"{self.name} must set n_a, the size of an action")
         given = {name: getattr(dynamics, name) for name in ("n_a", "sample_time", *SETTABLE)}
+        given |= settings
         try:
             grid = self._checked_grid()
-            target = np.broadcast_to(float_array("target", dynamics.target), grid.size).copy()
-            super().__init__(grid=grid, target=target, **(given | settings))
+            cost = self._declared_cost(grid, given)
+            for name, number in zip(WEIGHTS, cost.size, strict=True):
+                given[name] = number
+            super().__init__(grid=grid, target=cost.field_target, cost=cost, **given)
+            self.allowed = ActionSet(
+                self.n_a, dynamics.action_low, dynamics.action_high, dynamics.zero_mean
+            )
         except ValueError as error:
             raise ValueError(f"{self.name}: {error}") from error
-        if not np.isfinite(target).all():
-            raise ValueError(f"{self.name}: target must be finite, got NaN or infinity")
         self.supports = None if dynamics.supports is None else self._checked_supports()
         self._blas: ThreadpoolController | None = None
         self._modules = 0
@@ -74,6 +83,29 @@ class DynamicsPlant(BatchPlant):
         if n_z and n_z != grid.size:
             raise ValueError(f"n_z is {n_z}, but its grid has {grid.size} numbers")
         return grid
+
+    def _declared_cost(self, grid: Grid, given: Mapping[str, Any]) -> Cost:
+        """What the class says of the cost; a problem may replace weights that are numbers."""
+        own, weights = self.dynamics, {}
+        for name in WEIGHTS:
+            declared = getattr(own, name)
+            weights[name] = given[name] if np.ndim(declared) == 0 else declared
+            if np.ndim(weights[name]) == 0:
+                positive(name, weights[name])
+        target = float_array("target", own.target)
+        shape = (len(grid.components), *grid.shape)
+        if own.output is None and target.shape[-len(shape) :] == shape:
+            target = target.reshape(*target.shape[: -len(shape)], grid.size)
+        return Cost(
+            grid.size,
+            whole("n_a", own.n_a, 1),
+            whole("horizon", given["horizon"], 1),
+            target=target,
+            output=own.output,
+            action_target=own.action_target,
+            terminal_weight=own.terminal_weight,
+            **weights,
+        )
 
     def _checked_supports(self) -> Array:
         supports = float_array("supports", np.asarray(self.dynamics.supports))
@@ -131,20 +163,32 @@ class DynamicsPlant(BatchPlant):
         if not alive.size:
             return
         states, totals = self.states[alive], self.totals[alive]
-        lost = self._advanced(states, self.actions[alive], totals)
+        self.actions[alive] = held = self._held(self.actions[alive])
+        lost = self._advanced(states, held, totals, self.step_index)
+        if self.step_index + 1 == self.horizon:
+            self.cost.add_terminal(totals, states)
         self.states[alive], self.totals[alive] = states, totals
         self.diverged_step[alive[lost]] = self.step_index
 
     def _evaluate(self, states: Array, actions: Array) -> Array:
         costs = np.zeros(len(states))
-        self._advanced(states, actions, costs)
+        self._advanced(states, self._held(actions), costs, 0)
         return costs
 
-    def _advanced(self, states: Array, actions: Array, totals: Array) -> Any:
+    def _held(self, actions: Array) -> Array:
+        """What the actuators take, (M, n_a)."""
+        if type(self.dynamics).actuated is Dynamics.actuated:
+            return actions if self.allowed.everything else self.allowed.project(actions)
+        taken = [float_array("it", self._call("actuated", a.copy())) for a in actions]
+        held = np.stack(taken) if {a.shape for a in taken} == {(self.n_a,)} else np.zeros(0)
+        if held.shape != actions.shape or not np.isfinite(held).all():
+            raise OwnCodeError(f"{self.name}.actuated must return {self.n_a} finite numbers")
+        return held
+
+    def _advanced(self, states: Array, actions: Array, totals: Array, step: int) -> Any:
         """Advance states in place and add their stage costs; which of them diverged."""
         new = self._next(states, actions)
-        totals += self.state_weight * np.square(states - self.field_target).sum(axis=1)
-        totals += self.action_weight * np.square(actions).sum(axis=1)
+        self.cost.add(totals, states, actions, step)
         good = np.isfinite(totals) & (np.abs(new) <= self.divergence_bound).all(axis=1)
         states[good] = new[good]
         return ~good

@@ -321,7 +321,9 @@ def test_a_model_that_is_identified_otherwise_has_another_signature(name):
     known = asdict(DesignSettings(N_A, N_S, 1.0, 1.0))
     other = "dmdc" if name == "identification" else known[name] + 1
     assert design_digest(known | {name: other}) != design_digest(known)
-    assert {*DESIGN, "n_a", "action_limit"} == {*known}  # an action has the one, D the other
+    # An action has the first of these, D the second, and the third counts where it is not empty.
+    assert {*DESIGN, "n_a", "action_limit", "cost"} == {*known}
+    assert design_digest(known | {"cost": "another"}) != design_digest(known | {"cost": ""})
 
 
 def test_a_run_with_a_controller_that_does_not_sign_is_void_as_soon_as_another_signs():

@@ -1,0 +1,110 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""LQ tracking of any quadratic cost: the best actions by least squares, and the stationary law."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import linalg
+
+from loop_interfaces.cost import Cost
+from loop_method.adapt.closed_loop import ClosedLoop
+from loop_method.design.finite_horizon import finite_horizon, finite_horizon_of
+from loop_method.design.lqt import track
+from loop_method.design.tracking import track_horizon
+from loop_method.models.linear import LinearModel
+from loop_method.reduce.reduced_model import ReducedModel
+
+N, N_A, T, N_Y = 4, 2, 9, 3
+RNG = np.random.default_rng(3)
+A = RNG.standard_normal((N, N)) / 2
+B = RNG.standard_normal((N, N_A))
+C = RNG.standard_normal((N_Y, N))
+DRIFT = RNG.standard_normal(N)
+WHOLE: dict[str, Any] = {
+    "state_weight": [1.0, 3.0, 0.2],
+    "action_weight": [[0.5, 0.1], [0.1, 0.4]],
+    "target": RNG.standard_normal((T + 1, N_Y)),
+    "output": C,
+    "action_target": [0.3, -0.2],
+    "terminal_weight": 5.0,
+}
+
+
+def best_actions(cost: Cost, s0: np.ndarray, drift: np.ndarray) -> np.ndarray:
+    """All actions of an episode at once, by least squares: no recursion and no Riccati equation."""
+    size = T * N_A
+
+    def residuals(actions: np.ndarray) -> np.ndarray:
+        s, rows = s0, []
+        E, w = cost.residual(np.eye(N)), cost.residual_target()
+        root = linalg.cholesky(cost.action_matrix)
+        for k in range(T):
+            a = actions[k * N_A : (k + 1) * N_A]
+            rows += [E @ s - w[k], root @ (a - cost.action_target)]
+            s = A @ s + B @ a + drift
+        rows.append(
+            cost.residual(np.eye(N), terminal=True) @ s - cost.residual_target(terminal=True)
+        )
+        return np.concatenate(rows)
+
+    zero = residuals(np.zeros(size))
+    matrix = np.stack([residuals(unit) - zero for unit in np.eye(size)], axis=1)
+    return np.linalg.lstsq(matrix, -zero)[0].reshape(T, N_A)
+
+
+@pytest.mark.parametrize("words", [WHOLE, {"target": 1.5, "state_weight": np.diag([1, 2, 3, 4.0])}])
+def test_the_law_over_a_horizon_is_the_best_sequence_of_actions(words: Any) -> None:
+    cost, s = Cost(N, N_A, T, **words), RNG.standard_normal(N)
+    expected = best_actions(cost, s, DRIFT)
+    K, b = track_horizon(A, B, cost, np.eye(N), DRIFT)
+    for k in range(T):
+        a = K[k] @ s + b[k]
+        np.testing.assert_allclose(a, expected[k], atol=1e-9)
+        s = A @ s + B @ a + DRIFT
+
+
+def test_far_from_its_end_a_long_horizon_has_the_stationary_law() -> None:
+    words = WHOLE | {"target": [1.0, -0.5, 2.0], "terminal_weight": 0.0}
+    cost = Cost(N, N_A, 400, **words)
+    model = ReducedModel(A=A, B=B, U=np.eye(N))
+    gains = track(model, state_weight=1.0, action_weight=1.0, cost=cost)
+    K, b = track_horizon(A, B, cost, np.eye(N))
+    np.testing.assert_allclose(gains.K_a, K[0], atol=1e-9)
+    np.testing.assert_allclose(gains.K_b @ cost.field_target, b[0], atol=1e-9)
+    point = RNG.standard_normal(N)
+    own_K, own_b = finite_horizon_of(A, B, (A - np.eye(N)) @ point, cost, point)
+    np.testing.assert_allclose(own_K, K[0], atol=1e-9)
+    np.testing.assert_allclose(own_b - own_K @ point, b[0], atol=1e-9)
+
+
+def test_a_diagonal_of_equal_numbers_designs_the_law_of_the_number() -> None:
+    target = RNG.standard_normal(N)
+    model = ReducedModel(A=A, B=B, U=np.eye(N))
+    weights = {"state_weight": 2.0, "action_weight": 0.3}
+    number = track(model, **weights)
+    cost = Cost(N, N_A, T, state_weight=np.full(N, 2.0), action_weight=0.3, target=target)
+    diagonal = track(model, **weights, cost=cost)
+    np.testing.assert_allclose(diagonal.K_a, number.K_a, atol=1e-10)
+    np.testing.assert_allclose(diagonal.K_b @ target, number.K_b @ target, atol=1e-10)
+    for one, other in zip(
+        finite_horizon(A, B, DRIFT, 2.0, 0.3, T),
+        finite_horizon_of(A, B, DRIFT, cost, target),
+        strict=True,
+    ):
+        np.testing.assert_allclose(one, other, atol=1e-10)
+
+
+def test_the_gradient_of_a_closed_loop_is_that_of_its_cost() -> None:
+    cost = Cost(N, N_A, T, **WHOLE)
+    model = LinearModel("linear", 0.5 * A, B, DRIFT)
+    loop = ClosedLoop(model, np.eye(N), cost.field_target, 1.0, 1.0, T, cost=cost)
+    theta, fields = RNG.standard_normal((N_A, N + 1)) / 4, RNG.standard_normal((3, N))
+    weights, step = np.full(3, 1 / 3), 1e-6
+    value, gradient = loop.gradient(theta, fields, weights)
+    assert value == pytest.approx(loop.costs(theta, fields).mean())
+    change = RNG.standard_normal(theta.shape)
+    plus, minus = (loop.costs(theta + s * change, fields).mean() for s in (step, -step))
+    assert np.sum(gradient * change) == pytest.approx((plus - minus) / (2 * step), rel=1e-6)

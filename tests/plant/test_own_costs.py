@@ -1,0 +1,159 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Costs and bounds that a plant declares: what an episode costs, trainings with them, and refusals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import pdeloop
+from loop_interfaces.cost import Cost
+from loop_interfaces.spec import ParameterError
+from loop_method.design.finite_horizon import finite_horizon_of
+from loop_method.design.tracking import track_horizon
+from pde_sim_node.action_set import ActionSet
+from pde_sim_node.dynamics import Dynamics
+from pde_sim_node.plants import DynamicsPlant
+
+N_Z, N_A, T = 6, 2, 20
+A = 0.95 * np.linalg.qr(np.random.default_rng(0).standard_normal((N_Z, N_Z)))[0]
+B = np.random.default_rng(1).standard_normal((N_Z, N_A))
+
+
+class Servo(Dynamics):
+    """Two outputs of a linear system are to follow waves, and its actions are near (0.5, -0.5)."""
+
+    n_z, n_a, horizon = N_Z, N_A, T
+    output = np.eye(2, N_Z)
+    state_weight = np.array([4.0, 1.0])
+    action_weight = np.array([[0.5, 0.1], [0.1, 0.4]])
+    action_target = np.array([0.5, -0.5])
+    terminal_weight = 3.0
+    target = np.sin(0.2 * np.arange(T + 1))[:, None] + np.array([2.0, 1.0])
+
+    def initial_state(self, rng: np.random.Generator) -> np.ndarray:
+        return rng.standard_normal(N_Z)
+
+    def step(self, z: np.ndarray, a: np.ndarray) -> np.ndarray:
+        return A @ z + B @ a
+
+
+def test_an_episode_costs_the_stages_and_its_last_state() -> None:
+    plant = DynamicsPlant(Servo())
+    given = np.random.default_rng(2).standard_normal((T, 3, N_A))
+    episode = pdeloop.rollout(plant, lambda k, z: given[k], [0, 1, 2])
+    y = episode.states[:, :, :2] - Servo.target[:, None]
+    a = given - Servo.action_target
+    expected = (y[:T] ** 2 @ Servo.state_weight).sum(axis=0)
+    expected += np.einsum("kmi,ij,kmj->m", a, Servo.action_weight, a)
+    expected += 3.0 * (y[T] ** 2).sum(axis=1)
+    np.testing.assert_allclose(episode.costs.total, expected, rtol=1e-12)
+    alone = pdeloop.rollout(plant, lambda k, z: given[k, 1:2], [1])
+    assert alone.costs.total[0] == episode.costs.total[1]
+
+
+def test_no_law_costs_less_than_lq_tracking_over_the_horizon() -> None:
+    plant = DynamicsPlant(Servo())
+    K, b = track_horizon(A, B, plant.cost, np.eye(N_Z))
+
+    def cost(shift: np.ndarray) -> float:
+        law = lambda k, z: z @ K[k].T + b[k] + shift[k]  # noqa: E731
+        return float(pdeloop.rollout(plant, law, [5]).costs.mean[0])
+
+    best, rng = cost(np.zeros((T, N_A))), np.random.default_rng(3)
+    for size in (1e-3, 1e-1):
+        shift = size * rng.standard_normal((T, N_A))
+        up, down = cost(shift) - best, cost(-shift) - best
+        assert up == pytest.approx(down, rel=1e-6) and up > 0.0  # the slope is zero there
+
+
+def test_a_training_designs_and_adapts_for_it() -> None:
+    run = pdeloop.train(plant=Servo(), rollouts=9, evaluation_fields=2, reduced_order=N_Z)
+    plant, U = DynamicsPlant(Servo()), run.models[0].U
+    z_r, drift = plant.field_target, (A - np.eye(N_Z)) @ plant.field_target
+    K, b = finite_horizon_of(A, B, drift, plant.cost, z_r)
+    first, n_s = run.warm[0], U.shape[1]
+    np.testing.assert_allclose(first[:, :n_s] @ U.T, K, atol=1e-6)
+    np.testing.assert_allclose(first[:, n_s:] @ U.T @ z_r, b - K @ z_r, atol=1e-6)
+    best = track_horizon(A, B, plant.cost, np.eye(N_Z))
+    laws = {
+        "best": lambda k, z: z @ best.K[k].T + best.b[k],
+        "first": pdeloop.projected_law(plant, U, first),
+        "adapted": pdeloop.projected_law(plant, U, run.policies[0]),
+    }
+    fields = np.arange(100, 130)
+    cost = {name: pdeloop.rollout(plant, law, fields).costs.mean for name, law in laws.items()}
+    assert (cost["best"] < cost["adapted"]).all() and (cost["best"] < cost["first"]).all()
+    assert cost["adapted"].mean() < cost["first"].mean()
+
+
+def test_an_optimizer_that_cannot_use_a_cost_says_so() -> None:
+    with pytest.raises(ParameterError, match="'gauss_newton' needs weights that are numbers"):
+        pdeloop.train(plant=Servo(), optimizer="gauss_newton", rollouts=20)
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        (
+            {"target": np.zeros((7, 2))},
+            "Servo: target must be a number, 2 numbers, or 20 or 21 rows",
+        ),
+        ({"action_low": [1.0, 2.0, 3.0]}, "Servo: action_low must be a number or 2 numbers"),
+        ({"action_low": 1.0, "action_high": 0.0}, "action_low must be at most action_high"),
+        ({"action_low": 1.0, "zero_mean": True}, "no action between .* has mean zero"),
+        ({"action_weight": 0.0}, "action_weight must be positive"),
+    ],
+)
+def test_a_cost_that_does_not_fit_is_refused(changes: dict[str, Any], told: str) -> None:
+    servo = Servo()
+    vars(servo).update(changes)
+    with pytest.raises(ValueError, match=told):
+        DynamicsPlant(servo)
+
+
+def test_sensors_and_such_a_cost_do_not_go_together() -> None:
+    with pytest.raises(ValueError, match="sensors need weights that are numbers"):
+        pdeloop.problem(plant=Servo(), sensors=3).plant()
+
+
+def test_actions_are_moved_to_the_nearest_ones_that_are_allowed_and_cost_what_acts() -> None:
+    servo = Servo()
+    vars(servo).update(action_low=[-0.5, -2.0], action_high=[1.0, 0.25])
+    plant = DynamicsPlant(servo)
+    asked, taken = np.array([[3.0, -1.0], [-3.0, 7.0]]), np.array([[1.0, -1.0], [-0.5, 0.25]])
+    z = plant.reset([0, 1]).copy()
+    expected, costs = DynamicsPlant(Servo()).evaluate(z, taken)
+    np.testing.assert_array_equal(plant.step(asked), expected)
+    np.testing.assert_array_equal(plant.totals, costs)
+    np.testing.assert_array_equal(plant.actions, taken)
+
+
+def test_the_projection_to_mean_zero_and_bounds_is_the_nearest_point() -> None:
+    rng = np.random.default_rng(4)
+    low, high = -np.array([0.5, 1.0, 0.2, 3.0]), np.array([0.7, 0.1, 2.0, 1.0])
+    allowed = ActionSet(4, low, high, True)
+    for a in 3.0 * rng.standard_normal((20, 4)):
+        nearest = allowed.project(a[None])[0]
+        assert abs(nearest.sum()) < 1e-12
+        assert (nearest >= low).all() and (nearest <= high).all()
+        # The angle to every other point of a convex set is obtuse.
+        for other in allowed.project(3.0 * rng.standard_normal((20, 4))):
+            assert (a - nearest) @ (other - nearest) < 1e-9
+
+
+class Halved(Servo):
+    def actuated(self, a: np.ndarray) -> np.ndarray:
+        return a / 2
+
+
+def test_a_class_says_itself_what_its_actuators_take() -> None:
+    plant, own = DynamicsPlant(Halved()), DynamicsPlant(Servo())
+    for one in (plant, own):
+        one.reset([3])
+    np.testing.assert_array_equal(
+        plant.step(np.array([[2.0, 4.0]])), own.step(np.array([[1.0, 2.0]]))
+    )
+    assert Cost.parse(plant.cost.text).text == plant.cost.text
