@@ -48,6 +48,7 @@ TEST, VALIDATION = 0, 2024
 TUNING_SEEDS = (100, 101, 102, 103)
 BUDGETS = (20, 40, 80)
 LOOKS = {
+    "model-based": (CONTROLLERS["gauss_newton"].colour, "-s"),
     "gauss-newton": (CONTROLLERS["gauss_newton"].colour, "-o"),
     "two-point": (CONTROLLERS["lqt_po"].colour, "-o"),
     "lqt": (CONTROLLERS["lqt"].colour, "--o"),

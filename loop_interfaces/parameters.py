@@ -79,8 +79,8 @@ IDENTIFICATION = Spec(
     group="budget and method",
 ).means(
     "regression: least squares in reduced coordinates; field: a linearised model of the whole field, "
-    "where its law is better; dmdc: the paper's truncated DMDc, the default of optimizers that learn "
-    "from costs"
+    "where its law is better; dmdc: the paper's truncated DMDc. An optimizer may have a default of "
+    "its own: model_based has field, two_point dmdc"
 )
 
 PROBLEM = _section(

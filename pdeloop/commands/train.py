@@ -69,7 +69,7 @@ def add(commands: Commands) -> None:
     add(
         "--view",
         action="store_true",
-        help="a viewer_node beside the others, for RViz, Foxglove and PlotJuggler (docs/views.md)",
+        help="a viewer_node beside the others, for RViz, Foxglove and PlotJuggler (docs/watching.md)",
     )
     add = train.add_argument_group("machine").add_argument
     add(

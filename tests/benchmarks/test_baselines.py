@@ -14,10 +14,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from benchmarks import baselines
 from benchmarks.__main__ import parser
-from benchmarks.baselines import TEST, TUNING_SEEDS, VALIDATION, iqm, refuse_other_constants, run
+from benchmarks.baselines import (
+    STUDIES,
+    TEST,
+    TUNING_SEEDS,
+    VALIDATION,
+    iqm,
+    refuse_other_constants,
+    run,
+)
 from benchmarks.methods import (
     LIBRARIES,
     METHODS,
@@ -27,6 +36,7 @@ from benchmarks.methods import (
     evaluation_fields,
     measure,
 )
+from loop_method.adapt.registry import offered
 from loop_method.design import lqt
 from loop_method.reduce.reduced_model import ReducedModel
 from pde_sim_node.build import build_plant
@@ -101,6 +111,18 @@ def test_the_likeliest_field_is_the_true_one_where_it_is_a_candidate() -> None:
         rollout(*pair, [5, 3]).costs.mean for pair in ((sensed, estimated), (true, law))
     )
     np.testing.assert_allclose(found, whole, rtol=1e-12)
+
+
+@pytest.mark.parametrize("file", sorted(STUDIES.glob("*.yaml")), ids=lambda file: file.stem)
+def test_a_variant_is_of_the_optimizer_that_it_is_named_after(file: Path) -> None:
+    """Whatever the default is: the tables that name these files stay those of their columns."""
+    content = yaml.safe_load(file.read_text())
+    for label, table in content["variants"].items():
+        chosen = {**content["settings"], **table}["optimizer"]
+        if (name := label.replace("-", "_")) in offered():
+            assert chosen == name
+        else:
+            assert chosen in offered()
 
 
 def test_the_splits_are_disjoint() -> None:

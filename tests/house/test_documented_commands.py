@@ -48,7 +48,7 @@ def test_every_command_that_a_page_prints_is_understood(page):
         assert pdeloop_parser().parse_args(shlex.split(command)[1:]), command
 
 
-@pytest.mark.parametrize("name", ["comparison.md", "robustness.md", "problems.md"])
+@pytest.mark.parametrize("name", ["comparison.md", "appendix.md", "robustness.md", "problems.md"])
 def test_a_table_of_costs_names_its_command(name):
     sections = re.split(r"^## ", (DOCS / name).read_text(), flags=re.MULTILINE)
     measured = [text for text in sections if re.search(r"^\|.*\bLQT\b", text, re.MULTILINE)]
