@@ -79,6 +79,7 @@ def improve(
     weights: Array,
     curvature: Array,
     settings: ModelBasedSettings,
+    least_gain: float | None = None,
 ) -> Improvement | None:
     """The law after a descent, or None where no law to begin with is finite on the model.
 
@@ -94,6 +95,8 @@ def improve(
         G.
     settings : ModelBasedSettings
         Constants of the descent.
+    least_gain : float, optional
+        In place of that of the settings.
     """
     for _ in range(settings.halvings + 1):
         simulation = loop.simulate(theta, fields)
@@ -114,7 +117,8 @@ def improve(
     moment[np.diag_indices(len(moment))] += settings.isotropy * np.append(
         np.full(len(moment) - 1, size), 1.0
     )
-    return _descend(loop, theta, fields, weights, Coordinates(curvature, moment), settings)
+    gain = settings.least_gain if least_gain is None else least_gain
+    return _descend(loop, theta, fields, weights, Coordinates(curvature, moment), settings, gain)
 
 
 def _descend(
@@ -124,6 +128,7 @@ def _descend(
     weights: Array,
     coordinates: Coordinates,
     settings: ModelBasedSettings,
+    least_gain: float,
 ) -> Improvement:
     # Not at the top: a node that never improves a law has no need of it.
     from scipy.optimize import minimize
@@ -137,8 +142,10 @@ def _descend(
 
     def objective(y: Array) -> tuple[float, Array]:
         nonlocal best
-        at = theta + coordinates.theta(unit * y)
-        cost, gradient = loop.gradient(at, fields, weights)
+        at, cost, gradient = theta, before, by_theta  # the descent begins with what is known
+        if y.any():
+            at = theta + coordinates.theta(unit * y)
+            cost, gradient = loop.gradient(at, fields, weights)
         if not (cost < FAR * before and np.isfinite(gradient).all()):
             return FAR, np.zeros_like(y)
         if cost < best.after:
@@ -149,7 +156,7 @@ def _descend(
         values.append(best.after / before)
         earlier = values[max(len(values) - 1 - settings.window, 0)]
         few = len(values) <= settings.window
-        if not few and earlier - values[-1] <= settings.least_gain * values[-1]:
+        if not few and earlier - values[-1] <= least_gain * values[-1]:
             raise StopIteration
 
     minimize(

@@ -30,26 +30,26 @@ from scipy import linalg
 
 from loop_interfaces.arrays import Array
 
-KEPT = 0.999
+KEPT = 0.99
 """Share of the variance whose directions are drawn from."""
 
 
 def mixtures(
     fields: Array,
-    count: int,
+    most: int,
     rng: np.random.Generator,
     components: int = 1,
     *,
     periodic: bool = True,
 ) -> Array:
-    """Draws (count, n_z) of the distribution above; none from fewer than two fields.
+    """Draws (at most `most`, n_z) of the distribution above; none from fewer than two fields.
 
     Parameters
     ----------
     fields : (n, n_z) array
         Measured initial fields.
-    count : int
-        At least 2, to have the right mean and covariance.
+    most : int
+        Draws, at most: two more than twice as many as there are directions are enough.
     rng : numpy.random.Generator
         Of the draws.
     components : int
@@ -69,7 +69,9 @@ def mixtures(
     values, vectors = linalg.eigh((1.0 + 1.0 / n) * covariance)
     values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
     kept = int(np.searchsorted(np.cumsum(values), KEPT * values.sum())) + 1
-    draws = rng.standard_normal((count, min(kept, n_z)))
+    kept = min(kept, n_z)
+    count = min(most, 2 * kept + 2)
+    draws = rng.standard_normal((count, kept))
     draws -= draws.mean(axis=0)
     if draws.shape[1] < count:
         triangle = linalg.cholesky(draws.T @ draws / count, lower=True)

@@ -198,8 +198,8 @@ class ModelBased(Optimizer):
         at = self._settings.first_renewal
         while at - known <= self._records.count:
             at *= 2
-        # Two renewals with next to nothing between them are one.
-        return at - known if at - known + self._settings.judging <= last else last
+        # One is only worth it if as many rollouts again come before the last one.
+        return at - known if 2 * at - known <= last else last
 
     def _last_renewal(self) -> int:
         """Own rollouts after which the law is renewed for the last time."""
@@ -268,11 +268,11 @@ class ModelBased(Optimizer):
             row["reason"] = f"{reason} any more; the law stays"
         else:
             self._belief = belief
-            self._improve(belief, row)
+            self._improve(belief, row, final)
         if final:
             self._begin_judging()
 
-    def _improve(self, belief: Belief, row: Row) -> None:
+    def _improve(self, belief: Belief, row: Row, final: bool) -> None:
         loop, fields = belief.loop(self._context), self._fields()
         first, none = loop.theta(self._first), loop.theta(self._none)
         # A first law that is worse than no control is nothing to stay near to.
@@ -289,6 +289,7 @@ class ModelBased(Optimizer):
             self._settings,
             components=belief.components,
             periodic=self._context.periodic,
+            final=final,
         )
         if found is None:
             row["reason"] = "no law is finite on the model; the law stays"

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -67,6 +68,7 @@ def renew(
     *,
     components: int = 1,
     periodic: bool = True,
+    final: bool = True,
 ) -> Renewal | None:
     """The law that costs least on the model, as far as fields that were left out agree.
 
@@ -89,25 +91,32 @@ def renew(
         Fields that stand one after the other in a state.
     periodic : bool
         Whether they are on a ring.
+    final : bool
+        Whether it is the last one: others end sooner, on fewer fields that are drawn.
 
     Returns
     -------
     Renewal or None
         None where no law is finite on the model.
     """
-    curvature = _curvature(loop)
+    descend = partial(
+        _improved,
+        loop,
+        curvature=_curvature(loop),
+        rng=rng,
+        settings=settings,
+        components=components,
+        periodic=periodic,
+        least_gain=settings.least_gain if final else settings.first_gain,
+    )
+    few = settings.mixtures // 2
     part_of = np.arange(len(fields)) % settings.folds
     steps, made = 0, []
     for part, start in enumerate(parts or [first] * settings.folds):
-        others = fields[part_of != part]
-        found = _improved(
-            loop, [first, start], others, curvature, rng, settings, components, periodic
-        )
+        found = descend([first, start], fields[part_of != part], few)
         made.append(start if found is None else found[0])
         steps += 0 if found is None else found[1]
-    found = _improved(
-        loop, [first, improved], fields, curvature, rng, settings, components, periodic
-    )
+    found = descend([first, improved], fields, settings.mixtures if final else few)
     if found is None:
         return None
     fraction, change, deviation = held_out_fraction(loop, first, made, fields, settings)
@@ -160,14 +169,17 @@ def _improved(
     loop: ClosedLoop,
     starts: Sequence[Array],
     fields: Array,
+    most: int,
+    *,
     curvature: Array,
     rng: np.random.Generator,
     settings: ModelBasedSettings,
     components: int,
     periodic: bool,
+    least_gain: float,
 ) -> tuple[Array, int] | None:
     """The law after a descent from the cheapest start, and its steps."""
-    drawn = mixtures(fields, settings.mixtures, rng, components, periodic=periodic)
+    drawn = mixtures(fields, most, rng, components, periodic=periodic)
     share = settings.measured_share if len(drawn) else 1.0
     every = np.concatenate([fields, drawn])
     weights = np.append(
@@ -180,7 +192,7 @@ def _improved(
     common = np.isfinite(costs).all(axis=0)
     total = np.where(common, costs, 0.0) @ weights
     start = starts[int(np.lexsort((total, lost))[0])]
-    found = improve(loop, start, every, weights, curvature, settings)
+    found = improve(loop, start, every, weights, curvature, settings, least_gain)
     return None if found is None else (found.theta, found.steps)
 
 

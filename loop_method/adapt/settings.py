@@ -18,7 +18,7 @@ class ModelBasedSettings(Settings):
     first_renewal: int = setting(
         6,
         "rollouts, explorations among them, after which the law is improved for the first time, then "
-        "after twice as many each time, and before those that judge",
+        "after at least twice as many each time, at last before those that judge",
         2,
         1_000_000,
     )
@@ -39,17 +39,26 @@ class ModelBasedSettings(Settings):
         0.0,
         1.0,
     )
-    mixtures: int = setting(16, "initial fields drawn around the measured ones", 2, 1000)
+    mixtures: int = setting(
+        24,
+        "initial fields drawn around the measured ones, at most; half as many where the law is not the "
+        "final one",
+        4,
+        1000,
+    )
     measured_share: float = setting(
         0.5, "weight of the measured fields against the drawn ones", 0.0, 1.0
     )
-    iterations: int = setting(60, "steps of L-BFGS of an improvement, at most", 1, 10_000)
+    iterations: int = setting(100, "steps of L-BFGS of an improvement, at most", 1, 10_000)
     memory: int = setting(40, "differences of gradients that L-BFGS keeps", 1, 1000)
     window: int = setting(
         5, "steps of L-BFGS that together have to gain the share least_gain", 1, 100
     )
     least_gain: float = setting(
-        0.01, "share of the cost by which a window of steps has to lower it, to go on", 0.0, 1.0
+        1e-3, "share of the cost by which a window of steps has to lower it, to go on", 0.0, 1.0
+    )
+    first_gain: float = setting(
+        2e-2, "the same of every renewal but the last, which goes on from there", 0.0, 1.0
     )
     isotropy: float = setting(
         1e-3,

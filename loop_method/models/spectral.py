@@ -4,13 +4,15 @@
     d/dt F[z] = L F[z] + sum_q m_q F[g_q(z)] + F[B a + c],        g_q(z) = sum_{p >= 2} C_qp z^p,
 
 F the discrete Fourier transform, L and m_q numbers of every wavenumber, and time in sampling times. A
-sampling time is integrated by ETDRK4 in equal internal steps, and the nonlinear part on a finer grid
-that has room for its products, by the solver of the plants (`spectral_solver.polynomial_step`).
+sampling time is integrated by ETDRK4 in equal internal steps, the fewer the smaller the field, and the
+nonlinear part on a finer grid that has room for its products, by the solver of the plants
+(`spectral_solver.polynomial_step`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -43,6 +45,8 @@ class SpectralModel:
         Internal steps of a sampling time.
     clip : float
         z is cut to +-clip in g_q; infinite: it is not.
+    fewer : (n, 2) array
+        Rows max |z|, steps, both ascending: as many are enough where the field begins no larger.
     """
 
     kind: str
@@ -53,6 +57,7 @@ class SpectralModel:
     constant: Array
     substeps: int
     clip: float = np.inf
+    fewer: Array = field(default_factory=lambda: np.empty((0, 2)))
 
     @property
     def n_z(self) -> int:
@@ -75,23 +80,45 @@ class SpectralModel:
     @cached_property
     def compiled(self) -> PolynomialStep:
         """Its step in machine code, which one thread may use at a time."""
-        return PolynomialStep(
-            Polynomials(
-                self.linear,
-                self.multipliers,
-                self.polynomials,
-                self.B,
-                self.constant,
-                self.substeps,
-                self.clip,
-            )
+        return self._compiled(self.substeps)
+
+    @cached_property
+    def _steps(self) -> list[PolynomialStep]:
+        """With the steps of each row of `fewer`, and with all of them."""
+        return [*(self._compiled(int(steps)) for steps in self.fewer[:, 1]), self.compiled]
+
+    def _compiled(self, substeps: int) -> PolynomialStep:
+        equation = Polynomials(
+            self.linear,
+            self.multipliers,
+            self.polynomials,
+            self.B,
+            self.constant,
+            substeps,
+            self.clip,
         )
+        return PolynomialStep(equation)
+
+    def _alike(self, states: Array) -> Iterator[tuple[PolynomialStep, NDArray[np.bool_]]]:
+        """The rows of states that are stepped alike."""
+        level = np.searchsorted(self.fewer[:, 0], np.abs(states).max(axis=1, initial=0.0))
+        level = np.minimum(level, len(self.fewer))  # NaN is beyond infinity
+        for i in np.unique(level):
+            yield self._steps[i], level == i
 
     def step(self, states: Array, actions: Array) -> Array:
-        return self.compiled.step(states, actions)
+        after = np.empty(states.shape)
+        for compiled, rows in self._alike(states):
+            after[rows] = compiled.step(states[rows], actions[rows])
+        return after
 
     def pull_back(self, states: Array, actions: Array, covectors: Array) -> tuple[Array, Array]:
-        return self.compiled.pull_back(states, actions, covectors)
+        on_states, on_actions = np.empty(states.shape), np.empty(actions.shape)
+        for compiled, rows in self._alike(states):
+            on_states[rows], on_actions[rows] = compiled.pull_back(
+                states[rows], actions[rows], covectors[rows]
+            )
+        return on_states, on_actions
 
     def linearise(self, state: Array, action: Array) -> tuple[Array, Array]:
         return linearised(self, state, action)
@@ -107,6 +134,7 @@ class SpectralModel:
             "constant": self.constant,
             "substeps": np.array(self.substeps),
             "clip": np.array(self.clip),
+            "fewer": self.fewer,
         }
 
     @staticmethod
@@ -121,4 +149,5 @@ class SpectralModel:
             numbers_of(arrays, "constant"),
             substeps=int(arrays["substeps"].item()),
             clip=float(arrays["clip"].item()),
+            fewer=numbers_of(arrays, "fewer"),
         )

@@ -26,8 +26,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.fft import irfft, rfft
 
+from loop_interfaces.arrays import Array
 from loop_method.models.base import Samples
 from loop_method.models.columns import least_squares, orthonormal
 from loop_method.models.settings import FieldModelSettings
@@ -37,6 +39,8 @@ from spectral_solver.polynomial_step import phi_functions
 
 POWERS = 3
 """Above this degree the multipliers are powers of ik, each with a polynomial; else they are symbols."""
+SIZES = 48
+"""Sizes of fields for which the steps are counted."""
 
 
 def fit_spectral(
@@ -77,7 +81,9 @@ def fit_spectral(
         if found is None:
             break
         tried = replace(found, substeps=_substeps(found.symbols, largest, settings))
-    return best
+    if best is None:
+        return None
+    return replace(best, fewer=_fewer(best.symbols, largest, best.substeps, settings))
 
 
 def _between(first: SpectralModel, second: SpectralModel) -> SpectralModel:
@@ -149,10 +155,27 @@ def _regression(model: SpectralModel, samples: Samples, form: Form) -> Regressio
 
 def _substeps(symbols: Spectrum, largest: float, settings: FieldModelSettings) -> int:
     """So many that the fastest rate of the nonlinear part, of what is dealiased, is followed."""
+    return int(_counts(symbols, largest, settings)[-1])
+
+
+def _fewer(symbols: Spectrum, largest: float, most: int, settings: FieldModelSettings) -> Array:
+    """`fewer` of a `SpectralModel`: each row has about half as many steps again as the one before."""
+    counts, rows, steps = _counts(symbols, largest, settings), [], 1
+    while steps < most:
+        if enough := int(np.sum(counts <= steps)):
+            rows.append((largest * enough / SIZES, steps))
+        steps += max(steps // 2, 1)
+    return np.array(rows).reshape(-1, 2)
+
+
+def _counts(symbols: Spectrum, largest: float, settings: FieldModelSettings) -> NDArray[np.int64]:
+    """Internal steps, at least, of fields with max |z| = largest n/SIZES, n = 1 .. SIZES."""
     if len(symbols) < 2:
-        return 1
-    z = np.linspace(-largest, largest, 41)[:, None]
-    slopes = sum(p * z ** (p - 1) * symbols[p - 1] for p in range(2, len(symbols) + 1))
-    rate = np.abs(slopes).max(axis=0)[: 2 * symbols.shape[1] // 3].max()
-    steps = np.ceil(np.nan_to_num(rate) / settings.reach)
-    return int(np.clip(steps, 1, settings.substeps))
+        return np.ones(SIZES, dtype=np.int64)
+    size = largest * np.arange(1, SIZES + 1) / SIZES
+    z = np.stack([size, -size])[..., None]
+    low = symbols[:, : 2 * symbols.shape[1] // 3]
+    slopes = sum(p * z ** (p - 1) * low[p - 1] for p in range(2, len(symbols) + 1))
+    rates = np.nan_to_num(np.abs(slopes).max(axis=(0, 2)))
+    steps = np.ceil(np.maximum.accumulate(rates) / settings.reach)
+    return np.clip(steps, 1, settings.substeps).astype(np.int64)

@@ -70,6 +70,12 @@ def test_burgers_is_recovered_with_its_coefficients():
     np.testing.assert_allclose(squares[low], -0.05 * 0.5j * k[low], rtol=1e-3)
     assert np.abs(cubes[low]).max() < 1e-3 * np.abs(squares[low]).max()
     assert errors(fitted.model, rollouts[2:], target, 2.0)[0] < 1e-5
+    # The rate of u u_x is in proportion to u: half of the field needs half of the steps.
+    whole = fitted.model.substeps
+    assert len(fitted.model.fewer) > 1
+    largest = max(np.abs(rollout.states).max() for rollout in rollouts[:2])
+    for size, steps in fitted.model.fewer:
+        assert abs(steps / whole - size / largest) <= 1.5 / whole
 
 
 @pytest.mark.parametrize(

@@ -54,6 +54,7 @@ MODELS = {
     "cubes": lambda: spectral(degree=3),
     "degree 7": lambda: spectral(degree=7, clip=1.1),
     "odd": lambda: spectral(n_z=25),
+    "fewer steps": lambda: replace(spectral(), fewer=np.array([[0.9, 1.0], [1.2, 2.0]])),
     "one component": lambda: finite_difference(1, 5),
     "two components": lambda: finite_difference(2),
     "linear": linear,
@@ -124,6 +125,15 @@ def test_a_spectral_model_is_its_equation(n_z, degree):
     solved = solve_ivp(rate, (0, 1), np.fft.rfft(z) + 0j, method="DOP853", rtol=1e-11, atol=1e-11)
     expected = np.fft.irfft(solved.y[:, -1], n_z)
     np.testing.assert_allclose(model.step(z[None], a[None])[0], expected, atol=2e-8)
+
+
+def test_the_smaller_a_field_the_fewer_its_internal_steps():
+    model = MODELS["fewer steps"]()
+    z, a, _ = points(model)
+    z *= np.array([[0.5], [1.1], [1.5]]) / np.abs(z).max(axis=1, keepdims=True)
+    for i, steps in enumerate((1, 2, 3)):
+        alone = replace(model, substeps=steps, fewer=np.empty((0, 2)))
+        assert np.array_equal(model.step(z, a)[i : i + 1], alone.step(z[i : i + 1], a[i : i + 1]))
 
 
 def test_a_copied_model_that_was_used_is_a_model():

@@ -196,6 +196,7 @@ def test_mixtures_have_the_mean_and_covariance_they_claim() -> None:
     rng = np.random.default_rng(6)
     measured = rng.normal(size=(4, 20)) * np.exp(-np.arange(20) / 3.0)
     drawn = mixtures(measured, 40, rng)
+    assert 2 < len(drawn) <= 40
     mean, n = measured.mean(axis=0), len(measured)
     np.testing.assert_allclose(drawn.mean(axis=0), mean, atol=1e-12)
     rho, deviations = invariant_share(measured), measured - mean
@@ -203,8 +204,8 @@ def test_mixtures_have_the_mean_and_covariance_they_claim() -> None:
     covariance = (1 - rho) * own + rho * averaged_over_shifts(deviations)
     covariance *= (1 + 1 / n) / (n - 1)
     found = (drawn - mean).T @ (drawn - mean) / len(drawn)
-    assert np.trace(found) == pytest.approx(np.trace(covariance), rel=2e-3)
-    np.testing.assert_allclose(found, covariance, atol=2e-3 * np.trace(covariance))
+    assert np.trace(found) == pytest.approx(np.trace(covariance), rel=2e-2)
+    np.testing.assert_allclose(found, covariance, atol=2e-2 * np.trace(covariance))
     assert 0.0 < rho < 1.0
 
 

@@ -98,7 +98,7 @@ def test_the_known_optimum_of_a_linear_quadratic_plant_is_reached() -> None:
     # Over the horizon the law of the algebraic equation is optimal but for its last steps.
     assert plant.cost(optimizer.policy) <= 1.005 * best
     assert rows[-1]["chosen"] == ADAPTED and rows[-1]["predicted_change"] < 0.0
-    assert [row["rollouts"] for row in rows] == [4, 10, 15, 18]
+    assert [row["rollouts"] for row in rows] == [4, 15, 18]
     assert all(row["mismatch"] < 1e-6 for row in rows[:-1])
     for row in rows[1:]:  # said before the rollouts were fitted
         assert row["predicted"] == pytest.approx(row["cost"], rel=1e-3)
