@@ -70,12 +70,14 @@ class ControllerFastPath(FastPath):
         """What the responder was given last."""
 
     def prepare(self) -> bool:
-        """Within an episode that a law answers."""
+        """Within an episode that a law with a compiled form answers."""
         state, plan = self.last_state, self.plan
         answering = self._responder.answering(state) if state is not None else None
         if state is None or answering is None or answering.law is None:
             return False
-        law = answering.law
+        law = answering.law.compiled
+        if law is None:
+            return False
         batch, n_z = state.values.shape
         if not self.expect(state, (batch, n_z), (batch, law.n_a)):
             return False

@@ -26,7 +26,7 @@ from loop_method.reduce.reduced_model import ReducedModel
 
 @dataclass(frozen=True)
 class DesignSettings:
-    """How to identify and what to design for.
+    """How to identify, what to design for, and which law it is.
 
     Attributes
     ----------
@@ -44,6 +44,10 @@ class DesignSettings:
         "field": the regression, or a law from a model of the whole field (`field_law`) that is better.
     dmdc_rank, dmdc_order : int
         p and n_s of "dmdc"; 0: n_s + n_a, and reduced_order.
+    law : str
+        Name of the law that answers.
+    horizon : int
+        Steps of an episode, for a law that has parameters for each of them.
     """
 
     n_a: int
@@ -55,6 +59,8 @@ class DesignSettings:
     identification: str = "regression"
     dmdc_rank: int = 0
     dmdc_order: int = 0
+    law: str = "affine"
+    horizon: int = 1
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> DesignSettings:

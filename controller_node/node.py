@@ -47,9 +47,8 @@ class ControllerNode:
         values = declare(
             node, taken_by("controller_node"), given_parameters(node, "controller_node")
         )
-        settings = {k: v for k, v in values.items() if k not in ("problem", "pin")}
         pin_process(values["pin"])
-        responder = Responder(DesignSettings(**settings))
+        responder = Responder(DesignSettings.of(values))
         self._responder = responder
         self._diagnostics = ControllerDiagnostics(responder)
         load_compiled()  # before there is a publisher: a peer that discovers one expects answers
@@ -57,7 +56,9 @@ class ControllerNode:
             FAST_PATH.load_compiled()
         self.join(node, loop)
         order = model_order(values) or "suggested by the data"
-        node.get_logger().info(f"{values['problem']}: tracking law, order {order}")
+        node.get_logger().info(
+            f"{values['problem']}: tracking law '{values['law']}', order {order}"
+        )
 
     def join(self, node: Node, loop: NodeLoop) -> None:
         responder = self._responder

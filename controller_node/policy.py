@@ -109,17 +109,7 @@ class ProjectedLaw:
         if not np.isfinite(gains).all():
             raise ValueError("policies must be finite, but there is NaN or infinity in them.")
         count = gains.shape[0]
-        index = np.zeros(count, dtype=np.int64) if model_index is None else np.array(model_index)
-        if index.shape != (count,) or not np.issubdtype(index.dtype, np.integer):
-            raise ValueError(
-                f"model_index must be {count} integers, one per policy, but it has shape "
-                f"{index.shape} and type {index.dtype}."
-            )
-        if index.min() < 0 or index.max() >= len(self._bases):
-            raise ValueError(
-                f"model_index must lie in 0 .. {len(self._bases) - 1}, but it holds {index.min()} "
-                f".. {index.max()}."
-            )
+        index = checked_index(model_index, count, len(self._bases))
         self._take(gains, index)
         self._set = True
 
@@ -165,6 +155,22 @@ class ProjectedLaw:
         actions: Array = np.empty(shape)
         control(self._plan, z, actions)
         return actions
+
+
+def checked_index(model_index: ArrayLike | None, count: int, models: int) -> IndexArray:
+    """Which of the models each of `count` policies belongs to: the first one if not given."""
+    index = np.zeros(count, dtype=np.int64) if model_index is None else np.array(model_index)
+    if index.shape != (count,) or not np.issubdtype(index.dtype, np.integer):
+        raise ValueError(
+            f"model_index must be {count} integers, one per policy, but it has shape "
+            f"{index.shape} and type {index.dtype}."
+        )
+    if index.min() < 0 or index.max() >= models:
+        raise ValueError(
+            f"model_index must lie in 0 .. {models - 1}, but it holds {index.min()} "
+            f".. {index.max()}."
+        )
+    return index
 
 
 def excitations(rows: Array, step: int, n_a: int, action_limit: float = 0.0) -> Array:

@@ -2,9 +2,10 @@
 """The controller's side of the loop: answer every state. Pure: no ROS, no clock.
 
 It answers every state of an episode whose start it has, also one it has answered before, and the
-answer depends only on (state, policy, model) or, in an exploratory episode, on (seed, step). It
+answer depends only on (state, policy, model, step) or, in an exploratory episode, on (seed, step). It
 keeps nothing that the latched topics do not give it back after a restart, except the samples of an
-exploratory episode: if it missed some, it says so and the episode is run again.
+exploratory episode and the memory of a law that has one, which is a function of the episode's states:
+if it missed some, it says so and the episode is run again.
 """
 
 from collections import Counter, OrderedDict
@@ -17,8 +18,14 @@ import numpy as np
 from controller_node.answered_steps import AnsweredSteps
 from controller_node.exploration import Exploration
 from controller_node.identification import DesignSettings
-from controller_node.policy import ProjectedLaw
-from controller_node.run_state import Answering, Models, RunState, digest_of_start
+from controller_node.law_batch import ForgottenError, LawBatch
+from controller_node.run_state import (
+    Answering,
+    EpisodeInputs,
+    Models,
+    RunState,
+    digest_of_start,
+)
 from loop_interfaces import model_rows
 from loop_interfaces.episodes import episode_name
 from loop_interfaces.frames import KEPT_ARRAY, Frame, FrameError
@@ -32,6 +39,8 @@ from loop_interfaces.topics import (
     StartColumn,
     start_rows,
 )
+from loop_method.laws.calls import laws_of
+from loop_method.laws.registry import law_kind
 
 MAX_RUNS = 8
 """Runs, and plants, that are remembered. The least recently used is dropped first, but never the one
@@ -50,7 +59,8 @@ class Responder:
     """
 
     def __init__(self, settings: DesignSettings) -> None:
-        self._settings = settings
+        """ValueError if there is no law of that name, or it is code that is not allowed."""
+        self._settings, self._law_kind = settings, law_kind(settings.law)
         self._targets: OrderedDict[int, np.ndarray] = OrderedDict()
         self._runs: OrderedDict[int, RunState] = OrderedDict()
         self._served = (-1, -1)
@@ -130,13 +140,18 @@ class Responder:
         return self._answer_pending()
 
     def policy(self, frame: Frame) -> list[Publication | ModelFailure]:
-        """Take the policies [K_a K_b] of an episode's environments, (M, n_a, 2 n_s).
+        """Take theta of an episode's environments: gains (M, n_a, 2 n_s), of another law (M, size).
 
         Where others came for the episode before, those are taken that its start signs. FrameError
-        then, and for another number of actuators or gains beyond MAX_GAIN.
+        then, and for another number of axes or of actuators, or numbers beyond MAX_GAIN.
         """
-        n_a = self._settings.n_a
-        if frame.values.shape[1] != n_a:
+        n_a, kind = self._settings.n_a, self._law_kind
+        if frame.values.ndim != 1 + kind.axes:
+            raise FrameError(
+                f"expected a policy of the law '{kind.name}', with {1 + kind.axes} axes, got one of "
+                f"another law, of shape {frame.values.shape}; start both with the same 'law'"
+            )
+        if kind.axes == 2 and frame.values.shape[1] != n_a:
             raise FrameError(f"expected gains of {n_a} actuators, got {frame.values.shape[1]}")
         if frame.values.size and np.abs(frame.values).max() > MAX_GAIN:
             raise FrameError(f"expected gains of at most {MAX_GAIN:g} in magnitude")
@@ -165,7 +180,8 @@ class Responder:
         if digest not in [known.digest for known in before]:
             n_a = self._settings.n_a
             rows = [model_rows.unpack(rows.copy(), n_a) for rows in frame.values]
-            run.models.append(Models(frame.step, digest, rows))
+            laws = laws_of(self._law_kind, rows, self._settings.horizon)
+            run.models.append(Models(frame.step, digest, laws))
             run.answering = None
             if before:
                 raise FrameError(
@@ -193,7 +209,12 @@ class Responder:
             self.counters["states that had to wait"] += 1
             return []
         if answering.law is not None:
-            actions = answering.law.actions(frame.values)
+            try:
+                actions = answering.law.actions(frame.step, frame.values)
+            except ForgottenError as error:
+                return [self._forgotten(frame, str(error))]
+            if answering.law.remembers and not self._has_room(frame.run, 0):
+                answering.law.forget_answers()
         else:
             exploration = self._runs[frame.run].exploration
             assert exploration is not None
@@ -322,7 +343,7 @@ class Responder:
         if run.exploration is None:
             if (inputs := run.inputs_for(start, self._settings.action_limit)) is None:
                 return None
-            law = self._law(start, *inputs, target)
+            law = self._law(run, start, inputs, target)
         signed = NOT_SIGNED
         if start.plant:
             digest = digest_of_start(start, inputs, self._settings.action_limit)
@@ -330,16 +351,29 @@ class Responder:
         run.answering = Answering(frame.plant, frame.episode, law, signed)
         return run.answering
 
-    def _law(self, start: Frame, policy: Frame, models: Models, target: np.ndarray) -> ProjectedLaw:
-        """The law set for an episode."""
+    def _law(
+        self, run: RunState, start: Frame, inputs: EpisodeInputs, target: np.ndarray
+    ) -> LawBatch:
+        """The law set for an episode: the one in use, with its memory, if it is made from the same."""
+        policy, models = inputs
         index = start.values[:, StartColumn.MODEL].astype(np.int64)
         if len(policy.values) != len(index):
             raise FrameError(
                 f"expected policies for {len(index)} environments, got {len(policy.values)}"
             )
-        law = ProjectedLaw([model.U for model in models.rows], target, self._settings.action_limit)
-        law.set(policy.values, index)
-        return law
+        limit = self._settings.action_limit
+        made_from = start.episode, digest_of_start(start, inputs, limit), digest_of(target)
+        if run.law is None or run.law[0] != made_from:
+            law = LawBatch(models.laws, target, limit)
+            law.set(policy.values, index)
+            run.law = made_from, law
+        return run.law[1]
+
+    def _forgotten(self, state: Frame, reason: str) -> ModelFailure:
+        """That the episode has to be run again, as the law's memory is not known."""
+        self.counters["memories lost"] += 1
+        text = f"{reason}, on which the memory of the law '{self._law_kind.name}' depends"
+        return ModelFailure(state.run, state.episode, True, text)
 
     def _answer_pending(self) -> list[Publication | ModelFailure]:
         return self.state(self._pending) if self._pending is not None else []

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 from controller_node.exploration import Exploration
-from controller_node.policy import ProjectedLaw
-from loop_interfaces import model_rows
+from controller_node.law_batch import LawBatch
 from loop_interfaces.frames import Frame
 from loop_interfaces.signature import digest_of
+from loop_method.laws.base import Law
 
 MAX_KEPT = 4
 """Policies, and sets of reduced models, that are kept of a run: a stranger's beside the tuner's."""
@@ -25,17 +25,20 @@ class Answering:
 
     plant: int
     episode: int
-    law: ProjectedLaw | None
+    law: LawBatch | None
     signature: float
 
 
 @dataclass(frozen=True)
 class Models:
-    """Reduced models as a tuner has sent them: their number, which episodes name, and a digest."""
+    """Reduced models as a tuner has sent them: their number, which episodes name, and a digest.
+
+    laws: that of each model.
+    """
 
     number: int
     digest: int
-    rows: list[model_rows.ModelRows]
+    laws: list[Law]
 
 
 EpisodeInputs: TypeAlias = tuple[Frame, Models]
@@ -53,6 +56,8 @@ class RunState:
     models: deque[Models] = field(default_factory=lambda: deque(maxlen=MAX_KEPT))
     answering: Answering | None = None
     """Dropped with whatever arrives that changes it."""
+    law: tuple[tuple[int, ...], LawBatch] | None = None
+    """The one in use, and what identifies its episode and all that it is made from."""
 
     @property
     def nbytes(self) -> int:
@@ -60,11 +65,12 @@ class RunState:
         frames = [
             frame.values.nbytes for frame in (self.start, *self.policies) if frame is not None
         ]
-        rows = [model for models in self.models for model in models.rows]
+        rows = [law.model for models in self.models for law in models.laws]
         matrices = [a.nbytes for model in rows for a in (model.U, model.A, model.B)]
         samples = self.exploration.nbytes if self.exploration else 0
+        answers = self.law[1].nbytes if self.law else 0
         # The law has a copy of every U.
-        return sum(frames) + 2 * sum(matrices) + samples
+        return sum(frames) + 2 * sum(matrices) + samples + answers
 
     def policies_of(self, episode: int) -> list[Frame]:
         """All that came for an episode."""

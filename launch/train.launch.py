@@ -27,12 +27,14 @@ from loop_interfaces.parameters import flags
 from loop_interfaces.protocol import STOPPED
 from loop_interfaces.spec import ParameterError, assignment
 from loop_method.adapt.registry import OWN_OPTIMIZERS
+from loop_method.laws.registry import OWN_LAWS
 from pde_sim_node.equations import OWN_EQUATIONS
 from pde_sim_node.plants.loading import OWN_PLANTS
 from pdeloop.pairs import PAIR, PAIRS, Transport
 from pdeloop.supervisor import RECORDER_GRACE
 from pdeloop.training_run import begin, reopen, unused
 
+OWN_CODE = (OWN_EQUATIONS, OWN_PLANTS, OWN_OPTIMIZERS, OWN_LAWS)
 LOOP = Path(__file__).parent / "loop.launch.py"
 FLAGS = flags()
 ARGUMENTS = {
@@ -84,9 +86,10 @@ def training(context: LaunchContext) -> list[Any]:
     folder = run_folder(given, transport)
     given["problem"] = str(folder / "parameters.yaml")
     actions: list[Any] = [LogInfo(msg=f"training in {folder}")]
-    if given["optimizer"]:
-        allowed = context.environment[OWN_OPTIMIZERS.variable]
-        actions.append(SetEnvironmentVariable(OWN_OPTIMIZERS.variable, allowed))
+    for kind in (OWN_OPTIMIZERS, OWN_LAWS):
+        if given[kind.word]:
+            allowed = context.environment[kind.variable]
+            actions.append(SetEnvironmentVariable(kind.variable, allowed))
     for node in transport.nodes(folder):
         if node.package in PAIR:
             continue  # of the loop
@@ -116,11 +119,12 @@ def run_folder(given: dict[str, str], transport: Transport) -> Path:
     own |= dict(assignment(text) for text in filter(None, given["set"].split(",")))
     if given["model"]:
         own["model"] = str(Path(given["model"]).resolve())
-    kinds = [kind for kind in (OWN_EQUATIONS, OWN_PLANTS, OWN_OPTIMIZERS) if given[kind.word]]
+    kinds = [kind for kind in OWN_CODE if given[kind.word]]
     code = {kind.word: kind.allow(given[kind.word]) for kind in kinds}
     if given["resume"]:
-        if ":" in code.get("optimizer", ""):  # code of a run has to be named again
-            del own["optimizer"]
+        for word in own.keys() & code.keys():
+            if ":" in code[word]:  # code of a run has to be named again
+                del own[word]
         if own or given["out"]:
             names = ", ".join([*own, *["out"] * bool(given["out"])])
             raise ParameterError(

@@ -81,6 +81,8 @@ class _Layout:
 class ArrayCodec:
     """Encodes and decodes the arrays of one topic; labels: the names of the axes, in order.
 
+    others: the names where an array has another number of axes.
+
     >>> codec = ArrayCodec(("env", "actuator"))
     >>> raw = codec.encode(Frame(run=7, episode=1, step=0, time=0.5, values=np.ones((1, 2))))
     >>> frame = codec.decode(raw)
@@ -88,8 +90,9 @@ class ArrayCodec:
     (7, 0.5, array([[1., 1.]]))
     """
 
-    def __init__(self, labels: tuple[str, ...]) -> None:
+    def __init__(self, labels: tuple[str, ...], *others: tuple[str, ...]) -> None:
         self.labels = labels
+        self._labels = {len(names): names for names in (labels, *others)}
         self._templates: dict[tuple[int, ...], tuple[bytearray, int, NDArray[np.float64]]] = {}
         self._last: _Layout | None = None
 
@@ -142,11 +145,12 @@ class ArrayCodec:
         return Frame(int(run), int(episode), int(step), time, values, int(plant))
 
     def _template(self, shape: tuple[int, ...]) -> tuple[bytearray, int, NDArray[np.float64]]:
-        if len(shape) != len(self.labels):
+        labels = self._labels.get(len(shape))
+        if labels is None:
             raise FrameError(f"expected the axes {self.labels}, got an array of shape {shape}")
         total = math.prod(shape)
         head = bytearray(b"\x00\x01\x00\x00") + struct.pack("<I", len(shape))
-        for label, size, stride in zip(self.labels, shape, _strides(shape), strict=True):
+        for label, size, stride in zip(labels, shape, _strides(shape), strict=True):
             text = label.encode() + b"\0"
             head += struct.pack("<I", len(text)) + text
             head += bytes(-(len(head) - 4) % 4) + struct.pack("<II", size, stride)
@@ -179,10 +183,11 @@ class ArrayCodec:
             return int(value)
 
         axes = number()
-        if axes != len(self.labels):
+        labels = self._labels.get(axes)
+        if labels is None:
             raise FrameError(f"expected {len(self.labels)} axes {self.labels}, got {axes}")
         shape, strides = [], []
-        for expected in self.labels:
+        for expected in labels:
             length = number()
             label = raw[position : position + length].rstrip(b"\0")
             if length > 256 or label != expected.encode():

@@ -150,6 +150,15 @@ def identity(name: str) -> tuple[str, str]:
     return (str(Path(module).resolve()) if module.endswith(".py") else module), name_in_it
 
 
+def name_of(kind: type) -> str:
+    """The name by which another process can load a class of this one, from its module or file."""
+    module = sys.modules[kind.__module__]
+    importable = bool(getattr(module, "__package__", "")) and module.__name__ != "__main__"
+    file = getattr(module, "__file__", None)
+    source = module.__name__ if importable or not file else file
+    return f"{source}:{kind.__qualname__}"
+
+
 def located(error: Exception) -> str:
     """An exception in one line, with the line of the function that the `try` block called."""
     called = error.__traceback__.tb_next if error.__traceback__ else None

@@ -83,6 +83,11 @@ IDENTIFICATION = Spec(
     "its own: model_based has field, two_point dmdc"
 )
 
+LAW = Spec("law", "affine", nodes="CT", group="budget and method").means(
+    "control law: a shipped or installed name, or code that the user has to allow, "
+    "'package.module:Class' or 'path/to/file.py:Class'"
+)
+
 PROBLEM = _section(
     "PT",
     Spec("problem", "burgers", file_name=True, nodes="PCTV").means(
@@ -119,7 +124,7 @@ PROBLEM = _section(
     Spec("integration_time", 0.0025, positive=True, unit="s").means(
         "internal step of the integrator, of which sample_time is a whole multiple"
     ),
-    Spec("horizon", 300, 1, 1_000_000, nodes="PTV").means("steps T of an episode"),
+    Spec("horizon", 300, 1, 1_000_000, nodes="PCTV").means("steps T of an episode"),
     Spec("state_weight", 1.0, positive=True, nodes="PCTV").means("q of Q = q I in the stage cost"),
     Spec("action_weight", 1.0, positive=True, nodes="PCTV").means("r of R = r I in the stage cost"),
     Spec("divergence_bound", 1e3, positive=True, maximum=1e6).means(
@@ -130,6 +135,7 @@ PROBLEM = _section(
         "suggests (one seed only)"
     ),
     IDENTIFICATION,
+    LAW,
     Spec("dmdc_rank", 0, 0, 4096, nodes="CT").means(
         "rank p of [Z; Y] in the identification dmdc; 0: n_s + n_a"
     ),

@@ -78,8 +78,9 @@ def load_parameters(
     folder = path.resolve().parent if path else Path.cwd()
     for code in ("equation", "plant"):
         given[code] = _from(folder, str(given.get(code, "")))
-    if "optimizer" in given:
-        given["optimizer"] = _from(folder, str(given["optimizer"]))
+    for code in ("optimizer", "law"):
+        if code in given:
+            given[code] = _from(folder, str(given[code]))
     given = dict(preferred(given))
     if given["plant"]:
         given.setdefault("problem", _words(given["plant"]))

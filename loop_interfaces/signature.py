@@ -42,9 +42,15 @@ def digest_of(*arrays: ArrayLike) -> int:
 
 
 def design_digest(parameters: Mapping[str, Any]) -> int:
-    """h of the parameters DESIGN; text as the numbers of its UTF-8 bytes."""
+    """h of the parameters DESIGN; text as the numbers of its UTF-8 bytes.
+
+    The name of a law other than the affine one follows, without the file or module that it is in, and
+    the horizon.
+    """
     values = [parameters[name] for name in DESIGN]
     values += [parameters["cost"]] if parameters.get("cost") else []
+    law = parameters.get("law", "affine").rpartition(":")[2]
+    values += [law, parameters["horizon"]] if law != "affine" else []
     return digest_of(*(list(v.encode()) if isinstance(v, str) else v for v in values))
 
 

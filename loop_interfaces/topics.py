@@ -11,7 +11,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.frames import Frame, FrameError
+from loop_interfaces.frames import ArrayCodec, Frame, FrameError
 
 
 @dataclass(frozen=True)
@@ -19,11 +19,17 @@ class Topic:
     """One topic of arrays: its relative name, and the names of its axes.
 
     latched: transient local, so that a node that starts late or again receives the last message.
+    others: the names of the axes of an array with another number of them.
     """
 
     name: str
     labels: tuple[str, ...]
     latched: bool
+    others: tuple[tuple[str, ...], ...] = ()
+
+    def codec(self) -> ArrayCodec:
+        """What encodes and decodes its arrays."""
+        return ArrayCodec(self.labels, *self.others)
 
 
 class StartColumn(IntEnum):
@@ -107,7 +113,8 @@ VOID = -2
 
 # Latched: a node that restarts in the middle of an episode must learn of it without asking.
 START = Topic("episode/start", ("env", "seed_excitation_variance_model"), latched=True)
-POLICY = Topic("policy", ("env", "actuator", "gain"), latched=True)
+# Gains of the affine law; theta of any other.
+POLICY = Topic("policy", ("env", "actuator", "gain"), latched=True, others=(("env", "parameter"),))
 COST = Topic("episode/cost", ("env", "mean_total_ended"), latched=True)
 MODEL = Topic("model", ("model", "row", "mode"), latched=True)
 MODEL_IDENTIFIED = Topic("model/identified", ("model", "row", "mode"), latched=True)
@@ -143,7 +150,7 @@ VIEW_NUMBERS = {
     "tracking_error": "root of the mean square of z_k - z_r of the newest sample",
     "final_error": "the same at the last step of the last episode",
     "action_norm": "|a_k| of the newest sample",
-    "gain_norm": "Frobenius norm of the present gains [K_a K_b]",
+    "gain_norm": "Frobenius norm of the present gains [K_a K_b], or of another law's parameters",
     "gain_change": "Frobenius norm of their difference to the LQT gains, relative to these",
     "step": "k of the newest sample",
 }

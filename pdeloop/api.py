@@ -23,6 +23,9 @@ from loop_interfaces.parameters import table
 from loop_interfaces.problem import load_parameters
 from loop_interfaces.spec import FREE, flatten
 from loop_method.adapt.registry import OWN_OPTIMIZERS
+from loop_method.laws.base import Law
+from loop_method.laws.registry import OWN_LAWS
+from loop_method.laws.registry import hand_over as hand_over_law
 from loop_method.reduce.identifiability import IdentifiabilityWarning
 from loop_method.reduce.reduced_model import ReducedModel
 from pde_sim_node.build import build_plant, complete
@@ -141,7 +144,8 @@ def problem(
         The parameters of the equation itself, like {"viscosity": 1e-3}, or of a plant that is named.
     parameters
         Any parameter of docs/parameters.md by name: n_z, n_a, horizon, measurement_noise, ... Code of
-        one's own ('file.py:Class') is run if it is named here as `equation` or `optimizer`.
+        one's own ('file.py:Class') is run if it is named here as `equation`, `optimizer` or `law`,
+        which may be a class derived from `Law`, too.
 
     Returns
     -------
@@ -193,7 +197,9 @@ def named(source: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
     physical = given.pop("physical", None) or {}
     if not isinstance(physical, Mapping):
         raise ValueError(f"physical is {physical!r}; expected a dict of names and numbers")
-    for code in (OWN_EQUATIONS, OWN_OPTIMIZERS):
+    if isinstance(law := given.get("law"), type):
+        given["law"] = hand_over_law(law)
+    for code in (OWN_EQUATIONS, OWN_OPTIMIZERS, OWN_LAWS):
         if code.word in given:
             given[code.word] = code.allow(given[code.word])
     if (plant := given.pop("plant", None)) is not None:
@@ -270,6 +276,7 @@ def train(
     problem: Problem | str | None = None,
     *,
     plant: Dynamics | Plant | str | None = None,
+    law: type[Law] | str | None = None,
     out: str | Path | None = None,
     over_topics: bool = False,
     progress: TextIO | None = None,
@@ -283,6 +290,8 @@ def train(
         A problem, or its name; not needed with a plant.
     plant
         A plant of one's own, as of `problem`.
+    law
+        The control law: a class derived from `Law`, or a name; the problem's if not given.
     out
         Folder of the results, as the command line keeps them; none is kept if not given.
     over_topics
@@ -296,8 +305,8 @@ def train(
     Returns
     -------
     FinishedRun
-        With S seeds: `policies` and `warm` (S, n_a, 2 n_s), `models`, and `costs` by controller,
-        (S, fields).
+        With S seeds: `policies` and `warm` (S, n_a, 2 n_s), or (S, size) of another law than the
+        affine one, `models`, and `costs` by controller, (S, fields).
 
     Raises
     ------
@@ -327,6 +336,7 @@ def train(
             (problem.source, problem.given) if isinstance(problem, Problem) else (problem or "", {})
         )
         parameters |= {} if plant is None else {"plant": plant}
+        parameters |= {} if law is None else {"law": law}
         where = Path(temporary) / "run" if out is None else Path(out)
         folder, values = begin(source, {**given, **named(source, parameters)}, where, transport)
         display = Display(values["seed"], values["seeds"], progress or StringIO())

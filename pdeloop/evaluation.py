@@ -69,7 +69,7 @@ def changed(run: FinishedRun, changes: Mapping[str, Any]) -> FinishedRun:
             )
     values = {**run.values, **changes}
     plant = build_plant(values, compiled=False)
-    size, n_a = len(run.models[0].U), run.policies.shape[1]
+    size, n_a = len(run.models[0].U), run.models[0].B.shape[1]
     if (plant.state_size, plant.n_a) != (size, n_a):
         raise ParameterError(
             f"the policies are of a state of {size} numbers and of {n_a} actuators; the changed plant "
@@ -119,7 +119,7 @@ def mean_costs(
     seed: int,
     mean_field: bool = False,
 ) -> Array:
-    """Mean stage costs (N, fields) of policies (N, n_a, 2 n_s), each on the model of its index.
+    """Mean stage costs (N, fields) of policies (N, *shape), each on the model of its index.
 
     The fields are those of a closing evaluation with this seed, or the mean field alone. Each has a
     noise of its own, the same for all policies.

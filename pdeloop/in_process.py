@@ -13,10 +13,13 @@ from typing import Any
 import numpy as np
 
 from controller_node.identification import DesignSettings, design_each
-from controller_node.policy import ProjectedLaw, excitations
+from controller_node.law_batch import LawBatch
+from controller_node.policy import excitations
 from loop_interfaces import model_rows
 from loop_interfaces.arrays import Array
 from loop_interfaces.topics import CostColumn, StartColumn, noise_seeds
+from loop_method.laws.calls import laws_of
+from loop_method.laws.registry import law_kind
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import Plant
 from pdeloop.episode import EpisodeRecord, Law, rollout
@@ -34,7 +37,8 @@ class LocalPair:
         self.plant = plant or build_plant(values)
         self.fingerprint = self.plant.definition.fingerprint
         self._settings = DesignSettings.of(values)
-        self._law: ProjectedLaw | None = None
+        self._kind = law_kind(self._settings.law)
+        self._law: LawBatch | None = None
         self._generation = 0
 
     def follow(self, training: Training) -> None:
@@ -46,8 +50,9 @@ class LocalPair:
 
     def use_models(self, models: Array) -> None:
         """Take the reduced models (S, rows, n_s) that policies refer to."""
-        bases = [model_rows.unpack(rows, self._settings.n_a).U for rows in models]
-        self._law = ProjectedLaw(bases, self.plant.target, self._settings.action_limit)
+        unpacked = [model_rows.unpack(rows, self._settings.n_a) for rows in models]
+        laws = laws_of(self._kind, unpacked, self._settings.horizon)
+        self._law = LawBatch(laws, self.plant.target, self._settings.action_limit)
 
     def run(self, batch: Batch, max_batch: int = 1024) -> BatchResult:
         """Roll the batch out. ValueError if exploration gives no model."""
@@ -104,7 +109,7 @@ class LocalPair:
             law = self._law
             assert law is not None
             law.set(batch.policies, batch.rows[:, StartColumn.MODEL].astype(np.int64))
-            return lambda k, states: law.actions(states)
+            return law.actions
         n_a, limit = self._settings.n_a, self._settings.action_limit
         return lambda k, states: excitations(batch.rows, k, n_a, limit)
 

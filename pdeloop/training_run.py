@@ -36,13 +36,17 @@ from tuner_node.build import build_training
 from tuner_node.optimizer_parameters import kind_of, training_parameters
 from tuner_node.run_folder import RunFolder, RunFolderError, resuming, timestamp
 from tuner_node.run_store import RunWriter
+from tuner_node.training import Training
 
-BUILT_IN = {"nodes": [], "law": "affine"}
-"""The controller of a training in this process, as result.json has it."""
 POLL = 0.05
 """Seconds between two looks at the nodes."""
 QUIET = 5.0
 """Seconds without news of the training after which it is said what the nodes wait for."""
+
+
+def built_in(training: Training) -> dict[str, Any]:
+    """The controller of a training in this process, as result.json has it."""
+    return {"nodes": [], "law": training.settings.law.name}
 
 
 def resolve(problem: str, options: Mapping[str, Any]) -> dict[str, Any]:
@@ -191,7 +195,7 @@ def _train_here(
                 f"{error} (continue with: {resuming(folder)} --in-process)"
             ) from error
         try:
-            writer.finish({"transport": "in-process", "controller": BUILT_IN})
+            writer.finish({"transport": "in-process", "controller": built_in(training)})
         except OSError as error:
             raise RunFolderError(
                 f"cannot write the results to {folder}: {error.strerror}; make room and "

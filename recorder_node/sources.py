@@ -31,7 +31,7 @@ class Source:
     def codec(self) -> ArrayCodec:
         """Decodes its messages, if it has arrays."""
         assert self.array is not None
-        return ArrayCodec(self.array.labels)
+        return self.array.codec()
 
 
 CLOCK = Source(Channel("/clock", "rosgraph_msgs/msg/Clock"))

@@ -10,6 +10,7 @@ import numpy as np
 from loop_interfaces.arrays import Array
 from loop_interfaces.topics import COMPLETED, MAX_GAIN, START_COLUMNS, CostColumn
 from loop_method.adapt import Rollout, RolloutResult, Trajectory
+from loop_method.laws import Affine, Law
 
 UNKNOWN_PLANT = -1
 """The plant's fingerprint before the first cost."""
@@ -19,9 +20,9 @@ UNKNOWN_PLANT = -1
 class Batch:
     """Rollouts wanted together; any split into episodes gives the same results.
 
-    rows (R, 4), or (R, 5) with noise: the columns of `episode/start`; policies (R, n_a, 2 n_s),
-    None for an exploratory batch, whose result is a model for each row; trajectories: whether the
-    result has them.
+    rows (R, 4), or (R, 5) with noise: the columns of `episode/start`; policies (R, *shape): theta of
+    each, as messages have it (`Law.shape`), None for an exploratory batch, whose result is a model for
+    each row; trajectories: whether the result has them.
     """
 
     rows: Array
@@ -100,6 +101,9 @@ class TrainingSettings:
     """Whether the states are fields on one periodic axis."""
     model: Array | None = None
     """Rows of a reduced model to start from instead of identifying one."""
+    law: type[Law] = Affine
+    horizon: int = 1
+    """Steps of an episode as the parameters have it, for a law with parameters for each of them."""
 
     @property
     def all_seeds(self) -> list[int]:

@@ -3,7 +3,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,8 @@ from loop_interfaces.parameters import model_order, noisy
 from loop_interfaces.signature import design_digest
 from loop_interfaces.spec import ParameterError
 from loop_method.adapt import Context, Optimizer
+from loop_method.laws import Affine, Law
+from loop_method.laws.registry import law_kind
 from tuner_node.batch import UNKNOWN_PLANT, TrainingSettings
 from tuner_node.dispatch import Dispatcher
 from tuner_node.exploration import least_variance
@@ -86,6 +88,20 @@ def check_budget(
         )
 
 
+def law_of(values: Mapping[str, Any], kind: type[Optimizer]) -> type[Law]:
+    """The class of the law. ParameterError if there is none, or the optimiser cannot improve it."""
+    try:
+        law = law_kind(values["law"])
+    except ValueError as error:
+        raise ParameterError(str(error)) from error
+    if kind.needs_affine_law and law is not Affine:
+        raise ParameterError(
+            f"the optimizer '{values['optimizer']}' improves the gains of the law 'affine' alone, and "
+            f"the law is '{values['law']}'; take an optimizer that knows no law, such as two_point"
+        )
+    return law
+
+
 def build_training(values: Mapping[str, Any]) -> Training:
     """The training that the tuner's and the problem's parameters describe."""
     order = model_order(values)
@@ -102,9 +118,16 @@ def build_training(values: Mapping[str, Any]) -> Training:
         kind = kind_of({"optimizer": kind.with_sensors})
         chosen = kind.Settings()
 
+    law = law_of(values, kind)
+
     def make_optimizer(
         policy: NDArray[np.float64], seed: int, context: Context | None, rollouts: int
     ) -> Optimizer:
+        if not kind.needs_affine_law:  # for which theta is a vector, whatever the law is
+            policy = policy.ravel()
+            if context is not None:
+                measured = [replace(r, policy=r.policy.ravel()) for r in context.measured]
+                context = replace(context, measured=measured)
         return kind(policy, seed=seed, rollouts=rollouts, settings=chosen, context=context)
 
     explorations = 1 if sensors else kind.explorations
@@ -126,6 +149,7 @@ def build_training(values: Mapping[str, Any]) -> Training:
     readings = values["sensors"] * values["sensor_delays"] or values["n_z"]
     scale = math.sqrt(values["n_z"] / readings)
     given |= {
+        "law": law,
         "exploration_variance": max(values["exploration_variance"], variance),
         "sensors": sensors,
         "periodic": not values["grid"] or Grid.parse(values["grid"]).is_circle,

@@ -1,25 +1,28 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Whether the actions of a rollout are those of the law that the tuner publishes the gains of."""
+"""Whether the actions of a rollout are those of the law whose parameters the tuner publishes."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
-from loop_interfaces.model_rows import ModelRows
+from loop_interfaces.arrays import Array
 from loop_interfaces.topics import MAX_GAIN
 from loop_method.adapt import Rollout, Trajectory
+from loop_method.laws import Law
+from loop_method.laws.calls import along
 
 TOLERANCE = 1e-6
 """Relative difference of actions that rounding may explain."""
+AFFINE = "a = K_a U^T z + K_b U^T z_r"
 
 
 def check_law(
     asked: Sequence[Rollout],
-    model: ModelRows,
+    law: Law,
     seen: Sequence[Trajectory | None],
     action_limit: float = 0.0,
 ) -> None:
-    """See that a_k = K_a U^T z_k + K_b s_r all along in rollouts of one model; a ValueError if not.
+    """See that the actions are the law's all along in rollouts of one model; a ValueError if not.
 
     asked, seen: the policies, and what was measured under them; action_limit: 0: none.
     """
@@ -27,14 +30,24 @@ def check_law(
         assert trajectory is not None
         actions = trajectory.actions
         states = trajectory.states[: len(actions)]
-        K_a, K_b = np.hsplit(np.clip(rollout.policy, -MAX_GAIN, MAX_GAIN), 2)
+        theta = np.clip(rollout.policy, -MAX_GAIN, MAX_GAIN).ravel()
         with np.errstate(over="ignore", invalid="ignore"):
-            law = states @ model.U @ K_a.T + K_b @ model.s_r
+            expected = _actions(law, theta, states, actions)
         if action_limit > 0.0:
-            law = np.clip(law, -action_limit, action_limit)
+            expected = np.clip(expected, -action_limit, action_limit)
         scale = max(1.0, float(np.abs(actions).max(initial=0.0)))
-        if not np.allclose(actions, law, rtol=TOLERANCE, atol=TOLERANCE * scale):
+        if not np.allclose(actions, expected, rtol=TOLERANCE, atol=TOLERANCE * scale):
+            words = AFFINE if law.compiled else f"'{law.name}'"
             raise ValueError(
-                "the actions are not those of the law a = K_a U^T z + K_b U^T z_r, which this "
-                "optimizer needs; with a control law of your own use one that learns from costs alone"
+                f"the actions are not those of the law {words}, which this optimizer needs; with a "
+                "controller of your own use one that learns from costs alone"
             )
+
+
+def _actions(law: Law, theta: Array, states: Array, actions: Array) -> Array:
+    """The law's actions along a trajectory."""
+    if not law.compiled:
+        return along(law, theta, states, actions)
+    K_a, K_b = np.hsplit(law.gains(theta), 2)
+    expected: Array = states @ law.model.U @ K_a.T + K_b @ law.model.s_r
+    return expected

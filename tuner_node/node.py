@@ -281,8 +281,9 @@ class TunerNode:
                 self._full_name(namespace, topics.ACTION.name)
             )
         }
-        seen = self._session.training.law_seen
-        return {"nodes": sorted(found), "law": "affine" if seen else "not seen"}
+        training = self._session.training
+        law = training.settings.law.name if training.law_seen else "not seen"
+        return {"nodes": sorted(found), "law": law}
 
     def _all_several_publishers(self) -> dict[str, list[str]]:
         """The nodes of every topic that has had more than one publisher."""

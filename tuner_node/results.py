@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.topics import COMPLETED
+from loop_method.laws import Affine
 from tuner_node.budget import PURPOSES
 from tuner_node.rollouts import EVALUATED
 from tuner_node.training import Training
@@ -69,7 +70,9 @@ def policy_arrays(training: Training) -> dict[str, NDArray[Any]]:
     """The arrays of policy.npz."""
     assert training.models is not None
     settings = training.settings
+    affine = settings.law is Affine
     return {
+        **({} if affine else {"law": np.array(settings.law.name)}),
         "policy": training.policies(),
         "lqt": training.warm_starts(),
         "model": training.models,
@@ -104,7 +107,10 @@ def summarise(training: Training) -> dict[str, Any]:
         "seed": training.settings.seed,
         "seeds": training.settings.seeds,
         "rollouts": training.budget.by_purpose(),
-        "changed": (training.policies() != training.starts()).any(axis=(1, 2)).tolist(),
+        "changed": [
+            bool((own != start).any())
+            for own, start in zip(training.policies(), training.starts(), strict=True)
+        ],
         "history": training.history,
     }
 

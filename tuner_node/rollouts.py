@@ -53,7 +53,7 @@ def checks(
 ) -> list[tuple[int, Rollout]]:
     """No control and the warm start of each pending seed on the same field.
 
-    warm (S, n_a, 2 n_s): the warm starts of all seeds. Each rollout comes with the index of its seed.
+    warm (S, *shape): the warm starts of all seeds. Each rollout comes with the index of its seed.
     """
     return [
         (m, Rollout(policy, derive(settings.all_seeds[m], Purpose.CHECK_FIELD)))
@@ -67,7 +67,7 @@ def evaluations(
 ) -> list[tuple[int, Rollout]]:
     """The controllers of EVALUATED for every seed on the fields of the evaluation.
 
-    warm, adapted (S, n_a, 2 n_s): the policies. Each rollout comes with the index of its seed.
+    warm, adapted (S, *shape): the policies. Each rollout comes with the index of its seed.
     """
     fields = [
         derive(settings.evaluation_seed, Purpose.EVALUATION_FIELD, i)

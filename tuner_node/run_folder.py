@@ -7,7 +7,8 @@ run.json           the run's id on the network, how often its tuner was started,
                    what defines the training, and why nobody may continue it, if so
 progress.jsonl     what happened, one JSON object a line, as it happened
 checkpoint         the training's state (tuner_node.checkpoint), and the one before
-policy.npz         policy (S, n_a, 2 n_s), lqt (the same), model rows (S, rows, n_s), seeds (S,)
+policy.npz         policy (S, n_a, 2 n_s), lqt (the same), model rows (S, rows, n_s), seeds (S,);
+                   of another law than the affine one `law`, its name, and policies (S, size)
 result.json        costs, reductions, history, seeds, versions, timing, the plant's fingerprint
 logs/              one file a node, when the command line started them
 """
@@ -296,7 +297,8 @@ class RunFolder:
         try:
             arrays = read_arrays(path)
             model = taken(arrays, "model", "f", (seeds, None, None))
-            law = (seeds, n_a, 2 * model.shape[2])
+            affine = (seeds, n_a, 2 * model.shape[2])
+            law = affine if values["law"] == "affine" else (seeds, None)
             for rows in model:
                 model_rows.unpack(rows, n_a)
             return {

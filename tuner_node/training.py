@@ -27,8 +27,11 @@ import numpy as np
 from loop_interfaces import model_rows
 from loop_interfaces.arrays import Array
 from loop_interfaces.cost import Cost
+from loop_interfaces.frames import digest
 from loop_interfaces.topics import COMPLETED, CostColumn
 from loop_method.adapt import Context, Optimizer, Record, Rollout, Trajectory
+from loop_method.laws import Law
+from loop_method.laws.calls import laws_of
 from loop_method.reduce.identifiability import examine_excitation
 from tuner_node import rollouts
 from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, TrainingSettings, batch_of
@@ -59,7 +62,7 @@ class Training:
     history: list[dict[str, Any]] = field(default_factory=list)
     budget: Budget = field(init=False)
     law_seen: bool = False
-    """Whether rollouts were seen, all with the actions of the law that the policies are gains of."""
+    """Whether rollouts were seen, all with the actions of the law whose parameters the policies are."""
     evaluation: Array | None = None
     """Mean stage costs of the closing evaluation, (S, controllers, fields)."""
     ended: Array | None = None
@@ -76,6 +79,9 @@ class Training:
     """The rollouts of every seed's checks, where the optimiser wants trajectories."""
     worse: list[bool] = field(default_factory=list)
     """Whether the warm start of a seed was measured to be no better than no control."""
+    _laws: list[Law] = field(default_factory=list, repr=False)
+    _made_from: int = 0
+    """Digest of the models of these laws."""
 
     def __post_init__(self) -> None:
         settings, seeds = self.settings, self.settings.seeds
@@ -98,7 +104,12 @@ class Training:
         elif self.phase == "check":
             batch = batch_of(self._check_rollouts(), self.settings.trajectories)
         elif self.phase == "adapt":
-            wanted = [(m, rollout) for m, asked in enumerate(self._asked()) for rollout in asked]
+            shape = self.warm_starts().shape[1:]
+            wanted = [
+                (m, replace(rollout, policy=np.reshape(rollout.policy, shape)))
+                for m, asked in enumerate(self._asked())
+                for rollout in asked
+            ]
             batch = batch_of(wanted, self.settings.trajectories)
         elif self.phase == "evaluate":
             batch = batch_of(
@@ -152,20 +163,31 @@ class Training:
             )
         return next(iter(steps), 0)
 
+    def laws(self) -> list[Law]:
+        """The law of each seed's model."""
+        assert self.models is not None
+        made_from = digest(self.models)
+        if not self._laws or self._made_from != made_from:
+            models = [model_rows.unpack(rows, self.settings.n_a) for rows in self.models]
+            self._laws = laws_of(self.settings.law, models, self.settings.horizon)
+            self._made_from = made_from
+        return self._laws
+
     def policies(self) -> Array:
         """The adapted policies, of the shape of the warm starts."""
-        return np.stack([optimizer.policy for optimizer in self.optimizers])
+        shape = self.warm_starts().shape[1:]
+        return np.stack([optimizer.policy.reshape(shape) for optimizer in self.optimizers])
 
     def warm_starts(self) -> Array:
-        """The LQT policies of the models, (S, n_a, 2 n_s)."""
-        assert self.models is not None
-        return np.stack([model_rows.unpack(rows, self.settings.n_a).policy for rows in self.models])
+        """Where the laws of the models start, (S, *shape)."""
+        laws = self.laws()
+        return np.stack([law.theta_start.reshape(law.shape) for law in laws])
 
     def starts(self) -> Array:
         """The policies that the adaptation begins with, of the shape of the warm starts."""
         warm = self.warm_starts()
         zero = np.array(self.worse) | (self.settings.start == "zero")
-        return np.where(zero[:, None, None], 0.0, warm)
+        return np.where(zero.reshape(-1, *[1] * (warm.ndim - 1)), 0.0, warm)
 
     @property
     def evaluation_shape(self) -> tuple[int, int, int]:
@@ -201,11 +223,11 @@ class Training:
         else:
             self.models[self.pending] = models
         self.budget.count("identify", np.repeat(self.pending, self.settings.explorations))
-        rows = []
+        rows, warm = [], self.warm_starts()
         for m, own in zip(self.pending, models, strict=True):
             model = model_rows.unpack(own, self.settings.n_a)
             # What was kept ran without control, whose policy has the shape of the model's.
-            zero = np.zeros_like(model.policy)
+            zero = np.zeros_like(warm[m])
             self.measured[m] = [replace(kept, policy=zero) for kept in self.measured[m]]
             rows.append(
                 {
@@ -318,8 +340,9 @@ class Training:
         exploration = self.explorations[m]
         if exploration is None or self.target is None or self.models is None:
             return None
+        law = self.laws()[m]
         return Context(
-            U=model_rows.unpack(self.models[m], self.settings.n_a).U,
+            U=law.model.U,
             target=self.target,
             state_weight=self.settings.state_weight,
             action_weight=self.settings.action_weight,
@@ -333,22 +356,22 @@ class Training:
             periodic=self.settings.periodic,
             further=self.further[m],
             cost=Cost.parse(self.settings.cost) if self.settings.cost else None,
+            law=law,
         )
 
     def _asked(self) -> list[list[Rollout]]:
+        """What each optimiser asks for; its policies may be vectors."""
         return [[] if optimizer.done else optimizer.ask() for optimizer in self.optimizers]
 
     def _tell(self, result: BatchResult) -> list[dict[str, Any]]:
-        assert self.models is not None
-        rows, results = [], iter(result.rollouts())
+        rows, results, laws = [], iter(result.rollouts()), self.laws()
         for m, (optimizer, asked) in enumerate(zip(self.optimizers, self._asked(), strict=True)):
             if not asked:
                 continue
             own = list(islice(results, len(asked)))
             if result.trajectories is not None:
-                model = model_rows.unpack(self.models[m], self.settings.n_a)
                 seen = [measured.trajectory for measured in own]
-                check_law(asked, model, seen, self.settings.action_limit)
+                check_law(asked, laws[m], seen, self.settings.action_limit)
                 self.law_seen = True
             report = optimizer.tell(own)
             self.budget.count("adapt", [m] * len(asked))

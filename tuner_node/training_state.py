@@ -94,7 +94,8 @@ def _fill(training: Training, arrays: Arrays) -> None:
         while (name := f"further{m}.{len(training.further[m])}") + ".states" in arrays:
             training.further[m].append(taken_trajectory(arrays, name, n_z, n_a))
         while (name := f"measured{m}.{len(training.measured[m])}") + ".policy" in arrays:
-            training.measured[m].append(taken_record(arrays, name, n_z, (n_a, None)))
+            shape = (n_a, None) if training.settings.law.axes == 2 else (None,)
+            training.measured[m].append(taken_record(arrays, name, n_z, n_a, shape))
     _check(training)
     if training.phase in ("adapt", "evaluate", "done"):
         training.start_optimizers()

@@ -50,7 +50,7 @@ class LoopReader:
             name, qos = scoped(namespace, topic.name), reader_qos(topic)
             raw = raw_subscription(node, Float64MultiArray, name, qos)
             taken = SerializedSubscription(raw, Float64MultiArray, qos.depth)
-            self._topics.append((taken, ArrayCodec(topic.labels).decode, handle))
+            self._topics.append((taken, topic.codec().decode, handle))
         self._samples: SampleSubscription | None = None
         self._handlers: dict[int, tuple[Decoder, Handler]] = {
             STATE_KIND: (ArrayCodec(STATE.labels).decode, view.state),

@@ -17,7 +17,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.subscription import Subscription
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
-from loop_interfaces.frames import ArrayCodec, Frame
+from loop_interfaces.frames import Frame
 from loop_interfaces.samples import AGE, NO_TIME, STATE_KIND, SampleBatch, TokenBucket
 from loop_interfaces.topics import READER_DEPTH, SAMPLES, SAMPLES_THROTTLED, WRITER_DEPTH, Topic
 
@@ -198,7 +198,7 @@ class Sender:
         self, node: Node, topic: Topic, namespace: str = "", batcher: SampleBatcher | None = None
     ) -> None:
         self._batcher = batcher
-        self._codec = ArrayCodec(topic.labels)
+        self._codec = topic.codec()
         self.publisher: Publisher = node.create_publisher(
             Float64MultiArray, scoped(namespace, topic.name), writer_qos(topic)
         )
@@ -229,7 +229,7 @@ class Receiver:
         namespace: str = "",
     ) -> None:
         self.callback = callback
-        self.codec = ArrayCodec(topic.labels)
+        self.codec = topic.codec()
         self.decode = self.codec.decode
         self.subscription = raw_subscription(
             node, Float64MultiArray, scoped(namespace, topic.name), reader_qos(topic)

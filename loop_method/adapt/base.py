@@ -17,8 +17,10 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from loop_interfaces.array_files import taken
 from loop_interfaces.arrays import Array
 from loop_interfaces.cost import Cost
+from loop_method.laws.base import Law
 from loop_method.settings import Settings as _Settings
 
 Row = dict[str, float | int | bool | str]
@@ -45,7 +47,7 @@ class Trajectory:
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """An episode that an optimiser wants: this policy, from the field of this seed."""
+    """An episode that an optimiser wants: this policy, theta, from the field of this seed."""
 
     policy: Array
     field_seed: int
@@ -74,7 +76,8 @@ class Record:
 
     Attributes
     ----------
-    policy : (n_a, 2 n_s) array
+    policy : array
+        Theta, of the shape of the optimiser's.
     cost : float
         Mean stage cost; infinite if it diverged.
     states, actions : (L + 1, n_z) or (L, n_z), and (L, n_a) arrays
@@ -133,6 +136,8 @@ class Context:
         Other explorations, from other initial fields.
     cost : Cost or None
         The whole cost, where the weights and the target do not say it.
+    law : Law, optional
+        What theta is the parameters of, with its derivatives where it has them.
     """
 
     U: Array
@@ -149,6 +154,7 @@ class Context:
     periodic: bool = True
     further: Sequence[Trajectory] = ()
     cost: Cost | None = None
+    law: Law | None = None
 
     @property
     def every_exploration(self) -> Sequence[Trajectory]:
@@ -169,8 +175,9 @@ class Optimizer(Protocol):
 
     Parameters
     ----------
-    policy0 : (n_a, 2 n_s) array
-        Where to start, [K_a K_b].
+    policy0 : (size,) array
+        Where theta starts, the vector of a law's parameters, whichever law it is. An optimiser that
+        `needs_affine_law` is given the matrix [K_a K_b], (n_a, 2 n_s).
     seed : int
         Determines everything random.
     rollouts : int
@@ -187,6 +194,8 @@ class Optimizer(Protocol):
     """Its constants; none if it does not say otherwise."""
     needs_trajectories: ClassVar[bool] = False
     """Whether results have to come with their trajectories."""
+    needs_affine_law: ClassVar[bool] = False
+    """Whether it knows the law a = K_a s + K_b s_r, and improves those gains alone."""
     compares_first_law: ClassVar[bool] = False
     """Whether it compares the first law with no control itself where the state is that of few sensors,
     so that the plant is explored once and no law is checked before."""
@@ -248,8 +257,26 @@ class Optimizer(Protocol):
         """Go on from a `state` of an optimiser that was constructed with the same arguments."""
 
 
+def checked_theta(theta: ArrayLike) -> Array:
+    """A finite copy of a law's parameters, of any shape, or a ValueError."""
+    array = np.array(theta, dtype=np.float64, order="C")
+    if not array.size:
+        raise ValueError("a policy must have parameters, but it is empty.")
+    if not np.isfinite(array).all():
+        raise ValueError("a policy must be finite, but there is NaN or infinity in it.")
+    return array
+
+
+def taken_theta(state: Mapping[str, NDArray[np.generic]], like: Array) -> Array:
+    """The array `policy` of a `state`, of the shape of `like`: older ones have gains as matrices."""
+    known = state.get("policy")
+    if known is not None and known.size == like.size:
+        state = {"policy": known.reshape(like.shape)}
+    return taken(state, "policy", "f", like.shape).copy()
+
+
 def checked_policy(policy: ArrayLike) -> Array:
-    """A finite copy of shape (n_a, 2 n_s), or a ValueError."""
+    """A finite copy of gains of shape (n_a, 2 n_s), or a ValueError."""
     array = np.array(policy, dtype=np.float64, order="C")
     if array.ndim != 2 or 0 in array.shape or array.shape[1] % 2:
         raise ValueError(

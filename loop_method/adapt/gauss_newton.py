@@ -159,6 +159,7 @@ class GaussNewton(Optimizer):
     name = "gauss_newton"
     Settings = GaussNewtonSettings
     needs_trajectories = True
+    needs_affine_law = True
     compares_first_law = True
 
     def __init__(

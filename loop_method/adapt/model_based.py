@@ -77,6 +77,7 @@ class ModelBased(Optimizer):
     Settings = ModelBasedSettings
     needs_trajectories = True
     any_cost = True
+    needs_affine_law = True
     judges_first_law = True
     explorations = 2
     with_sensors = "gauss_newton"

@@ -19,9 +19,10 @@ from loop_method.adapt.base import (
     RolloutResult,
     Row,
     State,
-    checked_policy,
+    checked_theta,
     require_positive,
     require_results,
+    taken_theta,
 )
 from loop_method.seeds import field_seed
 
@@ -36,8 +37,8 @@ class StepOptimizer(Optimizer):
 
     Attributes
     ----------
-    policy : (n_a, 2 n_s) array
-        [K_a K_b] so far; `update` assigns the next one.
+    policy : array
+        The law's parameters theta so far; `update` assigns the next one.
     tells : int
         Steps so far.
     settings, context
@@ -59,7 +60,7 @@ class StepOptimizer(Optimizer):
         context: Context | None = None,
     ) -> None:
         require_positive(rollouts=rollouts)
-        self._policy = checked_policy(policy0)
+        self._policy = checked_theta(policy0)
         self._seed, self._budget, self._tells = seed, rollouts, 0
         self.settings, self.context = settings, context
 
@@ -94,7 +95,7 @@ class StepOptimizer(Optimizer):
 
     @policy.setter
     def policy(self, policy: ArrayLike) -> None:
-        self._policy = checked_policy(policy)
+        self._policy = checked_theta(policy)
 
     @property
     def tells(self) -> int:
@@ -122,9 +123,9 @@ class StepOptimizer(Optimizer):
         return {"policy": self.policy, "tells": np.array(self._tells), **own}
 
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
-        policy = taken(state, "policy", "f", self._policy.shape)
+        policy = taken_theta(state, self._policy)
         tells = int(taken(state, "tells", "i", ()))
         own = {name: taken(state, name, "f", np.shape(getattr(self, name))) for name in self.kept}
-        self._policy, self._tells = policy.copy(), tells
+        self._policy, self._tells = policy, tells
         for name, value in own.items():
             setattr(self, name, value.copy())

@@ -30,12 +30,17 @@ def record_arrays(name: str, record: Record) -> State:
 
 
 def taken_record(
-    arrays: Arrays, name: str, n_z: int | None, shape: tuple[int, int | None], stamp: int = -1
+    arrays: Arrays,
+    name: str,
+    n_z: int | None,
+    n_a: int,
+    shape: tuple[int | None, ...],
+    stamp: int = -1,
 ) -> Record:
     """The rollout of that name with a policy of this shape, or a ValueError."""
     policy = taken(arrays, f"{name}.policy", "f", shape)
     cost = float(taken(arrays, f"{name}.cost", "f", (), finite=False))
-    known = taken_trajectory(arrays, name, n_z, shape[0])
+    known = taken_trajectory(arrays, name, n_z, n_a)
     return Record(policy, cost, known.states, known.actions, stamp)
 
 
@@ -94,7 +99,9 @@ class Records:
         """Remember what a `state` does; a ValueError if it is none. shape: of the policies."""
         count, limit = taken(arrays, "count", "i", ()), taken(arrays, "limit", "f", ())
         stamps = taken(arrays, "stamps", "i", (None,)).tolist()
-        self._records = {s: taken_record(arrays, f"record{s}", n_z, shape, s) for s in stamps}
+        self._records = {
+            s: taken_record(arrays, f"record{s}", n_z, shape[0], shape, s) for s in stamps
+        }
         self.count, self._limit = int(count), float(limit)
 
     def sound(self, result: RolloutResult) -> tuple[Array, Array]:

@@ -34,9 +34,10 @@ from loop_method.adapt.base import (
     RolloutResult,
     Row,
     State,
-    checked_policy,
+    checked_theta,
     require_positive,
     require_results,
+    taken_theta,
 )
 from loop_method.seeds import DIRECTION_STREAM, field_seed
 from loop_method.settings import Settings
@@ -66,8 +67,8 @@ class TwoPoint(Optimizer):
 
     Parameters
     ----------
-    policy0 : (n_a, 2 n_s) array
-        Where to start.
+    policy0 : array
+        Where the law's parameters start.
     seed : int
         Determines all directions and fields.
     rollouts : int
@@ -91,7 +92,7 @@ class TwoPoint(Optimizer):
         context: Context | None = None,
     ) -> None:
         require_positive(rollouts=rollouts)
-        self._policy = checked_policy(policy0)
+        self._policy = checked_theta(policy0)
         self._seed = seed
         self._steps = rollouts // 2
         self._learning_rate = settings.learning_rate
@@ -173,7 +174,7 @@ class TwoPoint(Optimizer):
 
     def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
         """Continue from a checkpoint of an optimiser with the same arguments."""
-        policy = taken(state, "policy", "f", self._policy.shape).copy()
+        policy = taken_theta(state, self._policy)
         tells, learning_rate = (
             taken(state, "tells", "i", ()),
             taken(state, "learning_rate", "f", ()),
@@ -196,7 +197,6 @@ def direction(seed: int, iteration: int, shape: tuple[int, ...]) -> Array:
 
 
 def gradient(cost_plus: float, cost_minus: float, direction: Array, radius: float) -> Array:
-    """The two-point estimate (n_a n_s / r) (J+ - J-) Theta, shape (n_a, 2 n_s)."""
-    n_a, columns = direction.shape
-    estimate: Array = n_a * (columns // 2) / radius * (cost_plus - cost_minus) * direction
+    """The two-point estimate (d / 2 r) (J+ - J-) Theta, of the shape of Theta."""
+    estimate: Array = direction.size / 2 / radius * (cost_plus - cost_minus) * direction
     return estimate

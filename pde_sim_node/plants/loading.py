@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import inspect
 import json
-import sys
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from loop_interfaces.own_code import OwnCode, located
+from loop_interfaces.own_code import OwnCode, located, name_of
 from loop_interfaces.spec import ParameterError
 from loop_interfaces.text import shown
 from pde_sim_node.definition import described
@@ -121,10 +120,6 @@ def hand_over(plant: Dynamics | Plant) -> dict[str, Any]:
     Its code is allowed here and in the processes that are started.
     """
     kind = type(plant)
-    module = sys.modules[kind.__module__]
-    importable = bool(getattr(module, "__package__", "")) and module.__name__ != "__main__"
-    file = getattr(module, "__file__", None)
-    source = module.__name__ if importable or not file else file
     arguments = arguments_of(plant) if isinstance(plant, Dynamics) else {}
     stored = {
         name: described(name, value) if _storable(value) else f"{OBJECT} {described(name, value)}"
@@ -133,7 +128,7 @@ def hand_over(plant: Dynamics | Plant) -> dict[str, Any]:
     }
     if not isinstance(plant, Dynamics):  # nobody knows what it was made with
         stored = {"plant": f"{OBJECT} {plant.definition.fingerprint}"}
-    name = OWN_PLANTS.allow(f"{source}:{kind.__qualname__}")
+    name = OWN_PLANTS.allow(name_of(kind))
     _objects[_key(name, stored)] = Made(plant, stored)
     return {"plant": name} | {f"{PHYSICAL}{own}": value for own, value in stored.items()}
 

@@ -61,7 +61,7 @@ def add(commands: Commands) -> None:
         metavar="FILE",
         help="instead of those in the bag: a run's parameters.yaml, a bag's parameters.json",
     )
-    add_own_code(verify, ("equation", "plant", "optimizer"))
+    add_own_code(verify, ("equation", "plant", "optimizer", "law"))
     for action in (info, verify):
         add_json(action)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from loop_interfaces.own_code import identity
-from loop_interfaces.parameters import OPTIMIZER, PROBLEM, TUNER, flags
+from loop_interfaces.parameters import LAW, OPTIMIZER, PROBLEM, TUNER, flags
 from loop_interfaces.problem import shipped_problems
 from loop_interfaces.spec import ParameterError
 
@@ -60,7 +60,10 @@ _OWN_CODE = {
     "equation": "the problem's PDE",
     "plant": "a plant instead of an equation",
     "optimizer": "the method of the adapt phase",
+    "law": "the control law",
 }
+_NAMED_ANEW = ("optimizer", "law")
+"""Own code that has a flag among those of a group, too."""
 
 
 def spellings(flag: str) -> tuple[str, ...]:
@@ -71,7 +74,7 @@ def spellings(flag: str) -> tuple[str, ...]:
 def add_own_code(
     parser: argparse._ActionsContainer, words: Sequence[str] = ("equation", "plant")
 ) -> None:
-    """The flags --equation, --plant and --optimizer, or some of them; see `allow_own_code`."""
+    """The flags --equation, --plant, --optimizer and --law, or some of them; see `allow_own_code`."""
     for word in words:
         what = _OWN_CODE[word]
         parser.add_argument(
@@ -83,17 +86,25 @@ def add_own_code(
 
 
 def allow_own_code(options: argparse.Namespace) -> dict[str, str]:
-    """Allow the code that --equation, --plant or --optimizer names; the parameters that were given."""
+    """Allow the code that --equation, --plant, --optimizer or --law names; the parameters given."""
     from loop_method.adapt.registry import OWN_OPTIMIZERS
+    from loop_method.laws.registry import OWN_LAWS
     from pde_sim_node.equations import OWN_EQUATIONS
     from pde_sim_node.plants.loading import OWN_PLANTS
 
     given = {}
-    for kind in (OWN_EQUATIONS, OWN_PLANTS, OWN_OPTIMIZERS):
+    for kind in (OWN_EQUATIONS, OWN_PLANTS, OWN_OPTIMIZERS, OWN_LAWS):
         named = getattr(options, kind.word, None)
         if named is not None:
             given[kind.word] = kind.allow(named)
     return given
+
+
+def forget_named_anew(given: dict[str, object], own: Mapping[str, str]) -> None:
+    """Take the code that a run to be continued has, which has to be named again, out of its flags."""
+    for word in _NAMED_ANEW:
+        if ":" in own.get(word, ""):
+            del given[word]
 
 
 def refuse_other_code(options: argparse.Namespace, *runs: Mapping[str, object]) -> None:
@@ -135,11 +146,20 @@ def add_flags(parser: argparse._ActionsContainer, group: str) -> None:
         )
         if spec is OPTIMIZER:
             action.completer = _optimizers  # type: ignore[attr-defined]
+        elif spec is LAW:
+            action.completer = _laws  # type: ignore[attr-defined]
 
 
 def _optimizers(prefix: str, **_: object) -> list[str]:
     """The names of the optimisers, for the completion of the shells."""
     from loop_method.adapt.registry import offered
+
+    return offered()
+
+
+def _laws(prefix: str, **_: object) -> list[str]:
+    """The names of the laws, for the completion of the shells."""
+    from loop_method.laws.registry import offered
 
     return offered()
 

@@ -42,7 +42,7 @@ def add(commands: Commands) -> None:
         help="the mean of the initial distribution instead of sampled fields",
     )
     add_set(evaluate, "the policies under another parameter of the plant or the cost: any")
-    add_own_code(evaluate, ("equation", "plant", "optimizer"))
+    add_own_code(evaluate, ("equation", "plant", "optimizer", "law"))
     add_json(evaluate, "print the costs as JSON: {controller: [[cost a field] a seed]}")
 
 

@@ -29,7 +29,7 @@ def add(commands: Commands) -> None:
     report.add_argument(
         "folder", type=a_path, metavar="DIR", help="folder of a finished run or reproduction"
     )
-    add_own_code(report, ("equation", "plant", "optimizer"))
+    add_own_code(report, ("equation", "plant", "optimizer", "law"))
     report.add_argument("--out", type=a_path, metavar="DIR", help="[DIR/report]")
 
 

@@ -49,7 +49,7 @@ def add(commands: Commands) -> None:
         help="problems, seeds, variants, settings",
     )
     add_set(study, "for all trainings, any parameter")
-    add_own_code(study, ("equation", "plant", "optimizer"))
+    add_own_code(study, ("equation", "plant", "optimizer", "law"))
     add_execution(study)
 
 

@@ -16,6 +16,7 @@ from pdeloop.commands.common import (
     add_problem,
     allow_own_code,
     command,
+    forget_named_anew,
     given_flags,
     refuse_other_code,
 )
@@ -104,8 +105,7 @@ def _train(options: argparse.Namespace) -> int:
     if options.model is not None:
         given["model"] = str(options.model.resolve())
     if options.resume is not None:
-        if ":" in own.get("optimizer", ""):  # code of a run has to be named again
-            del given["optimizer"]
+        forget_named_anew(given, own)
         if options.problem or given or options.out:
             raise ParameterError(
                 "--resume continues a run with its own parameters; "

@@ -16,7 +16,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_msgs.msg import Float64MultiArray, String
 
-from loop_interfaces.frames import MAX_ID, ArrayCodec
+from loop_interfaces.frames import MAX_ID
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.protocol import ModelFailure
 from loop_interfaces.ros.endpoints import Sender, reader_qos, scoped, writer_qos
@@ -52,7 +52,7 @@ class RosWire:
         self._publishers: list[Publisher] = []
         for topic in ARRAYS:
             if topic in published:
-                take = partial(self._take, topic, ArrayCodec(topic.labels).decode)
+                take = partial(self._take, topic, topic.codec().decode)
                 name, qos = scoped(namespace, topic.name), reader_qos(topic)
                 node.create_subscription(Float64MultiArray, name, take, qos, raw=True)
             else:

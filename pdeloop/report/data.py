@@ -10,10 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from controller_node.policy import ProjectedLaw
+from controller_node.law_batch import LawBatch
 from loop_interfaces.array_files import read_arrays, taken
 from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import ModelRows, unpack
+from loop_method.laws import Affine
+from loop_method.laws.calls import laws_of
+from loop_method.laws.registry import law_kind
 from loop_method.reduce.order import OrderStudy, study_orders
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import DIVERGED_COST, MEAN_FIELD, Plant
@@ -94,10 +97,15 @@ class ProblemData:
 
     @property
     def policies(self) -> dict[str, Array]:
-        """The gains of the shown seed, by controller."""
+        """The law's parameters of the shown seed, by controller."""
         warm = self.first.warm[self.shown]
         own = {name: run.policies[self.shown] for name, run in self.runs.items()}
         return {"none": np.zeros_like(warm), "lqt": warm, **own}
+
+    @property
+    def affine(self) -> bool:
+        """Whether the parameters are gains [K_a K_b]."""
+        return bool(self.first.values["law"] == Affine.name)
 
     @property
     def models(self) -> list[ModelRows]:
@@ -236,12 +244,13 @@ def _behaviours(data: ProblemData) -> list[Behaviour]:
     """The shown seed's controllers from the mean field."""
     policies, values, plant = data.policies, data.first.values, data.plant
     models = {name: run.models[data.shown] for name, run in data.runs.items()}
-    bases = [models.get(name, data.models[data.shown]).U for name in policies]
-    law = ProjectedLaw(bases, plant.target, values["action_limit"])
+    used = [models.get(name, data.models[data.shown]) for name in policies]
+    laws = laws_of(law_kind(values["law"]), used, values["horizon"])
+    law = LawBatch(laws, plant.target, values["action_limit"])
     count = len(policies)
     law.set(np.stack([*policies.values()]), np.arange(count))
     starts, noise = np.full(count, MEAN_FIELD), np.zeros(count, dtype=np.int64)
-    episode = rollout(plant, lambda k, states: law.actions(states), starts, noise)
+    episode = rollout(plant, law.actions, starts, noise)
     costs, found = episode.costs, []
     for i, name in enumerate(policies):
         diverged = int(costs.diverged_step[i])

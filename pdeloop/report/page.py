@@ -137,12 +137,13 @@ def _of_problem(problem: ProblemData) -> Drawn:
         "the initial and the final field beside the target.",
         figures.behaviour(problem),
     )
-    yield (
-        f"{name}-gains",
-        "Gains",
-        f"Before (LQT) and after learning (seed {seed}).",
-        figures.gains(problem),
-    )
+    if problem.affine:
+        yield (
+            f"{name}-gains",
+            "Gains",
+            f"Before (LQT) and after learning (seed {seed}).",
+            figures.gains(problem),
+        )
     if problem.orders is not None:
         used = len(problem.models[problem.shown].A)
         yield (
@@ -154,6 +155,8 @@ def _of_problem(problem: ProblemData) -> Drawn:
             f"{problem.orders.suggested}.",
             figures.orders(problem.orders, used),
         )
+    if not problem.affine:
+        return
     yield (
         f"{name}-spectrum",
         "Eigenvalues",

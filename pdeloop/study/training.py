@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pdeloop.evaluation import mean_costs
 from pdeloop.in_process import LocalPair, train
-from pdeloop.training_run import BUILT_IN
+from pdeloop.training_run import built_in
 from tuner_node.build import build_training
 from tuner_node.results import versions
 from tuner_node.run_folder import RunFolder
@@ -82,7 +82,7 @@ def train_one(
                 rollouts.append(float(training.budget.paid[0]))
 
         train(training, pair, lambda row: None, max_batch=parameters["max_batch"], after_batch=note)
-        extra = {"transport": "in-process", "controller": BUILT_IN, "environment": here}
+        extra = {"transport": "in-process", "controller": built_in(training), "environment": here}
         folder.finish(training, extra)
         kept = {name: (folder.path / name).read_bytes() for name in FILES}
         if curves:
@@ -98,7 +98,7 @@ def curve(
 ) -> bytes:
     """The costs of every policy that a training of one seed had, as in its closing evaluation.
 
-    These rollouts belong to no budget. An .npz file: `policies` (N, n_a, 2 n_s), at the start and
+    These rollouts belong to no budget. An .npz file: `policies` (N, *shape), at the start and
     after every batch of the adaptation, their `costs` (N, fields), and the `rollouts` (N,) that
     were paid until then.
     """

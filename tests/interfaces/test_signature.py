@@ -321,9 +321,22 @@ def test_a_model_that_is_identified_otherwise_has_another_signature(name):
     known = asdict(DesignSettings(N_A, N_S, 1.0, 1.0))
     other = "dmdc" if name == "identification" else known[name] + 1
     assert design_digest(known | {name: other}) != design_digest(known)
-    # An action has the first of these, D the second, and the third counts where it is not empty.
-    assert {*DESIGN, "n_a", "action_limit", "cost"} == {*known}
+    # An action has the first of these, D the second, the third counts where it is not empty, and the
+    # last two with another law than the affine one.
+    assert {*DESIGN, "n_a", "action_limit", "cost", "law", "horizon"} == {*known}
     assert design_digest(known | {"cost": "another"}) != design_digest(known | {"cost": ""})
+
+
+def test_a_model_for_another_law_has_another_signature_and_the_affine_one_that_without_a_name():
+    known = asdict(DesignSettings(N_A, N_S, 1.0, 1.0))
+    nameless = {name: value for name, value in known.items() if name not in ("law", "horizon")}
+    own = [
+        design_digest(known | {"law": law, "horizon": T})
+        for law, T in (("own.py:A", 3), ("own.py:A", 4), ("own.py:B", 3), ("feedforward", 3))
+    ]
+    assert design_digest(known | {"horizon": 3}) == design_digest(nameless)
+    assert len({design_digest(nameless), *own}) == 5
+    assert design_digest(known | {"law": "/elsewhere/own.py:A", "horizon": 3}) == own[0]
 
 
 def test_a_run_with_a_controller_that_does_not_sign_is_void_as_soon_as_another_signs():

@@ -1,0 +1,164 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A law for the environments of an episode, each with its own theta and model.
+
+A law with a compiled form is computed by it; of any other the object itself is asked, one environment
+after the other. A law's memory is a function of the states and actions of its episode: it is kept
+from one step to the next, as are the actions that were answered, so that one that is asked for twice
+is the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from controller_node.policy import ProjectedLaw, checked_index
+from loop_interfaces.arrays import Array
+from loop_interfaces.frames import digest
+from loop_method.laws.base import Law, Parts
+from loop_method.laws.calls import action, one_thread, updated
+
+
+class ForgottenError(Exception):
+    """An action depends on steps of the episode that are not known; the text says which."""
+
+
+class LawBatch:
+    """A law of M environments. Call `set` before the first `actions` of an episode.
+
+    Parameters
+    ----------
+    laws : sequence of Law
+        That of each model that environments can use; all of one kind and size.
+    target : (n_z,) array
+        z_r.
+    action_limit : float
+        Largest magnitude of an action; 0 for none.
+
+    Anything malformed raises a ValueError and leaves it as it was.
+    """
+
+    def __init__(self, laws: Sequence[Law], target: ArrayLike, action_limit: float = 0.0) -> None:
+        self._laws, self._limit = list(laws), action_limit
+        self._projected = ProjectedLaw([law.model.U for law in laws], target, action_limit)
+        self._environments: list[tuple[Law, Parts]] = []
+        self._memories: list[Array] = []
+        self._next = 0
+        """The step to which the memories belong."""
+        self._answered: dict[int, tuple[int, Array]] = {}
+        """Of a law with memory by step: a digest of the states, and the actions."""
+        self.nbytes = 0
+        """Of the actions that are kept."""
+
+    @property
+    def compiled(self) -> ProjectedLaw | None:
+        """The compiled form, if the law has one."""
+        return self._projected if self._laws[0].compiled else None
+
+    @property
+    def n_a(self) -> int:
+        """Size of an action."""
+        return self._laws[0].n_a
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the law has a memory."""
+        return self._laws[0].memory_size > 0
+
+    def set(self, policies: ArrayLike, model_index: ArrayLike | None = None) -> None:
+        """Take theta of each environment for the next episode.
+
+        Parameters
+        ----------
+        policies : (M, *shape) array
+            Theta, as messages have it (`Law.shape`).
+        model_index : (M,) array of int, optional
+            Which of the models an environment uses; the first one if not given.
+        """
+        theta, shape = np.asarray(policies, dtype=np.float64), self._laws[0].shape
+        if theta.shape[1:] != shape or not len(theta):
+            raise ValueError(
+                f"policies must have shape (environments, {', '.join(map(str, shape))}) for the law "
+                f"'{self._laws[0].name}' of these models, but the shape is {theta.shape}."
+            )
+        if not np.isfinite(theta).all():
+            raise ValueError("policies must be finite, but there is NaN or infinity in them.")
+        index = checked_index(model_index, len(theta), len(self._laws))
+        laws = [self._laws[i] for i in index.tolist()]
+        if self.compiled:
+            gains = [law.gains(own) for law, own in zip(laws, _vectors(theta), strict=True)]
+            self.compiled.set(np.stack(gains), index)
+            return
+        self._environments = [
+            (law, law.parts(own)) for law, own in zip(laws, _vectors(theta), strict=True)
+        ]
+        self._begin()
+
+    def actions(self, step: int, states: Array) -> Array:
+        """The actions (M, n_a) that answer the states (M, n_z) of a step.
+
+        ForgottenError where the law has a memory and the steps before were not seen, or had other
+        states.
+        """
+        if self.compiled:
+            return self.compiled.actions(states)
+        if not self.remembers:
+            with one_thread():
+                return self._computed(step, states)
+        seen = digest(states)
+        if step in self._answered:
+            known, answer = self._answered[step]
+            if known == seen:
+                return answer.copy()
+            if step:
+                raise ForgottenError(f"two different states came for step {step}")
+        if step == 0:
+            self._begin()
+        elif step != self._next:
+            raise ForgottenError(f"the states before step {step} are not known, or not all of them")
+        with one_thread():
+            actions = self._computed(step, states)
+            self._memories = [
+                updated(law, theta, z, memory, a, step)
+                for (law, theta), z, memory, a in zip(
+                    self._environments, states, self._memories, actions, strict=True
+                )
+            ]
+        self._next, self._answered[step] = step + 1, (seen, actions.copy())
+        self.nbytes += actions.nbytes
+        return actions
+
+    def forget_answers(self) -> None:
+        """Keep the newest actions only."""
+        newest = self._next - 1
+        self._answered = {k: known for k, known in self._answered.items() if k == newest}
+        self.nbytes = sum(actions.nbytes for _, actions in self._answered.values())
+
+    def _begin(self) -> None:
+        self._memories = [law.memory_start() for law, _ in self._environments]
+        self._next, self._answered, self.nbytes = 0, {}, 0
+
+    def _computed(self, step: int, states: Array) -> Array:
+        if len(states) != len(self._environments):
+            raise ValueError(
+                f"states must be of {len(self._environments)} environments, one for each policy, but "
+                f"the shape is {states.shape}."
+            )
+        found = np.stack(
+            [
+                action(law, theta, z.copy(), memory, step)
+                for (law, theta), z, memory in zip(
+                    self._environments, states, self._memories, strict=True
+                )
+            ]
+        )
+        return np.clip(found, -self._limit, self._limit) if self._limit > 0.0 else found
+
+
+def _vectors(theta: Array) -> Sequence[Array]:
+    """Theta of each environment as a vector of its own."""
+    rows: Array = np.ascontiguousarray(theta).reshape(len(theta), -1).copy()
+    rows.flags.writeable = False
+    return list(rows)

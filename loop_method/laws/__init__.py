@@ -1,0 +1,7 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Control laws behind one interface: see `loop_method.laws.base`."""
+
+from loop_method.laws.affine import Affine as Affine
+from loop_method.laws.base import Law as Law
+from loop_method.laws.feedforward import FeedForward as FeedForward
+from loop_method.laws.observer import Observer as Observer

@@ -1,0 +1,107 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Calls of a law, whoever wrote it: what it returns is checked, what it raises is one sentence."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from threadpoolctl import ThreadpoolController
+
+from loop_interfaces.arrays import Array, float_array
+from loop_interfaces.model_rows import ModelRows
+from loop_interfaces.own_code import OwnCodeError, located
+from loop_method.laws.base import Law, Parts
+
+MAX_NUMBER = 1e9
+"""Largest magnitude of an action or a memory; what exceeds it, or is not finite, counts as this."""
+_blas: tuple[int, ThreadpoolController] | None = None
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """One LAPACK thread meanwhile: more of them round otherwise."""
+    global _blas
+    if _blas is None or _blas[0] != len(sys.modules):  # another library may have been loaded
+        _blas = len(sys.modules), ThreadpoolController()
+    with _blas[1].limit(limits=1), np.errstate(over="ignore", invalid="ignore"):
+        yield
+
+
+def laws_of(kind: type[Law], models: Sequence[ModelRows], horizon: int) -> list[Law]:
+    """The law of each model, whose start was looked at.
+
+    Raises
+    ------
+    OwnCodeError
+        A law cannot be made, its start is not usable, or theta = 0 is not no control.
+    """
+    return [_checked(kind, model, horizon) for model in models]
+
+
+def _checked(kind: type[Law], model: ModelRows, horizon: int) -> Law:
+    with one_thread():
+        law: Law = _called(kind.name, "__init__", kind, model, horizon)
+        start = _called(kind.name, "start", lambda: law.theta_start)
+        if not start.size or not np.isfinite(start).all():
+            raise OwnCodeError(f"{kind.name}.start must give finite numbers, one at the least")
+        if not kind.compiled:
+            none = np.zeros_like(start)
+            first = _called(kind.name, "memory_start", law.memory_start)
+            acted = action(law, law.parts(none), np.ones(len(model.U)), first, 0)
+            if acted.any():
+                raise OwnCodeError(
+                    f"{kind.name}.action gives an action other than zero for theta = 0, which must be "
+                    "no control: every law is compared with it"
+                )
+    return law
+
+
+def action(law: Law, theta: Parts, z: Array, memory: Array, k: int) -> Array:
+    """`Law.action`; OwnCodeError unless that is n_a numbers."""
+    return _numbers(law, "action", law.n_a, law.action, theta, z, memory, k)
+
+
+def updated(law: Law, theta: Parts, z: Array, memory: Array, a: Array, k: int) -> Array:
+    """`Law.memory_update`; OwnCodeError unless that is a memory."""
+    if not law.memory_size:
+        return memory
+    return _numbers(
+        law, "memory_update", law.memory_size, law.memory_update, theta, z, memory, a, k
+    )
+
+
+def along(law: Law, theta: Array, states: Array, actions: Array) -> Array:
+    """The law's actions along a trajectory: states (L, n_z) and actions (L, n_a) that were seen."""
+    parts, found = law.parts(theta), np.empty_like(actions)
+    with one_thread():
+        memory = law.memory_start()
+        for k, (z, a) in enumerate(zip(states, actions, strict=True)):
+            found[k] = action(law, parts, z, memory, k)
+            memory = updated(law, parts, z, memory, a, k)
+    return found
+
+
+def _numbers(law: Law, method: str, size: int, function: Callable[..., Any], *given: Any) -> Array:
+    returned = _called(law.name, method, function, *given)
+    try:
+        numbers = float_array("it", returned)
+    except ValueError:
+        got = f"{type(returned).__name__}, which is no array of real numbers"
+    else:
+        if numbers.shape == (size,):
+            whole = np.nan_to_num(numbers, nan=MAX_NUMBER, posinf=MAX_NUMBER, neginf=-MAX_NUMBER)
+            bounded: Array = np.clip(whole, -MAX_NUMBER, MAX_NUMBER)
+            return bounded
+        got = f"an array of shape {numbers.shape}"
+    raise OwnCodeError(f"{law.name}.{method} returned {got}; expected {size} numbers")
+
+
+def _called(name: str, method: str, function: Callable[..., Any], *given: Any) -> Any:
+    try:
+        return function(*given)
+    except Exception as error:
+        raise OwnCodeError(f"{name}.{method} fails: {located(error)}") from error

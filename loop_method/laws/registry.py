@@ -1,0 +1,65 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Which law a name stands for: ours, an entry point of another package, or code of one's own.
+
+Which code may be run: `loop_interfaces.own_code`.
+"""
+
+from __future__ import annotations
+
+from importlib.metadata import entry_points
+from types import MappingProxyType
+
+from loop_interfaces.own_code import OwnCode, name_of
+from loop_method.laws.affine import Affine
+from loop_method.laws.base import Law
+from loop_method.laws.feedforward import FeedForward
+from loop_method.laws.observer import Observer
+
+OWN_LAWS = OwnCode(
+    "law",
+    "PDELOOP_LAWS",
+    MappingProxyType({kind.name: kind for kind in (Affine, FeedForward, Observer)}),
+)
+
+_handed_over: dict[str, type[Law]] = {}
+"""Classes of this program, by the names that stand for them."""
+
+
+def offered() -> list[str]:
+    """The names of what is installed, ours first."""
+    others = {entry.name for entry in entry_points(group=OWN_LAWS.group)} - set(OWN_LAWS.shipped)
+    return [*OWN_LAWS.shipped, *sorted(others)]
+
+
+def law_kind(name: str) -> type[Law]:
+    """The class of the law of that name.
+
+    Raises
+    ------
+    ValueError
+        Nothing of that name can be loaded, it is code that is not allowed, or no complete `Law`.
+    """
+    return _handed_over.get(name) or complete(name, OWN_LAWS.configured(name))
+
+
+def hand_over(kind: type[Law]) -> str:
+    """The name of a class of this program, whose code is allowed here and in processes it starts."""
+    complete(getattr(kind, "__name__", repr(kind)), kind)
+    if OWN_LAWS.shipped.get(kind.name) is kind:
+        return str(kind.name)
+    name = OWN_LAWS.allow(name_of(kind))
+    _handed_over[name] = kind
+    return name
+
+
+def complete(name: str, found: object) -> type[Law]:
+    """What was found, if it is a whole law."""
+    called = getattr(found, "__name__", repr(found))
+    if not (isinstance(found, type) and issubclass(found, Law)):
+        raise ValueError(f"law {name!r}: {called} must be a class derived from pdeloop.Law")
+    missing = sorted(getattr(found, "__abstractmethods__", ()))
+    if missing:
+        raise ValueError(
+            f"law {name!r}: {called} does not define {', '.join(missing)}; see pdeloop.Law"
+        )
+    return found
