@@ -22,7 +22,7 @@ DONE, FAILED, CRASHED, INTERRUPTED, NOBODY_READS = 0, 1, 70, STOPPED_BY_SIGNAL, 
 """Exit codes; 2, a command that is not understood, is argparse's."""
 COMMANDS = (
     *("train", "evaluate", "identify", "bag", "monitor", "reproduce"),
-    *("report", "compare", "export", "study", "problems", "new", "check"),
+    *("report", "animate", "compare", "export", "study", "problems", "new", "check"),
 )
 """The modules of `pdeloop.commands`, in the order of the help."""
 

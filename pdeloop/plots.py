@@ -9,11 +9,13 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from loop_interfaces.colour_scale import field_range
 from pde_sim_node.plant import Plant
 from pdeloop.episode import EpisodeRecord
 from pdeloop.finished_run import FinishedRun
 from pdeloop.report import figures, learning, planes
 from pdeloop.report.data import ProblemData, of_run
+from pdeloop.report.places import beside
 from pdeloop.report.style import FIELD_MAP, STYLE, image
 
 __all__ = [
@@ -61,9 +63,12 @@ def plot_episode(plant: Plant, episode: EpisodeRecord, environment: int = 0) -> 
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(6.4, 1.6 + 1.7 * len(components)))
         *maps, below = figure.subplots(len(components) + 1, 1, sharex=True)
-        fields = np.split(episode.fields[:, environment], len(components), axis=1)
-        for ax, name, field in zip(maps, components, fields, strict=True):
-            drawn = image(ax, field.T, extent, origin="lower", cmap=FIELD_MAP)
+        for i, (ax, name) in enumerate(zip(maps, components, strict=True)):
+            own = plant.grid.part(i)
+            field, target = episode.fields[:, environment, own], plant.field_target[own]
+            low, high = field_range(field, target)
+            drawn = image(ax, field.T, extent, origin="lower", cmap=FIELD_MAP, vmin=low, vmax=high)
+            beside(ax, target, (low, high), axis.length)
             ax.set_ylabel(axis.label)
             figure.colorbar(drawn, ax=ax, label=f"{name}(x, t)", pad=0.01)
         held = episode.actions[:, environment]

@@ -30,14 +30,17 @@ from loop_interfaces.ros.observer import Observer
 from loop_interfaces.ros.parameters import declare, given_parameters, on_change
 from loop_interfaces.topics import VIEWS
 from viewer_node.diagnostics import ViewerDiagnostics
+from viewer_node.episode_samples import MAX_COMPONENTS, rows_of
 from viewer_node.loop_reader import PERIOD, LoopReader
 from viewer_node.loop_view import LoopView
-from viewer_node.picture import diverging, plane_of
+from viewer_node.picture import NONE, plane, space_time
+from viewer_node.shapes import shape_of
 
 GRAPH_PERIOD = 0.5
 """Period (s) of polling the ROS graph."""
 FRAME_ID = "field"
-"""Frame of the markers and the image: x is the place, y the value of the field; no transform needed."""
+"""Frame of the markers and the image: x is the place, y the value of the field or, of one on two axes,
+the other place; no transform needed."""
 LINE_WIDTH = 0.006
 """Width of the lines, as a share of the domain's length."""
 COLOURS = {"field": (0.13, 0.40, 0.67), "target": (0.90, 0.45, 0.10)}
@@ -49,9 +52,15 @@ class ViewerNode:
     def __init__(self, node: Node, loop: Observer) -> None:
         values = declare(node, taken_by("viewer_node"), given_parameters(node, "viewer_node"))
         self._length = float(values["length"])
-        self._grid = Grid.parse(values["grid"]) if values["grid"] else None
+        told = values["grid"]  # else one periodic axis of the states that come
+        self._grid = Grid.parse(told) if told else Grid.interval(self._length, 1)
         weights = float(values["state_weight"]), float(values["action_weight"])
-        self._view = LoopView(horizon=values["horizon"], weights=weights, curve_from_topics=False)
+        self._view = LoopView(
+            horizon=values["horizon"],
+            weights=weights,
+            curve_from_topics=False,
+            components=self._grid.components,
+        )
         self._diagnostics = ViewerDiagnostics(self._view)
         self._due = loop.now()
         self._adjust({spec.name: values[spec.name] for spec in VIEWER})
@@ -95,28 +104,48 @@ class ViewerNode:
         if profile is None:
             return
         z, target = profile
-        x = self._length / len(z) * np.arange(len(z), dtype=np.float64)
-        for name, values in (("field", z), ("target", target)):
-            if values is not None and self._wanted(name):
-                self._publishers[name].publish(self._marker(name, x, values))
+        for name in ("field", "target"):
+            if (name == "field" or target is not None) and self._wanted(name):
+                self._publishers[name].publish(self._marker(name, z, target))
         if self._wanted("spacetime"):
-            fields = self._view.space_time(now)
-            if (plane := plane_of(self._grid, z)) is not None:
-                fields = plane
-            if fields is not None:
-                self._publishers["spacetime"].publish(self._picture(diverging(fields)))
+            self._publishers["spacetime"].publish(self._picture(self._colours(now, z, target)))
 
-    def _marker(self, name: str, x: NDArray[np.float64], values: NDArray[np.float64]) -> Marker:
-        marker = Marker(ns=name, id=list(COLOURS).index(name), type=Marker.LINE_STRIP)
+    def _marker(
+        self, name: str, z: NDArray[np.float64], target: NDArray[np.float64] | None
+    ) -> Marker:
+        shape = shape_of(
+            self._grid, z, NONE if target is None else target, is_target=name == "target"
+        )
+        marker = Marker(ns=name, id=list(COLOURS).index(name))
         marker.header.frame_id = FRAME_ID
         marker.header.stamp = self._node.get_clock().now().to_msg()
         marker.action = Marker.ADD
         marker.pose.orientation.w = 1.0
-        marker.scale.x = LINE_WIDTH * self._length
         red, green, blue = COLOURS[name]
         marker.color = ColorRGBA(r=red, g=green, b=blue, a=1.0)
-        marker.points = [Point(x=a, y=b) for a, b in zip(x.tolist(), values.tolist(), strict=True)]
+        marker.points = [Point(x=a, y=b) for a, b in shape.points.tolist()]
+        if shape.size is None:
+            marker.type = Marker.LINE_LIST if shape.pairs else Marker.LINE_STRIP
+            marker.scale.x = LINE_WIDTH * self._length
+        else:
+            marker.type = Marker.CUBE_LIST
+            marker.scale.x, marker.scale.y = shape.size
+            marker.scale.z = LINE_WIDTH * self._length
+            marker.colors = [ColorRGBA(r=r, g=g, b=b, a=1.0) for r, g, b in shape.colours.tolist()]
         return marker
+
+    def _colours(
+        self, now: float, z: NDArray[np.float64], target: NDArray[np.float64] | None
+    ) -> NDArray[np.uint8]:
+        """The picture of a field on two axes or more as it is now, of others over space and time."""
+        known = NONE if target is None else target
+        if len(self._grid.axes) > 1 and z.size == self._grid.size:
+            return plane(self._grid, z, known)
+        shown, fields = self._view.shown(now), self._view.space_time(now)
+        assert shown is not None and fields is not None  # there is a profile
+        kept = rows_of(z.size, shown.components)
+        parts = [shown.part(i) for i in range(min(shown.components, MAX_COMPONENTS))]
+        return space_time(fields, parts, known[kept] if known.size else known)
 
     def _picture(self, colours: NDArray[np.uint8]) -> Image:
         height, width, _ = colours.shape

@@ -1,52 +1,56 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The field of one environment over space and time as a picture. Pure."""
+"""The field of one environment as a picture: over space and time, or on two axes as it is now. Pure."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.colour_scale import colours, field_range
 from loop_interfaces.grid import Grid
 
 UNSEEN = (128, 128, 128)
 """Colour of steps that were not seen."""
-_NEGATIVE, _ZERO, _POSITIVE = (33, 102, 172), (247, 247, 247), (178, 24, 43)
+NONE: Array = np.empty(0)
 
 
-def _colours() -> NDArray[np.uint8]:
-    """511 colours from blue over white to red."""
-    up = np.linspace(0.0, 1.0, 256)[:, None]
-    positive = (1 - up) * _ZERO + up * np.array(_POSITIVE)
-    negative = (1 - up) * _ZERO + up * np.array(_NEGATIVE)
-    return np.concatenate([negative[:0:-1], positive]).round().astype(np.uint8)
+def diverging(
+    fields: NDArray[np.floating], target: Array = NONE, all_fields: NDArray[np.floating] = NONE
+) -> NDArray[np.uint8]:
+    """Colours (..., 3) of numbers (...): the target or 0 is white; see `field_range`.
 
-
-_COLOURS = _colours()
-
-
-def plane_of(grid: Grid | None, state: Array) -> NDArray[np.float32] | None:
-    """The components of a state on two axes or more as one picture, one below the other.
-
-    The last axis to the right, the one before upwards; of others the middle. None for what has fewer
-    axes, or is not of this grid.
+    NaN stands for what was not seen; target: of any shape, empty if it is not known; all_fields: what
+    the range of the colours is taken from, if not from `fields`.
     """
-    if grid is None or len(grid.axes) < 2 or state.size != grid.size:
-        return None
-    fields = grid.fields(state)
-    while fields.ndim > 3:
-        fields = fields[:, fields.shape[1] // 2]
-    return np.concatenate([field[::-1] for field in fields]).astype(np.float32)
-
-
-def diverging(fields: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Colours (..., 3) of numbers (...): zero is white, the largest magnitude full red or blue.
-
-    NaN stands for what was not seen.
-    """
+    low, high = field_range(all_fields if all_fields.size else fields, target)
     seen = np.isfinite(fields)
-    scale = float(np.abs(fields[seen]).max()) if seen.any() else 0.0
-    level = np.where(seen, fields, 0.0) / (scale or 1.0)
-    picture = _COLOURS[(255 * level).round().astype(np.int64) + 255]
+    picture = colours((np.where(seen, fields, low) - low) / (high - low))
     picture[~seen] = UNSEEN
     return picture
+
+
+def space_time(
+    fields: NDArray[np.floating], parts: Sequence[slice], target: Array = NONE
+) -> NDArray[np.uint8]:
+    """Fields (steps, points) of components side by side, one row a step, each with its own range."""
+    shown = [diverging(fields[:, part], target[part]) for part in parts]
+    return np.concatenate(shown, axis=1)
+
+
+def plane(grid: Grid, state: Array, target: Array = NONE) -> NDArray[np.uint8]:
+    """The components of a state on two axes or more, one below the other, each with its own range.
+
+    The last axis to the right, the one before upwards; of others the middle.
+    """
+    known = target.size == state.size
+    shown = []
+    for component in range(len(grid.components)):
+        part = grid.part(component)
+        values = grid.fields(state)[component]
+        while values.ndim > 2:
+            values = values[len(values) // 2]
+        shown.append(diverging(values, target[part] if known else NONE, state[part])[::-1])
+    return np.concatenate(shown)

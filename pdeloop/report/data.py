@@ -217,7 +217,7 @@ def _problem(runs: Mapping[str, FinishedRun], curves: Sequence[Curve], shown: in
         )
         return data
     orders = _orders(data.first, shown, data.plant)
-    return replace(data, behaviours=_behaviours(data), orders=orders)
+    return replace(data, behaviours=behaviours(data), orders=orders)
 
 
 def _orders(run: FinishedRun, shown: int, plant: Plant) -> OrderStudy | None:
@@ -240,8 +240,8 @@ def _orders(run: FinishedRun, shown: int, plant: Plant) -> OrderStudy | None:
         return None
 
 
-def _behaviours(data: ProblemData) -> list[Behaviour]:
-    """The shown seed's controllers from the mean field."""
+def behaviours(data: ProblemData, field: int = MEAN_FIELD, noise_seed: int = 0) -> list[Behaviour]:
+    """The shown seed's controllers, all from the initial field of this seed and with this noise."""
     policies, values, plant = data.policies, data.first.values, data.plant
     models = {name: run.models[data.shown] for name, run in data.runs.items()}
     used = [models.get(name, data.models[data.shown]) for name in policies]
@@ -249,13 +249,13 @@ def _behaviours(data: ProblemData) -> list[Behaviour]:
     law = LawBatch(laws, plant.target, values["action_limit"])
     count = len(policies)
     law.set(np.stack([*policies.values()]), np.arange(count))
-    starts, noise = np.full(count, MEAN_FIELD), np.zeros(count, dtype=np.int64)
+    starts, noise = np.full(count, field), np.full(count, noise_seed, dtype=np.int64)
     episode = rollout(plant, law.actions, starts, noise)
     costs, found = episode.costs, []
     for i, name in enumerate(policies):
         diverged = int(costs.diverged_step[i])
-        field, action = episode.fields[:, i], episode.actions[:, i]
+        states, actions = episode.fields[:, i], episode.actions[:, i]
         if diverged >= 0:
-            field[diverged + 1 :], action[diverged:] = np.nan, np.nan
-        found.append(Behaviour(name, field, action, float(costs.mean[i]), diverged))
+            states[diverged + 1 :], actions[diverged:] = np.nan, np.nan
+        found.append(Behaviour(name, states, actions, float(costs.mean[i]), diverged))
     return found

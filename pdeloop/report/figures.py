@@ -13,10 +13,12 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.colour_scale import field_range
 from loop_interfaces.model_rows import ModelRows
 from loop_method.reduce.order import OrderStudy
 from pdeloop.report import planes
 from pdeloop.report.data import Behaviour, ProblemData
+from pdeloop.report.places import beside, mark_places
 from pdeloop.report.style import COLOURS, FIELD_MAP, GAIN_MAP, NAMES, image, plain_log
 
 Eigenvalues = NDArray[Any]
@@ -50,7 +52,7 @@ def behaviour(problem: ProblemData) -> Figure:
     for i, name in enumerate(components):
         own = problem.plant.grid.part(i)
         _maps(figure, problem, own, grid[i], name, float(times[-1]))
-        _profiles(problem, own, grid[fields + 1 + i], name)
+        _profiles(problem, i, grid[fields + 1 + i], name)
     figure.legend(
         *grid[fields + 1, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3
     )
@@ -62,41 +64,28 @@ def _maps(
 ) -> None:
     """A component of the state in space and time."""
     fields = [b.states[:, own] for b in problem.behaviours]
-    # A few extreme points, a shock's tip or a divergence, would leave no contrast to the rest.
-    low, high = np.nanpercentile(np.stack(fields), (0.3, 99.7))
-    axis = problem.plant.grid.line
+    target, axis = problem.plant.field_target[own], problem.plant.grid.line
+    low, high = field_range(np.stack(fields), target)
     for ax, values in zip(axes, fields, strict=True):
         ax.set_facecolor("0.9")
         extent = (0.0, end, 0.0, axis.length)
         drawn = image(ax, values.T, extent, origin="lower", cmap=FIELD_MAP, vmin=low, vmax=high)
         ax.set_xlabel("t (s)")
     axes[0].set_ylabel(axis.label)
+    beside(axes[-1], target, (low, high), axis.length)
     figure.colorbar(drawn, ax=list(axes), label=f"{name}(x, t)", aspect=14, pad=0.01, extend="both")
 
 
-def _profiles(problem: ProblemData, own: slice, axes: Sequence[Axes], name: str) -> None:
-    """Its initial and final profiles, and the target."""
-    axis = problem.plant.grid.line
+def _profiles(problem: ProblemData, component: int, axes: Sequence[Axes], name: str) -> None:
+    """Its initial and final profiles, the target, and where actuators act and sensors measure."""
+    own = problem.plant.grid.part(component)
+    axis, target = problem.plant.grid.line, problem.plant.field_target[own]
     for ax, b in zip(axes, problem.behaviours, strict=True):
-        colour = COLOURS[b.controller]
-        ax.plot(
-            problem.plant.grid.line.points,
-            b.states[0, own],
-            ":",
-            color="0.45",
-            linewidth=1,
-            label="initial field",
-        )
-        ax.plot(
-            problem.plant.grid.line.points,
-            problem.plant.field_target[own],
-            color="black",
-            linewidth=0.9,
-            label="target",
-        )
-        ax.plot(
-            problem.plant.grid.line.points, b.states[-1, own], color=colour, label="final field"
-        )
+        mark_places(ax, problem.plant, component)
+        first, last = b.states[0, own], b.states[-1, own]
+        ax.plot(axis.points, first, ":", color="0.45", linewidth=1, label="initial field")
+        ax.plot(axis.points, target, color="black", linewidth=0.9, label="target")
+        ax.plot(axis.points, last, color=COLOURS[b.controller], label="final field")
         ax.set_xlim(0, axis.length)
         ax.set_xlabel(axis.label)
     axes[0].set_ylabel(f"{name}(x, T)")

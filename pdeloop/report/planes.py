@@ -11,8 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.colour_scale import field_range
 from loop_interfaces.grid import Grid
 from pde_sim_node.plant import Plant
+from pdeloop.report.places import mark_places, supports_of
 from pdeloop.report.style import COLOURS, FIELD_MAP, NAMES
 
 if TYPE_CHECKING:
@@ -37,6 +39,7 @@ def behaviour(problem: ProblemData) -> Figure:
             row, k = axes[len(SHARES) * i + s], round(share * steps)
             for ax, b in zip(row, shown, strict=False):
                 drawn = plane(ax, grid, b.states[k], i, low, high)
+                mark_places(ax, plant, i)
             row[0].set_ylabel(f"t = {k * plant.sample_time:.3g} s\n{grid.axes[-2].label}")
             row[-1].set_axis_off()
         last = axes[len(SHARES) * (i + 1) - 1, -1]
@@ -69,6 +72,7 @@ def episode(plant: Plant, record: EpisodeRecord, environment: int) -> Figure:
         for ax, share in zip(axes[i], SHARES, strict=True):
             k = round(share * steps)
             drawn = plane(ax, grid, fields[k], i, low, high)
+            mark_places(ax, plant, i)
             ax.set_title(f"t = {k * plant.sample_time:.3g} s")
         axes[i, 0].set_ylabel(grid.axes[-2].label)
         figure.colorbar(drawn, ax=axes[i].tolist(), label=name, pad=0.01)
@@ -98,22 +102,20 @@ def fields(plant: Plant, mean: Array, drawn: Array) -> Figure:
         axes[i, 3].set_axis_off()
         if supports is not None:
             axes[i, 3].set_axis_on()
-            plane(axes[i, 3], grid, np.tile(supports, len(components)), i, 0.0, supports.max())
+            largest = supports.max(axis=1)
+            plane(axes[i, 3], grid, np.tile(largest, len(components)), i, 0.0, largest.max())
             axes[i, 3].set_title("actuators")
     return figure
 
 
 def plane(ax: Axes, grid: Grid, state: Array, component: int, low: float, high: float) -> Any:
     """Draw a component of a state as a picture over the last two axes; of others the middle."""
-    values = grid.fields(state)[component]
-    while values.ndim > 2:
-        values = values[len(values) // 2]
     y, x = grid.axes[-2:]
     ax.set_facecolor("0.9")
     ax.set_xlabel(x.label)
     ax.spines[["top", "right"]].set_visible(True)
     return ax.imshow(
-        values,
+        middle(grid.fields(state)[component]),
         cmap=FIELD_MAP,
         extent=(0.0, x.length, 0.0, y.length),
         origin="lower",
@@ -122,22 +124,17 @@ def plane(ax: Axes, grid: Grid, state: Array, component: int, low: float, high: 
     )
 
 
-def supports_of(plant: Plant, component: int) -> Array | None:
-    """Where the actuators act on a component, largest magnitude over all of them; None if unknown."""
-    if plant.supports is None:
-        return None
-    everywhere = np.zeros((plant.n_z, plant.n_a))
-    everywhere[plant.forced] = plant.supports
-    largest: Array = np.abs(everywhere[plant.grid.part(component)]).max(axis=1)
-    return largest if largest.any() else None
+def middle(values: Array) -> Array:
+    """A component on its last two axes; of others the middle."""
+    while values.ndim > 2:
+        values = values[len(values) // 2]
+    return values
 
 
 def _range(parts: Sequence[Array], plant: Plant, component: int) -> tuple[float, float]:
-    """Of the colours, which a few extreme points do not decide."""
+    """Of the colours of a component."""
     values = np.concatenate([part.ravel() for part in parts])
-    target = plant.field_target[plant.grid.part(component)]
-    low, high = np.nanpercentile(values, (0.3, 99.7))
-    return min(float(low), float(target.min())), max(float(high), float(target.max()))
+    return field_range(values, plant.field_target[plant.grid.part(component)])
 
 
 def _held(ax: Axes, times: Array, actions: Array, **how: Any) -> None:

@@ -1,7 +1,8 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """What all figures of a report share. A controller's colour: loop_interfaces.controllers.
 
-Fields are drawn with cividis and gains with PuOr, which any colour vision can read.
+Fields are drawn in the colours of loop_interfaces.colour_scale and gains with PuOr, which any colour
+vision can read.
 """
 
 from __future__ import annotations
@@ -9,17 +10,19 @@ from __future__ import annotations
 from typing import Any
 
 from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.colour_scale import LIGHT
 from loop_interfaces.controllers import CONTROLLERS
 
 COLOURS = {key: controller.colour for key, controller in CONTROLLERS.items()}
 NAMES = {key: controller.name for key, controller in CONTROLLERS.items()}
 LINES: dict[str, Any] = {"lqt": "--", "pure_po": "-.", "gauss_newton": (0, (5, 1))}
 """Line styles; the others are solid."""
-FIELD_MAP, GAIN_MAP = "cividis", "PuOr"
+FIELD_MAP, GAIN_MAP = LinearSegmentedColormap.from_list("field", LIGHT), "PuOr"
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9,

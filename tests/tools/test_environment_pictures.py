@@ -20,6 +20,7 @@ from gymnasium.wrappers.vector import RecordVideo as RecordVideos
 import pdeloop
 from loop_interfaces.grid import Axis, Grid
 from loop_interfaces.problem import shipped_problems
+from pde_sim_node.plants.loading import as_plant
 from pdeloop.environments import environment_id
 from pdeloop.environments.picture import Picture
 
@@ -63,23 +64,31 @@ def test_a_batch_draws_each_of_its_environments() -> None:
     [Grid.vector(6), Grid((Axis("y", 1.0, 2), Axis("x", 1.0, 3))), Grid.interval(1.0, 3, "uv")],
 )
 def test_states_of_any_grid_are_drawn(grid: Grid) -> None:
-    class Any6:
-        n_a = 2
+    class Any6(pdeloop.Dynamics):
+        n_a, horizon = 2, 5
 
         def __init__(self) -> None:
-            self.grid, self.field_target = grid, np.zeros(6)
-            self.states, self.actions = np.arange(6.0)[np.newaxis], np.ones((1, 2))
+            self.grid = grid
 
-    plant: Any = Any6()
+        def initial_state(self, rng: np.random.Generator) -> np.ndarray:
+            return np.arange(6.0)
+
+        def step(self, z: np.ndarray, a: np.ndarray) -> np.ndarray:
+            return -z
+
+    plant = as_plant(Any6())
+    plant.reset([0])
     picture = Picture()
     frame = picture.frame(plant, 0)
-    plant.states = -plant.states
+    assert np.array_equal(picture.frame(plant, 0), frame)
+    plant.step(np.ones((1, 2)))
     assert not np.array_equal(picture.frame(plant, 0), frame)
 
 
 def test_where_matplotlib_is_missing_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     env = gymnasium.make(BURGERS, render_mode="rgb_array", **GRID)
     env.reset(seed=0)
+    monkeypatch.delitem(sys.modules, "pdeloop.frames", raising=False)
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(DependencyNotInstalled, match=r"pip install 'pdeloop\[report\]'"):
         env.render()

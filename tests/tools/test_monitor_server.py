@@ -6,6 +6,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import re
 import socket
 import time
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ import aiohttp
 import numpy as np
 import pytest
 
+from loop_interfaces.colour_scale import DARK, LIGHT, colours
 from tests.support.browser import browser
 from viewer_node.loop_nodes import Endpoint
 from viewer_node.operation import Call
@@ -236,16 +238,16 @@ def test_the_headers_allow_nothing_from_elsewhere_and_no_inline_script():
         assert "https://" not in text and "http://" not in text and "eval(" not in text, name
 
 
-def test_the_colour_map_is_that_of_the_report():
-    from matplotlib import colormaps
-
+def test_the_colours_of_a_field_are_those_of_the_report():
     from pdeloop.report.style import FIELD_MAP
 
-    hexadecimal = (STATIC / "cividis.js").read_text().split("const COLOURS")[0]
-    text = "".join(hexadecimal.split('"')[1::2])
-    ours = np.frombuffer(bytes.fromhex(text), np.uint8).reshape(-1, 3)
-    theirs = (colormaps[FIELD_MAP](np.arange(256))[:, :3] * 255).round()
-    np.testing.assert_array_equal(ours, theirs)
+    text = (STATIC / "scale.js").read_text()
+    for name, stops in (("light", LIGHT), ("dark", DARK)):
+        (line,) = re.findall(rf"  {name}: \[(.*)\],", text)
+        assert tuple(re.findall(r"#[0-9a-f]{6}", line)) == stops
+    levels = np.linspace(0.0, 1.0, 11)
+    report = np.rint(255 * FIELD_MAP(levels)[:, :3])
+    assert np.abs(report - colours(levels)).max() <= 2  # matplotlib's table has 256 colours
 
 
 def test_the_page_tells_what_a_node_computes_and_what_became_of_a_request(tmp_path):

@@ -292,6 +292,6 @@ def test_a_plant_of_two_fields_shows_both(tmp_path):
     svg = (tmp_path / "both.svg").read_text()
     for words in (">u(x, t)<", ">u_t(x, t)<", ">u(x, T)<", ">u_t(x, T)<"):
         assert words in svg, words
-    # A map of each field and a profile of each, under every controller, beside two colour bars.
+    # A map and a profile of each field under every controller, and a target and a colour bar of each.
     maps = re.findall(r'<g id="axes_\d+">', svg)
-    assert len(maps) == 3 * (2 + 1 + 2) + 2
+    assert len(maps) == 3 * (2 + 1 + 2) + 2 * 2

@@ -2,10 +2,9 @@
 // Actions, profile and learning curve.
 
 import { Chart } from "./chart.js";
-import { css } from "./cividis.js";
-import { DARK, colour, text } from "./format.js";
+import { colour, text } from "./format.js";
 
-// Okabe and Ito's colours, readable with any colour vision; more lines than these go along cividis.
+// Okabe and Ito's colours, readable with any colour vision; more lines than these go from the first to the second.
 const LINES = ["#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00"];
 const DOTTED = [2, 3];
 const DASHED = [7, 4];
@@ -26,8 +25,7 @@ export function extent(...lists) {
 
 export function actionsChart(model) {
   const chart = new Chart("actions", { right: BAR });
-  // Of cividis the part that stands out from the background.
-  const along = (share) => css(DARK.matches ? 0.35 + 0.65 * share : 0.8 * share);
+  const along = (share) => `color-mix(in oklab, ${LINES[1]} ${Math.round(100 * share)}%, ${LINES[0]})`;
   const style = (j, count) => (count <= LINES.length ? LINES[j] : along((j + 0.5) / count));
 
   chart.update = () => {

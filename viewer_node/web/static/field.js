@@ -1,7 +1,7 @@
 // Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 // What was seen of the shown episode, and its picture in space and time.
 
-import { CIVIDIS, css } from "./cividis.js";
+import { css, pixels } from "./scale.js";
 import { Chart } from "./chart.js";
 import { colour, text } from "./format.js";
 
@@ -58,14 +58,15 @@ export function fieldChart(model) {
     picture.height = rows;
     const paint = picture.getContext("2d");
     const image = paint.createImageData(columns, rows);
-    const pixels = new Uint32Array(image.data.buffer);
+    const painted = new Uint32Array(image.data.buffer);
+    const colours = pixels();
     const [low, high] = range;
-    const scale = CIVIDIS.length / (high - low);
+    const scale = (colours.length - 1) / (high - low);
     for (let i = 0; i < columns; i++) {
       for (let r = 0; r < rows; r++) {
         const u = fields[i * rows + r];
-        const k = Math.max(0, Math.min(CIVIDIS.length - 1, Math.floor((u - low) * scale)));
-        if (!Number.isNaN(u)) pixels[(rows - 1 - r) * columns + i] = CIVIDIS[k];
+        const k = Math.max(0, Math.min(colours.length - 1, Math.round((u - low) * scale)));
+        if (!Number.isNaN(u)) painted[(rows - 1 - r) * columns + i] = colours[k];
       }
     }
     paint.putImageData(image, 0, 0);

@@ -1,0 +1,53 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""`pdeloop animate`."""
+
+from __future__ import annotations
+
+import argparse
+
+from pdeloop.commands.common import (
+    Commands,
+    a_path,
+    add_own_code,
+    allow_own_code,
+    command,
+    refuse_other_code,
+)
+
+NAME = "animation.gif"
+
+
+def add(commands: Commands) -> None:
+    """The command `animate`."""
+    animate = command(
+        commands,
+        "animate",
+        _animate,
+        help="a moving picture of a run: no control, LQT and the adapted law",
+        description="An episode of a finished run without control, with LQT and with the adapted law "
+        "side by side, from the same initial field and in the same colours, as GIF, or as MP4 where "
+        "ffmpeg is installed.",
+        example="pdeloop animate runs/burgers --out burgers.gif",
+    )
+    add = animate.add_argument
+    add("folder", type=a_path, metavar="RUN", help="folder of a finished run")
+    add("--out", type=a_path, metavar="FILE", help=f".gif or .mp4 [RUN/{NAME}]")
+    add("--field", type=int, default=0, metavar="I", help="of the closing evaluation [0]")
+    add("--seconds", type=float, default=6.0, metavar="S", help="that it lasts [6]")
+    add_own_code(animate, ("equation", "plant", "optimizer"))
+
+
+def _animate(options: argparse.Namespace) -> int:
+    from pdeloop.animation import animated, write, writes
+    from pdeloop.finished_run import load_run
+
+    if not 0 < options.seconds <= 60:
+        options.refuse(f"--seconds is {options.seconds:g}; expected a number above 0, at most 60")
+    path = options.out or options.folder / NAME
+    writes(path)
+    allow_own_code(options)
+    run = load_run(options.folder)
+    refuse_other_code(options, run.values)
+    write(path, animated(run, field=options.field, seconds=options.seconds))
+    print(f"animation in {path}")
+    return 0
