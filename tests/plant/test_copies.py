@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import copy
+import os
 import pickle
 import subprocess
 import sys
@@ -126,7 +127,7 @@ def continued_elsewhere(plant: Plant) -> tuple[Plant, list[np.ndarray]]:
         capture_output=True,
         check=True,
         timeout=120,
-        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},  # the working directory may be left out
     )
     found: tuple[Plant, list[np.ndarray]] = pickle.loads(done.stdout)
     return found
