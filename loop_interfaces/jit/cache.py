@@ -24,8 +24,8 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def jit(function: F) -> F:
-    """Compile as a part of a function that is cached."""
-    compiled: F = numba.njit(function)
+    """Compile as a part of a function that is cached; only compiled code can call it."""
+    compiled: F = numba.njit(function, no_cpython_wrapper=True, no_cfunc_wrapper=True)
     return compiled
 
 
