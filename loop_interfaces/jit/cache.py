@@ -25,7 +25,9 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 def jit(function: F) -> F:
     """Compile as a part of a function that is cached; only compiled code can call it."""
-    compiled: F = numba.njit(function, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+    # Options of the CPU target that Numba's declarations of njit leave out.
+    entries: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    compiled: F = numba.njit(**entries)(function)
     return compiled
 
 
