@@ -75,7 +75,13 @@ def changed(run: FinishedRun, changes: Mapping[str, Any]) -> FinishedRun:
             f"the policies are of a state of {size} numbers and of {n_a} actuators; the changed plant "
             f"has {plant.state_size} and {plant.n_a}"
         )
-    return replace(run, values=values)
+    there = replace(run, values=values)
+    if (shape := there.laws[0].shape) != run.policies.shape[1:]:
+        raise ParameterError(
+            f"the law '{values['law']}' has parameters of shape {shape} for the changed plant, and "
+            f"those of the run are of shape {run.policies.shape[1:]}"
+        )
+    return there
 
 
 def another_loop(run: FinishedRun) -> str:

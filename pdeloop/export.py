@@ -16,6 +16,7 @@ import numpy as np
 from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import ModelRows, pack
 from loop_interfaces.spec import ParameterError
+from loop_method.laws import Law
 from pdeloop.finished_run import FinishedRun
 
 LAWS = ("adapted", "lqt")
@@ -25,7 +26,42 @@ _C = Path(__file__).parent / "commands" / "template" / "law.c.txt"
 
 
 @dataclass(frozen=True, eq=False)
-class Law:
+class Parameters:
+    """Of a law that has no gains: theta, by its name, with the model that it is a law of.
+
+    law: None where it is code that is not allowed, so that theta has no parts.
+    """
+
+    kind: str
+    theta: Array
+    model: ModelRows
+    law: Law | None
+    limit: float
+    sample_time: float
+
+    def npz(self) -> bytes:
+        """`law`, its name, `theta`, its parts as `theta.NAME`, and the reduced model."""
+        parts = self.law.parts(self.theta) if self.law else {}
+        arrays = {f"theta.{name}": part for name, part in parts.items()}
+        known = {name: getattr(self.model, name) for name in self.model.__dataclass_fields__}
+        return _archive(
+            law=np.array(self.kind),
+            theta=self.theta,
+            sample_time=np.array(self.sample_time),
+            action_limit=np.array(self.limit),
+            **arrays,
+            **known,
+        )
+
+    def c(self) -> bytes:
+        """Refused with a ParameterError: only gains are written in C."""
+        raise ParameterError(
+            f"the law '{self.kind}' has no gains, so there is none in C; write its parameters as .npz"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class GainLaw:
     """a = K_a U^T z + K_b s_r, limited to +- limit where that is above 0.
 
     model: with the law's own gains; sample_time in s; name: what it is the law of, in words.
@@ -41,15 +77,12 @@ class Law:
         arrays: dict[str, Any] = {
             name: getattr(self.model, name) for name in self.model.__dataclass_fields__
         }
-        content = BytesIO()
-        np.savez(
-            content,
+        return _archive(
             model=pack(self.model)[np.newaxis],
             sample_time=np.array(self.sample_time),
             action_limit=np.array(self.limit),
             **arrays,
         )
-        return content.getvalue()
 
     def c(self) -> bytes:
         """One function in C99 without a library, whose numbers are the law's own to the bit."""
@@ -70,7 +103,9 @@ class Law:
         return Template(_C.read_text()).substitute(filled).encode()
 
 
-def law_of(run: FinishedRun, which: str = "adapted", seed: int | None = None) -> Law:
+def law_of(
+    run: FinishedRun, which: str = "adapted", seed: int | None = None
+) -> GainLaw | Parameters:
     """A law of a run: adapted or lqt, of its first seed or a given one.
 
     ParameterError for a seed that the run has not.
@@ -83,12 +118,30 @@ def law_of(run: FinishedRun, which: str = "adapted", seed: int | None = None) ->
             f"the run has no seed {seed}; expected one from {run.seeds[0]} to {run.seeds[-1]}"
         )
     m = run.seeds.index(seed)
-    gains = (run.policies if which == "adapted" else run.warm)[m]
-    model = run.models[m]
-    n_s = model.U.shape[1]
+    policy = (run.policies if which == "adapted" else run.warm)[m]
+    model, limit = run.models[m], float(run.values["action_limit"])
+    law = _loaded(run, m)
+    if law is None or not law.compiled:
+        kind, step = str(run.values["law"]), float(run.values["sample_time"])
+        return Parameters(kind, policy.ravel(), model, law, limit, step)
+    gains, n_s = law.gains(policy.ravel()), model.U.shape[1]
     own = replace(model, K_a=gains[:, :n_s].copy(), K_b=gains[:, n_s:].copy())
     name = f"the {which} law of {run.values['problem']}, seed {seed}"
-    return Law(own, float(run.values["action_limit"]), float(run.values["sample_time"]), name)
+    return GainLaw(own, limit, float(run.values["sample_time"]), name)
+
+
+def _loaded(run: FinishedRun, m: int) -> Law | None:
+    """The law of a seed; None if it is code that is not allowed, or is not there any more."""
+    try:
+        return run.laws[m]
+    except ValueError:
+        return None
+
+
+def _archive(**arrays: Any) -> bytes:
+    content = BytesIO()
+    np.savez(content, **arrays)
+    return content.getvalue()
 
 
 def curve_csv(run: FinishedRun) -> bytes:

@@ -16,6 +16,9 @@ from loop_interfaces import model_rows
 from loop_interfaces.arrays import Array
 from loop_interfaces.model_rows import ModelRows
 from loop_interfaces.topics import COMPLETED
+from loop_method.laws import Law
+from loop_method.laws.calls import laws_of
+from loop_method.laws.registry import law_kind
 from pde_sim_node.plant import DIVERGED_COST, EpisodeCosts
 from pdeloop.episode import EpisodeRecord
 from tuner_node.rollouts import EVALUATED
@@ -38,7 +41,8 @@ class FinishedRun:
     result : dict
         result.json.
     policies, warm : (S, n_a, 2 n_s) array
-        The adapted gains [K_a, K_b], and LQT's.
+        The adapted gains [K_a, K_b], and LQT's; of another law than the affine one its parameters, and
+        where they started, (S, size).
     models : list of ModelRows
         The reduced model of each seed: A (n_s, n_s), B (n_s, n_a), U (n_z, n_s), gains, and
         U^T z_r (n_s,).
@@ -67,6 +71,14 @@ class FinishedRun:
         """The training seeds."""
         first = int(self.values["seed"])
         return range(first, first + len(self.policies))
+
+    @property
+    def laws(self) -> list[Law]:
+        """The law of each seed; `law.parts(policy.ravel())` are its parameters by name.
+
+        ValueError if it is code that is not allowed.
+        """
+        return laws_of(law_kind(self.values["law"]), self.models, self.values["horizon"])
 
     @property
     def before(self) -> list[int]:

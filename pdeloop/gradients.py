@@ -8,7 +8,8 @@ the transposed derivative of the plant's own step (`pde_sim_node.plant.Adjoint`)
     eta_k = (df/dz)^T eta_{k+1} + 2q/(MT) (z_k - z_r) + U K_a^T g_k
 
 dJ/da_k = g_k for given actions (without the last term), dJ/dz_0 = eta_0, and
-dJ/dtheta = sum_k g_k [s_k; 1]^T for the law a = K_a s + b = theta [s; 1], s = U^T z.
+dJ/dtheta = sum_k g_k [s_k; 1]^T for the law a = K_a s + b = theta [s; 1], s = U^T z. Any law with
+derivatives stands in the place of the last term; its memory has an adjoint mu_k = dJ/dm_k of its own.
 """
 
 from __future__ import annotations
@@ -19,10 +20,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loop_interfaces.arrays import Array
+from loop_method.laws.base import Law, differentiable
+from loop_method.laws.calls import action, one_thread, updated
 from pde_sim_node.dynamics import Dynamics
 from pde_sim_node.plant import EpisodeCosts, Plant
 from pde_sim_node.plants.loading import as_plant
-from pdeloop.episode import EpisodeRecord, Law, finite_array, finite_basis, rollout
+from pdeloop.episode import EpisodeRecord, finite_array, finite_basis, rollout
+from pdeloop.episode import Law as Actions
 
 __all__ = ["CostGradient", "Gradients", "features"]
 
@@ -34,8 +38,8 @@ class CostGradient(NamedTuple):
     ----------
     cost : float
         J, the mean stage cost, averaged over the M initial fields; infinite if a rollout diverges.
-    gradient : (T, M, n_a) or (n_a, 2 n_s) array
-        dJ/da or dJ/dpolicy, of its argument's shape; zero if a rollout diverges.
+    gradient : (T, M, n_a), (n_a, 2 n_s) or (size,) array
+        dJ/da, dJ/dpolicy or dJ/dtheta, of its argument's shape; zero if a rollout diverges.
     of_fields : (M, n_z) array
         dJ/dz_0.
     """
@@ -160,6 +164,75 @@ class Gradients:
         """
         return self._gradient(self.law(U, theta, fields), theta, U)
 
+    def of_theta(self, law: Law, theta: ArrayLike, fields: ArrayLike) -> CostGradient:
+        """J and dJ/dtheta of any law that has derivatives, through its memory where it has one.
+
+        Parameters
+        ----------
+        law : Law
+            As `FinishedRun.laws` gives it, or made from a model.
+        theta : (size,)
+            Its parameters.
+        fields : (M,) int, or (M, n_z)
+            Initial fields.
+
+        Returns
+        -------
+        CostGradient
+            J, dJ/dtheta (size,) and dJ/dz_0 (M, n_z).
+
+        Raises
+        ------
+        ValueError
+            Shapes that do not fit the law, NaN or infinity, or a law without derivatives.
+        """
+        if not differentiable(type(law)):
+            raise ValueError(
+                f"the law '{law.name}' has no derivatives, which exact gradients need: it has no "
+                "pull_back(theta, z, memory, k, y), or none of its memory"
+            )
+        given = finite_array("theta", theta, (law.size,))
+        parts, memories = law.parts(given), []
+        rows = [law.memory_start() for _ in range(len(np.atleast_1d(fields)))]
+
+        def acted(k: int, z: Array) -> Array:
+            nonlocal rows
+            a = np.stack([action(law, parts, *own, k) for own in zip(z, rows, strict=True)])
+            memories.append(rows)
+            rows = [updated(law, parts, *own, k) for own in zip(z, rows, a, strict=True)]
+            return a
+
+        with one_thread():
+            episode = self._roll(fields, acted)
+            return self._gradient_of_theta(law, given, episode, memories)
+
+    def _gradient_of_theta(
+        self, law: Law, theta: Array, episode: EpisodeRecord, memories: list[list[Array]]
+    ) -> CostGradient:
+        M, parts = len(episode.costs.mean), law.parts(theta)
+        gradient, eta = np.zeros_like(theta), np.zeros((M, self.plant.n_z))
+        if not episode.whole:
+            return CostGradient(np.inf, gradient, eta)
+        mu = np.zeros((M, law.memory_size))
+        eta += self._terminal_slope(episode)
+        for k in range(self.plant.horizon - 1, -1, -1):
+            z, a = episode.states[k], episode.actions[k]
+            eta, g = self._pulled_back(k, z, a, eta)
+            for m, memory in enumerate(memories[k]):
+                on_memory = np.zeros_like(mu[m])
+                if law.memory_size:
+                    on_theta, on_z, on_memory, on_a = law.pull_back_memory(
+                        parts, z[m], memory, a[m], k, mu[m]
+                    )
+                    gradient += law.vector(on_theta)
+                    eta[m] += on_z
+                    g[m] += on_a
+                on_theta, on_z, directly = law.pull_back(parts, z[m], memory, k, g[m])
+                gradient += law.vector(on_theta)
+                eta[m] += on_z
+                mu[m] = on_memory + directly
+        return CostGradient(float(episode.costs.mean.mean()), gradient, eta)
+
     def law(self, U: Array, theta: Array, fields: ArrayLike) -> EpisodeRecord:
         """An episode under the law a = theta [U^T z; 1].
 
@@ -181,7 +254,7 @@ class Gradients:
             fields, lambda _, states: features(U, self.plant.target, states) @ theta.T
         )
 
-    def _roll(self, fields: ArrayLike, law: Law) -> EpisodeRecord:
+    def _roll(self, fields: ArrayLike, law: Actions) -> EpisodeRecord:
         def finite(k: int, z: Array) -> Array:
             a = law(k, z)
             if not np.isfinite(a).all():
@@ -206,22 +279,35 @@ class Gradients:
         gradient, eta = np.zeros_like(argument), np.zeros((M, plant.n_z))
         if not episode.whole:
             return CostGradient(np.inf, gradient, eta)
-        q, r = 2 * plant.state_weight / (M * T), 2 * plant.action_weight / (M * T)
-        if not plant.cost.plain:
-            eta += plant.cost.terminal_slope(episode.states[T]) / (M * T)
+        eta += self._terminal_slope(episode)
         for k in range(T - 1, -1, -1):
             z, a = episode.states[k], episode.actions[k]
-            eta, g = self._adjoint.pull_back(z, a, eta)
-            if plant.cost.plain:
-                g += r * a
-                eta += q * (z - plant.target)
-            else:
-                on_z, on_a = plant.cost.slopes(z, a, k)
-                g += on_a / (M * T)
-                eta += on_z / (M * T)
+            eta, g = self._pulled_back(k, z, a, eta)
             if U is None:
                 gradient[k] = g
             else:
                 eta += g @ argument[:, :-1] @ U.T
                 gradient += g.T @ features(U, plant.target, z)
         return CostGradient(float(episode.costs.mean.mean()), gradient, eta)
+
+    def _terminal_slope(self, episode: EpisodeRecord) -> Array | float:
+        """dJ/dz_T, of what z_T itself costs."""
+        plant, M = self.plant, len(episode.costs.mean)
+        if plant.cost.plain:
+            return 0.0
+        slope: Array = plant.cost.terminal_slope(episode.states[-1]) / (M * plant.horizon)
+        return slope
+
+    def _pulled_back(self, k: int, z: Array, a: Array, eta: Array) -> tuple[Array, Array]:
+        """dJ/dz_k and dJ/da_k for a given action, from dJ/dz_{k+1}."""
+        plant = self.plant
+        count = len(z) * plant.horizon
+        eta, g = self._adjoint.pull_back(z, a, eta)
+        if plant.cost.plain:
+            g += 2 * plant.action_weight / count * a
+            eta += 2 * plant.state_weight / count * (z - plant.target)
+        else:
+            on_z, on_a = plant.cost.slopes(z, a, k)
+            g += on_a / count
+            eta += on_z / count
+        return eta, g

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from loop_interfaces.colour_scale import field_range
+from loop_method.laws import Affine
 from pde_sim_node.plant import Plant
 from pdeloop.episode import EpisodeRecord
 from pdeloop.finished_run import FinishedRun
@@ -134,7 +135,13 @@ def plot_gains(run: FinishedRun) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
+
+    Raises
+    ------
+    ValueError
+        The run's law is not the affine one.
     """
+    _require_gains(run)
     return _drawn(figures.gains, run)
 
 
@@ -149,8 +156,23 @@ def plot_spectrum(run: FinishedRun) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
+
+    Raises
+    ------
+    ValueError
+        The run's law is not the affine one.
     """
+    _require_gains(run)
     return _drawn(figures.spectrum, run)
+
+
+def _require_gains(run: FinishedRun) -> None:
+    """ValueError if the run's law has other parameters than gains."""
+    if run.values["law"] != Affine.name:
+        raise ValueError(
+            f"the run has the law '{run.values['law']}', and this figure shows the gains of the law "
+            f"'{Affine.name}'"
+        )
 
 
 def _drawn(draw: Callable[[ProblemData], Figure], run: FinishedRun) -> Figure:

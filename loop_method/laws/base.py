@@ -242,7 +242,7 @@ class Law(ABC):
         -------
         (size,)
         """
-        return np.concatenate([np.ravel(parts[name]) for name in self._shapes])
+        return np.concatenate([np.zeros(0), *(np.ravel(parts[name]) for name in self._shapes)])
 
     def reduced(self, z: Array) -> Array:
         """The reduced state s = U^T z.

@@ -19,7 +19,8 @@ def add(commands: Commands) -> None:
         help="a run's law as .npz or C, its curve as .csv",
         description="Write the law a = K_a U^T z + K_b s_r of a finished run for other programs: as "
         ".npz with K_a, K_b, U, s_r and the model, which `pdeloop train --model` takes too, or as one "
-        "function in C99; and the cost after each step of the training as .csv.",
+        "function in C99; of another law its parameters as .npz; and the cost after each step of the "
+        "training as .csv.",
         example="pdeloop export runs/burgers-20260101-120000-1 --out law.c --curve curve.csv",
     )
     add_argument = export.add_argument
@@ -50,7 +51,7 @@ def _export(options: argparse.Namespace) -> int:
     if options.out is not None:
         law = law_of(run, options.law or "adapted", options.seed)
         contents[options.out] = law.c() if options.out.suffix.lower() == ".c" else law.npz()
-        if run.result.get("controller", {}).get("law", "affine") != "affine":
+        if run.result.get("controller", {}).get("law") == "not seen":
             print("WARNING: the run's controller was not seen to use this law", file=sys.stderr)
     if options.curve is not None:
         contents[options.curve] = curve_csv(run)
