@@ -157,8 +157,9 @@ class LawBatch:
         return np.clip(found, -self._limit, self._limit) if self._limit > 0.0 else found
 
 
-def _vectors(theta: Array) -> Sequence[Array]:
-    """Theta of each environment as a vector of its own."""
-    rows: Array = np.ascontiguousarray(theta).reshape(len(theta), -1).copy()
-    rows.flags.writeable = False
-    return list(rows)
+def _vectors(theta: Array) -> list[Array]:
+    """Theta of each environment as a vector of its own, wherever it was."""
+    rows = [np.array(own, order="C").ravel() for own in theta]
+    for row in rows:
+        row.flags.writeable = False
+    return rows

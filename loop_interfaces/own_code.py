@@ -72,6 +72,11 @@ class OwnCode:
         ValueError
             The name is code that is not allowed; or see `load`.
         """
+        self.require(name, environment)
+        return self.load(name)
+
+    def require(self, name: str, environment: Mapping[str, str] = os.environ) -> None:
+        """A ValueError if the name is code that is not allowed."""
         allowed = {identity(item.strip()) for item in environment.get(self.variable, "").split(",")}
         if ":" in name and identity(name) not in allowed:
             quoted = shlex.quote(name)
@@ -80,7 +85,6 @@ class OwnCode:
                 f"you trust it, name it yourself: --{self.word} {quoted}, or for nodes and workers "
                 f"{self.variable}={quoted} in the environment"
             )
-        return self.load(name)
 
     def load(self, name: str) -> Any:
         """What a name stands for; code is executed, whoever wrote it.

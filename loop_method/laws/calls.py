@@ -6,6 +6,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -34,12 +35,21 @@ def one_thread() -> Iterator[None]:
 def laws_of(kind: type[Law], models: Sequence[ModelRows], horizon: int) -> list[Law]:
     """The law of each model, whose start was looked at.
 
+    A model from a message may lie at any address and in any order, for which products round otherwise:
+    each law has a copy of its own.
+
     Raises
     ------
     OwnCodeError
         A law cannot be made, its start is not usable, or theta = 0 is not no control.
     """
-    return [_checked(kind, model, horizon) for model in models]
+    return [_checked(kind, _copied(model), horizon) for model in models]
+
+
+def _copied(model: ModelRows) -> ModelRows:
+    return ModelRows(
+        *(np.array(getattr(model, item.name), order="C") for item in fields(ModelRows))
+    )
 
 
 def _checked(kind: type[Law], model: ModelRows, horizon: int) -> Law:

@@ -39,7 +39,8 @@ def law_kind(name: str) -> type[Law]:
     ValueError
         Nothing of that name can be loaded, it is code that is not allowed, or no complete `Law`.
     """
-    return _handed_over.get(name) or complete(name, OWN_LAWS.configured(name))
+    OWN_LAWS.require(name)
+    return _handed_over.get(name) or complete(name, OWN_LAWS.load(name))
 
 
 def hand_over(kind: type[Law]) -> str:

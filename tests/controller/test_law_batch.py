@@ -114,3 +114,20 @@ def test_a_policy_of_another_law_is_refused() -> None:
     batch.set(policies, index)
     with pytest.raises(ValueError, match="states must be of 3 environments"):
         batch.actions(0, states[0, :2])
+
+
+@pytest.mark.parametrize("kind", [FeedForward, Observer])
+def test_where_a_model_a_policy_or_a_state_lies_in_memory_does_not_matter(kind: type[Law]) -> None:
+    """Numbers in a message lie at an odd address, for which a product rounds otherwise."""
+
+    def moved(array: np.ndarray) -> np.ndarray:
+        raw = np.frombuffer(b"\0\0\0\0" + array.tobytes(), np.uint8)
+        return raw[4:].view(np.float64).reshape(array.shape)
+
+    policies, index, states = episode(kind, 4)
+    here, there = made(kind), [ModelRows(*map(moved, vars(m).values())) for m in models(2)]
+    elsewhere = LawBatch(laws_of(kind, there, T), moved(TARGET))
+    here.set(policies, index)
+    elsewhere.set(moved(policies), index)
+    for k, z in enumerate(states):
+        assert same_bits(elsewhere.actions(k, moved(z)), here.actions(k, z))

@@ -187,3 +187,16 @@ def test_the_registry_knows_ours_and_refuses_what_is_no_law(monkeypatch, tmp_pat
     for name, words in (("No", "must be a class derived from"), ("Half", "define action, start")):
         with pytest.raises(ValueError, match=words):
             law_kind(OWN_LAWS.allow(f"{tmp_path}/own.py:{name}"))
+
+
+def test_an_installed_package_offers_its_laws_by_name(monkeypatch, tmp_path) -> None:
+    source = "from loop_method.laws import Affine\nclass Tanh(Affine): name = 'tanh'\n"
+    (tmp_path / "packaged_law.py").write_text(source)
+    about = tmp_path / "packaged-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: packaged\nVersion: 1.0\n")
+    entries = ["[pdeloop.laws]", "tanh = packaged_law:Tanh", "affine = packaged_law:Tanh"]
+    (about / "entry_points.txt").write_text("\n".join(entries))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert law_kind("tanh").name == "tanh" and "tanh" in offered()
+    assert law_kind("affine") is Affine, "no package takes a name of ours"

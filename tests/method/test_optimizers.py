@@ -24,6 +24,13 @@ def cost(policy: np.ndarray, field_seed: int) -> float:
     return (1.0 + 0.2 * (field_seed % 7) / 7) * float(np.sum((policy - 0.3) ** 2)) + 1.0
 
 
+SETTINGS: dict[str, Any] = {
+    "seed": 3,
+    "rollouts": 24,
+    "settings": TwoPointSettings(learning_rate=1e-3, smoothing_radius=0.1),
+}
+
+
 def two_point(**changes: Any) -> TwoPoint:
     constants = {"learning_rate": 1e-3, "smoothing_radius": 0.1}
     constants |= {name: changes.pop(name) for name in constants if name in changes}
@@ -193,8 +200,22 @@ def test_refuses_bad_parameters(name: str, value: float) -> None:
 def test_refuses_bad_policies() -> None:
     settings: dict[str, Any] = {"seed": 0, "rollouts": 16}
     settings["settings"] = TwoPointSettings(learning_rate=1.0)
-    for policy in (POLICY[0], POLICY[:, :5], POLICY[:0]):
-        with pytest.raises(ValueError, match="must have shape"):
-            TwoPoint(policy, **settings)
+    with pytest.raises(ValueError, match="must have parameters"):
+        TwoPoint(POLICY[:0], **settings)
     with pytest.raises(ValueError, match="must be finite"):
         TwoPoint(POLICY * np.inf, **settings)
+
+
+def test_it_knows_no_shape_and_takes_the_checkpoint_of_gains_as_a_matrix() -> None:
+    """The parameters of any law are one vector; older checkpoints have gains of shape (n_a, 2 n_s)."""
+    matrix, vector = two_point(), TwoPoint(POLICY.ravel(), **SETTINGS)
+    for _ in range(4):
+        rows = [optimizer.tell(measure(optimizer)) for optimizer in (matrix, vector)]
+        assert rows[0] == rows[1]
+    assert vector.policy.tobytes() == matrix.policy.tobytes()
+    again = TwoPoint(POLICY.ravel(), **SETTINGS)
+    again.restore(through_file(matrix))
+    assert again.policy.shape == (POLICY.size,)
+    while not again.done:
+        assert again.tell(measure(again)) == matrix.tell(measure(matrix))
+    assert again.policy.tobytes() == matrix.policy.tobytes()

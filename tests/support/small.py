@@ -14,7 +14,7 @@ from tuner_node.build import build_training
 from tuner_node.dispatch import Dispatcher
 from tuner_node.training import Training
 
-_OWN = ("optimizer", "seed", "seeds", "rollouts", "iterations", "start")
+_OWN = ("law", "optimizer", "seed", "seeds", "rollouts", "iterations", "start")
 
 SMALL = Path(__file__).parents[1] / "data" / "small.yaml"
 REPRODUCED = (str(SMALL), "--seeds", "2", "--iterations", "8")

@@ -1,0 +1,198 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A law of one's own: trained, continued, evaluated, exported, and never run by a file alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pdeloop
+from loop_method.laws.registry import OWN_LAWS
+from pdeloop.cli import main
+from pdeloop.evaluation import evaluate
+from pdeloop.finished_run import load_run
+from pdeloop.in_process import LocalPair
+from pdeloop.report.data import of_run
+from pdeloop.report.page import _of_problem
+from tests.support.interpreter import ROOT
+from tests.support.made_once import made_once
+from tests.support.small import SMALL, same_bits
+from tests.tools.test_own_optimizer import OWN as RANDOM_SEARCH
+from tests.tools.test_own_optimizer import policies
+from tuner_node.build import build_training
+from tuner_node.run_folder import RunFolder
+from tuner_node.run_store import RunWriter
+
+FILE = ROOT / "examples" / "laws" / "saturating.py"
+OWN = f"{FILE}:Saturating"
+BUDGET = {"rollouts": 15, "evaluation_fields": 2}
+FLAGS = ["--rollouts", "15", "--evaluation-fields", "2"]
+N_A, N_S, LIMIT = 4, 4, 0.5
+
+
+@pytest.fixture(autouse=True)
+def nothing_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(OWN_LAWS.variable, "")
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run of the law of one's own."""
+
+    def make(folder: Path) -> Path:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv(OWN_LAWS.variable, "")
+            return pdeloop.train(str(SMALL), law=OWN, out=folder / "run", **BUDGET).folder
+
+    return made_once(tmp_path_factory, "own-law", make)
+
+
+def test_it_trains_in_python_and_by_the_command_to_the_same_bits(
+    finished: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    words = ["train", str(SMALL), "--law", OWN, *FLAGS, "--in-process", "--out", str(out)]
+    assert main(words) == 0
+    assert same_bits(policies(out), policies(finished))
+    assert policies(out).shape == (1, N_A * N_S + N_A)
+    assert RunFolder(out).values()["law"] == OWN
+    assert RunFolder(out).result()["controller"]["law"] == "saturating"
+    assert RunFolder(out).result()["changed"] == [True]
+    with np.load(out / "policy.npz") as arrays:
+        assert str(arrays["law"]) == "saturating"
+
+
+def test_a_class_of_the_program_is_a_law(finished: Path) -> None:
+    saturating = OWN_LAWS.load(OWN)
+    assert same_bits(
+        pdeloop.train(str(SMALL), law=saturating, **BUDGET).policies, policies(finished)
+    )
+    with pytest.raises(ValueError, match="does not define action"):
+        pdeloop.train(str(SMALL), law=type("Half", (pdeloop.Law,), {"start": lambda self: {}}))
+
+
+def test_its_parameters_are_those_of_its_actions(finished: Path) -> None:
+    OWN_LAWS.allow(OWN)
+    run = load_run(finished)
+    (law,), theta = run.laws, run.policies[0]
+    parts = law.parts(theta)
+    assert {name: part.shape for name, part in parts.items()} == {"K": (N_A, N_S), "b": (N_A,)}
+    z = np.linspace(-1.0, 1.0, len(run.models[0].U))
+    expected = LIMIT * np.tanh((parts["K"] @ (run.models[0].U.T @ z) + parts["b"]) / LIMIT)
+    np.testing.assert_allclose(law.action(parts, z, np.zeros(0), 0), expected, rtol=1e-12)
+    assert same_bits(run.warm[0], law.theta_start)
+    assert same_bits(law.parts(run.warm[0])["K"], run.models[0].K_a)
+
+
+def test_an_interrupted_run_of_it_is_continued_when_it_is_named_again(
+    finished: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """From a checkpoint in the middle of the adaptation."""
+    out = tmp_path / "run"
+    OWN_LAWS.allow(OWN)
+    interrupt_after(out, RunFolder(finished).values(), batches=5)
+    monkeypatch.setenv(OWN_LAWS.variable, "")
+    resume = ["train", "--resume", str(out), "--in-process"]
+    assert main(resume) == 1
+    assert "--law" in capsys.readouterr().err
+    assert main([*resume, "--law", "other.py:Other"]) == 1
+    assert "leave it out, or name the run's" in capsys.readouterr().err
+    assert main([*resume, "--law", OWN]) == 0
+    assert same_bits(policies(out), policies(finished))
+
+
+def interrupt_after(folder: Path, values: dict, batches: int) -> None:
+    """Carry out so many batches of a run in a new folder, as a process that is then killed."""
+    RunFolder(folder).create(values)
+    training, pair = build_training(values), LocalPair(values)
+    writer = RunWriter(folder, values, training, warn=print)
+    for _ in range(batches):
+        pair.follow(training)
+        batch = training.next_batch()
+        assert batch is not None
+        for row in training.finish(pair.run(batch)):
+            writer.note(row)
+    assert training.phase == "adapt" and training.optimizers[0].tells
+    writer.keep(now=0.0, force=True)
+
+
+def test_evaluate_report_and_export_know_it(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["evaluate", str(finished), "--fields", "2"]) == 1
+    assert "is code, which is not run because a file names it" in capsys.readouterr().err
+    assert main(["evaluate", str(finished), "--fields", "2", "--law", OWN]) == 0
+    run = load_run(finished)
+    costs = evaluate(run, fields=2, seed=run.values["evaluation_seed"])
+    for name, there in run.costs.items():
+        assert same_bits(costs[name], there)
+    data = of_run(run)
+    assert not data.missing and len(data.behaviours) == 3
+    assert [name for name, *_ in _of_problem(data)] == ["small-behaviour", "small-orders"]
+    assert main(["export", str(finished), "--out", str(tmp_path / "law.npz")]) == 0
+    with np.load(tmp_path / "law.npz") as arrays:
+        assert str(arrays["law"]) == OWN
+        assert same_bits(arrays["theta"], run.policies[0])
+        assert same_bits(arrays["theta.b"], run.laws[0].parts(run.policies[0])["b"])
+        assert same_bits(arrays["U"], run.models[0].U)
+    capsys.readouterr()
+    assert main(["export", str(finished), "--out", str(tmp_path / "law.c")]) == 1
+    assert "has no gains, so there is none in C" in capsys.readouterr().err
+    assert not (tmp_path / "law.c").exists()
+    with pytest.raises(ValueError, match="this figure shows the gains"):
+        pdeloop.plot_gains(run)
+
+
+def test_a_file_alone_does_not_run_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "own.py").write_text(FILE.read_text())
+    problem = tmp_path / "own.yaml"
+    problem.write_text(SMALL.read_text() + "    law: own.py:Saturating\n")
+    out = tmp_path / "run"
+    words = ["train", str(problem), *FLAGS, "--in-process", "--out", str(out)]
+    assert main(words) == 1
+    assert "is code, which is not run because a file names it" in capsys.readouterr().err
+    assert not out.exists()
+    assert main([*words, "--law", f"{tmp_path}/own.py:Saturating"]) == 0
+    monkeypatch.setenv(OWN_LAWS.variable, "")
+    with pytest.raises(ValueError, match="is code"):
+        build_training(RunFolder(out).values())
+
+
+@pytest.mark.parametrize("optimizer", ["model_based", "gauss_newton"])
+def test_an_optimizer_of_gains_refuses_another_law_in_one_sentence(
+    optimizer: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    words = ["train", str(SMALL), "--law", "feedforward", "--optimizer", optimizer]
+    assert main([*words, "--in-process", "--out", str(tmp_path / "run")]) == 1
+    told = capsys.readouterr().err
+    assert "improves the gains of the law 'affine' alone, and the law is 'feedforward'" in told
+    assert told.count("\n") == 1 and not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("law", ["feedforward", "observer"])
+def test_an_optimizer_of_ones_own_knows_theta_alone(law: str) -> None:
+    run = pdeloop.train(str(SMALL), law=law, optimizer=RANDOM_SEARCH, **BUDGET)
+    assert run.result["changed"] == [True]
+    assert (run.costs["adapted"] <= 1.2 * run.costs["lqt"]).all()
+
+
+def test_parameters_for_each_step_fit_one_horizon(tmp_path: Path) -> None:
+    run = pdeloop.train(str(SMALL), law="feedforward", out=tmp_path / "run", **BUDGET)
+    assert run.policies.shape == (1, N_A * N_S + 30 * N_A)
+    fields = {"fields": 2, "seed": 0}
+    assert evaluate(run, **fields, changes={"physical.viscosity": 0.02})["lqt"].shape == (1, 2)
+    with pytest.raises(ValueError, match=r"parameters of shape \(216,\) for the changed plant"):
+        evaluate(run, **fields, changes={"horizon": 50})
+
+
+def test_the_documents_code_is_that_of_the_example() -> None:
+    page = (ROOT / "docs" / "bring-your-own.md").read_text()
+    code = page.partition("## A control law")[2].partition("```python\n")[2].partition("```")[0]
+    assert code and code in FILE.read_text()

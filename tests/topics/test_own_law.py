@@ -1,0 +1,45 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Laws of one's own, and with memory, over topics: the bits of one process, through faults."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+import pdeloop
+from loop_method.laws.registry import OWN_LAWS
+from tests.support.loop_harness import Processes, until
+from tests.support.small import SMALL, parameters, same_bits, train_here
+from tests.support.small_loop import LIMIT, adapted, assert_same_training
+from tests.tools.test_own_law import BUDGET, FLAGS, OWN, policies
+
+pytestmark = pytest.mark.topics
+
+
+def test_it_trains_over_topics_to_the_bits_of_one_process_and_is_recorded(
+    loop: Processes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "run"
+    words = [str(SMALL), "--law", OWN, *FLAGS, "--record", "--out", str(out)]
+    loop.wait(loop.pdeloop("train", *words), LIMIT)
+    monkeypatch.setenv(OWN_LAWS.variable, "")
+    assert same_bits(policies(out), pdeloop.train(str(SMALL), law=OWN, **BUDGET).policies)
+    verified = loop.wait(loop.pdeloop("bag", "verify", str(out), "--law", OWN), LIMIT)
+    assert "no difference, to the bit" in verified
+
+
+def test_a_controller_that_is_killed_under_a_law_with_memory_changes_nothing(
+    loop: Processes, tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    words = [str(SMALL), "--law", "observer", "--iterations", "60", "--out", str(out)]
+    run = loop.pdeloop("train", *words)
+    until(lambda: adapted(out) >= 10, LIMIT, "iteration 10")
+    (pid,) = loop.pids("controller_node")
+    os.kill(pid, signal.SIGKILL)
+    told = loop.wait(run, LIMIT)
+    assert "controller_node was killed by SIGKILL; starting it again" in told
+    assert_same_training(out, train_here(parameters(law="observer", iterations=60)))
