@@ -64,7 +64,7 @@ lint: setup
 types: setup
 	$(BIN)/mypy
 
-# Pages of the Python API from its docstrings, in site/; warnings are errors.
+# The site of all documents and of the Python API, in site/; warnings are errors.
 docs: setup
 	$(BIN)/mkdocs build --strict --quiet
 

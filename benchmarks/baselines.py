@@ -182,7 +182,7 @@ def pairs(words: Sequence[str]) -> dict[str, Any]:
             found[name] = json.loads(value)
         except json.JSONDecodeError as error:
             raise ValueError(
-                f"{word!r} is no setting; expected NAME=JSON like sigma=0.1"
+                f"{word!r} is not a setting; expected NAME=JSON like sigma=0.1"
             ) from error
     return found
 
@@ -209,7 +209,7 @@ def candidates(
 def with_methods(
     study: Study, entries: Mapping[str, Mapping[str, Any]], budget: int
 ) -> tuple[Study, dict[str, Any]]:
-    """The study with these variants at a budget, and the tasks of those that are no trainings."""
+    """The study with these variants at a budget, and the tasks of those that are not trainings."""
     known = {spec.name for spec in parameters()}
     variants, tasks = {}, {}
     for label, table in entries.items():

@@ -3,7 +3,7 @@
 
     python -m benchmarks.reader [http://127.0.0.1:8080/]
 
-It says `reading` once there has been a field or an episode, and goes on until it is ended.
+It says `reading` once there has been a field or an episode, and continues until it is ended.
 """
 
 from __future__ import annotations

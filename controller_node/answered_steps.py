@@ -37,7 +37,7 @@ class AnsweredSteps:
             self._claimed = NONE, -1
 
     def contradiction(self, cost: Frame) -> str:
-        """Why the episode of a cost cannot be relied on; empty if it can, as far as is known."""
+        """Why the episode of a cost cannot be relied on; empty if nothing is known against it."""
         episode = cost.run, cost.plant, cost.episode
         if not (cost.values[:, -1:] == VOID).any():
             if episode == self._episode and cost.step > self._furthest:

@@ -127,7 +127,7 @@ def examined(
 
 
 def check_sizes(settings: DesignSettings, state_size: int, steps: int) -> None:
-    """ValueError if one episode of so many steps is too short for the model that is asked for."""
+    """ValueError if one episode of this many steps is too short for the requested model."""
     n_s, n_a = min(model_order(asdict(settings)), state_size), settings.n_a
     if not n_s:
         return  # as the data suggest

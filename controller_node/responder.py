@@ -86,7 +86,7 @@ class Responder:
 
     @property
     def under_way(self) -> bool:
-        """Whether the episode that was answered last goes on."""
+        """Whether the last answered episode is still under way."""
         run = self._served[0]
         return run in self._runs and (run, self.episode) != self._ended
 

@@ -117,7 +117,7 @@ class SerializedMessage(ctypes.Structure):
 
 @jit
 def slot_after(channel: Any, messages: int) -> int:
-    """Address of the slot so many messages behind the first."""
+    """Address of the slot this many messages after the first."""
     slot: int = channel.slots + SLOT_BYTES * ((channel.first + messages) % SLOTS)
     return slot
 

@@ -85,7 +85,7 @@ class FastPath(ABC):
 
     @abstractmethod
     def synchronise(self, answers: int, last: float) -> None:
-        """Bring the protocol up to date: so many messages were answered, the last one at a time (s)."""
+        """Tell the protocol how many messages were answered, and when the last one was (s)."""
 
     def expect(self, like: Frame, shape: tuple[int, ...], answer: tuple[int, ...]) -> bool:
         """Expect messages with the run, episode and plant of `like`, a message of the episode.

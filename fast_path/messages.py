@@ -135,7 +135,7 @@ class OwnMessage:
 
 @jit
 def write_answer(head: int, step: int, time: float, values: int, count: int) -> None:
-    """Fill in step, time and values, an array at an address, of an own message."""
+    """Fill in step, time and values (an array at an address) of one of our messages."""
     store_unaligned(head, STEP, step)
     store_unaligned(head, TIME, time)
     last = count % WIDTH

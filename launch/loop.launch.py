@@ -32,8 +32,14 @@ ARGUMENTS = {
     "problem": ("burgers", f"one of {', '.join(shipped_problems())}, or the path of a YAML file"),
     "namespace": ("", "namespace of all nodes; empty: none"),
     "pairs": ("1", PAIRS.description),
-    "equation": ("", "the problem's PDE; own code (file.py:Class) has to be named here, too"),
-    "plant": ("", "a plant in its place; own code (file.py:Class) has to be named here, too"),
+    "equation": (
+        "",
+        "the problem's PDE; code of your own (file.py:Class) also has to be named here",
+    ),
+    "plant": (
+        "",
+        "a plant instead of it; code of your own (file.py:Class) also has to be named here",
+    ),
     **{spec.name: ("", f"{spec.description} [the problem's]") for spec in PLANT_FLAGS},
     "network": ("false", "true: let messages leave this machine; false: loopback only"),
     "log_level": ("info", "least severe messages that are shown"),
@@ -73,11 +79,11 @@ def pairs_of_nodes(context: LaunchContext) -> list[Any]:
             actions.append(SetEnvironmentVariable(kind.variable, allowed))
     if given["network"] == "true":
         actions.append(SetEnvironmentVariable(NETWORK, "1"))
-    # Read here, too, so that what is wrong is said before a node starts; and because the nodes would
+    # Also read here, so that errors appear before a node starts, and because the nodes would
     # look for a relative file of an equation in their working directory.
     values = load_parameters(given["problem"], own)
     own["equation"] = values["equation"]
-    if values["plant"]:  # what it says itself is to be known to the other nodes, too
+    if values["plant"]:  # the other nodes also need what the plant fills in
         _, values = complete(values)
         own |= {name: values[name] for name in ("plant", *OF_THE_PLANT)}
     problem = find_problem(given["problem"]).resolve()

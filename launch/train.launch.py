@@ -74,7 +74,7 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def training(context: LaunchContext) -> list[Any]:
-    """Begin a run, or go on with one, in its folder, and start the nodes for it."""
+    """Begin or continue a run in its folder, and start its nodes."""
     given = context.launch_configurations
     on = {name for name in ("record", "record_or_stop", "view") if given[name] == "true"}
     required, recorded = "record_or_stop" in on, bool(on & {"record", "record_or_stop"})

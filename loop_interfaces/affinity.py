@@ -37,7 +37,7 @@ def join_solver(cores: Collection[int]) -> None:
 
 
 def pin_process(core: int) -> None:
-    """Keep every thread of this process on one core; threads made later stay there, too. -1: on any.
+    """Keep every thread of this process on one core; threads started later also stay there. -1: on any.
 
     All of them, because the middleware has its own already, and it is their wake-ups that count.
     Raises ValueError when this process may not use that core.

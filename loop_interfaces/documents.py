@@ -126,7 +126,7 @@ def _depth_exceeds(content: Any, most: int) -> bool:
 
 
 def _whole(digits: str) -> int:
-    """A whole number that NumPy can hold, and a floating-point number, too."""
+    """A whole number of at most 64 bits."""
     if len(digits) > 20 or not -(2**63) <= (number := int(digits)) < 2**63:
         raise ValueError(f"expected whole numbers of at most 64 bits, got {digits[:20]}...")
     return number

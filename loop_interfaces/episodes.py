@@ -2,7 +2,7 @@
 """How our tuner numbers episodes, and how a number is written for people.
 
 The tuner starts counting at a further multiple of `EPISODES_PER_START` each time that it is started, so
-that a run which goes on never uses a number twice.
+that a continued run never uses a number twice.
 """
 
 EPISODES_PER_START = 2**32

@@ -117,7 +117,7 @@ class Grid:
 
     @classmethod
     def vector(cls, numbers: int, name: str = "z", unit: str = "") -> Grid:
-        """Of a state that is no field.
+        """Of a state that is not a field.
 
         Parameters
         ----------
@@ -185,7 +185,7 @@ class Grid:
         Raises
         ------
         ValueError
-            The text is no grid's.
+            The text does not describe a grid.
 
         Examples
         --------
@@ -204,7 +204,7 @@ class Grid:
                 int(numbers),
             )
         except (TypeError, ValueError) as error:
-            raise ValueError(f"{text[:200]!a} is no grid: {error}") from error
+            raise ValueError(f"{text[:200]!a} does not describe a grid: {error}") from error
 
     @property
     def shape(self) -> tuple[int, ...]:

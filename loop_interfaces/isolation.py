@@ -31,7 +31,7 @@ def keep_on_this_machine() -> None:
 
 
 def check_profile() -> None:
-    """ValueError where the user's Fast DDS profile is none: Fast DDS would go on with its defaults."""
+    """ValueError if the user's Fast DDS profile is invalid: Fast DDS would use its defaults."""
     path = os.environ.get(PROFILE)
     if not path:
         return
@@ -57,7 +57,7 @@ def is_confined() -> bool:
 def outside_sockets() -> list[str]:
     """Addresses of this process's UDP sockets that reach beyond the loopback interface.
 
-    Fast DDS only logs a profile that it cannot read and goes on with its defaults, which send to
+    Fast DDS only logs a profile that it cannot read and uses its defaults, which send to
     every interface: so look at what it has opened. Multicast addresses are groups that were joined,
     on the interface of the profile, and count as inside.
     """

@@ -148,7 +148,7 @@ _Dumper.add_representer(str, _Dumper.represent_str)
 
 
 def _blocks(node: yaml.Node, outer: str) -> Iterator[tuple[str, yaml.MappingNode]]:
-    """The names of nodes and their parameters, in and below a map that is no parameters."""
+    """The names of nodes and their parameters, in and below a map of nodes."""
     if not isinstance(node, yaml.MappingNode):
         expected = (
             "'/**:' with 'ros__parameters:' in it" if not outer else f"'{_PARAMETERS}:' in it"
@@ -162,7 +162,7 @@ def _blocks(node: yaml.Node, outer: str) -> Iterator[tuple[str, yaml.MappingNode
             continue
         if not _NODE_NAME.fullmatch(outer):
             raise ValueError(
-                f"{shown(outer)} is no name of a node (line {_line(key)})"
+                f"{shown(outer)} is not the name of a node (line {_line(key)})"
                 if outer
                 else f"'{_PARAMETERS}' stands below no name of a node in line {_line(key)}"
             )

@@ -36,7 +36,7 @@ AGE = 0.1
 MAX_TIME = 2.0**31
 """Simulated time in s up to which /clock, whose seconds are an int32, can tell it."""
 RATE, COUNTED = 600.0, 4096
-"""Samples a second that viewers get, of up to so many bytes."""
+"""Samples per second that viewers get, of up to this many bytes."""
 
 _MESSAGE = struct.Struct("<4sIIIQ")
 """CDR of an UInt8MultiArray without dims up to its data, and the first eight bytes of those."""
@@ -126,7 +126,7 @@ class Sample:
 def unpack(message: bytes) -> tuple[int, Iterator[Sample]]:
     """When the batch was sent (ns on the plant's clock) and what is in it.
 
-    Raises FrameError, also while the samples are read, for bytes that are no batch.
+    Raises FrameError, also while the samples are read, for bytes that are not a batch.
     """
     if len(message) < _MESSAGE.size:
         raise FrameError(f"expected a batch of samples, got {len(message)} bytes")
@@ -147,7 +147,9 @@ def _samples(message: bytes, end: int) -> Iterator[Sample]:
         kind, length, stamp, time = _SAMPLE.unpack_from(message, position)
         position = start + length
         if kind > ACTION_KIND or position > end:
-            raise FrameError("a batch of samples holds something that is no state or action")
+            raise FrameError(
+                "a batch of samples holds something that is neither a state nor an action"
+            )
         yield Sample(kind, stamp, message[start:position], time)
 
 

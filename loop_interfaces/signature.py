@@ -10,7 +10,7 @@ tell whether an action comes from a controller that has what the tuner published
 
 with h the first 53 bits of BLAKE2b over the numbers as little-endian float64. Where the controller
 explores there is neither policy nor model. A simulated time is never negative, so a controller that
-echoes the state's time, or sends 0, differs from one that signs. It is no protection from somebody
+echoes the state's time, or sends 0, differs from one that signs. It does not protect from somebody
 who reads the wire and copies the number.
 """
 

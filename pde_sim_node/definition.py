@@ -45,7 +45,7 @@ class Definition:
 
 
 def sources_of(kind: type, root: type) -> list[str]:
-    """The source of a class and of the classes it is derived from, as far as they derive from `root`.
+    """The source of a class and of its base classes below `root`.
 
     Each with its whole module: constants and functions beside the class are part of it.
     """

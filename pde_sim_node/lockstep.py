@@ -21,7 +21,7 @@ state T advances nothing: it acknowledges the last state.
 Which starts and actions contradict, and which are signed: pde_sim_node.taken_actions.
 
 A pause is independent of the phase: a paused plant takes the answer it waits for, and sends no further
-state. Nothing is sent again and nothing is given up meanwhile; `episode/paused` says so to those who
+state. Nothing is repeated or abandoned meanwhile; `episode/paused` tells those who
 wait for the plant.
 """
 
@@ -97,7 +97,7 @@ class Lockstep:
         self.run = 0
         self.episode = -1
         self.time = 0.0
-        """Simulated time in s; it goes on from one episode to the next."""
+        """Simulated time in s, continuing from one episode to the next."""
         self.steps_total = self.rounds_total = self.episodes_total = 0
         self.last_cost: np.ndarray | None = None
         """The rows of the last `episode/cost`."""

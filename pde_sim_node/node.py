@@ -105,7 +105,9 @@ class PlantNode:
             f"{plant.horizon} steps of {values['sample_time']:g} s"
         )
         if self._lockstep.paused:
-            node.get_logger().warning("paused, as when its process ended: ~/resume lets it go on")
+            node.get_logger().warning(
+                "still paused, as when its process ended; call ~/resume to continue"
+            )
 
     def join(self, node: Node, loop: NodeLoop) -> None:
         self._node, self._loop = node, loop

@@ -221,7 +221,7 @@ class Plant(Protocol):
         """
 
     def restart(self, environments: NDArray[np.intp], seeds: ArrayLike) -> Array:
-        """Begin again in some environments of an episode that goes on, and ends for all together.
+        """Restart some environments of a running episode, which still ends for all together.
 
         Parameters
         ----------

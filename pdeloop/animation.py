@@ -96,7 +96,7 @@ def writes(path: Path) -> None:
     """ValueError unless an animation can be written as a file of this name."""
     suffix = path.suffix.lower()
     if suffix not in (".gif", ".mp4"):
-        raise ValueError(f"{path} is no animation; expected a file that ends in .gif or .mp4")
+        raise ValueError(f"{path} is not an animation; expected a file that ends in .gif or .mp4")
     if suffix == ".mp4" and shutil.which("ffmpeg") is None:
         raise ValueError(
             f"{path} needs ffmpeg, which is not found; install it (apt install ffmpeg), or write a "

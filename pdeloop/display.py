@@ -21,7 +21,7 @@ _MOST_AT_ONCE = 4_000_000
 
 
 class StreamConsole(Console):
-    """Lines and a bar on a stream, for work that goes on where that cannot be written any more."""
+    """Lines and a bar on a stream, for work that continues when the stream can no longer be written."""
 
     def __init__(self, stream: TextIO) -> None:
         super().__init__(file=stream, highlight=False, soft_wrap=True)
@@ -37,7 +37,7 @@ class StreamConsole(Console):
         except BrokenPipeError:
             raise
         except OSError as error:
-            complain(f"no more lines can be written ({error.strerror}); the work goes on")
+            complain(f"no more lines can be written ({error.strerror}); the work continues")
             self.quiet = True
             drop_unwritable()
 

@@ -133,7 +133,7 @@ def load_run(folder: str | Path) -> FinishedRun:
     Raises
     ------
     ValueError
-        There is no run, or it is not finished; the message says how to go on.
+        There is no run, or it is not finished; the message says how to continue.
     """
     if not isinstance(folder, str | PathLike):
         raise ValueError(f"folder is {folder!r}; expected the path of a run")

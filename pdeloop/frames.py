@@ -158,7 +158,7 @@ class Frames:
         return show
 
     def _past(self, ax: Axes, column: int, component: int) -> Show:
-        """The same in space and time, as far as it has come."""
+        """The same in space and time, up to the current step."""
         assert self._fields is not None
         own = self._plant.grid.part(component)
         whole = self._fields[column, :, own].T

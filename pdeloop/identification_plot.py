@@ -107,6 +107,6 @@ def _lines(
 
 
 def _spread(count: int) -> list[int]:
-    """A few of so many, equally spaced."""
+    """A few of them, equally spaced."""
     few = np.linspace(0, count - 1, min(count, CHANNELS))
     return [int(i) for i in few.round()]

@@ -172,7 +172,7 @@ class Transport:
         tuner = {
             **serving,
             "out": str(folder.resolve()),
-            "resume": True,  # so that one that is started again goes on where it was
+            "resume": True,  # so that a restarted one continues where it was
             "recorder": self.recorder,
             "plant_fingerprint": fingerprint(RunFolder(folder).values()),
         }

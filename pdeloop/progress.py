@@ -17,7 +17,7 @@ class Progress:
     """Shows how much of a task is done; title, unit: a word for the task, and for what is counted.
 
     On a terminal a bar, which leaves no trace. Elsewhere a line for every tenth of the work, and
-    for the first news after some seconds without one; what was said already is no news.
+    for the first news after some seconds without one; what was already printed is not news.
     """
 
     def __init__(self, console: Console, title: str, unit: str) -> None:

@@ -47,7 +47,7 @@ class NodeError(RuntimeError):
 class Child:
     """One node: how it is started and how its life went.
 
-    command: gives its words, before each start; optional: the others go on without it when it ends
+    command: gives its words, before each start; optional: the others continue without it when it ends
     by itself, or dies too often; cores: those that it may use, empty: any; ended: it is optional,
     and has ended for good.
     """

@@ -110,7 +110,7 @@ def begin(
 
 
 def reopen(folder: Path) -> dict[str, Any]:
-    """The parameters of the unfinished training in `folder`, which goes on if it was paused.
+    """The parameters of the unfinished training in `folder`, which is no longer paused.
 
     RunFolderError if there is none.
     """
@@ -297,5 +297,5 @@ class Waiting:
 def unused(path: Path) -> Path:
     """`path`, or the first of path-2, path-3, ... that does not exist."""
     numbered = (path.with_name(f"{path.name}-{n}") for n in itertools.count(2))
-    # A link that leads nowhere is there, too.
+    # A dangling link counts as present.
     return next(p for p in itertools.chain([path], numbered) if not os.path.lexists(p))

@@ -51,7 +51,7 @@ def _reason(name: str, values: Mapping[str, Any], *, in_process: bool, viewed: b
         if values[chooser] != word:
             return f"it is of the {chooser} {word}, and this one is {values[chooser]}"
     if name == "sensor_delays" and not values["sensors"]:
-        return "there are no sensors; give sensors, too"
+        return "there are no sensors; give sensors as well"
     if name in OF_THE_COMMAND:
         return "it follows from how the training is started; see pdeloop train --help"
     if name in OF_NODES and in_process:

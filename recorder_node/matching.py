@@ -47,7 +47,7 @@ class Matching:
         return changed
 
     def parameters(self) -> dict[str, object]:
-        """The loop's parameters, as far as its nodes have answered."""
+        """The parameters of the nodes that have answered."""
         known = {spec.name for spec in table()}
         return {
             name: value

@@ -48,7 +48,7 @@ LOOK = 0.1
 DEPTH = 1000
 """Messages of a topic that may wait: seconds of the fastest loop, if this process is held up."""
 LATCHED = DurabilityPolicy.TRANSIENT_LOCAL
-"""A node that starts later gets the messages of before, too."""
+"""A node that starts later also gets the earlier messages."""
 QUIET, END = 0.1, 1.0
 """At the end: seconds without a message after which the recording ends, and at the most."""
 

@@ -49,7 +49,7 @@ class Budget:
 
     @property
     def total(self) -> Counts:
-        """What each seed may pay, as far as it is known, (S,)."""
+        """What each seed may pay, where known, (S,)."""
         return self._sum("identify", "check") + self.adaptation
 
     @property
@@ -60,7 +60,7 @@ class Budget:
         return self._rollouts - self._sum("identify", "check")
 
     def allows(self, seed: int, rollouts: int) -> bool:
-        """Whether a seed may pay so many more."""
+        """Whether a seed may pay for this many more."""
         return not self._rollouts or bool(self.paid[seed] + rollouts <= self._rollouts)
 
     def by_purpose(self) -> list[dict[str, int]]:

@@ -46,7 +46,7 @@ def save(path: Path, arrays: Arrays) -> None:
 def restore(path: Path, take: Callable[[dict[str, NDArray[Any]]], None]) -> tuple[bool, list[str]]:
     """Call `take` with the newest usable checkpoint: that at `path`, or the one before it.
 
-    take: goes on from the arrays, or raises ValueError where it cannot, having changed nothing.
+    take: continues from the arrays, or raises ValueError without changing anything.
     Returns whether there was a usable one, and a sentence for each that was not. Those are set
     aside as `NAME.damaged`, so that the next `save` does not take them for the checkpoint to keep.
     """

@@ -154,7 +154,7 @@ class Dispatcher:
         return self._begin_episodes(now)
 
     def pause(self) -> None:
-        """Begin no new episode; those under way go on."""
+        """Begin no new episode; those under way continue."""
         self.paused = True
 
     def resume(self, now: float) -> list[PairPublication]:

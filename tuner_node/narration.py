@@ -13,7 +13,7 @@ _TOGETHER = ("designed", "checked", "evaluated")
 
 
 class Narration:
-    """Sentences for the rows of progress.jsonl, of so many seeds from the first, `seed`, on.
+    """Sentences for the rows of progress.jsonl, of `seeds` seeds from the first, `seed`, on.
 
     Of several seeds mean and range are shown, in one line for all of them.
     """

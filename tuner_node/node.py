@@ -80,7 +80,7 @@ class TunerNode:
         dispatcher = build_dispatcher(values, training, identity)
         if identity.paused:
             dispatcher.pause()
-            log.warning("paused, as when its process ended: ~/resume lets it go on")
+            log.warning("still paused, as when its process ended; call ~/resume to continue")
         self._session = Session(training, dispatcher, self._rows.append)
         self._diagnostics = TunerDiagnostics(self._session)
         self._participants = Participants(self._session, values["recorder"])
@@ -273,7 +273,7 @@ class TunerNode:
             self._log.info(self._narration.progress, throttle_duration_sec=PROGRESS_PERIOD)
 
     def _controller(self) -> dict[str, Any]:
-        """Who answered the states, and by which law as far as that was seen."""
+        """Who answered the states, and by which law if that was seen."""
         found = {
             full_name(there)
             for namespace in self._pairs

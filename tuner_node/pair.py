@@ -176,7 +176,7 @@ class Pair:
             )
 
     def sample(self, what: str, frame: Frame, width: int) -> None:
-        """Take a sample of its episode: "states" or "actions". FrameError unless of so many numbers."""
+        """Take a sample of its episode: "states" or "actions". FrameError if their number is wrong."""
         for late in self.used_samples():
             late.take(what, frame)
         if self.chunk is None or frame.run != self.run or not self.runs(frame.episode):

@@ -54,7 +54,7 @@ class Participants:
         return publications + self._session.dispatcher.tick(now)
 
     def newly_paused(self, now: float) -> str:
-        """That plants were paused or go on since the last call, in words; empty if neither is so."""
+        """Which plants were paused or resumed since the last call, in words; may be empty."""
         dispatcher = self._session.dispatcher
         paused, before = dispatcher.paused_pairs(now), self._paused
         if paused == before:

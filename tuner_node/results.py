@@ -16,7 +16,7 @@ from tuner_node.rollouts import EVALUATED
 from tuner_node.training import Training
 
 WORDS = ("event", "role", "model", "chosen", "reason")
-"""Entries of a row of the history that are no numbers."""
+"""Entries of a row of the history that are not numbers."""
 
 
 def check_result(content: Mapping[str, Any], seed: int, seeds: int) -> None:
@@ -42,13 +42,15 @@ def check_result(content: Mapping[str, Any], seed: int, seeds: int) -> None:
     ):
         raise ValueError(f"its 'rollouts' are not a table of {', '.join(kinds)} for each seed")
     if not all(_texts(content.get(name, {})) for name in ("versions", "environment")):
-        raise ValueError("its 'versions' or 'environment' are no table of texts")
+        raise ValueError("its 'versions' or 'environment' are not a table of texts")
     controller = content.get("controller", {})
     nodes = controller.get("nodes", []) if isinstance(controller, dict) else None
     several = content.get("several_publishers", {})
     lists = [nodes, *several.values()] if isinstance(several, dict) else [None]
     if not all(isinstance(n, list) and all(isinstance(node, str) for node in n) for n in lists):
-        raise ValueError("its 'controller' or 'several_publishers' is no table of lists of nodes")
+        raise ValueError(
+            "its 'controller' or 'several_publishers' is not a table of lists of nodes"
+        )
 
 
 def check_history(history: object, seed: int, seeds: int) -> None:

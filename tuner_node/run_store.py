@@ -25,10 +25,10 @@ CHECKPOINT_SHARE = 0.2
 
 
 class RunWriter:
-    """Writes what `training` does into the folder `path`, going on from what is there.
+    """Writes the progress of `training` into the folder `path`, continuing what is there.
 
     A file that cannot be written (full disk) is reported through `warn` and tried again; the
-    training goes on and the previous checkpoint stays.
+    training continues and the previous checkpoint stays.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class RunWriter:
         except OSError as error:
             self._warn(
                 f"cannot write the checkpoint to {self._folder.path}: {error.strerror}; "
-                "the training goes on, the previous checkpoint stays"
+                "the training continues, the previous checkpoint stays"
             )
         took = time.monotonic() - began
         self._save_at = now + max(CHECKPOINT_PERIOD, took / CHECKPOINT_SHARE)
@@ -115,7 +115,7 @@ def open_run(
     locks: ExitStack,
     warn: Callable[[str], None],
 ) -> tuple[RunWriter | None, RunIdentity]:
-    """Begin the run in the folder `out` of the tuner's parameters, or go on with it (`resume`).
+    """Begin the run in the folder `out` of the tuner's parameters, or continue it (`resume`).
 
     locks: the folder is locked until it is closed, before anything in it is looked at or written, as
     somebody else may begin a run in it, too. Without a folder nothing is written.

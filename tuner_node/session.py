@@ -49,7 +49,7 @@ class Session:
         return sum(costs) / len(costs) if costs else None
 
     def stop(self) -> list[PairPublication]:
-        """End when the rollouts under way are over; at once in a pause, where none goes on.
+        """End when the rollouts under way are over; at once in a pause, when none is running.
 
         What an unfinished batch of them has is dropped, and computed again when the run is continued,
         identically.

@@ -135,7 +135,7 @@ class EpisodeSamples:
         self.version = next(_VERSIONS)
 
     def part(self, component: int) -> slice:
-        """The rows of one component; of the last one if there are not so many."""
+        """The rows of one component; of the last one if there are fewer."""
         kept = min(self.components, MAX_COMPONENTS)
         size = self.fields.shape[1] // kept
         component = min(component, kept - 1)

@@ -30,7 +30,7 @@ Handler = Callable[[Frame, float], None]
 
 
 class LoopReader:
-    """Subscribes to what a view shows: the latched topics, and the samples while `listen` says so.
+    """Subscribes to what a view shows: the latched topics, and the samples while `listen` is true.
 
     namespace: of the pair; empty: the node's own. What is read goes to the view.
     """
@@ -58,7 +58,7 @@ class LoopReader:
         }
 
     def listen(self, yes: bool) -> None:
-        """Whether states and actions are read, too: each costs their sender something."""
+        """Whether states and actions are read as well: each reader costs their sender something."""
         if yes and self._samples is None:
             self._samples = SampleSubscription(self._node, self._namespace, throttled=True)
             self._samples.poll()

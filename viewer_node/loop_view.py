@@ -205,7 +205,7 @@ class LoopView:
         return shown.fields[: max(shown.columns, self.horizon // shown.stride + 1)]
 
     def state_of_loop(self, now: float) -> str:
-        """What goes on, in one word."""
+        """What is happening, in one word."""
         nobody = not any(node.present for node in self.nodes.by_role.values())
         quiet = self.quiet(now)
         # The last message of a tuner that was interrupted may be lost: then everybody is gone. Who

@@ -73,7 +73,7 @@ def other(equation: str, **settings: Any) -> Case:
 
 
 def foreign(plant: str, group: str = "plants of other kinds") -> Case:
-    """A plant that is no equation of the compiled solver."""
+    """A plant that is not an equation of the compiled solver."""
     return Case(group, "", {}, {}, "", plant)
 
 

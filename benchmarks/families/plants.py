@@ -14,7 +14,7 @@ from loop_interfaces.arrays import Array
 
 
 def runge_kutta(rate: Callable[[Array], Array], z: Array, duration: float, steps: int) -> Array:
-    """Classical Runge-Kutta of fourth order in so many steps."""
+    """Classical Runge-Kutta of fourth order in this many steps."""
     h = duration / steps
     for _ in range(steps):
         k1 = rate(z)

@@ -48,7 +48,7 @@ def call_c(typing_context: Any, address: Any, arguments: Any) -> Any:
 
 @intrinsic
 def load_acquire(typing_context: Any, address: Any) -> Any:
-    """The word at an address; what was written before it was is seen, too."""
+    """The word at an address, with acquire semantics: writes before it are visible as well."""
 
     def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.load_atomic(builder.inttoptr(args[0], WORD.as_pointer()), "acquire", 8)

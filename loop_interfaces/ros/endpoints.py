@@ -124,7 +124,7 @@ class SampleBatcher:
 
     Make it before the publisher of the states: a process that has discovered the states has
     then discovered the samples.
-    timed: whether the time of each state goes on /clock.
+    timed: whether the time of each state is published on /clock.
     """
 
     def __init__(self, node: Node) -> None:
@@ -192,7 +192,7 @@ class SampleBatcher:
 
 
 class Sender:
-    """Publishes frames on one topic; what it sends goes to the batcher, too."""
+    """Publishes frames on one topic; what it sends also goes to the batcher."""
 
     def __init__(
         self, node: Node, topic: Topic, namespace: str = "", batcher: SampleBatcher | None = None

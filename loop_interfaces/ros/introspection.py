@@ -231,7 +231,7 @@ class Introspection:
         return due
 
     def _namesakes(self, now: float) -> int:
-        """How many other nodes have had this one's full name for a while; says so.
+        """How many other nodes have had this one's full name for a while; reports them.
 
         A node is there as long as its services are: the graph's list of names can keep a node that has
         left, for good, when what it said last is read only after it has gone.

@@ -113,7 +113,7 @@ class NodeLoop(EventLoop):
         """Messages since the last round; when something last happened; whether that is long ago."""
 
     def sender(self, topic: Topic, namespace: str = "", *, sampled: bool = False) -> Sender:
-        """A publisher of frames on `topic`; sampled: they go out on `samples`, too."""
+        """A publisher of frames on `topic`; sampled: they are also published on `samples`."""
         return Sender(self.node, topic, namespace, self.batcher if sampled else None)
 
     def receive(

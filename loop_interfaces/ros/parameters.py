@@ -70,7 +70,7 @@ def declare(node: Node, specs: Iterable[Spec], given: dict[str, Any]) -> dict[st
 
 
 def take_over(node: Node, former: Node) -> None:
-    """Declare the parameters of a node that is no more, with the values that they had last."""
+    """Declare the parameters of a node that has ended, with their last values."""
     for name in former.get_parameters_by_prefix(""):
         if name and not node.has_parameter(name):  # rclpy lets a request make one without a name
             value, description = former.get_parameter(name).value, former.describe_parameter(name)

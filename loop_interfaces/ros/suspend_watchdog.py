@@ -26,7 +26,7 @@ def sleep_for(seconds: float) -> None:
 class SuspendWatchdog:
     """A thread that does nothing but wake up, so that only a suspension keeps it from it.
 
-    The loop itself is no measure: it may compute for seconds. A thread that sleeps is scheduled
+    The loop itself cannot tell: it may compute for seconds. A thread that sleeps is scheduled
     promptly even on a busy machine, and NumPy and Numba let it in between.
 
     on_tick: called from that thread, about every PERIOD seconds.

@@ -7,7 +7,7 @@
 
 An optimiser runs no rollout and knows no clock, so the same object serves a loop over topics and a
 loop in one process. Its randomness is a pure function of (seed, tells), and `state` holds
-everything that `restore` needs to go on as if nothing had happened, to the last bit.
+everything that `restore` needs to continue as if nothing had happened, to the last bit.
 """
 
 from collections.abc import Mapping, Sequence

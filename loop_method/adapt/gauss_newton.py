@@ -11,7 +11,7 @@ step
 1. fits local models to the remembered trajectories (`fit`) and keeps those that predict measured
    differences of trajectories (`selection`),
 2. solves (H + lambda D) d = -g with the averaged Gauss-Newton curvature (`sensitivity`),
-3. rolls out theta + d on the M fields of the moment, one by one, giving up as soon as the mean is
+3. rolls out theta + d on the current M fields, one by one, giving up as soon as the mean is
    clearly above the incumbent's, accepts it if the mean over all fields fell, and adapts lambda;
    an incumbent that diverges is halved instead,
 4. after an acceptance replaces the oldest field, so that the policy does not fit M fields, or adds one
@@ -100,7 +100,7 @@ class SearchState:
 
     @classmethod
     def begin(cls, policy: Array, count: int, first: int) -> SearchState:
-        """Before the first rollout, with so many fields from the number `first` on."""
+        """Before the first rollout, with this many fields from number `first` on."""
         incumbents, trials, others = np.full((3, count), _NONE, dtype=np.int64)
         numbers = first + np.arange(count, dtype=np.int64)
         return cls(policy.copy(), policy.copy(), numbers, incumbents, trials, others)

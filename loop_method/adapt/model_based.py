@@ -120,7 +120,7 @@ class ModelBased(Optimizer):
         self._begun = 0
         """Own rollouts before the search."""
         self._none_is_close = False
-        """Whether no control is judged, too."""
+        """Whether no control is judged as well."""
         self._safe = True
         """Whether the first law is better than no control on the model."""
 
@@ -145,7 +145,7 @@ class ModelBased(Optimizer):
         return self._stage == ENDED
 
     def ask(self) -> list[Rollout]:
-        """The rollouts of the present stage, at once as far as they do not depend on each other."""
+        """The rollouts of the current stage, at once where they do not depend on each other."""
         own = self._records.count
         if self._stage == RENEWING:
             laws = [self._policy] * (self._next_renewal() - own)
@@ -337,7 +337,7 @@ class ModelBased(Optimizer):
             self._end(row, f"{row['reason']}, for which too few rollouts are left")
 
     def _search_from(self, begun: int) -> LocalSearch:
-        """Local steps after so many own rollouts."""
+        """Local steps after this many rollouts of its own."""
         return LocalSearch(
             self._context,
             self._first,

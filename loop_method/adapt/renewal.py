@@ -70,7 +70,7 @@ def renew(
     periodic: bool = True,
     final: bool = True,
 ) -> Renewal | None:
-    """The law that costs least on the model, as far as fields that were left out agree.
+    """The law that costs least on the model, moved only as far as the fields left out confirm.
 
     Parameters
     ----------

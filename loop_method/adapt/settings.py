@@ -55,10 +55,13 @@ class ModelBasedSettings(Settings):
         5, "steps of L-BFGS that together have to gain the share least_gain", 1, 100
     )
     least_gain: float = setting(
-        1e-3, "share of the cost by which a window of steps has to lower it, to go on", 0.0, 1.0
+        1e-3,
+        "share of the cost that a window of steps must gain for the descent to continue",
+        0.0,
+        1.0,
     )
     first_gain: float = setting(
-        2e-2, "the same of every renewal but the last, which goes on from there", 0.0, 1.0
+        2e-2, "the same for every renewal but the last, which continues from there", 0.0, 1.0
     )
     isotropy: float = setting(
         1e-3,

@@ -96,7 +96,7 @@ class Loop:
         return moved
 
     def noise_of(self, count: int) -> Array:
-        """What is added to U^T z of so many fields, (T, count, n_s); the same for every law."""
+        """Noise added to U^T z of `count` fields, (T, count, n_s); the same for every law."""
         size = self.horizon, count, self.U.shape[1]
         return self.noise * np.random.default_rng(0).standard_normal(size)
 
@@ -127,7 +127,7 @@ class Loop:
         return float(cost) / max(math.prod(actions.shape[:-1]), 1)
 
     def cost_of(self, record: Record) -> float:
-        """Mean stage cost of a measured rollout, as far as it was recorded."""
+        """Mean stage cost of the recorded part of a rollout."""
         return self.mean_cost(record.acted_from, record.actions)
 
     def mean_cost_of(self, records: Sequence[Record]) -> float:
@@ -199,7 +199,7 @@ def mismatch(
 def mismatch_of_pieces(
     loop: Loop, model: FieldModel, measured: Sequence[tuple[Array, Array]], length: int
 ) -> float:
-    """How far the rollouts, simulated anew every so many steps, are from the measured ones.
+    """How far rollouts, restarted at regular intervals, are from the measured ones.
 
         sum |z_k^model - z_k|^2 / sum |z_k - z_r|^2
 
@@ -326,7 +326,7 @@ def adjoint_gradient(
         g_k = 2 r a_k + (d step / da)^T p_{k+1},
         p_k = 2 q (z_k - z_r) + (d step / dz)^T p_{k+1} + U K^T g_k.
 
-    Near the optimum of a loop with steep fronts the one in fewer coordinates is no descent any more.
+    Near the optimum of a loop with steep fronts the one in fewer coordinates no longer descends.
     """
     K, (horizon, count) = theta[:, :-1], simulation.states.shape[:2]
     noise = loop.noise_of(count)

@@ -38,9 +38,9 @@ from loop_method.reduce.reduced_model import Trajectory, pieces
 LARGEST = 512
 """Points of a field, at most: the work grows with their third power."""
 PIECES, REPRODUCED = 8, 0.05
-"""A model predicts trajectories, or so many pieces of each, up to this share of sum |z - z_r|^2."""
+"""Largest error of a usable model, over whole trajectories or pieces, relative to sum |z - z_r|^2."""
 THINNING = 5
-"""One of so many simulated states is enough for the modes."""
+"""Interval between the simulated states that the modes are computed from."""
 ROOM = 2
 """Modes per actuator from which on the rows of K come first."""
 

@@ -6,7 +6,7 @@
 
 on a periodic domain of length 1, with time in sampling times and the declared centres p_i of the
 actuators. Nothing else depends on where on the domain something happens, so that there are a dozen
-unknowns, however fine the grid. The fields in which the rollouts begin are unknown, too: a few Fourier
+unknowns, however fine the grid. The initial fields of the rollouts are unknown as well: a few Fourier
 coefficients each. All of them are fitted at once to the readings y_k = z_k(sensors) of whole rollouts,
 and to d, the mean of (z - z_r)^2 over all points and steps of each, which its cost tells,
 
@@ -49,7 +49,7 @@ SHARED = _COEFFICIENTS + _ACTUATORS
 # The wavenumber and the number of samples that give the coefficients and actuators their units.
 _WAVENUMBER = 2.0 * np.pi * 8
 _TIME = 100.0
-# Fourier coefficients of an initial field: the mean, and so many cosines and sines.
+# Fourier coefficients of an initial field: the mean, and this many cosines and sines.
 _WAVES = 16
 # The least number of grid points.
 _POINTS = 64
@@ -114,7 +114,7 @@ class SensedModel:
 
     @classmethod
     def of(cls, shared: Array, sensors: int, centres: Array) -> SensedModel:
-        """With the grid for so many sensors."""
+        """With the grid for this many sensors."""
         n = grid_points(sensors)
         return cls(shared, centres, np.fft.irfft(_Equation(shared, n, centres).actuators, n).T)
 
@@ -366,7 +366,7 @@ class _Problem:
 
     @staticmethod
     def _stride(steps: int) -> int:
-        """Of so many steps every how many-th is compared."""
+        """Interval between compared steps, for a given number of steps."""
         return -(-steps // _COMPARED)
 
     def _residuals(self, shared: Array, fields: Array, steps: int) -> Array:

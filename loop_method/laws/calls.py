@@ -100,7 +100,7 @@ def _numbers(law: Law, method: str, size: int, function: Callable[..., Any], *gi
     try:
         numbers = float_array("it", returned)
     except ValueError:
-        got = f"{type(returned).__name__}, which is no array of real numbers"
+        got = f"{type(returned).__name__}, which is not an array of real numbers"
     else:
         if numbers.shape == (size,):
             whole = np.nan_to_num(numbers, nan=MAX_NUMBER, posinf=MAX_NUMBER, neginf=-MAX_NUMBER)

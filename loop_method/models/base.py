@@ -120,7 +120,7 @@ class Samples:
         return Samples(before, actions, after)
 
     def thinned(self, most: int) -> Samples:
-        """At most so many of them, at equal distances."""
+        """At most this many of them, equally spaced."""
         some = slice(None, None, max(-(-len(self) // most), 1))
         return Samples(self.before[some], self.actions[some], self.after[some])
 

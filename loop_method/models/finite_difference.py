@@ -4,7 +4,7 @@
     dz_c/dt (x) = sum_f C_fc(x) D^{j_f} M_f(z)(x) + (B a + c)(x),
 
 for every component c of the field; M_f is a monomial of the components, and D^j, j = 0, 1, 2, a central
-difference on a ring of grid points of distance 1. What is no ring (walls) has coefficients of its own
+difference on a ring of grid points of distance 1. Anything else (walls) has coefficients of its own
 where that shows. Time is in sampling times, each of equal Runge-Kutta steps of order 4.
 """
 
@@ -27,7 +27,7 @@ MOST_FACTORS = 5
 
 
 def features_of(components: int, degree: int = 3) -> tuple[Feature, ...]:
-    """Those of a field of so many components, up to degree 3; pure powers up to `degree`."""
+    """Monomials of a field's components up to degree 3; pure powers up to `degree`."""
     orders = {1: 3, 2: 3 if components == 1 else 2}
     monomials = [m for p in (1, 2, 3) for m in combinations_with_replacement(range(components), p)]
     monomials += [(c,) * p for c in range(components) for p in range(4, degree + 1)]

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A linear model of the whole state, for plants that are no equation on a grid, and its fit."""
+"""A linear model of the whole state, for plants that are not equations on a grid, and its fit."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ def _leading(good: NDArray[np.bool_]) -> int:
 
 
 def pieces(rollout: Measured, count: int) -> list[Measured]:
-    """A rollout cut into so many parts of equal length, or fewer, each with the state at its end."""
+    """A rollout cut into at most this many parts of equal length, each with the state at its end."""
     steps = min(len(rollout.actions), len(rollout.states) - 1)
     edges = [steps * part // count for part in range(count + 1)]
     return [

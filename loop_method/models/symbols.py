@@ -35,9 +35,10 @@ class Form:
     linear_order : int
         Highest power of ik in L.
     shares : sequence of int
-        In each pass, the last one in all others: one of so many wavenumbers is compared, the lowest.
+        For each pass, n: the lowest 1/n of the wavenumbers is compared. The last entry also holds
+        for all further passes.
     hilbert : bool
-        Whether L has the Hilbert transforms of its derivatives, too.
+        Whether L also has the Hilbert transforms of its derivatives.
     free : {"none", "linear", "all"}
         Symbols that are free at every wavenumber.
     """

@@ -107,7 +107,7 @@ def _kept(psi: Array, n_a: int, p: int) -> Array:
 
 
 def check_sizes(p: int, n_s: int, *, n_z: int, n_a: int, steps: int) -> None:
-    """ValueError if trajectories of so many steps cannot hold p directions, or those no n_s modes."""
+    """ValueError if this many steps cannot hold p directions, or p directions not n_s modes."""
     if n_s < 1 or p < 1:
         raise ValueError(f"p and n_s must be at least 1, but p is {p} and n_s is {n_s}.")
     largest = min(n_z + n_a, steps)

@@ -188,7 +188,7 @@ def _inputs(data: Steps, s: Array, channels: Channels) -> tuple[Array, list[str]
         names = [channels.input(j) for j in still]
         faults.append(words.never_moved(names, [float(y[0, j]) for j in still]))
     own: list[int] = []
-    """Inputs that are no combination of those before them."""
+    """Inputs that are not combinations of those before them."""
     for j in range(n_a):
         if j in still:
             continue

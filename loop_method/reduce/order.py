@@ -8,7 +8,7 @@ from the measurement by
     one step    z_{k+1} - U (A U^T z_k + B a_k)
     rollout     z_{k+1} - U s_{k+1},    s_{k+1} = A s_k + B a_k,    s_0 = U^T z_0,
 
-so that what lies outside of the modes counts, too. An error is the root of the sum of squares over all
+so that what lies outside the modes counts as well. An error is the root of the sum of squares over all
 held-out steps, relative to that of z_{k+1} - z_k for one step and z_{k+1} - z_0 for the rollout: 1 is
 as good as a model in which nothing changes.
 

@@ -149,7 +149,7 @@ def repeated(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> dict[int, i
 
 
 def pieces(trajectories: Sequence[Trajectory], count: int) -> list[Trajectory]:
-    """Every trajectory cut into so many pieces of about one length; neighbours share a state."""
+    """Every trajectory cut into this many pieces of similar length; neighbours share a state."""
     cut = []
     for states, actions in trajectories:
         edges = np.unique(np.linspace(0, len(actions), count + 1).astype(int))

@@ -84,7 +84,7 @@ def exact_regression(
 
 
 def check_sizes(n_s: int, n_a: int, steps: int) -> None:
-    """ValueError if so many steps determine no model of this order."""
+    """ValueError if this many steps cannot determine a model of this order."""
     if n_s < 1:
         raise ValueError(f"n_s must be at least 1, but it is {n_s}.")
     if steps < n_s + n_a:

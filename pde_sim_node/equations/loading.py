@@ -23,8 +23,8 @@ def configured_equation(name: str, environment: Mapping[str, str] = os.environ) 
     Raises
     ------
     ValueError
-        The name is code that is not allowed, nothing of that name can be loaded, or it is no complete
-        `Equation`.
+        The name is code that is not allowed, nothing of that name can be loaded, or it is not a
+        complete `Equation`.
     """
     return complete(name, OWN_EQUATIONS.configured(name, environment))
 
@@ -41,7 +41,7 @@ def load_equation(name: str) -> type[Equation]:
     Raises
     ------
     ValueError
-        Nothing of that name can be loaded, or it is no complete `Equation`.
+        Nothing of that name can be loaded, or it is not a complete `Equation`.
     """
     return complete(name, OWN_EQUATIONS.load(name))
 

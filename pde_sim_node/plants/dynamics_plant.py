@@ -232,7 +232,7 @@ class DynamicsPlant(BatchPlant):
         try:
             numbers = float_array("it", returned)
         except ValueError:
-            got = f"{type(returned).__name__}, which is no array of real numbers"
+            got = f"{type(returned).__name__}, which is not an array of real numbers"
         else:
             if numbers.shape in shapes:
                 return numbers.reshape(count, grid.size)

@@ -60,7 +60,7 @@ def from_gymnasium(
     Raises
     ------
     ValueError
-        The spaces are no boxes, nobody says how long an episode is, or the target does not fit.
+        The spaces are not boxes, the length of an episode is unknown, or the target does not fit.
     """
     import gymnasium
 

@@ -88,7 +88,7 @@ def make(values: Mapping[str, Any]) -> Made:
 
 
 def fitting(maker: Callable[..., Any], given: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """The arguments to make it with: a whole number where it has a fraction as default is one, too.
+    """The arguments to make it with: whole numbers become floats where the default is a float.
 
     ParameterError for one that it does not take, and where one is missing.
     """

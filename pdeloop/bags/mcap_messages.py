@@ -97,7 +97,7 @@ def finished(path: Path) -> bool:
 
 
 def _records(path: Path) -> Iterator[McapRecord]:
-    """The records of a file, those in its chunks, too."""
+    """The records of a file, including those in its chunks."""
     with open_ordinary(path) as file:
         size = os.fstat(file.fileno()).st_size
         left = RATIO * size + SLACK

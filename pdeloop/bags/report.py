@@ -38,7 +38,7 @@ class Report:
         return not (self.count or self.missing)
 
     def count_compared(self, what: str, number: int) -> None:
-        """Note that so many of something were compared."""
+        """Count compared items of one kind."""
         self.compared[what] = self.compared.get(what, 0) + number
 
     def differs(self, text: str) -> None:

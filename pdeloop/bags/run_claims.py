@@ -36,7 +36,7 @@ class RunClaims:
     paid : dict of int to int
         Rollouts by seed that the training had used, at the least.
     parameters : dict
-        Those that define the run, as far as run.json has them.
+        Those in run.json that define the run.
     unreadable : list of str
         Files that are there and cannot be read, in words.
     """

@@ -4,7 +4,7 @@
 The files of a bag are held against its metadata, and what is recorded of a run against the run's folder
 where it lies there. The target is the plant's. Every complete episode is run again from its seeds,
 policies and models (or the excitation's seed): initial fields, actions, states, costs, and the reduced
-model after exploration. The whole training is run again, too: every recorded policy, with its models,
+model after exploration. The whole training is run again: every recorded policy, with its models,
 must be one that it asks for, and every rollout that it asks for must be recorded.
 """
 

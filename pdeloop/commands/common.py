@@ -63,7 +63,7 @@ _OWN_CODE = {
     "law": "the control law",
 }
 _NAMED_ANEW = ("optimizer", "law")
-"""Own code that has a flag among those of a group, too."""
+"""Code of one's own whose flag is also among those of a group."""
 
 
 def spellings(flag: str) -> tuple[str, ...]:

@@ -92,7 +92,7 @@ def add(commands: Commands) -> None:
         commands,
         "new",
         _new,
-        help="class, YAML and test of an own PDE, to begin with",
+        help="write class, YAML and test of a PDE of your own, as a start",
         description="Write a folder with the class, the YAML file and the test of a PDE that runs, to "
         "be changed into your own (docs/bring-your-own.md).",
         example="pdeloop new my-pde",

@@ -19,7 +19,7 @@ def add(commands: Commands) -> None:
         "problems",
         _problems,
         help="list the shipped problems",
-        description="List the shipped problems and their files, which are examples for own ones.",
+        description="List the shipped problems and their files, which serve as templates for your own.",
         example="pdeloop problems",
     )
     add_json(problems)

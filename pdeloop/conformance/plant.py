@@ -293,7 +293,7 @@ class PlantCheck(Check):
         self.episode((2, 2), (1, 1), like=[two, one])
 
     def divergence(self) -> None:
-        """A row that diverges is frozen and marked with the step; another one goes on."""
+        """A row that diverges is frozen and marked with the step; another one continues."""
         step, others = min(2, self.horizon - 1), int(self.serves_two)
 
         def draw(now: int, *rows: Row) -> Array:

@@ -39,7 +39,7 @@ class UnexpectedError(Exception):
 
 
 class NoAnswerError(UnexpectedError):
-    """The same, and the check cannot go on."""
+    """The same, and the check cannot continue."""
 
 
 class NoteError(Exception):

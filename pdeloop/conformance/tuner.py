@@ -185,7 +185,7 @@ class TunerCheck(Check):
         self.again(START, start.values)
 
     def divergence(self) -> None:
-        """After a row that diverged the run goes on."""
+        """After a row that diverged the run continues."""
         self.rollout()
         self.answer(ended=50.0)
         self.advance()

@@ -48,12 +48,12 @@ class Behaviour:
 
 @dataclass(frozen=True)
 class Curve:
-    """A controller's cost while it learns: it holds from so many rollouts on.
+    """A controller's cost while it learns; each value holds from that many rollouts on.
 
     rollouts (N,): how many a seed's adaptation has used; costs (N, S): by then, NaN where a rollout
     diverged. over_lqt: each is that of a policy on the fields of the closing evaluation, divided by
     the cost of the seed's LQT law on the same; else they were measured on the training's own fields,
-    which change as it goes on, so that nothing that was measured on others compares with them.
+    which change during the training, so nothing measured on other fields compares with them.
     """
 
     controller: str

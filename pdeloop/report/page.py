@@ -92,7 +92,7 @@ def _shared(problems: Sequence[ProblemData]) -> Drawn:
         what = (
             "divided by the cost of LQT, of both on the fields of the closing evaluation"
             if over_lqt
-            else "on the training's own fields, which change as it goes on. So no cost on other "
+            else "on the training's own fields, which change during the training, so no cost on other "
             "fields, LQT's among them, compares with it; the table compares all on the same fields"
         )
         over = f" Line and band: mean and standard deviation over {seeds} seeds." * (seeds > 1)

@@ -44,7 +44,7 @@ STYLE: dict[Any, Any] = {
 
 
 def panels(count: int, height: float, width: float, least: float) -> tuple[Figure, list[Axes]]:
-    """A row of so many axes of this width, in a figure that is not narrower than `least` (inches)."""
+    """A row of this many axes of this width, in a figure that is not narrower than `least` (inches)."""
     figure = Figure(figsize=(max(width * count + 0.5, least), height))
     return figure, list(figure.subplots(1, count, squeeze=False)[0])
 

@@ -60,7 +60,7 @@ def _begin(parent: int) -> None:
 def cluster(address: str) -> Iterator[Executor]:
     """The workers of the Dask scheduler at `address` (tcp://HOST:PORT).
 
-    StudyError where that is no address, no scheduler answers there, it or a worker has another
+    StudyError where that is not an address, no scheduler answers there, it or a worker has another
     version of Dask, there are no workers, or one has no pdeloop.
     """
     from distributed import Client

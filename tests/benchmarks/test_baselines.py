@@ -343,7 +343,7 @@ def test_the_command_line_hands_the_program_its_options_alone(
         ({"studies": ["kvd"]}, "no study .*kvd.yaml; expected one of allen-cahn, burgers, "),
         (
             {"studies": ["kdv"], "settings": ["sensors"]},
-            "'sensors' is no setting; expected NAME=JSON",
+            "'sensors' is not a setting; expected NAME=JSON",
         ),
     ],
 )

@@ -313,13 +313,13 @@ def test_a_terminal_does_not_obey_what_a_file_says(tmp_path, capsys):
 
 def test_a_pipe_in_place_of_a_file_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "study.yaml")
-    with pytest.raises(ParameterError, match="no ordinary file"):
+    with pytest.raises(ParameterError, match="not a regular file"):
         read_document(tmp_path / "study.yaml")
     os.mkfifo(tmp_path / "policy.npz")
-    with pytest.raises(FileError, match="no ordinary file"):
+    with pytest.raises(FileError, match="not a regular file"):
         array_files.read_arrays(tmp_path / "policy.npz")
     os.mkfifo(tmp_path / "lock")
-    with pytest.raises(OSError, match="no ordinary file"):
+    with pytest.raises(OSError, match="not a regular file"):
         open_own(tmp_path / "lock", 0)
 
 

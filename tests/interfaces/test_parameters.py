@@ -261,7 +261,7 @@ def test_a_file_for_a_whole_system_is_read_as_the_nodes_read_it(tmp_path, text):
         ("/**: {ros__parameters: {physical: {}}}", "empty group 'physical'"),
         ("/**: {ros__parameters: {a: {b.c: {d: 1}}}}", "dots in the name of a group"),
         ("/**: {ros__parameters: {n_z: }}", "'n_z' has no value in line 1"),
-        ("/my-plant: {ros__parameters: {n_z: 64}}", "'/my-plant' is no name of a node"),
+        ("/my-plant: {ros__parameters: {n_z: 64}}", "'/my-plant' is not the name of a node"),
     ],
 )
 def test_a_file_that_ros_misreads_or_that_contradicts_itself_is_refused(tmp_path, text, words):

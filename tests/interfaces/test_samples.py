@@ -109,7 +109,7 @@ def test_an_unknown_kind_and_a_length_beyond_the_end_are_refused():
     for offset, number in ((24, 2), (28, 2**32 - 1)):
         broken = bytearray(raw)
         struct.pack_into("<I", broken, offset, number)
-        with pytest.raises(FrameError, match="no state or action"):
+        with pytest.raises(FrameError, match="neither a state nor an action"):
             list(unpack(bytes(broken))[1])
 
 

@@ -140,8 +140,14 @@ def test_numbers_that_are_not_finite_are_a_divergence(how: str) -> None:
             "shape",
             r"Breaking.step returned an array of shape \(2, 2\); expected numbers of shape \(3,\)",
         ),
-        ("none", "Breaking.step returned NoneType, which is no array of real numbers; expected"),
-        ("complex", "Breaking.step returned ndarray, which is no array of real numbers; expected"),
+        (
+            "none",
+            "Breaking.step returned NoneType, which is not an array of real numbers; expected",
+        ),
+        (
+            "complex",
+            "Breaking.step returned ndarray, which is not an array of real numbers; expected",
+        ),
         ("changes z", r"Breaking.step changes its argument z, .* work on a copy, z.copy\(\)"),
         ("changes a", "Breaking.step changes its argument a"),
         (

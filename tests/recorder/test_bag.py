@@ -570,7 +570,7 @@ def test_what_is_no_ordinary_file_in_a_bag_is_not_waited_for(tmp_path):
     for name in ("parameters.json", "metadata.yaml", "bag.mcap"):
         (bag / name).unlink()
         os.mkfifo(bag / name)
-        with pytest.raises(BagError, match=f"{name} cannot be read: it is no ordinary file"):
+        with pytest.raises(BagError, match=f"{name} cannot be read: it is not a regular file"):
             describe(bag)
         (bag / name).unlink()
         (bag / name).touch()

@@ -215,7 +215,7 @@ def test_a_training_goes_on_where_its_output_cannot_be_written(tmp_path: Path) -
         )
     assert done.returncode == 0
     (told,) = [line for line in done.stderr.splitlines() if line.startswith("pdeloop:")]
-    assert told.endswith("(No space left on device); the work goes on")
+    assert told.endswith("(No space left on device); the work continues")
     assert (out / "result.json").exists()
 
 

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The README's three terminals, as it prints them."""
+"""The three terminals of docs/ros2.md, as the page prints them."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ LIMIT = 180.0
 
 
 def blocks() -> list[str]:
-    page = (ROOT / "README.md").read_text()
+    page = (ROOT / "docs" / "ros2.md").read_text()
     section = page.partition("## The nodes by hand")[2].partition("\n## ")[0]
     found: list[str] = re.findall(r"```sh\n(.*?)```", section, flags=re.DOTALL)
     return found
 
 
-def test_the_readmes_three_terminals_train_and_say_where_the_results_are(
+def test_the_three_terminals_train_and_say_where_the_results_are(
     loop: Processes, tmp_path: Path
 ) -> None:
     found = blocks()

@@ -44,8 +44,8 @@ MOST_PAGES = 16
 MOST_CONNECTIONS = 128
 """Connections at the same time; further ones are closed as they come."""
 LINGER = 10.0
-"""Seconds after which a connection ends that is no page's WebSocket: one after its present request, one
-that is still not over after as long again at once."""
+"""Seconds after which a connection other than a page's WebSocket ends: one after its current request,
+one that is still busy after as long again, at once."""
 MAX_BODY = 10_000
 HOST = "127.0.0.1"
 STATIC = Path(__file__).parent / "static"
@@ -91,7 +91,7 @@ class Server:
 
     @property
     def address(self) -> str:
-        """Of the page that may ask for what it offers, too."""
+        """Of the page that may also use its buttons."""
         return f"{self.url}?token={self.token}"
 
     def start(self) -> None:

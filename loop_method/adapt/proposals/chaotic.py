@@ -18,9 +18,9 @@ from loop_method.adapt.proposals.proposal import LEAST_FALL, MODES, TRUST, Propo
 from loop_method.adapt.simulation import Loop, improve, mismatch
 from loop_method.field_models import FieldModel
 
-# The error of a rollout is more than so many times that of its pieces; noise adds up more slowly.
+# Least ratio of the error of a rollout to that of its pieces; noise accumulates more slowly.
 _GROWTH = 20.0
-# A law is improved from so many measured states, one of three, and chosen by its cost from the others.
+# Number of measured states, one in three, from which a law is improved; the others choose it by cost.
 _STARTS = 80
 _HELD_OUT = 3
 

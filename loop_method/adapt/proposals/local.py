@@ -79,7 +79,7 @@ def propose(
 def _fit(
     data: Sequence[Record], shares: Sequence[float], V: Array, fields: int
 ) -> list[LocalModel]:
-    """The local models on V; so many rollouts make a rollout older by one."""
+    """The local models on V; after this many rollouts, a rollout ages by one."""
     newest = max(record.stamp for record in data)
     ages = [(newest - record.stamp) // fields for record in data]
     young = [max(_AGEING**age, _AGEING_FLOOR) for age in ages]

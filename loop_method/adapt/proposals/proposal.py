@@ -18,7 +18,7 @@ LEAST_FALL = 1e-3
 TRUST = 1e-2
 # The newest rollouts that a model of the field has to reproduce.
 COMPARED = 8
-# Further initial fields are so many times as far from the mean of the measured ones.
+# How many times as far from the mean the additional initial fields lie as the measured ones.
 _BEYOND = 1.5
 
 

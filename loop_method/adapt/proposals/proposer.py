@@ -96,7 +96,7 @@ class Proposer:
         records : sequence of Record
             All remembered rollouts.
         incumbents : sequence of Record
-            The rollouts of the incumbent on the fields of the moment.
+            The rollouts of the incumbent on the current fields.
         others : sequence of Record or None
             On the same fields: the candidate that was rejected last, or the previous incumbent.
         damping : float

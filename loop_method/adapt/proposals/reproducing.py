@@ -21,7 +21,7 @@ REPRODUCED_NOISY = 0.3
 # Powers and ridges of the convolution models.
 _DEGREES = (2, 3)
 _RIDGES = (1e-7, 1e-6, 1e-5, 1e-4)
-# No model reproduces the rollouts of a chaotic plant, but one may reproduce so many pieces of each.
+# Pieces of each rollout: a model may reproduce these where whole rollouts are chaotic.
 _PIECES = 8
 
 
@@ -58,7 +58,7 @@ def reproducing_model(
 
 
 def ranks(model: FieldModel, loop: Loop, rejected: Sequence[tuple[Record, Record]]) -> bool:
-    """Whether the rejected candidate costs more than the incumbent on the model, too.
+    """Whether the rejected candidate also costs more than the incumbent on the model.
 
     rejected: rollouts of the incumbent and of the candidate on the same fields.
     """
