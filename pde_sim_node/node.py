@@ -13,6 +13,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
+import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
@@ -23,6 +24,7 @@ from loop_interfaces.files import FileError
 from loop_interfaces.frames import Frame
 from loop_interfaces.isolation import keep_on_this_machine
 from loop_interfaces.parameters import PLANT, taken_by
+from loop_interfaces.places import boxes_of, text_of
 from loop_interfaces.problem import own_values
 from loop_interfaces.protocol import Publication
 from loop_interfaces.ros.node_loop import NodeLoop
@@ -60,7 +62,21 @@ def declare_parameters(node: Node) -> tuple[Plant, dict[str, Any]]:
         values |= physical | declare(node, physical_specs(str(values["equation"])), given)
         plant, values = complete(values)
     declare(node, said, values)
+    told = ParameterDescriptor(
+        description="where each actuator acts: component, and low and high along each axis, in m",
+        read_only=True,
+    )
+    node.declare_parameter("actuators", actuators_of(plant), told, True)
     return plant, values
+
+
+def actuators_of(plant: Plant) -> str:
+    """Where the actuators act, for pictures; empty if the plant does not know it."""
+    if plant.supports is None:
+        return ""
+    everywhere = np.zeros((plant.n_z, plant.n_a))
+    everywhere[plant.forced] = plant.supports
+    return text_of(boxes_of(plant.grid, everywhere))
 
 
 def physical_specs(equation: str) -> list[Spec]:

@@ -15,10 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.frames import Frame
+from loop_interfaces.grid import Grid
 
 Array = NDArray[np.float32]
 COLUMNS = 512
 ROWS = 256
+SIDE = 96
+"""Points along each axis that are kept of a field on two, of its newest and its first state."""
 MAX_ACTIONS = 32
 """Actions that are kept: more lines than that nobody can tell apart."""
 MAX_COMPONENTS = 8
@@ -52,6 +55,25 @@ def rows_of(n_z: int, components: int = 1) -> NDArray[np.intp]:
     return (n_x * np.arange(min(components, MAX_COMPONENTS))[:, None] + points).ravel()
 
 
+@lru_cache(maxsize=16)
+def plane_of(grid: Grid) -> tuple[NDArray[np.intp], tuple[int, int]]:
+    """Indices, within a component, of the points that are kept of a plane, and its rows and columns.
+
+    Of more than two axes it is the middle.
+
+    Examples
+    --------
+    >>> from loop_interfaces.grid import Axis
+    >>> points, shape = plane_of(Grid((Axis("y", 1.0, 2), Axis("x", 1.0, 3))))
+    >>> points.tolist(), shape
+    ([0, 1, 2, 3, 4, 5], (2, 3))
+    """
+    kept = [np.linspace(0, n - 1, min(n, SIDE)).round().astype(np.intp) for n in grid.shape[-2:]]
+    first = [np.array([n // 2]) for n in grid.shape[:-2]]
+    indices = np.ravel_multi_index(np.meshgrid(*first, *kept, indexing="ij"), grid.shape)
+    return indices.ravel(), (len(kept[0]), len(kept[1]))
+
+
 class EpisodeSamples:
     """What was seen of one environment in one episode.
 
@@ -65,6 +87,8 @@ class EpisodeSamples:
         Of the state.
     horizon
         Steps that are expected; the columns are enough for them.
+    grid
+        Of the state, if it is known; it matters on two axes or more.
 
     Attributes
     ----------
@@ -74,8 +98,10 @@ class EpisodeSamples:
         Steps of a column.
     fields, actions
         What was seen, (COLUMNS, rows) and (COLUMNS, n_a); NaN where nothing was.
-    z
-        The newest state (n_z,).
+    z, z_first
+        The newest state (n_z,), and the first that was seen.
+    plane
+        Rows and columns of the picture of a component on two axes; None of fewer.
     ended
         Whether the episode is over.
     version
@@ -83,7 +109,13 @@ class EpisodeSamples:
     """
 
     def __init__(
-        self, frame: Frame, *, environment: int = 0, components: int = 1, horizon: int = 0
+        self,
+        frame: Frame,
+        *,
+        environment: int = 0,
+        components: int = 1,
+        horizon: int = 0,
+        grid: Grid | None = None,
     ) -> None:
         self.batch, n_z = frame.values.shape
         self.key, self.environment = key_of(frame), min(environment, self.batch - 1)
@@ -94,7 +126,10 @@ class EpisodeSamples:
             self.stride *= 2
         self.fields = _empty(len(rows_of(n_z, self.components)))
         self.actions = _empty(0)
-        self.z = np.empty(n_z)
+        self.z = self.z_first = np.array(frame.values[self.environment], dtype=np.float64)
+        planar = grid is not None and len(grid.axes) > 1 and grid.size == n_z
+        self._grid = grid if planar else None
+        self.plane = plane_of(grid)[1] if planar and grid is not None else None
         self.sample_time = 0.0
         self.ended = False
         self.version = next(_VERSIONS)
@@ -140,6 +175,12 @@ class EpisodeSamples:
         size = self.fields.shape[1] // kept
         component = min(component, kept - 1)
         return slice(component * size, (component + 1) * size)
+
+    def picture(self, z: NDArray[np.float64], component: int) -> NDArray[np.float64]:
+        """A state's numbers of a component as they are drawn: a curve, or a plane row by row."""
+        if self._grid is None:
+            return z[rows_of(len(z), self.components)[self.part(component)]]
+        return z[self._grid.part(component)][plane_of(self._grid)[0]]
 
     def _column(self, step: int) -> int:
         while (step - self.first) // self.stride >= COLUMNS:

@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.colour_scale import field_range
 from loop_interfaces.frames import Frame
+from loop_interfaces.grid import Grid
 from loop_interfaces.topics import VOID, CostColumn
 from viewer_node.episode_samples import EpisodeSamples, Key, key_of, rows_of
 from viewer_node.learning_curve import LearningCurve
@@ -25,8 +27,6 @@ SLOW = 1.0
 """Seconds after which an episode is shown while it runs; shorter ones when they are over."""
 SILENT = 5.0
 """Seconds without a message after which a loop is not going."""
-EXTREMES = (0.3, 99.7)
-"""Percentiles of the field that the colours span, as in the report."""
 STEADY = 0.15
 """Share of the colours' range by which it must change to be changed: they would only flicker."""
 COSTS = {"none": "cost_no_control", "lqt": "cost_lqt", "adapted": "cost"}
@@ -52,6 +52,8 @@ class LoopView:
     ) -> None:
         self.only, self.curve_from_topics = only, curve_from_topics
         self.horizon, self.weights, self.components = horizon, weights, list(components)
+        self.grid: Grid | None = None
+        """Of the state, if it is known."""
         self.environment = 0
         """The one that is shown; of a smaller episode the last one is."""
         self.nodes = LoopNodes()
@@ -90,6 +92,7 @@ class LoopView:
                 environment=self.environment,
                 components=len(self.components),
                 horizon=self.horizon,
+                grid=self.grid,
             )
         current.state(frame)
         self._count(key, frame.step)
@@ -231,26 +234,26 @@ class LoopView:
     def colours(
         self, component: int, before: tuple[float, float], now: float
     ) -> tuple[float, float]:
-        """The range of u that the colours span; `before` if it is hardly another one."""
+        """The range that the colours of a component span; `before` if it is hardly another one."""
         shown = self.shown(now)
         if shown is None:
             return before
         part = shown.part(component)
-        seen = shown.fields[: shown.columns, part]
-        seen = seen[np.isfinite(seen)]
-        if not seen.size:
+        seen = shown.fields[: shown.columns, part].ravel()
+        if not np.isfinite(seen).any():
             return before
-        some = seen[:: max(1, seen.size // 20_000)]
-        low, high = (float(v) for v in np.percentile(some, EXTREMES))
         target = self.target_of(shown.key)
-        if target is not None:
-            target = target[rows_of(len(target), shown.components)][part]
-            low, high = min(low, float(target.min())), max(high, float(target.max()))
-        if high - low < 1e-9:
-            low, high = low - 0.5, high + 0.5
+        known = np.empty(0) if target is None else target
+        if known.size == shown.z.size:
+            known = known[rows_of(len(known), shown.components)][part]
+        low, high = field_range(seen[:: max(1, seen.size // 20_000)], known)
         size = STEADY * max(high - low, before[1] - before[0])
         same = abs(low - before[0]) <= size and abs(high - before[1]) <= size
         return before if same else (low, high)
+
+    def newest_target(self) -> Array | None:
+        """z_r of the plant that was heard last; None before the first."""
+        return next((frame.values for frame in reversed(self._targets.values())), None)
 
     def target_of(self, key: Key) -> Array | None:
         """z_r of the plant of an episode."""

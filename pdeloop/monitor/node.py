@@ -107,7 +107,8 @@ class MonitorNode:
             return
         with self._page.lock:
             self._reader.read()
-        self._reader.listen(self._page.open)
+        # A page that is opened later has an episode to show at once.
+        self._reader.listen(self._page.open or self._view.finished is None)
 
     def _serve_requests(self) -> None:
         with contextlib.suppress(queue.Empty):

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from loop_interfaces.frames import Frame
+from loop_interfaces.grid import Axis, Grid
+from loop_interfaces.places import Box, text_of
 from loop_interfaces.topics import COMPLETED, VOID
 from viewer_node.episode_samples import COLUMNS, MAX_COMPONENTS, ROWS, EpisodeSamples, rows_of
 from viewer_node.learning_curve import MAX_POINTS, SENT, LearningCurve
@@ -18,7 +20,7 @@ from viewer_node.loop_nodes import Endpoint, LoopNodes
 from viewer_node.loop_view import SILENT, SLOW, LoopView
 from viewer_node.operation import FAILURE, Call
 from viewer_node.rollout_costs import RolloutCosts
-from viewer_node.web.page import Page
+from viewer_node.web.page import Page, axes_of, places_of
 
 PLANT = 7
 
@@ -130,26 +132,96 @@ def test_of_very_many_delayed_measurements_the_first_are_kept():
     assert episode.part(999) == episode.part(MAX_COMPONENTS - 1)
 
 
-def test_one_component_of_the_state_is_shown_at_a_time():
+def test_a_few_components_are_shown_beside_each_other_each_in_its_own_range():
     page, sent = Page(), {}
     view = page.view
     view.components = ["u", "u_t"]
-    view.target(frame([0.0, 0.0, 7.0, 8.0]), 0.0)
+    view.target(frame([0.0, 0.0, 90.0, 90.0]), 0.0)
     for k in range(3):
-        view.state(frame([[k, k, 90, 99]], step=k), 0.0)
+        view.state(frame([[k, k, 90, 100]], step=k), 0.0)
     page.refresh(10.0)
-    for component, values, aim, span in (
-        (0, [0, 0, 1, 1, 2, 2, 2, 2], [0, 0], [0, 2]),
-        (1, [90, 99] * 4, [7, 8], [7, 99]),
-    ):
+    parts = dict(map(part, page.updates(sent, 0.0)))
+    assert parts["status"][0]["panels"] == [0, 1]
+    np.testing.assert_array_equal(parts["target"][1], [0, 0, 90, 90] * 2)
+    header, numbers = parts["episode"]
+    assert header["panels"] == [0, 1] and header["rows"] == 2 and header["plane"] is None
+    expected = [0, 0, 90, 100, 1, 1, 90, 100, 2, 2, 90, 100]
+    np.testing.assert_array_equal(numbers, [*expected, 2, 2, 90, 100, 0, 0, 90, 100])
+    (low, high), about = header["ranges"]
+    assert low == -high and high == pytest.approx(2.0, abs=0.1)
+    assert about == pytest.approx([80.0, 100.0])
+
+
+def test_of_many_components_one_is_shown_at_a_time():
+    page, sent = Page(), {}
+    view = page.view
+    view.components = [f"y{i}" for i in range(6)]
+    view.state(frame([np.repeat(np.arange(6.0), 2)]), 0.0)
+    for component in (0, 4):
         assert page.choose({"component": component})
         page.refresh(20.0 + component)
         parts = dict(map(part, page.updates(sent, 0.0)))
         assert parts["status"][0]["component"] == component
-        np.testing.assert_array_equal(parts["target"][1], aim)
         header, numbers = parts["episode"]
-        np.testing.assert_array_equal(numbers, values)
-        assert header["rows"] == 2 and header["range"] == pytest.approx(span, abs=0.1)
+        assert header["panels"] == [component]
+        np.testing.assert_array_equal(numbers, [component] * 6)
+
+
+def test_a_field_on_two_axes_is_sent_as_it_is_now_and_was_at_first():
+    axes = (Axis("y", 1.0, 2, periodic=False), Axis("x", 1.0, 200))
+    grid, page, sent = Grid(axes, ("u", "v")), Page(), {}
+    page.take_parameters({"grid": grid.text, "equation": "burgers"})
+    view, z = page.view, np.arange(800.0)
+    view.components = ["u", "v"]
+    view.target(frame(-z), 0.0)
+    page.refresh(0.0)
+    parts = dict(map(part, page.updates(sent, 0.0)))
+    assert "episode" not in parts and parts["target"][0]["plane"] == [2, 96]
+    for k in range(3):
+        view.state(frame([z + k], step=k), 0.0)
+    page.refresh(10.0)
+    parts = dict(map(part, page.updates(sent, 0.0)))
+    header, numbers = parts["episode"]
+    assert header["plane"] == [2, 96] and header["rows"] == 256
+    newest, first = numbers[-768:].reshape(2, 2, 2, 96)
+    np.testing.assert_array_equal(newest - first, 2.0)
+    np.testing.assert_array_equal(first[:, :, [0, -1]], grid.fields(z)[:, :, [0, -1]])
+    np.testing.assert_array_equal(np.diff(first[..., 0]), [[200.0], [200.0]])
+    np.testing.assert_array_equal(parts["target"][1][:384], -first.ravel())
+
+
+def test_the_target_is_there_before_the_first_state():
+    page, sent = Page(), {}
+    page.view.target(frame([1.0, 2.0, 3.0, 4.0]), 0.0)
+    parts = dict(map(part, page.updates(sent, 0.0)))
+    np.testing.assert_array_equal(parts["target"][1], [1, 2, 3, 4] * 2)
+    assert "episode" not in parts
+
+
+def test_axes_and_places_are_those_that_the_plant_says():
+    walls = Grid.interval(2.0, 5, periodic=False)
+    cells = Grid.interval(2.0, 4, periodic=False, walls=False)
+    for grid, ends in (
+        (walls, [0.0, 2.0]),
+        (cells, [0.25, 1.75]),
+        (Grid.interval(2.0, 4), [0.0, 1.5]),
+    ):
+        (axis,) = axes_of({"grid": grid.text})
+        assert axis == {"label": "x (m)", "length": 2.0, "ends": ends}
+    assert axes_of({"grid": Grid.vector(3).text})[0]["label"] == "number"
+    assert axes_of({"grid": walls.text, "sensors": 4})[0] == {
+        "label": "sensor",
+        "length": 0.0,
+        "ends": None,
+    }
+    assert axes_of({"length": 3.0})[0]["length"] == 3.0
+    boxes = text_of([Box(0, ((0.0, 1.0),))])
+    assert places_of({"grid": walls.text, "actuators": boxes})["actuators"] == [
+        {"component": 0, "sides": ((0.0, 1.0),)}
+    ]
+    plane = Grid((Axis("y", 1.0, 2), Axis("x", 1.0, 2))).text
+    for told in (boxes, "", "[[0, [0, NaN]]]", "[[0]]", "7", "<script>"):
+        assert places_of({"grid": plane, "actuators": told})["actuators"] == []
 
 
 # The curve.
@@ -447,10 +519,12 @@ def test_a_page_is_sent_the_whole_episode_whenever_something_of_it_is_new():
             parts = dict(map(part, page.updates(sent, 0.0)))
             header, numbers = parts["episode"]
             assert (header["columns"], header["rows"], header["actions"]) == (k + 1, 4, 2)
-            field, actions, newest = np.split(numbers, np.cumsum([4 * (k + 1), 2 * (k + 1)]))
+            ends = np.cumsum([4 * (k + 1), 2 * (k + 1), 4])
+            field, actions, newest, first = np.split(numbers, ends)
             expected = 100 + np.arange(k + 1)[:, None] + np.arange(4) / 10
             np.testing.assert_allclose(field.reshape(-1, 4), expected, rtol=1e-6)
             np.testing.assert_allclose(newest, expected[-1], rtol=1e-6)
+            np.testing.assert_allclose(first, expected[0], rtol=1e-6)
             acted = 100.0 + np.arange(k + 1)
             acted[20:21] = np.nan
             np.testing.assert_array_equal(actions[::2], acted)
@@ -470,7 +544,7 @@ def test_the_chosen_environment_and_another_loop_are_sent():
     for k in range(5):
         view.state(state(k), 0.0)
     parts = dict(map(part, page.updates(sent, 0.0)))
-    np.testing.assert_array_equal(parts["target"][1], [1, 2, 3, 4])
+    np.testing.assert_array_equal(parts["target"][1], [1, 2, 3, 4] * 2)  # drawn, and by column
     header, numbers = parts["episode"]
     assert header["environment"] == 1 and numbers[0] == 100
     view = LoopView()
@@ -491,9 +565,10 @@ def test_the_colours_span_the_field_and_the_target_and_do_not_flicker():
     def colours(k: int) -> Any:
         view.state(state(k), 0.0)
         page.refresh(10.0 * k)
-        return unpacked(page.updates(sent, 0.0)[-1])[0]["range"]
+        (limits,) = unpacked(page.updates(sent, 0.0)[-1])[0]["ranges"]
+        return limits
 
     first = colours(0)
-    assert first == [-10.0, pytest.approx(0.3, abs=0.01)]
+    assert first == [-10.0, 10.0]
     assert colours(1) == first
     assert colours(90)[1] > 80

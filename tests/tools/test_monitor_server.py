@@ -17,8 +17,12 @@ import numpy as np
 import pytest
 
 from loop_interfaces.colour_scale import DARK, LIGHT, colours
+from loop_interfaces.frames import Frame
+from loop_interfaces.grid import Axis, Grid
+from loop_interfaces.places import Box, text_of
 from tests.support.browser import browser
 from viewer_node.loop_nodes import Endpoint
+from viewer_node.loop_view import LoopView
 from viewer_node.operation import Call
 from viewer_node.web.page import Page, ShowLoop
 from viewer_node.web.server import FILES, STATIC, Server
@@ -289,6 +293,56 @@ def test_the_page_tells_what_a_node_computes_and_what_became_of_a_request(tmp_pa
         view.operation.answered(stop, now, None)
         shows("training paused", "The training ends after the rollouts under way.")
         assert tab.ask(f"{button % 'stop'}.disabled")
+        assert tab.console == []
+
+
+def test_a_plane_its_target_and_the_result_are_there_and_on_a_phone_the_curve_is_second(tmp_path):
+    """In a real browser, with a plant that is only told of, whose names are hostile."""
+    axes = (Axis("<b>y", 1.0, 3, periodic=False), Axis("x", 2.0, 4))
+    grid = Grid(axes, ("<img src=x onerror=alert(1)>", "v"))
+    box = text_of([Box(0, ((0.0, 0.5), (-0.5, 0.5)))])
+    painted = """(() => {
+      const canvas = document.querySelector("#field canvas");
+      const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+      return new Set(new Uint32Array(data.buffer)).size;
+    })()"""
+    with served() as (server, page), browser(tmp_path) as tab:
+        view = LoopView(curve_from_topics=False)
+        page.show(view, domain=1, namespace="/")
+        page.take_parameters({"grid": grid.text, "actuators": box, "problem": "<i>sheet"})
+        view.components = list(grid.components)
+        view.target(Frame(1, 1, 0, 0.0, np.linspace(-1.0, 1.0, 24), 2), time.monotonic())
+        page.refresh(time.monotonic())
+        tab.size(390, 844)
+        tab.go(server.address)
+        said = "document.querySelector('#field-text').textContent"
+        tab.until(f"{said}.includes('the target is there')", 30.0)
+        assert tab.ask(painted) > 30
+        for step in range(2):
+            z = np.cos(np.arange(24.0) + step)[np.newaxis]
+            view.state(Frame(1, 1, step, 0.1 * step, z, 2), time.monotonic())
+        for row in (
+            {"event": "phase", "phase": "adapt", "rollouts": [], "budget": [20]},
+            {"event": "adapted", "seed": 0, "rollouts": 12, "cost": 3.0},
+            {"event": "evaluated", "seed": 0, "none": 8.0, "lqt": 4.0, "adapted": 3.0},
+        ):
+            view.curve.row(row)
+        page.refresh(time.monotonic())
+        tab.until(f"{said}.includes('step 1')", 30.0)
+        tab.until(
+            "document.querySelector('#share')?.textContent.includes('25.0 % below LQT')", 30.0
+        )
+        share = tab.ask("document.querySelector('#share').textContent")
+        assert "37.5 % of the cost without control is left" in share
+        assert tab.ask("document.querySelector('#progress').value") == 12
+        assert "improving the law" in tab.ask("document.querySelector('#figures').textContent")
+        tops = tab.ask(
+            "['result', 'field', 'curve', 'actions', 'profile'].map((id) =>"
+            " document.getElementById(id).getBoundingClientRect().top)"
+        )
+        assert tops == sorted(tops)
+        assert tab.ask("document.documentElement.scrollWidth") == 390
+        assert tab.ask("document.querySelectorAll('main img, main b b, h1 i').length") == 0
         assert tab.console == []
 
 

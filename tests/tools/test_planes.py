@@ -8,12 +8,12 @@ import pytest
 from matplotlib.figure import Figure
 
 import pdeloop
+from loop_interfaces.places import Box, boxes_of, parse, text_of
 from pde_sim_node.plants.loading import as_plant
 from pdeloop.monitor.node import component_names
 from pdeloop.report import planes
 from viewer_node.picture import UNSEEN, plane, space_time
 from viewer_node.shapes import shape_of
-from viewer_node.web.page import Page
 
 GRID = pdeloop.Grid(
     (pdeloop.Axis("y", 1.0, 3, periodic=False), pdeloop.Axis("x", 2.0, 4)), ("u", "v")
@@ -101,11 +101,14 @@ def test_an_episode_and_the_check_are_drawn_as_pictures() -> None:
     assert drawn[1][3].sum() == 2.0  # where two actuators act
 
 
-def test_the_live_page_says_grid_point_where_a_row_is_no_place() -> None:
-    for grid, length in ((pdeloop.Grid.interval(2.0, 24), 2.0), (GRID, 0.0), (GRID.vector(4), 0.0)):
-        page = Page()
-        page.take_parameters({"grid": grid.text, "length": 2.0, "horizon": 5})
-        assert page.parameters["length"] == length
+def test_actuators_act_where_their_supports_are_at_least_half_as_large() -> None:
+    supports = np.zeros((24, 3))
+    supports[[0, 3], 0] = 1.0  # around the ring in x, at the wall in y
+    supports[[17, 18, 21, 22], 1] = 2.0, 1.0, 1.1, 0.9
+    wrapped, inner = boxes_of(GRID, supports)
+    assert wrapped == Box(0, ((-0.25, 0.25), (-0.75, 0.25)))
+    assert inner == Box(1, ((0.25, 1.25), (0.25, 1.25)))
+    assert parse(text_of([wrapped, inner])) == [wrapped, inner]
 
 
 def test_the_live_page_names_the_components_of_a_grid() -> None:

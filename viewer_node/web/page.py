@@ -25,7 +25,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.grid import Grid
+from loop_interfaces.frames import Frame
+from loop_interfaces.grid import Axis, Grid
+from loop_interfaces.places import parse
 from viewer_node.episode_samples import MAX_COMPONENTS, EpisodeSamples, rows_of
 from viewer_node.loop_view import SILENT, LoopView
 from viewer_node.operation import Call
@@ -34,8 +36,58 @@ RATE_WINDOW = 3.0
 """Seconds over which rates are taken."""
 COLOUR_PERIOD = 0.5
 """Seconds between two computations of the range of the colours."""
-PARAMETERS = ("problem", "length", "n_a", "horizon", "sample_time")
-"""Parameters that the page needs."""
+PARAMETERS = ("problem", "n_a", "horizon", "sample_time")
+"""Parameters that the page needs, with what `axes_of` and `places_of` read."""
+MOST_PANELS = 4
+"""Components that are shown beside each other; of more, one is chosen."""
+Axes = list[dict[str, Any]]
+Range = tuple[float, float]
+
+
+def axes_of(values: Mapping[str, Any]) -> Axes:
+    """The axes of a picture from a plant's parameters: label, length and where the points lie.
+
+    One of a field on one axis or of numbers, the last two of a field on more.
+    """
+    if values.get("sensors"):
+        return [_numbers("sensor")]
+    try:
+        grid = Grid.parse(str(values["grid"]))
+    except (KeyError, ValueError):
+        length = float(values.get("length") or 0.0)
+        return [_axis("x (m)", length)] if length > 0 else [_numbers("grid point")]
+    told = [_axis(axis.label, axis.length, _ends(axis)) for axis in grid.axes[-2:]]
+    return told or [_numbers("number")]
+
+
+def _ends(axis: Axis) -> list[float]:
+    """Places of its first and last point; of an axis that somebody told of, however long."""
+    first = 0.0 if axis.periodic or axis.walls else 0.5 * axis.spacing
+    return [first, first + (axis.size - 1) * axis.spacing]
+
+
+def _axis(label: str, length: float, ends: list[float] | None = None) -> dict[str, Any]:
+    """ends: places of the first and last point; None: one spacing before the end, as on a ring."""
+    return {"label": label, "length": length, "ends": ends}
+
+
+def _numbers(label: str) -> dict[str, Any]:
+    """An axis that counts."""
+    return _axis(label, 0.0)
+
+
+def places_of(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Where the actuators act and the sensors measure, from a plant's parameters."""
+    try:
+        grid = Grid.parse(str(values["grid"]))
+        boxes = parse(str(values.get("actuators") or "[]"))
+    except (KeyError, ValueError):
+        return {"actuators": [], "sensors": 0}
+    dimensions = max(1, len(grid.axes))
+    fitting = [box for box in boxes if len(box.sides) == dimensions]
+    told = [{"component": box.component, "sides": box.sides[-2:]} for box in fitting]
+    sensors = int(values.get("sensors") or 0)
+    return {"actuators": [] if sensors else told, "sensors": sensors}
 
 
 @dataclass(frozen=True)
@@ -65,7 +117,9 @@ class Page:
         self.requests: queue.SimpleQueue[Call | ShowLoop] = queue.SimpleQueue()
         self.open = False
         self._status: str | None = None
-        self._colours = (0.0, 1.0)
+        self._of_plant: dict[str, Any] = {}
+        """Its parameters that say where things are."""
+        self._colours: dict[int, Range] = {}
         self._coloured = float("-inf")
         self._counts: deque[tuple[float, int, int]] = deque()
         """Time, rounds and episodes of the last RATE_WINDOW."""
@@ -82,7 +136,8 @@ class Page:
         with self.lock:
             view.environment = self.view.environment
             self.view = view
-            self.parameters, self.controls = {}, []
+            self.parameters, self.controls, self._of_plant = {}, [], {}
+            self._colours, self._coloured = {}, float("-inf")
             self._counts.clear()
             self.place = {
                 "domain": domain,
@@ -95,11 +150,12 @@ class Page:
     def take_parameters(self, values: Mapping[str, Any]) -> None:
         """Take parameters of a node."""
         self.parameters |= {name: values[name] for name in PARAMETERS if name in values}
-        if values.get("grid"):
-            with contextlib.suppress(ValueError):
-                axes = Grid.parse(str(values["grid"])).axes
-                if len(axes) != 1:  # the rows of a picture are numbers of the state, not places
-                    self.parameters["length"] = 0.0
+        names = ("grid", "length", "sensors", "actuators")
+        self._of_plant |= {name: values[name] for name in names if values.get(name)}
+        with contextlib.suppress(TypeError, ValueError):
+            self.parameters["axes"] = axes_of(self._of_plant)
+            self.parameters["places"] = places_of(self._of_plant)
+            self.view.grid = Grid.parse(str(self._of_plant.get("grid")))
         self.view.horizon = int(self.parameters.get("horizon", 0))
 
     def request_call(self, node: object, verb: object) -> bool:
@@ -144,6 +200,7 @@ class Page:
                 "quiet": None if quiet is None or quiet < SILENT else round(quiet),
                 "remaining": None if remaining is None else round(remaining),
                 "parameters": self.parameters,
+                "panels": self._panels(),
                 "component": min(self.component, len(names) - 1),
                 "components": names,
                 "rounds": round((view.rounds - rounds) / elapsed, 2),
@@ -154,7 +211,8 @@ class Page:
             self._status = json.dumps(status)
             if now - self._coloured > COLOUR_PERIOD:
                 self._coloured = now
-                self._colours = view.colours(self.component, self._colours, now)
+                for i in self._panels():
+                    self._colours[i] = view.colours(i, self._colours.get(i, (0.0, 1.0)), now)
 
     def updates(self, sent: dict[str, object], now: float) -> list[str | bytes]:
         """The messages that are new to a page.
@@ -174,48 +232,83 @@ class Page:
         view, curve, shown = self.view, self.view.curve, self.view.shown(now)
         yield "status", self._status, lambda: str(self._status)
         yield "curve", curve.version, lambda: json.dumps({"part": "curve", **curve.message()})
-        if shown is None:
+        panels = self._panels()
+        if shown is None:  # the target is latched: it is there before the first episode is
+            target = view.newest_target()
+            if target is not None and panels:
+                shown = EpisodeSamples(
+                    Frame(0, 0, 0, 0.0, target[np.newaxis], 0),
+                    components=len(view.components),
+                    grid=view.grid,
+                )
+                version = (self.place["begun"], *panels, id(target), view.grid)
+                yield "target", version, partial(self._target, target, shown)
             return
         target = view.target_of(shown.key)
-        chosen = (self.place["begun"], shown.components, self.component)
+        chosen = (self.place["begun"], shown.components, shown.plane, *panels)
         yield "target", (*chosen, id(target)), partial(self._target, target, shown)
-        samples = (*chosen, shown.version, shown.ended, self._colours)
+        ranges = tuple(self._colours.get(i, (0.0, 1.0)) for i in panels)
+        samples = (*chosen, shown.version, shown.ended, ranges)
         yield "episode", samples, partial(self._episode, shown)
 
+    def _panels(self) -> list[int]:
+        """The components that are shown."""
+        count = min(len(self.view.components), MAX_COMPONENTS)
+        return list(range(count)) if count <= MOST_PANELS else [min(self.component, count - 1)]
+
+    def _of_shown(self, shown: EpisodeSamples) -> list[int]:
+        """The panels that the samples have a component for."""
+        return [i for i in self._panels() if i < _kept(shown)] or [0]
+
     def _target(self, target: NDArray[np.float64] | None, shown: EpisodeSamples) -> bytes:
-        """z_r at the kept grid points of the shown component; no numbers if it is not known."""
-        z_r = np.empty(0) if target is None else self._points(target, shown)
-        return _pack({"part": "target"}, z_r)
+        """z_r as it is drawn, and at the grid points of the columns; no numbers if it is not known."""
+        panels = self._of_shown(shown)
+        z_r = np.empty(0)
+        if target is not None and target.size == shown.z.size:
+            rows = target[rows_of(len(target), shown.components)]
+            z_r = np.concatenate(
+                [shown.picture(target, i) for i in panels] + [rows[shown.part(i)] for i in panels]
+            )
+        header = {"part": "target", "panels": panels, "plane": shown.plane}
+        return _pack({**header, "rows": shown.fields.shape[1] // _kept(shown)}, z_r)
 
     def _episode(self, shown: EpisodeSamples) -> bytes:
-        """The shown episode: its field (columns, rows), actions (columns, n_a), newest state (rows)."""
-        fields = shown.fields[: shown.columns, shown.part(self.component)]
-        actions = shown.actions[: shown.columns]
+        """The shown episode.
+
+        The panels' fields (columns, panels, rows), the actions (columns, n_a), and the panels' newest
+        and first state as they are drawn.
+        """
+        panels = self._of_shown(shown)
+        parts = [shown.fields[: shown.columns, shown.part(i)] for i in panels]
+        fields, actions = np.concatenate(parts, axis=1), shown.actions[: shown.columns]
         header = {
             "part": "episode",
             "run": shown.key[0],
             "episode": shown.key[1],
             "controller": self.view.controller(shown),
             "environment": shown.environment,
-            "columns": len(fields),
-            "rows": fields.shape[1],
+            "panels": panels,
+            "plane": shown.plane,
+            "columns": shown.columns,
+            "rows": parts[0].shape[1],
             "actions": actions.shape[1],
             "stride": shown.stride,
             "begin": shown.first,
             "last": shown.last,
             "ended": shown.ended,
             "sample_time": shown.sample_time or self.parameters.get("sample_time", 0.0),
-            "range": self._colours,
+            "ranges": [self._colours.get(i, (0.0, 1.0)) for i in panels],
         }
-        newest = self._points(shown.z, shown)
-        return _pack(header, np.concatenate([fields.ravel(), actions.ravel(), newest]))
-
-    def _points(self, z: NDArray[np.float64], shown: EpisodeSamples) -> NDArray[np.float64]:
-        """A state at the kept grid points of the shown component."""
-        return z[rows_of(len(z), shown.components)[shown.part(self.component)]]
+        drawn = [shown.picture(z, i) for z in (shown.z, shown.z_first) for i in panels]
+        return _pack(header, np.concatenate([fields.ravel(), actions.ravel(), *drawn]))
 
     def _state(self, now: float) -> str:
         return "searching" if self.place["domain"] is None else self.view.state_of_loop(now)
+
+
+def _kept(shown: EpisodeSamples) -> int:
+    """Components of which there are samples."""
+    return min(shown.components, MAX_COMPONENTS)
 
 
 def _pack(header: Mapping[str, Any], values: NDArray[np.floating]) -> bytes:

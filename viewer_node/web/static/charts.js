@@ -2,13 +2,13 @@
 // Actions, profile and learning curve.
 
 import { Chart } from "./chart.js";
+import { RIGHT } from "./field.js";
 import { colour, text } from "./format.js";
 
 // Okabe and Ito's colours, readable with any colour vision; more lines than these go from the first to the second.
 const LINES = ["#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00"];
 const DOTTED = [2, 3];
 const DASHED = [7, 4];
-const BAR = 74; // width of the field's colour bar: what has the same time axis keeps it free, too
 const MOST_SEEDS = 24; // whose lines can be told apart at all
 
 export function extent(...lists) {
@@ -24,7 +24,7 @@ export function extent(...lists) {
 }
 
 export function actionsChart(model) {
-  const chart = new Chart("actions", { right: BAR });
+  const chart = new Chart("actions", { right: RIGHT });
   const along = (share) => `color-mix(in oklab, ${LINES[1]} ${Math.round(100 * share)}%, ${LINES[0]})`;
   const style = (j, count) => (count <= LINES.length ? LINES[j] : along((j + 0.5) / count));
 
@@ -58,41 +58,76 @@ export function actionsChart(model) {
   return chart;
 }
 
+// The newest state over its one axis, beside the target; of a field on two axes how far it is from it.
 export function profileChart(model) {
   const chart = new Chart("profile");
 
-  chart.update = () => {
+  function curves() {
     const { facts, episode } = model;
-    const { header, target } = episode;
-    const now = episode.latest;
-    const initial = header?.begin === 0 ? episode.fields.subarray(0, header.rows) : [];
-    const length = facts.length || Math.max(1, now.length);
+    const { header, panels } = episode;
+    const axis = facts.axes[0];
+    const count = episode.rows;
+    const length = axis.length || Math.max(1, count);
+    const [first, last] = axis.length ? (axis.ends ?? [0, (length * (count - 1)) / count]) : [0, count - 1];
     const lines = [];
-    if (initial.length) lines.push(["initial", initial, { stroke: colour("muted"), dash: DOTTED, width: 1.3 }]);
-    if (target.length === now.length && now.length) {
-      lines.push(["target", target, { stroke: colour("text"), dash: DASHED, width: 1.3 }]);
-    }
-    if (header) lines.push([facts.name, now, { stroke: colour(header.controller || "accent"), width: 2 }]);
-    const [low, high] = extent(...lines.map(([, values]) => values), header?.range ?? []);
-    let caption = "";
-    if (header) {
-      caption = header.sample_time ? `t = ${text(episode.time(header.last))} s` : `step ${header.last}`;
-      if (target.length === now.length) {
-        const squares = now.reduce((sum, u, i) => sum + (u - target[i]) ** 2, 0);
-        caption += `, rms distance to the target ${text(Math.sqrt(squares / now.length))}`;
+    panels.forEach((component, p) => {
+      const name = facts.names[component] ?? "u";
+      const [of, many] = panels.length > 1 ? [` of ${name}`, true] : ["", false];
+      const target = episode.ofTarget(p);
+      if (header?.begin === 0 && !many) {
+        lines.push(["initial", episode.drawn(episode.initial, p), { stroke: colour("muted"), dash: DOTTED, width: 1.3 }]);
       }
-    }
-    chart.show({
+      if (target.length) {
+        const stroke = many ? LINES[p % LINES.length] : colour("text");
+        lines.push([`target${of}`, target, { stroke, dash: DASHED, width: 1.3 }]);
+      }
+      if (header) {
+        const stroke = many ? LINES[p % LINES.length] : colour(header.controller || "accent");
+        lines.push([name, episode.drawn(episode.latest, p), { stroke, width: 2 }]);
+      }
+    });
+    const [low, high] = extent(...lines.map(([, values]) => values), ...(header?.ranges ?? []));
+    const room = 0.08 * (high - low) || 0.1 * Math.abs(high) || 1;
+    return {
       data: [
-        Array.from(now, (_, i) => (i / now.length) * length),
+        Array.from({ length: count }, (_, i) => first + (count > 1 ? (i / (count - 1)) * (last - first) : 0)),
         ...lines.map(([, values]) => Array.from(values, (u) => (Number.isNaN(u) ? null : u))),
       ],
       series: lines.map(([label, , style]) => ({ label, ...style })),
-      x: { label: facts.length ? "x (m)" : "grid point", range: [0, length] },
-      y: { label: facts.name, range: [low - 0.08 * (high - low), high + 0.08 * (high - low)] },
-      caption,
-      words: `Profile ${caption ? `at ${caption}` : ": nothing yet"}`,
-    });
+      x: { label: axis.label, range: [0, length] },
+      y: { label: panels.map((i) => facts.names[i] ?? "u").join(", "), range: [low - room, high + room] },
+    };
+  }
+
+  function distances() {
+    const { facts, episode } = model;
+    const { header, panels } = episode;
+    const columns = header?.columns ?? 0;
+    const lists = panels.map((_, p) => Array.from({ length: columns }, (_, i) => episode.distance(i, p)));
+    const [, high] = extent(...lists);
+    return {
+      data: [Array.from({ length: columns }, (_, i) => episode.time(episode.step(i))), ...lists],
+      series: panels.map((i, p) => ({
+        label: facts.names[i] ?? "u",
+        stroke: panels.length > 1 ? LINES[p % LINES.length] : colour(header?.controller || "accent"),
+        width: 2,
+      })),
+      x: { label: episode.timeLabel, range: header ? episode.span(facts.horizon) : [0, 1] },
+      y: { label: "rms distance", range: [0, 1.08 * high || 1] },
+    };
+  }
+
+  chart.update = () => {
+    const { episode } = model;
+    const { header, panels } = episode;
+    let caption = "";
+    if (header) {
+      caption = header.sample_time ? `t = ${text(episode.time(header.last))} s` : `step ${header.last}`;
+      const distance = panels.length === 1 ? episode.distance(header.columns - 1, 0) : null;
+      if (distance !== null) caption += `, rms distance to the target ${text(distance)}`;
+    }
+    const shown = episode.plane ? distances() : curves();
+    chart.show({ ...shown, caption, words: `${episode.plane ? "Distance" : "Profile"}${caption ? ` at ${caption}` : ": nothing yet"}` });
   };
   return chart;
 }
@@ -164,7 +199,7 @@ export function curveChart(model) {
         { label: "low", ...hidden },
         ...seeds.map((_, i) => ({ ...hidden, label: `seed ${told.seeds[i]}`, stroke: colour("seed"), width: 1 })),
         ...flat,
-        { label: `while learning, on its own fields (band: ${told.band})`, stroke: colour("adapted"), width: 2, value },
+        { label: `while learning (band: ${told.band})`, stroke: colour("adapted"), width: 2, value },
       ],
       bands: [{ series: [1, 2], fill: colour("band") }],
       x: { label: axis, range: [0, end], whole: true },

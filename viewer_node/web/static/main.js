@@ -2,7 +2,8 @@
 // The live page: what comes over the link goes into the charts and the page around them.
 
 import { actionsChart, curveChart, profileChart } from "./charts.js";
-import { Episode, fieldChart } from "./field.js";
+import { Episode } from "./episode.js";
+import { FieldChart } from "./field.js";
 import { Link } from "./link.js";
 import { showPage } from "./page.js";
 
@@ -15,7 +16,7 @@ const model = {
   curve: null, // as the monitor tells it, like the status
   status: null,
   controllers: {}, // names, by key
-  facts: { length: 0, horizon: 0, n_a: 0, name: "u" }, // of the loop, as far as its nodes told
+  facts: { axes: [{ label: "grid point", length: 0 }], actuators: [], horizon: 0, n_a: 0, names: ["u"] }, // as told
   connected: null,
   notice: "",
   called: null, // "role/verb" of the button that was pressed, until the next status
@@ -30,7 +31,7 @@ function set(changes) {
 
 set({});
 const training = curveChart(model);
-const ofEpisode = [fieldChart(model), actionsChart(model), profileChart(model)];
+const ofEpisode = [new FieldChart(model), actionsChart(model), profileChart(model)];
 
 function update(charts) {
   for (const chart of charts) chart.update();
@@ -45,8 +46,8 @@ const take = {
     for (const chart of [training, ...ofEpisode]) chart.restyle();
   },
   status(status) {
-    const { length = 0, horizon = 0, n_a = 0 } = status.parameters;
-    const facts = { length, horizon, n_a, name: status.components[status.component] };
+    const { axes = model.facts.axes, places = {}, horizon = 0, n_a = 0 } = status.parameters;
+    const facts = { axes, actuators: places.actuators ?? [], horizon, n_a, names: status.components };
     if (model.status?.place.begun !== status.place.begun) model.episode = new Episode();
     set({ status, facts, called: null });
     update(ofEpisode);
@@ -55,9 +56,9 @@ const take = {
     set({ curve });
     update([training]);
   },
-  target(_, numbers) {
-    model.episode.target = numbers;
-    update(ofEpisode.slice(2));
+  target(header, numbers) {
+    model.episode.takeTarget(header, numbers);
+    update(ofEpisode);
   },
   episode(header, numbers) {
     model.episode.take(header, numbers);

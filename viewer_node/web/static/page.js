@@ -23,6 +23,16 @@ const VERBS = {
   step: ["Step", "Stepping…", "one step, then pause again"],
   stop: ["Stop", "Stopping…", "end after this iteration"],
 };
+const PHASES = {
+  identify: "exploring the plant",
+  check: "checking the first law",
+  adapt: "improving the law",
+  evaluate: "comparing on held-out fields",
+  done: "finished",
+  policy: "running laws",
+  compare: "comparing controllers",
+};
+const COMPARED = ["none", "lqt", "adapted"];
 const ROLES = { plant: "plant", tuner: "training" };
 const LEVELS = ["good", "warn", "bad", "warn"];
 
@@ -37,11 +47,11 @@ export function showPage(model, actions) {
         <${Title} ...${model} />
         ${known && html`<${Controls} ...${model} ...${actions} />`}
       </header>
-      ${known && html`<${Notice} ...${model} /><${Figures} ...${model} />`}
+      ${known && html`<${Notice} ...${model} /><${Result} ...${model} />`}
       <main>
         <${Panel} id="field" title="Field" before=${known && html`<${Choices} ...${model} ...${actions} />`} />
         <${Panel} id="actions" title=${html`Actions <i>a</i><sub>j</sub>(<i>t</i>)`} />
-        <${Panel} id="profile" title="Profile and target" />
+        <${Panel} id="profile" title=${model.facts.axes.length > 1 ? "Distance to the target" : "Profile and target"} />
         <${Panel} id="curve" title="Training" />
         ${known && html`<${Seeds} ...${model} />`}
         ${known && html`<${Nodes} ...${model} />`}
@@ -142,41 +152,83 @@ function Notice({ status, notice }) {
   return html`<p id="notice" class="notice" role="alert" hidden=${!all}>${all}</p>`;
 }
 
-function Figures({ status, curve }) {
-  const { mean, references, budget, axis, phase, seeds, paid } = curve;
+// The result so far, how far the training is, and how fast.
+function Result({ status, curve, controllers }) {
+  const { mean, references, checked, budget, axis, phase, seeds, paid } = curve;
   const { remaining, rounds, episodes } = status;
-  const closing = references.adapted; // what the closing evaluation gave counts, once it is there
-  const cost = closing ?? mean.at(-1) ?? null;
-  // Only then are both costs on the same fields.
-  const share = references.lqt && closing !== undefined ? 100 * (1 - closing / references.lqt) : null;
-  const side = share === null ? "" : share >= 0 ? " % below" : " % above";
+  const { none, lqt, adapted } = references; // of the closing evaluation: all on the same fields
+  const evaluated = adapted !== undefined;
+  const cost = adapted ?? mean.at(-1) ?? null;
+  const said = [];
+  if (evaluated && lqt) said.push(below(lqt, adapted, controllers.lqt));
+  if (evaluated && none) said.push(`${((100 * adapted) / none).toPrecision(3)} % of the cost without control is left`);
+  if (!evaluated && cost !== null) said.push("on the training's own fields; all controllers are compared at the end");
+  if (!evaluated && cost === null && checked.lqt !== undefined) {
+    said.push(`first check: ${text(checked.lqt)} with ${controllers.lqt}`);
+    if (checked.none !== undefined) said.push(`${text(checked.none)} without control`);
+  }
   const count = paid[0] === paid[1] ? paid[1] : `${paid[0]} to ${paid[1]}`;
   const rows = [
-    ["phase", phase],
+    ["phase", PHASES[phase] ?? phase],
     [axis, paid[1] && count, budget ? ` of ${budget}` : ""],
     ["time left", remaining !== null && duration(remaining)],
-    [closing === undefined ? "cost now" : "evaluated cost", text(cost)],
-    ["against LQT", share !== null && Math.abs(share).toFixed(1), side],
     ["seeds", seeds.length],
     ["rounds", text(rounds < 10 ? rounds : Math.round(rounds)), " 1/s"],
     ["episodes", text(episodes), " 1/s"],
   ];
   return html`
-    <dl id="figures" class="figures">
-      ${rows.map(
-        ([name, value, unit = ""]) => html`
-          <div><dt>${name}</dt><dd><span>${value || "–"}</span><small>${unit}</small></dd></div>
+    <section id="result" class="panel result" aria-label="Result and progress">
+      <div class="outcome">
+        <p id="cost">
+          ${cost === null ? "no cost of an adapted law yet" : html`<b>${text(cost)}</b> mean stage cost ${evaluated ? "of the adapted law" : "now"}`}
+        </p>
+        <p id="share" class="muted">${said.join(" · ")}</p>
+        ${evaluated && html`<${Costs} costs=${references} controllers=${controllers} />`}
+      </div>
+      <div class="advance">
+        <progress id="progress" max=${budget || 1} value=${budget ? Math.min(paid[0], budget) : 0} aria-label="rollouts of the budget"></progress>
+        <dl id="figures" class="figures">
+          ${rows.map(
+            ([name, value, unit = ""]) => html`
+              <div><dt>${name}</dt><dd><span>${value || "–"}</span><small>${unit}</small></dd></div>
+            `,
+          )}
+        </dl>
+      </div>
+    </section>
+  `;
+}
+
+// The costs as bars, from 0 to the largest.
+function Costs({ costs, controllers }) {
+  const known = COMPARED.filter((name) => Number.isFinite(costs[name]));
+  const largest = Math.max(...known.map((name) => costs[name]));
+  return html`
+    <dl class="bars">
+      ${known.map(
+        (name) => html`
+          <dt>${controllers[name]}</dt>
+          <dd>
+            <i style=${{ width: `${(80 * costs[name]) / largest}%`, background: `var(--${name}, var(--accent))` }}></i>
+            ${text(costs[name])}
+          </dd>
         `,
       )}
     </dl>
   `;
 }
 
+// By how much a cost is below another one.
+function below(base, cost, name = "") {
+  const share = 100 * (1 - cost / base);
+  return `${Math.abs(share).toFixed(1)} % ${share >= 0 ? "below" : "above"} ${name}`.trim();
+}
+
 // Which component and pair is shown.
 function Choices({ status, choose }) {
-  const { components, component, place } = status;
+  const { components, component, place, panels } = status;
   const choice = (name, names, chosen, take) => html`
-    <label hidden=${names.length < 2}>
+    <label hidden=${names.length < 2 || (name === "component" && panels.length > 1)}>
       ${name} <select id=${name} value=${chosen} onChange=${(event) => take(event.target.value)}>
         ${names.map((one) => html`<option value=${one}>${one}</option>`)}
       </select>
@@ -199,11 +251,6 @@ function Seeds({ curve, controllers }) {
   const { evaluations, references } = curve;
   const known = Object.entries(evaluations);
   if (!known.length) return null;
-  const names = ["none", "lqt", "adapted"];
-  const below = ({ lqt, adapted }) => {
-    const share = 100 * (1 - adapted / lqt);
-    return `${Math.abs(share).toFixed(1)} % ${share >= 0 ? "below" : "above"}`;
-  };
   const rows = known.length > 1 ? [...known, ["mean", references]] : known;
   return html`
     <section id="seeds-panel" class="panel seeds" aria-labelledby="seeds-title">
@@ -212,15 +259,15 @@ function Seeds({ curve, controllers }) {
         <table id="seeds">
           <tr>
             <th>seed</th>
-            ${names.map((name) => html`<th>${controllers[name]}</th>`)}
+            ${COMPARED.map((name) => html`<th>${controllers[name]}</th>`)}
             <th>against ${controllers.lqt}</th>
           </tr>
           ${rows.map(
             ([seed, costs]) => html`
               <tr>
                 <td>${seed}</td>
-                ${names.map((name) => html`<td>${text(costs[name])}</td>`)}
-                <td>${below(costs)}</td>
+                ${COMPARED.map((name) => html`<td>${text(costs[name])}</td>`)}
+                <td>${below(costs.lqt, costs.adapted)}</td>
               </tr>
             `,
           )}
