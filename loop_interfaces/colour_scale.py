@@ -46,8 +46,8 @@ def field_range(values: NDArray[np.floating], target: NDArray[np.floating]) -> t
 
     Examples
     --------
-    >>> field_range(np.array([0.0, 3.0, np.nan]), np.array([2.0, 2.0]))
-    (0.04, 3.96)
+    >>> field_range(np.array([4.0, 4.0, np.nan]), np.array([2.0, 2.0]))
+    (0.0, 4.0)
     >>> field_range(np.zeros(5), np.array([-1.0, 4.0]))
     (-4.0, 4.0)
     >>> field_range(np.array([]), np.array([]))
