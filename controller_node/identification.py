@@ -38,8 +38,8 @@ class DesignSettings:
         Of the stage cost.
     action_limit : float
         Magnitude at which actions saturate; 0: none. The gains are designed without it.
-    cost : str
-        The whole cost (`loop_interfaces.cost.Cost.text`) where the weights do not say it.
+    cost : sequence of str
+        The whole cost (`loop_interfaces.cost.Cost.texts`) where the weights do not say it.
     identification : {"field", "regression", "dmdc"}
         "field": the regression, or a law from a model of the whole field (`field_law`) that is better.
     dmdc_rank, dmdc_order : int
@@ -55,7 +55,7 @@ class DesignSettings:
     state_weight: float
     action_weight: float
     action_limit: float = 0.0
-    cost: str = ""
+    cost: Sequence[str] = ()
     identification: str = "regression"
     dmdc_rank: int = 0
     dmdc_order: int = 0
@@ -195,7 +195,7 @@ def designed(
     weights: dict[str, Any] = {
         "state_weight": settings.state_weight,
         "action_weight": settings.action_weight,
-        "cost": Cost.parse(settings.cost) if settings.cost else None,
+        "cost": Cost.parse(settings.cost),
     }
     gains = lqt.track(model, **weights)
     s_r = ProjectedLaw([model.U], target).reduced_targets[0]

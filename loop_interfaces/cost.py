@@ -14,6 +14,7 @@ import base64
 import json
 import math
 import zlib
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,8 @@ from loop_interfaces.arrays import Array, float_array
 
 _SEMIDEFINITE = 1e-10
 """An eigenvalue of a weight below minus this, relative to the largest, is negative."""
+_LINE = 8000
+"""Characters of one text; a YAML file takes no much longer ones."""
 _ARRAYS = ("state_weight", "action_weight", "target", "output", "action_target", "terminal_weight")
 
 
@@ -155,23 +158,28 @@ class Cost:
         )
 
     @property
-    def text(self) -> str:
-        """As a parameter has it; empty where numbers and a constant target say everything."""
+    def texts(self) -> list[str]:
+        """As a parameter has it; none where numbers and a constant target say everything."""
         if self.plain:
-            return ""
+            return []
         arrays = {name: getattr(self, name) for name in _ARRAYS}
         packed = {n: _packed(a) for n, a in arrays.items() if a is not None}
-        return json.dumps([self.n_z, self.n_a, self.horizon, packed])
+        text = json.dumps([self.n_z, self.n_a, self.horizon, packed])
+        return [text[i : i + _LINE] for i in range(0, len(text), _LINE)]
 
     @classmethod
-    def parse(cls, text: str) -> Cost:
-        """The cost of a parameter; ValueError if the text is none.
+    def parse(cls, texts: Sequence[str]) -> Cost | None:
+        """The cost of a parameter, None where it is empty; ValueError if the texts are none.
 
         Examples
         --------
-        >>> Cost.parse(Cost(2, 1, 9, action_weight=[3.0]).text).action_weight
+        >>> cost = Cost.parse(Cost(2, 1, 9, action_weight=[3.0]).texts)
+        >>> cost.action_weight
         array([3.])
         """
+        text = "".join(texts)
+        if not text:
+            return None
         try:
             n_z, n_a, horizon, packed = json.loads(text)
             arrays = {str(name): _unpacked(value) for name, value in packed.items()}

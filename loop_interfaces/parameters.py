@@ -104,7 +104,7 @@ PROBLEM = _section(
     Spec("grid", "", nodes="PTV").means(
         "axes and components of the state as JSON, filled in by the plant; empty: one periodic axis"
     ),
-    Spec("cost", "", nodes="CT").means(
+    Spec("cost", [], nodes="CT").means(
         "the cost as packed JSON, filled in by the plant; empty: numbers and a constant target"
     ),
     Spec("length", 1.0, positive=True, unit="m", nodes="PTV").means(

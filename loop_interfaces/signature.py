@@ -48,7 +48,7 @@ def design_digest(parameters: Mapping[str, Any]) -> int:
     the horizon.
     """
     values = [parameters[name] for name in DESIGN]
-    values += [parameters["cost"]] if parameters.get("cost") else []
+    values += ["".join(parameters["cost"])] if parameters.get("cost") else []
     law = parameters.get("law", "affine").rpartition(":")[2]
     values += [law, parameters["horizon"]] if law != "affine" else []
     return digest_of(*(list(v.encode()) if isinstance(v, str) else v for v in values))

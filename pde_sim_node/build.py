@@ -60,7 +60,7 @@ def complete(values: Mapping[str, Any], *, compiled: bool = True) -> tuple[Plant
     own = {name: getattr(plant, name) for name in (*_FIXED, *SETTABLE)}
     axes = plant.grid.axes
     own |= {"grid": plant.grid.text, "length": axes[-1].length if axes else 1.0, "reduced_order": 0}
-    own["cost"] = plant.cost.text
+    own["cost"] = plant.cost.texts
     given = {**values, **{f"{PHYSICAL}{name}": value for name, value in physical.items()}}
     if values["plant"]:
         return plant, {**own, **given}
@@ -94,7 +94,7 @@ def _own_plant(values: Mapping[str, Any]) -> tuple[Plant, Mapping[str, Any]]:
                 f"parameter '{name}' is {values[name]!r}, and that of {values['plant']} is "
                 f"{getattr(plant, name)!r}; leave it out"
             )
-    if values.get("cost") and values["cost"] != plant.cost.text:
+    if values.get("cost") and "".join(values["cost"]) != "".join(plant.cost.texts):
         raise ParameterError(
             f"parameter 'cost' is another one than that of {values['plant']}; leave it out"
         )

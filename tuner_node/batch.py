@@ -95,10 +95,12 @@ class TrainingSettings:
     """Point sensors whose readings the states are; 0: the states are whole."""
     actuator_positions: Sequence[float] = ()
     """Centres of the actuators as shares of the domain; none: equally spaced."""
-    cost: str = ""
-    """The whole cost (`loop_interfaces.cost.Cost.text`) where the weights do not say it."""
+    cost: Sequence[str] = ()
+    """The whole cost (`loop_interfaces.cost.Cost.texts`) where the weights do not say it."""
     periodic: bool = True
     """Whether the states are fields on one periodic axis."""
+    line: bool = True
+    """Whether they are fields on one axis, or plain vectors."""
     model: Array | None = None
     """Rows of a reduced model to start from instead of identifying one."""
     law: type[Law] = Affine

@@ -148,11 +148,13 @@ def build_training(values: Mapping[str, Any]) -> Training:
     # The published readings are scaled (docs/robustness.md).
     readings = values["sensors"] * values["sensor_delays"] or values["n_z"]
     scale = math.sqrt(values["n_z"] / readings)
+    grid = Grid.parse(values["grid"]) if values["grid"] else None
     given |= {
         "law": law,
         "exploration_variance": max(values["exploration_variance"], variance),
         "sensors": sensors,
-        "periodic": not values["grid"] or Grid.parse(values["grid"]).is_circle,
+        "periodic": grid is None or grid.is_circle,
+        "line": grid is None or len(grid.axes) < 2,
         "measurement_noise": values["measurement_noise"] * scale,
         "model": read_model(Path(values["model"]), values["n_a"]) if values["model"] else None,
     }

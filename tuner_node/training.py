@@ -354,8 +354,9 @@ class Training:
             sensors=self.settings.sensors,
             actuator_positions=self.settings.actuator_positions,
             periodic=self.settings.periodic,
+            line=self.settings.line,
             further=self.further[m],
-            cost=Cost.parse(self.settings.cost) if self.settings.cost else None,
+            cost=Cost.parse(self.settings.cost),
             law=law,
         )
 

@@ -132,6 +132,8 @@ class Context:
         Centres of the actuators as shares of the domain; none: equally spaced.
     periodic : bool
         Whether the states are fields on one periodic axis, which models of the whole field assume.
+    line : bool
+        Whether they are fields on one axis, or plain vectors.
     further : sequence of Trajectory
         Other explorations, from other initial fields.
     cost : Cost or None
@@ -152,6 +154,7 @@ class Context:
     sensors: int = 0
     actuator_positions: Sequence[float] = ()
     periodic: bool = True
+    line: bool = True
     further: Sequence[Trajectory] = ()
     cost: Cost | None = None
     law: Law | None = None

@@ -63,6 +63,7 @@ def believe(
             noise=context.noise,
             action_limit=context.action_limit,
             first=last.model.kind if last else None,
+            line=context.line,
         )
 
     counts = list(range(1, MOST_COMPONENTS + 1))

@@ -110,6 +110,12 @@ def renew(
         least_gain=settings.least_gain if final else settings.first_gain,
     )
     few = settings.mixtures // 2
+    if len(fields) == 1:  # every episode begins with this one: there is nothing to leave out
+        found = descend([first, improved], fields, 0)
+        if found is None:
+            return None
+        before, after = (float(loop.costs(theta, fields)[0]) for theta in (first, found[0]))
+        return Renewal(found[0], found[0], [], 1.0, after - before, 0.0, found[1])
     part_of = np.arange(len(fields)) % settings.folds
     steps, made = 0, []
     for part, start in enumerate(parts or [first] * settings.folds):

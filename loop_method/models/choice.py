@@ -52,6 +52,7 @@ def fit_field_model(
     noise: float = 0.0,
     action_limit: float = 0.0,
     first: str | None = None,
+    line: bool = True,
 ) -> FittedModel | None:
     """The model of the whole field that predicts measured rollouts, or None where none can be fitted.
 
@@ -71,12 +72,14 @@ def fit_field_model(
         Magnitude at which actions saturate; 0 for none.
     first : str, optional
         Kind to be tried first, that of the last choice.
+    line : bool
+        Whether the states are fields on one axis, or plain vectors.
     """
     settings = settings or FieldModelSettings()
     rollouts = [_limited(rollout, action_limit) for rollout in rollouts]
     if len(Samples.of(rollouts)) < FEWEST_SAMPLES:
         return None
-    kinds = kinds_of(len(target), components, settings)
+    kinds = kinds_of(len(target), components, settings, line=line)
     kinds.sort(key=lambda kind: kind.name != first)
     judged: dict[Kind, float] = {}
     with threadpool_limits(limits=1):  # a rounding must not depend on the machine's load

@@ -11,6 +11,7 @@ from loop_method.models.base import FieldModel, Samples
 from loop_method.models.finite_difference import features_of
 from loop_method.models.finite_difference_fit import fit_finite_difference
 from loop_method.models.linear import fit_convolution, fit_linear
+from loop_method.models.low_rank import fit_low_rank
 from loop_method.models.settings import FieldModelSettings
 from loop_method.models.spectral_fit import fit_spectral
 from loop_method.models.symbols import Form
@@ -29,6 +30,7 @@ FORMS = (
 )
 POINT_RIDGES = {"x-shared": None, "x1e-3": 1e-3, "x1e-5": 1e-5, "x1e-7": 1e-7}
 LINEAR_RIDGES = {"linear": 1e-6, "linear1e-4": 1e-4}
+LOW_RANKS = {"modes8": 8, "modes16": 16, "modes32": 32, "modes64": 64}
 SIMPLEST = 4
 """Forms of the fewest unknowns, the first ones."""
 FEWEST_POINTS = 8
@@ -53,9 +55,21 @@ class Kind:
     unknowns: tuple[float, int]
 
 
-def kinds_of(n_z: int, components: int, settings: FieldModelSettings) -> list[Kind]:
-    """The kinds for states of that size."""
+def kinds_of(
+    n_z: int, components: int, settings: FieldModelSettings, *, line: bool = True
+) -> list[Kind]:
+    """The kinds for states of that size.
+
+    line: whether a point has one neighbour at each side, which is not so on several axes.
+    """
     kinds: list[Kind] = []
+    if not line or n_z > settings.dense:
+        kinds = [
+            Kind(name, partial(fit_low_rank, kind=name, most=most, ridge=1e-12), (float(most), 0))
+            for name, most in LOW_RANKS.items()
+        ]
+    if not line:
+        return kinds + _linear(n_z, settings)
     if components == 1 and n_z >= FEWEST_POINTS:
         kinds += [
             Kind(form.name, partial(fit_spectral, form=form, settings=settings), form.unknowns)
@@ -67,10 +81,16 @@ def kinds_of(n_z: int, components: int, settings: FieldModelSettings) -> list[Ki
         # Linear ones are tried early, as that is quick.
         kinds[SIMPLEST:SIMPLEST] = [kind for kind in two if kind.name == "two-convolution"]
         kinds += [kind for kind in two if kind.name != "two-convolution"]
-    if n_z <= settings.dense:
-        for name, ridge in LINEAR_RIDGES.items():
-            kinds.append(Kind(name, partial(fit_linear, kind=name, ridge=ridge), (n_z, 0)))
-    return kinds
+    return kinds + _linear(n_z, settings)
+
+
+def _linear(n_z: int, settings: FieldModelSettings) -> list[Kind]:
+    if n_z > settings.dense:
+        return []
+    return [
+        Kind(name, partial(fit_linear, kind=name, ridge=ridge), (n_z, 0))
+        for name, ridge in LINEAR_RIDGES.items()
+    ]
 
 
 def _several_fields(

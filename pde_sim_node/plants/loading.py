@@ -20,10 +20,11 @@ from loop_interfaces.text import shown
 from pde_sim_node.definition import described
 from pde_sim_node.dynamics import Dynamics, arguments_of, signature_of
 from pde_sim_node.plant import Plant
+from pde_sim_node.plants.cavity import Cavity
 from pde_sim_node.plants.dynamics_plant import DynamicsPlant
 from pde_sim_node.plants.interval import Interval
 
-PLANTS: Mapping[str, type[Dynamics]] = MappingProxyType({"interval": Interval})
+PLANTS: Mapping[str, type[Dynamics]] = MappingProxyType({"interval": Interval, "cavity": Cavity})
 """Those that are shipped, by name."""
 OWN_PLANTS = OwnCode("plant", "PDELOOP_PLANTS", PLANTS)
 OBJECT = "object of a Python program:"

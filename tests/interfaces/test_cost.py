@@ -45,7 +45,8 @@ def test_an_episode_costs_what_the_formula_says() -> None:
     expected += last @ np.diag([1.0, 0.0, 4.0]) @ last
     cost = Cost(N_Z, N_A, T, **WHOLE)
     assert total(cost, states, actions) == pytest.approx(expected, rel=1e-13)
-    again = Cost.parse(cost.text)
+    again = Cost.parse(cost.texts)
+    assert again is not None
     assert total(again, states, actions) == total(cost, states, actions)
     assert not cost.plain
 
@@ -98,7 +99,7 @@ def test_rounding_does_not_depend_on_the_batch() -> None:
 
 def test_numbers_and_a_constant_target_need_no_text() -> None:
     cost = Cost(N_Z, N_A, T, state_weight=2.0, action_weight=0.1, target=np.arange(5.0))
-    assert cost.plain and cost.text == "" and cost.size == (2.0, 0.1)
+    assert cost.plain and cost.texts == [] and cost.size == (2.0, 0.1)
     assert cost.field_target.tolist() == [0, 1, 2, 3, 4]
 
 
@@ -121,9 +122,9 @@ def test_what_is_no_cost_is_refused(words: Any, told: str) -> None:
 
 
 def test_a_text_that_claims_more_than_it_holds_is_refused() -> None:
-    text = Cost(N_Z, N_A, T, state_weight=np.ones(N_Z)).text
+    (text,) = Cost(N_Z, N_A, T, state_weight=np.ones(N_Z)).texts
     sizes = json.loads(text)
     sizes[3]["state_weight"]["shape"] = [10**9]
     for bad in (json.dumps(sizes), text[:-9], "[]", "3", "nonsense"):
         with pytest.raises(ValueError, match="is not a cost"):
-            Cost.parse(bad)
+            Cost.parse([bad])

@@ -324,7 +324,7 @@ def test_a_model_that_is_identified_otherwise_has_another_signature(name):
     # An action has the first of these, D the second, the third counts where it is not empty, and the
     # last two with another law than the affine one.
     assert {*DESIGN, "n_a", "action_limit", "cost", "law", "horizon"} == {*known}
-    assert design_digest(known | {"cost": "another"}) != design_digest(known | {"cost": ""})
+    assert design_digest(known | {"cost": ["another"]}) != design_digest(known | {"cost": []})
 
 
 def test_a_model_for_another_law_has_another_signature_and_the_affine_one_that_without_a_name():

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import pdeloop
-from loop_interfaces.cost import Cost
 from loop_interfaces.spec import ParameterError
 from loop_method.design.finite_horizon import finite_horizon_of
 from loop_method.design.tracking import track_horizon
@@ -156,4 +155,3 @@ def test_a_class_says_itself_what_its_actuators_take() -> None:
     np.testing.assert_array_equal(
         plant.step(np.array([[2.0, 4.0]])), own.step(np.array([[1.0, 2.0]]))
     )
-    assert Cost.parse(plant.cost.text).text == plant.cost.text

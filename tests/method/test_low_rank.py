@@ -1,0 +1,46 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A model in POD modes recovers a planted one; its pull-back is the transpose; it is written whole."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from loop_method.models import Measured, fit_field_model
+from loop_method.models.files import model_of
+from loop_method.models.low_rank import LowRankModel
+
+N_Z, R, N_A = 3000, 5, 2
+RNG = np.random.default_rng(0)
+V = np.linalg.qr(RNG.standard_normal((N_Z, R)))[0]
+A = 0.9 * np.linalg.qr(RNG.standard_normal((R, R)))[0]
+PLANTED = LowRankModel("modes8", V, A, RNG.standard_normal((R, N_A)), RNG.standard_normal(R))
+
+
+def rollouts(count: int) -> list[Measured]:
+    found = []
+    for _ in range(count):
+        states, actions = [V @ RNG.standard_normal(R)], RNG.standard_normal((30, N_A))
+        for a in actions:
+            states.append(PLANTED.step(states[-1][None], a[None])[0])
+        found.append(Measured(np.array(states), actions))
+    return found
+
+
+def test_a_planted_model_of_a_large_field_on_two_axes_is_recovered() -> None:
+    fitted = fit_field_model(rollouts(3), np.zeros(N_Z), line=False)
+    assert fitted is not None and fitted.error < 1e-12
+    assert fitted.model.kind == "modes8"
+    z, a = (V @ RNG.standard_normal(R))[None], RNG.standard_normal((1, N_A))
+    np.testing.assert_allclose(fitted.model.step(z, a), PLANTED.step(z, a), atol=1e-6)
+    again = model_of(fitted.model.arrays())
+    assert np.array_equal(again.step(z, a), fitted.model.step(z, a))
+
+
+def test_the_pull_back_is_the_transpose() -> None:
+    z, a = RNG.standard_normal((3, N_Z)), RNG.standard_normal((3, N_A))
+    y = RNG.standard_normal((3, N_Z))
+    on_z, on_a = PLANTED.pull_back(z, a, y)
+    origin = PLANTED.step(np.zeros((3, N_Z)), np.zeros((3, N_A)))
+    forward = np.sum((PLANTED.step(z, a) - origin) * y)
+    assert np.sum(on_z * z) + np.sum(on_a * a) == pytest.approx(forward, rel=1e-11)
