@@ -8,10 +8,8 @@ from dataclasses import dataclass
 
 from loop_method.adapt.base import Context, Record
 from loop_method.adapt.closed_loop import ClosedLoop
-from loop_method.models import FieldModel, FittedModel, Measured, affine_law, fit_field_model
-
-MOST_COMPONENTS = 2
-"""Fields one after the other in a state, as many as are tried."""
+from loop_method.models import FieldModel, Measured, affine_law, fit_field_model
+from loop_method.models.prediction import pieces
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +36,7 @@ class Belief:
 
 
 def believe(
-    context: Context, records: Sequence[Record], last: Belief | None, enough: float
+    context: Context, records: Sequence[Record], first: str = "", parts: int = 1
 ) -> Belief | None:
     """The model that predicts the rollouts best, or None where none can be fitted.
 
@@ -48,38 +46,25 @@ def believe(
         The law's basis and target.
     records : sequence of Record
         Explorations, whose policy is zero and whose cost is infinite, and rollouts of laws.
-    last : Belief or None
-        What was believed before, of whose kind the first model is.
-    enough : float
-        E above which a state of several components is tried.
+    first : str
+        The kind that is tried first, which was believed before; empty: none.
+    parts : int
+        Pieces of equal length that are predicted in place of a rollout.
     """
     rollouts = [_measured(context, record) for record in records if len(record.actions)]
-
-    def fitted(components: int) -> FittedModel | None:
-        return fit_field_model(
-            rollouts,
-            context.target,
-            components=components,
-            noise=context.noise,
-            action_limit=context.action_limit,
-            first=last.model.kind if last else None,
-            line=context.line,
-        )
-
-    counts = list(range(1, MOST_COMPONENTS + 1))
-    if last is not None:
-        counts.sort(key=lambda count: count != last.components)
-    best: Belief | None = None
-    for components in counts:
-        if context.target.size % components:
-            continue
-        found = fitted(components)
-        if found is not None and (best is None or found.error < best.error):
-            two = found.model.kind.startswith("two-")
-            best = Belief(found.model, found.error, 2 if two else components)
-        if best is not None and best.error <= enough:
-            break
-    return best
+    if parts > 1:
+        rollouts = [part for rollout in rollouts for part in pieces(rollout, parts)]
+    found = fit_field_model(
+        rollouts,
+        context.target,
+        noise=context.noise,
+        action_limit=context.action_limit,
+        first=first,
+        line=context.line,
+    )
+    if found is None:
+        return None
+    return Belief(found.model, found.error, 2 if found.model.kind.startswith("two-") else 1)
 
 
 def _measured(context: Context, record: Record) -> Measured:

@@ -83,7 +83,9 @@ class SearchState:
     numbers of the initial fields that judge; incumbents, trials, others (M,): stamps of the
     rollouts on these fields of the incumbent, of the candidate, and of what the incumbent is
     compared to, the candidate rejected last or the incumbent before, -1: none; fall: what the
-    candidate is predicted to gain; damping: lambda; accepted: whether the last candidate was.
+    candidate is predicted to gain; damping: lambda; accepted: whether the last candidate was;
+    believed: the kind of the model of the whole field, empty for none; tried: rollouts, when none was
+    found.
     """
 
     policy: Array
@@ -97,6 +99,8 @@ class SearchState:
     accepted: bool = True
     proposed: bool = False
     tells: int = 0
+    believed: str = ""
+    tried: int = 0
 
     @classmethod
     def begin(cls, policy: Array, count: int, first: int) -> SearchState:
@@ -343,6 +347,9 @@ class GaussNewton(Optimizer):
             now.candidate, now.fall, now.proposed = 0.5 * start, 0.0, True
             return
         # One thread: a threaded LAPACK rounds differently for another number of threads.
+        count = self._records.count
+        # To find that no model of the whole field is good enough takes long.
+        again = bool(now.believed) or count >= 2 * now.tried
         with threadpool_limits(limits=1):
             proposal = self._proposer.propose(
                 self._records.all(),
@@ -350,7 +357,10 @@ class GaussNewton(Optimizer):
                 [None if stamp == _NONE else self._records[int(stamp)] for stamp in now.others],
                 damping=now.damping,
                 accepted=now.accepted,
+                first=now.believed if again else None,
             )
         if proposal is not None:
+            if again:
+                now.believed, now.tried = proposal.believed, count
             now.candidate, now.fall, now.proposed = proposal.policy, proposal.fall, True
             row.update(proposal.row())

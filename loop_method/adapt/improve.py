@@ -80,6 +80,7 @@ def improve(
     curvature: Array,
     settings: ModelBasedSettings,
     least_gain: float | None = None,
+    trust: float = 0.0,
 ) -> Improvement | None:
     """The law after a descent, or None where no law to begin with is finite on the model.
 
@@ -97,6 +98,9 @@ def improve(
         Constants of the descent.
     least_gain : float, optional
         In place of that of the settings.
+    trust : float
+        What |x - x_0|^2 costs besides, with x_0 the law to begin with: of a linear plant the step is
+        1/(1 + trust) of the whole one.
     """
     for _ in range(settings.halvings + 1):
         simulation = loop.simulate(theta, fields)
@@ -118,7 +122,9 @@ def improve(
         np.full(len(moment) - 1, size), 1.0
     )
     gain = settings.least_gain if least_gain is None else least_gain
-    return _descend(loop, theta, fields, weights, Coordinates(curvature, moment), settings, gain)
+    return _descend(
+        loop, theta, fields, weights, Coordinates(curvature, moment), settings, gain, trust
+    )
 
 
 def _descend(
@@ -129,6 +135,7 @@ def _descend(
     coordinates: Coordinates,
     settings: ModelBasedSettings,
     least_gain: float,
+    trust: float,
 ) -> Improvement:
     # Not at the top: a node that never improves a law has no need of it.
     from scipy.optimize import minimize
@@ -139,21 +146,24 @@ def _descend(
     if not (unit > 0.0 and np.isfinite(unit) and before > 0.0):
         return Improvement(theta, before, before, 0)
     best, values = Improvement(theta, before, before, 0), [1.0]
+    least, held = before, trust * unit**2
 
     def objective(y: Array) -> tuple[float, Array]:
-        nonlocal best
+        nonlocal best, least
         at, cost, gradient = theta, before, by_theta  # the descent begins with what is known
         if y.any():
             at = theta + coordinates.theta(unit * y)
             cost, gradient = loop.gradient(at, fields, weights)
         if not (cost < FAR * before and np.isfinite(gradient).all()):
             return FAR, np.zeros_like(y)
-        if cost < best.after:
-            best = Improvement(at, before, cost, best.steps)
-        return cost / before, unit / before * coordinates.gradient(gradient)
+        total = cost + held * float(y @ y)
+        if total < least:
+            least, best = total, Improvement(at, before, cost, best.steps)
+        slope = unit * coordinates.gradient(gradient) + 2.0 * held * y
+        return total / before, slope / before
 
     def stop_when_flat(_: Array) -> None:
-        values.append(best.after / before)
+        values.append(least / before)
         earlier = values[max(len(values) - 1 - settings.window, 0)]
         few = len(values) <= settings.window
         if not few and earlier - values[-1] <= least_gain * values[-1]:

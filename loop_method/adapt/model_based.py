@@ -252,7 +252,8 @@ class ModelBased(Optimizer):
         final = self._records.count >= self._last_renewal()
         noisy = bool(self._context.noise)
         most = settings.believed_noisy if noisy else settings.believed
-        belief = believe(self._context, data, self._belief, most)
+        last = self._belief.model.kind if self._belief else ""
+        belief = believe(self._context, data, last)
         if belief is not None:
             row["model"], row["mismatch"] = belief.model.kind, belief.error
         if belief is None or not belief.error <= most:

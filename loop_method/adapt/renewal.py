@@ -102,7 +102,7 @@ def renew(
     descend = partial(
         _improved,
         loop,
-        curvature=_curvature(loop),
+        curvature=curvature_of(loop),
         rng=rng,
         settings=settings,
         components=components,
@@ -202,7 +202,7 @@ def _improved(
     return None if found is None else (found.theta, found.steps)
 
 
-def _curvature(loop: ClosedLoop) -> Array:
+def curvature_of(loop: ClosedLoop) -> Array:
     """R + B^T P B of the model linearised at the target; R where that is not to be had."""
     n_a, r = loop.model.n_a, loop.action_weight
     if loop.model.n_z <= LARGEST:

@@ -80,7 +80,7 @@ def fit_spectral(
             found = _between(best or model, tried)  # half of the way
         if found is None:
             break
-        tried = replace(found, substeps=_substeps(found.symbols, largest, settings))
+        tried = replace(found, substeps=substeps_of(found.symbols, largest, settings))
     if best is None:
         return None
     return replace(best, fewer=_fewer(best.symbols, largest, best.substeps, settings))
@@ -153,7 +153,7 @@ def _regression(model: SpectralModel, samples: Samples, form: Form) -> Regressio
     )
 
 
-def _substeps(symbols: Spectrum, largest: float, settings: FieldModelSettings) -> int:
+def substeps_of(symbols: Spectrum, largest: float, settings: FieldModelSettings) -> int:
     """So many that the fastest rate of the nonlinear part, of what is dealiased, is followed."""
     return int(_counts(symbols, largest, settings)[-1])
 

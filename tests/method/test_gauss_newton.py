@@ -12,11 +12,8 @@ import numpy as np
 import pytest
 
 from loop_method.adapt import Context, GaussNewton, Rollout, RolloutResult, Trajectory
-from loop_method.adapt.proposals import Proposer, chaotic
-from loop_method.adapt.simulation import mismatch, mismatch_of_pieces
-from loop_method.adapt.trajectories import Records
+from loop_method.adapt.proposals import Proposer
 from loop_method.design.lqt import track
-from loop_method.field_models.convolution import ConvolutionModel, fit_convolutions
 from loop_method.reduce.reduced_model import ReducedModel
 from tests.support.small import parameters, same_bits, train_here
 
@@ -57,7 +54,8 @@ class Plant:
         noise = 0.3 * np.random.default_rng(1).standard_normal((T, N_A))
         exploration = self.run(np.zeros((N_A, 2 * N_S)), 77, noise).trajectory
         assert exploration is not None
-        return Context(self.U, self.target, Q, R, T, exploration)
+        # No field on a ring, of which models of the whole field are tried.
+        return Context(self.U, self.target, Q, R, T, exploration, periodic=False)
 
 
 def make(plant: Plant, policy: np.ndarray | None = None, **changes: Any) -> GaussNewton:
@@ -152,7 +150,7 @@ def test_asks_are_pure_rows_are_json_and_the_budget_is_kept() -> None:
         assert json.loads(json.dumps(row, allow_nan=False)) == row
         assert row["rollouts"] == total
         costs.append(row["cost"])
-    assert 24 - 3 < total <= 24
+    assert 24 - 2 * 3 < total <= 24  # what is left is no step of up to twice three fields
     assert optimizer.ask() == []
     with pytest.raises(ValueError, match="done"):
         optimizer.tell([])
@@ -358,61 +356,3 @@ def test_a_reduced_model_larger_than_the_default_number_of_modes_is_adapted() ->
     assert training.policies().shape == (1, 2, 68)
     _, lqt, adapted = training.evaluation.mean(axis=2)[0]
     assert adapted < lqt
-
-
-def test_a_plant_that_forgets_is_improved_from_many_states_until_it_gains_nothing() -> None:
-    """And not from the few initial fields, whose costs say nothing about others."""
-    plant = Plant()
-    proposer = Proposer(plant.context(), plant.best)
-    policy, seeds = 0.6 * plant.best, range(4)
-    records = Records(40, 1e9)
-    for seed in seeds:
-        records.add(policy, plant.run(policy, seed), set())
-    data = records.all()
-    states = [record.states for record in data]
-    z, then = (np.concatenate([s[i : T + i] for s in states]) for i in (0, 1))
-    a = np.concatenate([record.actions for record in data])
-    (model,) = fit_convolutions(z, a, then, np.ones(len(z)), degrees=(1,), ridges=(1e-9,))
-    falls = []
-    for _ in range(20):
-        proposal = chaotic.propose(proposer.loop, model, 0.01, data, policy, 1e-3)
-        if proposal is None:
-            break
-        falls.append(proposal.fall)
-        policy = proposal.policy
-    assert proposal is None
-    assert falls
-    other = plant.run(data[0].policy, 99).trajectory
-    assert other is not None
-    before, after = (
-        proposer.loop.simulate(model, proposer.loop.theta(p), other.states).cost
-        for p in (data[0].policy, policy)
-    )
-    assert after < 0.95 * before
-
-
-def test_chaos_is_told_from_disturbances() -> None:
-    """A map at every point: the chaotic logistic one, nearly known, or a random walk."""
-    plant = Plant()
-    proposer, rng = Proposer(plant.context(), plant.best), np.random.default_rng(3)
-
-    def forgets(true: tuple[float, float], known: tuple[float, float], disturbance: float) -> bool:
-        """z+ = true_1 z + true_2 z^2 + disturbance, and a model of it with other coefficients."""
-        symbols = np.array(known)[:, None, None, None] * np.ones(N_Z // 2 + 1)
-        model = ConvolutionModel(symbols.astype(complex), np.zeros((N_Z, N_A)), np.zeros(N_Z))
-        records = Records(10, 1e9)
-        for policy in (0.0 * plant.best, plant.best):
-            states = [rng.uniform(0.2, 0.8, N_Z)]
-            for _ in range(T):
-                after = true[0] * states[-1] + true[1] * states[-1] ** 2
-                states.append(after + disturbance * rng.standard_normal(N_Z))
-            done = Trajectory(np.array(states), np.zeros((T, N_A)))
-            records.add(policy, RolloutResult(1.0, False, done), set())
-        measured = [proposer.loop.measured(record) for record in records.all()]
-        error = mismatch_of_pieces(proposer.loop, model, measured, T // 8)
-        assert 0.0 < error < 0.05
-        assert all(mismatch(proposer.loop, model, [own], 9.0) > 0.05 for own in measured)
-        return chaotic.forgets(proposer.loop, model, error, records.all(), 0.05)
-
-    assert forgets((3.9, -3.9), (3.9001, -3.9001), 0.0)
-    assert not forgets((1.0, 0.0), (1.0, 0.0), 0.03)

@@ -160,6 +160,19 @@ def test_the_riccati_law_of_a_linear_plant_is_reached() -> None:
     np.testing.assert_allclose(found.theta, riccati, atol=0.05)
 
 
+def test_the_less_a_law_is_trusted_to_move_the_less_it_does() -> None:
+    closed, start, first = loop(), fields(3), np.full((N_A, N_S + 1), 0.1)
+    weights, settings = np.full(3, 1 / 3), ModelBasedSettings(least_gain=1e-6)
+    found = [
+        improve(closed, first, start, weights, np.eye(N_A), settings, trust=trust)
+        for trust in (0.0, 1.0, 10.0)
+    ]
+    moves = [np.linalg.norm(each.theta - first) for each in found if each is not None]
+    costs = [each.after for each in found if each is not None]
+    assert len(found) == len(moves) and moves[0] > 1.2 * moves[1] > 1.2 * moves[2] > 0.0
+    assert costs[0] < costs[1] < costs[2] < found[0].before
+
+
 def test_the_same_improvement_has_the_same_bits() -> None:
     arguments = fields(3), np.full(3, 1 / 3), np.eye(N_A), ModelBasedSettings(iterations=5)
     one, other = (improve(loop(), np.zeros((N_A, N_S + 1)), *arguments) for _ in range(2))

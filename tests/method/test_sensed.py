@@ -10,9 +10,10 @@ from threadpoolctl import threadpool_limits
 import pdeloop
 from loop_method.adapt import Context, GaussNewton, Rollout, RolloutResult, Trajectory
 from loop_method.adapt.base import Record
+from loop_method.adapt.loop import Loop
 from loop_method.adapt.proposals.sensed import SensedProposals
-from loop_method.adapt.simulation import Loop
-from loop_method.field_models.sensed import SensedModel, fit_sensed, grid_points, interpolated
+from loop_method.models.sensed import fit_sensed, grid_points, interpolated, sensed_model
+from loop_method.models.spectral import SpectralModel
 from pdeloop.episode import rollout
 from tests.support.small import same_bits
 
@@ -21,7 +22,7 @@ SENSORS = 8
 FIELD = 11
 
 
-def _fitted(problem: pdeloop.Problem, seed: int) -> tuple[SensedModel, Array, float]:
+def _fitted(problem: pdeloop.Problem, seed: int) -> tuple[SpectralModel, Array, float]:
     """From an exploration and a rollout without control."""
     plant = problem.plant()
     explored, actions = problem.explore(seed)
@@ -29,12 +30,22 @@ def _fitted(problem: pdeloop.Problem, seed: int) -> tuple[SensedModel, Array, fl
     readings = np.stack([explored[:-1], uncontrolled.states[:-1, 0]])
     positions = problem.values["actuator_positions"] or _equally_spaced(plant.n_a)
     with threadpool_limits(1):
-        return fit_sensed(
+        shared, fields, error = fit_sensed(
             readings,
             [actions, uncontrolled.actions[:, 0]],
             np.array(positions),
             problem.values["measurement_noise"] * _scale(problem),
         )
+    return sensed_model(shared, SENSORS, np.array(positions), _largest(fields)), fields, error
+
+
+def _largest(fields: Array) -> float:
+    return float(np.abs(fields).max())
+
+
+def _step(model: SpectralModel, z: Array, a: Array) -> Array:
+    """One state a sampling time later."""
+    return model.step(z[None], a[None])[0]
 
 
 def test_the_cost_of_a_rollout_tells_of_the_field_between_the_sensors() -> None:
@@ -49,14 +60,14 @@ def test_the_cost_of_a_rollout_tells_of_the_field_between_the_sensors() -> None:
     def off(*known: Array) -> float:
         """The relative error of the simulated distance from the target."""
         with threadpool_limits(1):
-            model, fields, error = fit_sensed(
-                readings, actions, _equally_spaced(plant.n_a), 0.0, None, *known
-            )
+            centres = _equally_spaced(plant.n_a)
+            shared, fields, error = fit_sensed(readings, actions, centres, 0.0, None, *known)
         assert error < 1e-5
+        model = sensed_model(shared, SENSORS, centres, _largest(fields))
         z, target, squares = fields[1], interpolated(plant.target), []
         for action in actions[1]:
             squares.append(np.mean((z - target) ** 2))
-            z = model.step(z, action)
+            z = _step(model, z, action)
         return abs(float(np.mean(squares)) / distance - 1.0)
 
     assert off() > 0.02
@@ -93,8 +104,8 @@ def test_noise_does_not_hide_the_allen_cahn_equation() -> None:
     model, _, error = _fitted(problem, 1000)
     assert error < 1e-4
     small, none = 1e-3, np.zeros(model.B.shape[1])
-    still = model.step(np.zeros(len(model.B)), none)
-    growth = (model.step(np.full(len(model.B), small), none) - still) / small
+    still = _step(model, np.zeros(len(model.B)), none)
+    growth = (_step(model, np.full(len(model.B), small), none) - still) / small
     assert np.mean(growth) == pytest.approx(np.exp(0.05), rel=0.015)
 
 
@@ -109,16 +120,16 @@ def test_actuators_need_not_be_equally_spaced() -> None:
     np.testing.assert_allclose(x @ effect / effect.sum(axis=0), positions, atol=0.02)
 
 
-def _coefficients(model: SensedModel) -> Array:
+def _coefficients(model: SpectralModel) -> Array:
     """c_11, c_12, c_13, c_21 per second, of a sampling time of 0.01 s."""
     small, n = 1e-4, len(model.B)
     x = np.arange(n) / n
     none = np.zeros(model.B.shape[1])
-    still = model.step(np.zeros(n), none)
+    still = _step(model, np.zeros(n), none)
 
     def effect(z: Array) -> Array:
         """dz/dt in Fourier space."""
-        return np.fft.rfft(model.step(z, none) - still - z) / (0.01 * n / 2)
+        return np.fft.rfft(_step(model, z, none) - still - z) / (0.01 * n / 2)
 
     one, two = (effect(small * np.cos(2 * np.pi * k * x))[k] / small for k in (1, 2))
     k = 2 * np.pi
@@ -132,25 +143,11 @@ def _coefficients(model: SensedModel) -> Array:
     return np.array([transport, diffusion, dispersion, quadratic])
 
 
-@pytest.fixture
-def model() -> SensedModel:
+def test_an_action_moves_the_field_as_the_input_matrix_says() -> None:
     shared = np.array([2.0, 1.0, 1.5, -3.0, 0.2, 0.5, -0.1, 0.1, 5.0, -1.0, 0.5, 2.0])
-    return SensedModel.of(shared, SENSORS, _equally_spaced(5))
-
-
-def test_jacobians_are_the_derivatives_of_a_step(model: SensedModel) -> None:
-    n = len(model.B)
-    z = np.cos(2 * np.pi * np.arange(n) / n) + np.linspace(0.0, 0.5, 3)[:, None]
-    V = np.linalg.qr(np.random.default_rng(0).standard_normal((n, 6)))[0]
-    change, none = V @ np.arange(1.0, 7.0), np.zeros(5)
-    moved = (model.step(z + 1e-3 * change, none) - model.step(z - 1e-3 * change, none)) / 2e-3
-    expected = np.einsum("tij,j->ti", model.jacobians(z, V), np.arange(1.0, 7.0))
-    np.testing.assert_allclose(moved @ V, expected, rtol=1e-4, atol=1e-4)
-
-
-def test_an_action_moves_the_field_as_the_input_matrix_says(model: SensedModel) -> None:
+    model = sensed_model(shared, SENSORS, _equally_spaced(5), 1.0)
     z, action = np.zeros(len(model.B)), np.array([0.0, 1.0, 0.0, 0.0, -0.5])
-    moved = model.step(z, action) - model.step(z, 0.0 * action)
+    moved = _step(model, z, action) - _step(model, z, 0.0 * action)
     effect = model.B @ action
     assert np.linalg.norm(moved - effect) < 0.05 * np.linalg.norm(effect)
 

@@ -13,11 +13,10 @@ import numpy as np
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Record
 from loop_method.adapt.fit import LocalModel, extended_basis, fit
+from loop_method.adapt.loop import Loop
 from loop_method.adapt.proposals.proposal import LEAST_FALL, MODES, Proposal
-from loop_method.adapt.proposals.reproducing import steps_of
 from loop_method.adapt.selection import KAPPAS, LOCAL, RIDGES, Comparison, choices, mismatches
 from loop_method.adapt.sensitivity import damped_step
-from loop_method.adapt.simulation import Loop
 
 # Coordinates that the cubic part of a model acts on, at most.
 _CUBIC_MODES = 12
@@ -86,6 +85,19 @@ def _fit(
     weights = [own * share for own, share in zip(young, shares, strict=True)]
     x, a, after, weight = steps_of(data, weights, V)
     return fit(x, a, after - x, weight, RIDGES, leading=min(_CUBIC_MODES, V.shape[1]))
+
+
+def steps_of(
+    data: Sequence[Record], weights: Sequence[float], V: Array
+) -> tuple[Array, Array, Array, Array]:
+    """V^T z, a and V^T z after of all steps, and the weights of their rollouts."""
+    parts = []
+    for record, weight in zip(data, weights, strict=True):
+        x = record.states @ V
+        n = min(len(record.actions), len(x) - 1)
+        parts.append((x[:n], record.actions[:n], x[1 : n + 1], np.full(n, weight)))
+    before, a, after, every = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    return before, a, after, every
 
 
 def _comparisons(

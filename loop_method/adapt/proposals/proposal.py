@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A policy to try, and what the four kinds of proposals have in common."""
+"""A policy to try, and what the kinds of proposals have in common."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ import numpy as np
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Row
 
+LOCAL = "local"
 # Coordinates of the local models and of the sensitivities, at least.
 MODES = 32
 # A step that predicts less than this share of the cost is not worth its rollouts.
 LEAST_FALL = 1e-3
-# Trust region of a law that is improved on a model, relative to that of a single step.
-TRUST = 1e-2
-# The newest rollouts that a model of the field has to reproduce.
+# Trust region of a law that is improved on a model of the field, per lambda; see `improve`.
+TRUST = 3e-2
+# The newest rollouts that such a model is about.
 COMPARED = 8
-# How many times as far from the mean the additional initial fields lie as the measured ones.
-_BEYOND = 1.5
+# Further initial fields are this many times as far from the mean of the measured ones.
+BEYOND = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,9 +38,12 @@ class Proposal:
         Forgetting.
     mismatch : float
         Their smallest relative error in predicting measured differences of trajectories, or that of the
-        model of the whole field in reproducing the rollouts.
+        model of the whole field in predicting rollouts.
     kind : str
-        "local", "convolution", "differential" or "sensed".
+        "local", "sensed", or the kind of the model of the whole field.
+    believed : str
+        The kind of the model of the whole field that was believed, also where the step is local; empty:
+        none.
     """
 
     policy: Array
@@ -47,7 +51,8 @@ class Proposal:
     models: int
     kappa: float
     mismatch: float
-    kind: str = "local"
+    kind: str = LOCAL
+    believed: str = ""
 
     def row(self) -> Row:
         """What a history row says about it."""
@@ -67,4 +72,4 @@ def spread(fields: Array) -> Array:
     rollouts.
     """
     mean = fields.mean(axis=0)
-    return np.concatenate([fields, mean + _BEYOND * (fields - mean)])
+    return np.concatenate([fields, mean + BEYOND * (fields - mean)])

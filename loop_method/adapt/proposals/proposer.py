@@ -11,22 +11,13 @@ import numpy as np
 
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Context, Record
-from loop_method.adapt.proposals import chaotic, local, whole_field
-from loop_method.adapt.proposals.proposal import COMPARED, Proposal
-from loop_method.adapt.proposals.reproducing import (
-    REPRODUCED,
-    REPRODUCED_NOISY,
-    ranks,
-    reproducing_model,
-    steps_of,
-)
+from loop_method.adapt.loop import Loop
+from loop_method.adapt.proposals import field, local
+from loop_method.adapt.proposals.proposal import Proposal
 from loop_method.adapt.proposals.sensed import MOST_SENSORS, SensedProposals
 from loop_method.adapt.selection import LOCAL
-from loop_method.adapt.simulation import Loop
+from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.trajectories import denoised
-
-# The smallest weight of a rollout in the fit of a model of the whole field.
-_LEAST_WEIGHT = 0.05
 
 
 class Proposer:
@@ -68,7 +59,9 @@ class Proposer:
         self.loop = Loop(U, target, *weights, context.horizon, context.action_limit)
         # Few readings cannot be cleaned; what is fitted to them knows of their noise.
         self._noise = 0.0 if context.sensors else context.noise
-        self._reproduced = REPRODUCED_NOISY if self._noise else REPRODUCED
+        limits = ModelBasedSettings()
+        self._believed = limits.believed_noisy if self._noise else limits.believed
+        self._context = replace(context, noise=self._noise)
         self._cleaned: WeakKeyDictionary[Record, Record] = WeakKeyDictionary()
         exploration = Record(np.zeros_like(policy), np.inf, states, actions)
         self._before = [self._clean(record) for record in (exploration, *context.measured)]
@@ -88,6 +81,7 @@ class Proposer:
         *,
         damping: float,
         accepted: bool,
+        first: str | None = "",
     ) -> Proposal | None:
         """The next policy to try, or None if no model gives a finite step.
 
@@ -103,8 +97,10 @@ class Proposer:
             lambda.
         accepted : bool
             Whether the last candidate was accepted.
+        first : str or None
+            Kind of the model of the whole field to try first; None: try none.
         """
-        loop, reproduced = self.loop, self._reproduced
+        loop = self.loop
         records = [self._clean(record) for record in records]
         incumbents = [self._clean(record) for record in incumbents]
         others = [other and self._clean(other) for other in others]
@@ -120,23 +116,19 @@ class Proposer:
         # A rollout counts less in a fit, the more it costs above the incumbent's.
         level = loop.mean_cost_of(incumbents)
         shares = [min(1.0, level / max(loop.cost_of(record), 1e-300)) ** 2 for record in data]
-        if not self._periodic:  # what the models of the whole field do not describe
-            return local.propose(
-                *(loop, data, shares, incumbents, others), damping=damping, accepted=accepted
-            )
-        model, error, whole = reproducing_model(
-            loop,
-            steps_of(data, [max(share, _LEAST_WEIGHT) for share in shares]),
-            [loop.measured(record) for record in data if record.usable][-COMPARED:],
-            reproduced,
-        )
-        if model is not None and chaotic.forgets(loop, model, error, data, reproduced):
-            return chaotic.propose(loop, model, error, data, policy, damping)
-        if model is not None and whole and (not rejected or ranks(model, loop, rejected)):
-            return whole_field.propose(loop, model, error, data, policy, damping)
-        return local.propose(
+        believed = ""
+        if self._periodic and first is not None:
+            belief, whole = field.field_model(self._context, data, first, self._believed)
+            if belief is not None:
+                believed = belief.model.kind
+                if not rejected or not whole or field.ranks(self._context, belief, rejected):
+                    return field.propose(
+                        *(self._context, belief, whole, data, policy, damping),
+                    )
+        proposal = local.propose(
             *(loop, data, shares, incumbents, others), damping=damping, accepted=accepted
         )
+        return proposal and replace(proposal, believed=believed)
 
     def _clean(self, record: Record) -> Record:
         """The rollout without what of its noise can be told from the fields."""

@@ -7,18 +7,19 @@ Applies where every sensor is read once and a model of the field reproduces the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Record
-from loop_method.adapt.fit import extended_basis
-from loop_method.adapt.proposals.proposal import COMPARED, TRUST, Proposal, spread
-from loop_method.adapt.proposals.reproducing import REPRODUCED
-from loop_method.adapt.simulation import Loop, improve
-from loop_method.field_models.sensed import SHARED, SensedModel, fit_sensed, interpolated
+from loop_method.adapt.closed_loop import ClosedLoop
+from loop_method.adapt.loop import Loop
+from loop_method.adapt.proposals.field import improved
+from loop_method.adapt.proposals.proposal import BEYOND, COMPARED, Proposal, spread
+from loop_method.models.sensed import KIND, SHARED, fit_sensed, interpolated, sensed_model
 
+# The readings are reproduced up to this share of their sum of squares.
+_REPRODUCED = 0.05
 # More point sensors than this are taken for a field.
 MOST_SENSORS = 32
 
@@ -53,34 +54,33 @@ class SensedProposals:
         rollouts = self._chosen(data)
         starts = (self.equation, None) if self.equation.any() else (None,)
         for start in starts:
-            model, fields, error = self._fit(rollouts, start)
-            if error <= REPRODUCED:
+            shared, fields, error = self._fit(rollouts, start)
+            if error <= _REPRODUCED:
                 break
         else:
             return None
-        self.equation = model.shared
+        self.equation = shared
         loop, (sensors, n_s) = self._loop, self._loop.U.shape
-        n = fields.shape[1]
+        n, largest = fields.shape[1], float(np.abs(fields).max())
         U = np.zeros((n, n_s))
         U[n // (2 * sensors) :: n // sensors] = loop.U
-        between = replace(
-            loop,
-            U=U,
-            target=interpolated(loop.target),
-            state_weight=loop.state_weight * sensors / n,
-            noise=self._noise,
+        between = ClosedLoop(
+            sensed_model(shared, sensors, self._centres, BEYOND * largest),
+            U,
+            interpolated(loop.target),
+            loop.state_weight * sensors / n,
+            loop.action_weight,
+            loop.horizon,
+            loop.action_limit,
+            self._noise,
         )
         own = dict(zip((record.states[0].tobytes() for record in rollouts), fields, strict=True))
-        improved = improve(
-            between,
-            model,
-            loop.theta(policy),
-            spread(np.stack(list(own.values()))),
-            extended_basis(U, [np.eye(n)], n),
-            TRUST * damping,
-        )
-        candidate = loop.moved(policy, improved.theta - loop.theta(policy))
-        return Proposal(candidate, improved.fall, 1, 0.0, error, model.name)
+        theta = between.theta(policy)
+        found = improved(between, theta, spread(np.stack(list(own.values()))), damping)
+        if found is None:
+            return None
+        candidate = between.policy(found[0], policy)
+        return Proposal(candidate, found[1], 1, 0.0, error, KIND)
 
     def _chosen(self, records: Sequence[Record]) -> list[Record]:
         """Whole rollouts, the newest, each once, and none that went far away."""
@@ -92,10 +92,8 @@ class SensedProposals:
         }
         return list(whole.values())[-COMPARED:]
 
-    def _fit(
-        self, rollouts: Sequence[Record], start: Array | None
-    ) -> tuple[SensedModel, Array, float]:
-        """The model, the initial fields, and the relative error of the readings."""
+    def _fit(self, rollouts: Sequence[Record], start: Array | None) -> tuple[Array, Array, float]:
+        """The shared unknowns, the initial fields, and the relative error of the readings."""
         readings = [record.acted_from for record in rollouts]
         actions = [record.actions for record in rollouts]
         return fit_sensed(

@@ -28,14 +28,15 @@ Lawson, SIAM J. Numer. Anal. 4(3), 1967 (the integrator: Runge-Kutta with the li
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import scipy  # whose signal processing, half a second of a core, loads when it is used
 from numpy.typing import NDArray
 
 from loop_interfaces.arrays import Array
+from loop_method.models.settings import FieldModelSettings
+from loop_method.models.spectral import SpectralModel
+from loop_method.models.spectral_fit import substeps_of
 
 Spectrum = NDArray[np.complex128]
 
@@ -44,6 +45,7 @@ _TERMS = ((1, 0), (1, 1), (1, 2), (1, 3), (2, 0), (2, 1), (3, 0))
 _COEFFICIENTS = len(_TERMS) + 1
 # b, x_0, s and w.
 _ACTUATORS = 4
+KIND = "sensed"
 SHARED = _COEFFICIENTS + _ACTUATORS
 """Unknowns that all rollouts share."""
 # The wavenumber and the number of samples that give the coefficients and actuators their units.
@@ -91,52 +93,32 @@ def interpolated(readings: Array) -> Array:
     return np.roll(field, n // (2 * sensors))
 
 
-@dataclass(frozen=True, eq=False)
-class SensedModel:
-    """The equation on n grid points, stepped by one sampling time.
+def sensed_model(shared: Array, sensors: int, centres: Array, largest: float) -> SpectralModel:
+    """The equation on the grid for this many sensors.
 
-    Attributes
+    Parameters
     ----------
     shared : (12,) array
         The unknowns that all rollouts share, in their units.
+    sensors : int
+        n_y.
     centres : (n_a,) array
         x_i, as it was declared.
-    B : (n, n_a) array
-        What the actions do in a sampling time.
+    largest : float
+        Largest |z| that is simulated; the internal steps follow it.
     """
-
-    shared: Array
-    centres: Array
-    B: Array
-
-    name = "sensed"
-    components = 1
-
-    @classmethod
-    def of(cls, shared: Array, sensors: int, centres: Array) -> SensedModel:
-        """With the grid for this many sensors."""
-        n = grid_points(sensors)
-        return cls(shared, centres, np.fft.irfft(_Equation(shared, n, centres).actuators, n).T)
-
-    @cached_property
-    def _equation(self) -> _Equation:
-        return _Equation(self.shared, len(self.B), self.centres)
-
-    def step(self, z: Array, a: Array) -> Array:
-        """The field after a sampling time from z (..., n), with the actions a (..., n_a)."""
-        after = self._equation.step(np.fft.rfft(z), self._equation.force(a))
-        moved: Array = np.fft.irfft(after, z.shape[-1])
-        return moved
-
-    def jacobians(self, z: Array, V: Array) -> Array:
-        """V^T (d step / dz) V, (T, r, r), at the states z (T, n); V (n, r) is orthonormal."""
-        size = _DIFFERENCE * max(float(np.abs(z).max()), 1e-300)
-        force = self._equation.force(np.zeros(self.B.shape[1]))
-        first = self._equation.step(np.fft.rfft(z), force)
-        changed = self._equation.step(np.fft.rfft(z[:, None] + size * V.T), force)
-        moved = np.fft.irfft((changed - first[:, None]) / size, z.shape[1])
-        jacobians: Array = (moved @ V).swapaxes(1, 2)
-        return jacobians
+    n = grid_points(sensors)
+    equation = _Equation(shared, n, centres)
+    symbols = np.stack([equation.linear, equation.square, equation.cube])
+    return SpectralModel(
+        KIND,
+        equation.linear,
+        symbols[1:],
+        np.eye(2),
+        np.fft.irfft(equation.actuators, n).T,
+        np.full(n, equation.constant / n),
+        substeps=substeps_of(symbols, largest, FieldModelSettings()),
+    )
 
 
 class _Equation:
@@ -151,11 +133,11 @@ class _Equation:
         for i, (p, j) in enumerate(_TERMS):
             unit = 1.0 / (_TIME * _WAVENUMBER**j)
             symbols[p - 1] += unit * shared[..., i, None] * derivative**j
-        linear, self._square, self._cube = symbols
-        linear = np.minimum(linear.real, _FASTEST_GROWTH) + 1j * linear.imag
-        self._half = np.exp(0.5 * linear)
+        linear, self.square, self.cube = symbols
+        self.linear = np.minimum(linear.real, _FASTEST_GROWTH) + 1j * linear.imag
+        self._half = np.exp(0.5 * self.linear)
         self._whole = self._half**2
-        self._constant = n / _TIME * shared[..., _COEFFICIENTS - 1]
+        self.constant = n / _TIME * shared[..., _COEFFICIENTS - 1]
         b, x_0, s, w = np.moveaxis(shared[..., _COEFFICIENTS:, None, None], -3, 0) / _TIME
         n_a = len(centres)
         own = np.arange(n_a)[:, None]
@@ -168,7 +150,7 @@ class _Equation:
     def force(self, a: Array) -> Spectrum:
         """The constant, and the effect of the actions (..., n_a)."""
         force: Spectrum = (a[..., None, :] @ self.actuators)[..., 0, :]
-        force[..., 0] += self._constant
+        force[..., 0] += self.constant
         return force
 
     def step(self, z: Spectrum, force: Spectrum) -> Spectrum:
@@ -186,8 +168,8 @@ class _Equation:
         field = 2.0 * np.fft.irfft(z, 2 * self.n)
         square = field * field
         rate: Spectrum = force + 0.5 * (
-            self._square * np.fft.rfft(square)[..., :count]
-            + self._cube * np.fft.rfft(square * field)[..., :count]
+            self.square * np.fft.rfft(square)[..., :count]
+            + self.cube * np.fft.rfft(square * field)[..., :count]
         )
         rate *= self._kept
         return rate
@@ -201,7 +183,7 @@ def fit_sensed(
     start: Array | None = None,
     target: Array | None = None,
     distances: Array | None = None,
-) -> tuple[SensedModel, Array, float]:
+) -> tuple[Array, Array, float]:
     """Fit the equation and the initial fields of rollouts.
 
     Parameters
@@ -221,9 +203,9 @@ def fit_sensed(
 
     Returns
     -------
-    SensedModel, (rollouts, n) array and float
-        The one with the least error, its initial fields, and the error: what is minimised, but for
-        the ridge and for what noise has in it.
+    (12,) array, (rollouts, n) array and float
+        The shared unknowns with the least error, the initial fields, and the error: what is minimised,
+        but for the ridge and for what noise has in it.
     """
     y, a = np.stack(readings), np.stack(actions)
     if target is None or distances is None:
@@ -240,9 +222,8 @@ def fit_sensed(
     else:
         shared = start
     error, shared, fields = problem.fit(shared, fields)
-    model = SensedModel.of(shared, y.shape[2], centres)
-    n = len(model.B)
-    return model, np.fft.irfft(_spectrum(fields, n), n), max(error - problem.noise, 0.0)
+    n = grid_points(y.shape[2])
+    return shared, np.fft.irfft(_spectrum(fields, n), n), max(error - problem.noise, 0.0)
 
 
 def _first_guess(problem: _Problem) -> tuple[Array, Array]:

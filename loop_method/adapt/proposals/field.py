@@ -1,0 +1,103 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""A law that is improved on a model of the whole field.
+
+Applies where such a model predicts the rollouts. Of a chaotic plant, which forgets where it began, it
+predicts pieces of them alone. There a cost depends on the initial field as if by chance, and a law that
+is better from a few of them is not from others. So it is improved from many measured states, and tried
+only where it is better from others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from loop_interfaces.arrays import Array
+from loop_method.adapt.base import Context, Record
+from loop_method.adapt.belief import Belief, believe
+from loop_method.adapt.closed_loop import ClosedLoop
+from loop_method.adapt.improve import improve
+from loop_method.adapt.proposals.proposal import COMPARED, LEAST_FALL, TRUST, Proposal, spread
+from loop_method.adapt.renewal import curvature_of
+from loop_method.adapt.sensitivity import ISOTROPY
+from loop_method.adapt.settings import ModelBasedSettings
+
+SETTINGS = ModelBasedSettings(isotropy=ISOTROPY)
+# Chaos: the error of a rollout is more than this many times that of its pieces; noise adds up more
+# slowly.
+_GROWTH, _PIECES = 20.0, 8
+# A law is improved from this many measured states, one of three, and judged by its cost from others.
+_STARTS, _HELD_OUT = 80, 3
+
+
+def field_model(
+    context: Context, data: Sequence[Record], first: str, most: float
+) -> tuple[Belief | None, bool]:
+    """The model of the whole field that predicts the rollouts, and whether it does as a whole.
+
+    first: the kind to try first; most: the largest error E.
+    """
+    whole = believe(context, data, first)
+    if whole is None or whole.error <= most:
+        return whole, True
+    parts = believe(context, data, first, _PIECES)
+    chaotic = parts is not None and parts.error <= min(most, whole.error / _GROWTH)
+    return (parts if chaotic else None), False
+
+
+def propose(
+    context: Context,
+    belief: Belief,
+    whole: bool,
+    data: Sequence[Record],
+    policy: Array,
+    damping: float,
+) -> Proposal | None:
+    """The best law on the model near to a policy, or None where that gains nothing."""
+    loop = belief.loop(context)
+    if whole:
+        fields = list({record.states[0].tobytes(): record.states[0] for record in data}.values())
+        chosen, others = spread(np.stack(fields[-COMPARED:])), None
+    else:
+        states = np.concatenate([record.states for record in data])
+        every = states[np.linspace(0, len(states) - 1, _STARTS * _HELD_OUT).astype(int)]
+        held_out = np.arange(len(every)) % _HELD_OUT > 0
+        chosen, others = every[~held_out], every[held_out]
+    first = loop.theta(policy)
+    found = improved(loop, first, chosen, damping)
+    if found is None:
+        return None
+    theta, fall = found
+    if others is not None:
+        with np.errstate(invalid="ignore"):
+            before, after = (loop.costs(law, others).mean() for law in (first, theta))
+            fall = before - after
+        if not fall > LEAST_FALL * before:  # also where it is not finite
+            return None
+    kind = belief.model.kind
+    return Proposal(loop.policy(theta, policy), fall, 1, 0.0, belief.error, kind, kind)
+
+
+def improved(
+    loop: ClosedLoop, theta: Array, fields: Array, damping: float
+) -> tuple[Array, float] | None:
+    """The best law on a model near to theta, and by how much its cost is lower."""
+    weights = np.full(len(fields), 1.0 / len(fields))
+    found = improve(
+        *(loop, theta, fields, weights, curvature_of(loop), SETTINGS), trust=TRUST * damping
+    )
+    return None if found is None else (found.theta, found.before - found.after)
+
+
+def ranks(context: Context, belief: Belief, rejected: Sequence[tuple[Record, Record]]) -> bool:
+    """Whether the rejected candidate costs more than the incumbent on the model, too.
+
+    rejected: rollouts of the incumbent and of the candidate on the same fields.
+    """
+    loop = belief.loop(context)
+    fields = np.stack([incumbent.states[0] for incumbent, _ in rejected])
+    incumbent, candidate = (
+        loop.costs(loop.theta(record.policy), fields).mean() for record in rejected[0]
+    )
+    return bool(candidate > incumbent)
