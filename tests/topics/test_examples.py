@@ -24,7 +24,7 @@ from pde_sim_node.equations import ALLOWED, Equation, load_equation
 from pdeloop.cli import main
 from tests.support.loop_harness import ROOT, Processes, until
 from tests.support.small_loop import LIMIT
-from tests.topics.test_foreign import STAND_IN, code_block, documented_command
+from tests.topics.test_foreign import PLANT, documented_command
 
 pytestmark = pytest.mark.topics
 PAGE = (ROOT / "docs" / "bring-your-own.md").read_text()
@@ -134,9 +134,8 @@ def test_a_pde_of_ones_own_is_offered_by_its_package() -> None:
 def test_a_model_from_a_bag_of_a_foreign_plant_starts_a_training(
     loop: Processes, tmp_path: Path
 ) -> None:
-    (tmp_path / "linear_plant.py").write_text(code_block(STAND_IN, "python", "class LinearPlant"))
     mark = "pdeloop identify --bag lab"
-    loop.start(str(tmp_path / "linear_plant.py"), name="linear_plant")
+    loop.start(str(PLANT), name="linear_plant")
     loop.node("controller_node", *documented_command("controller_node"))
     recorder = loop.node("recorder_node", *ros_arguments(mark, "recorder_node"))
     out = f"out:={tmp_path / 'first'}"

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What the documents say is enough: their examples are taken from the pages and run as they stand."""
+"""What the documents say is enough: their examples and commands run as they stand."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from tests.support.small_loop import LIMIT
 
 pytestmark = pytest.mark.topics
 STAND_IN = (ROOT / "docs" / "stand-in.md").read_text()
+PLANT = ROOT / "examples" / "linear_plant.py"
 
 
 def code_block(page: str, language: str, mark: str) -> str:
@@ -29,23 +30,22 @@ def code_block(page: str, language: str, mark: str) -> str:
 
 def documented_command(mark: str) -> list[str]:
     """The ROS arguments of the documented shell line that starts with `mark`."""
-    block = code_block(STAND_IN, "sh", "python linear_plant.py").replace("\\\n", " ")
+    block = code_block(STAND_IN, "sh", "python examples/linear_plant.py").replace("\\\n", " ")
     (line,) = [line for line in block.splitlines() if line.startswith(mark)]
     return line.split("--ros-args")[1].split()
 
 
-def test_a_linear_plant_written_from_the_page_is_identified_and_tuned(
+def test_a_linear_plant_of_ordinary_messages_is_identified_and_tuned(
     loop: Processes, tmp_path: Path
 ) -> None:
-    source = code_block(STAND_IN, "python", "class LinearPlant")
-    assert "pdeloop" not in re.sub(r'"""[^"]*"""', "", source)
+    source = PLANT.read_text()
+    assert "pdeloop" not in re.sub(r'#.*|"""[^"]*"""', "", source)
     assert not re.search(r"import (loop_interfaces|pde_sim_node|controller_node|pdeloop)", source)
-    (tmp_path / "linear_plant.py").write_text(source)
     space: dict[str, np.ndarray] = {"__name__": "linear_plant"}
     exec(compile(source.split("VOLATILE =")[0], "linear_plant", "exec"), space)
     A, B, target = (np.asarray(space[name]) for name in ("A", "B", "TARGET"))
 
-    loop.start(str(tmp_path / "linear_plant.py"), name="linear_plant")
+    loop.start(str(PLANT), name="linear_plant")
     check = loop.start("-m", "pdeloop", "check", "plant", "--n-a", "2", name="check")
     assert "BAD" not in loop.wait(check, LIMIT)
     loop.node("controller_node", *documented_command("controller_node"))
