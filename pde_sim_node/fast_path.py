@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numba.extending import register_jitable
 
 from fast_path import channel
 from fast_path.handler import FastPath, fast_handler, plan_type
@@ -71,7 +70,7 @@ def add_sample(plan: Any, kind: int, time: float, raw: int, length: int) -> None
             append(batch, kind, stamp, time, raw, length)
 
 
-@register_jitable  # type: ignore[untyped-decorator, unused-ignore]
+@jit
 def advance(plan: Any, head: int, message: int, length: int) -> bool:
     """Apply the awaited action, and fill in the next state."""
     if load_unaligned(head, STEP) != plan.step or plan.steps == plan.limit:

@@ -12,7 +12,6 @@ environment is computed alone and by the same instructions whatever stands besid
 from typing import Any
 
 import numpy as np
-from numba.extending import register_jitable
 
 from loop_interfaces.jit import native, simd
 from loop_interfaces.jit.cache import jit
@@ -95,7 +94,7 @@ def advance_component(
         put(w, plan.x + k, d, total)
 
 
-@register_jitable  # type: ignore[untyped-decorator, unused-ignore]
+@jit
 def advance(state: int, action: int, w: int, d: int, plan: Any, c: int, e: int) -> None:
     """The state a sampling time later, in the scratch."""
     for f in range(plan.components):

@@ -17,7 +17,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numba.extending import register_jitable
 
 from loop_interfaces.jit import native, simd
 from loop_interfaces.jit.cache import jit
@@ -142,7 +141,7 @@ def force(action: int, w: int, d: int, plan: Any, c: int, e: int) -> None:
         put(w, plan.ff + k, d, product(c, plan.f + k, e, total))
 
 
-@register_jitable  # type: ignore[untyped-decorator, unused-ignore]
+@jit
 def advance(state: int, action: int, w: int, d: int, plan: Any, c: int, e: int) -> None:
     """The state a sampling time later, in the scratch."""
     force(action, w, d, plan, c, e)

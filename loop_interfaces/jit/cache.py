@@ -13,21 +13,57 @@ import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from types import FunctionType, ModuleType
+from types import FunctionType, ModuleType, SimpleNamespace
 from typing import Any, TypeVar
 
 import numba
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler
 
 from loop_interfaces.files import private_folder
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 
+class _Part(JITCodeLibrary):  # type: ignore[misc, unused-ignore]
+    """The code of a function that only compiled functions call: no machine code is made of it.
+
+    Numba would optimise it and make machine code of it, with all that it calls, and do so again for
+    each function that calls it.
+    """
+
+    @property
+    def codegen(self) -> Any:
+        """What puts Python objects into machine code, where there is none."""
+        return SimpleNamespace(set_env=lambda name, environment: None)
+
+    def get_pointer_to_function(self, name: str) -> int:
+        self._ensure_finalized()  # type: ignore[no-untyped-call, unused-ignore]
+        return 0
+
+    def _optimize_final_module(self) -> None:
+        """Left to the function that is made of it."""
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()  # type: ignore[no-untyped-call, unused-ignore]
+        self._verify_declare_only_symbols()  # type: ignore[no-untyped-call, unused-ignore]
+        self._finalized = True
+
+
+class _PartCompiler(Compiler):  # type: ignore[misc, unused-ignore]
+    """Numba's compiler, for a `_Part`."""
+
+    def __init__(self, typing: Any, target: Any, library: Any, *how: Any) -> None:
+        made: Any = _Part
+        parts = library or made(target.codegen(), "part")
+        super().__init__(typing, target, parts, *how)  # type: ignore[no-untyped-call, unused-ignore]
+
+
 def jit(function: F) -> F:
     """Compile as a part of a function that is cached; only compiled code can call it."""
     # Options of the CPU target that Numba's declarations of njit leave out.
     entries: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-    compiled: F = numba.njit(**entries)(function)
+    compiled: F = numba.njit(pipeline_class=_PartCompiler, **entries)(function)
     return compiled
 
 
