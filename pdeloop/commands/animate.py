@@ -32,8 +32,14 @@ def add(commands: Commands) -> None:
     add = animate.add_argument
     add("folder", type=a_path, metavar="RUN", help="folder of a finished run")
     add("--out", type=a_path, metavar="FILE", help=f".gif or .mp4 [RUN/{NAME}]")
-    add("--field", type=int, default=0, metavar="I", help="of the closing evaluation [0]")
-    add("--seconds", type=float, default=6.0, metavar="S", help="that it lasts [6]")
+    add(
+        "--field",
+        type=int,
+        default=0,
+        metavar="I",
+        help="initial field of the closing evaluation, by its number [0]",
+    )
+    add("--seconds", type=float, default=6.0, metavar="S", help="duration in seconds [6]")
     add_own_code(animate, ("equation", "plant", "optimizer"))
 
 

@@ -25,7 +25,7 @@ def add(commands: Commands) -> None:
         commands,
         "bag",
         None,
-        help="look into a recorded bag, verify it",
+        help="inspect or verify a recorded bag",
         description="Look into a bag that --record or recorder_node wrote, or verify it "
         "(docs/recording.md).",
         example="pdeloop bag info runs/burgers-20260101-120000-1",

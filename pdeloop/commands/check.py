@@ -37,7 +37,7 @@ def add(commands: Commands) -> None:
         commands,
         "check",
         _check,
-        help="whether a problem can be trained on, or a node of yours keeps to the interface",
+        help="whether a problem can be trained on, or a node of your own keeps to the protocol",
         description="Check a problem before training on it: halve the integration step, see whether "
         "the actuators reach the modes that are unstable at the target, explore once, say which order "
         "the data support and what the first law costs, and draw fields and supports. Exit code "
@@ -55,11 +55,13 @@ def add(commands: Commands) -> None:
     )
     whole, real = _number(int, 1, 65536), _number(float, 0.1, 86400.0)
     add_option = check.add_argument_group("of a node").add_argument
-    add_option("--n-a", type=_number(int, 1, 1024), metavar="N", help="its actuators [1]")
-    add_option("--n-z", type=whole, metavar="N", help="a controller's state [64, and its order]")
+    add_option("--n-a", type=_number(int, 1, 1024), metavar="N", help="number of its actuators [1]")
+    add_option(
+        "--n-z", type=whole, metavar="N", help="size of a controller's state [64, and its order]"
+    )
     add_option("--patience", type=real, metavar="S", help="seconds that an answer may take [10]")
     add_option("--limit", type=real, metavar="S", help="seconds that the check may take [600]")
-    add_option("--namespace", metavar="NS", help="where its topics are")
+    add_option("--namespace", metavar="NS", help="namespace of its topics")
     add_option("--network", action="store_true", default=None, help="it may run on another machine")
     add_own_code(check)
     check.add_argument(

@@ -80,8 +80,8 @@ def add_own_code(
         parser.add_argument(
             *spellings(f"--{word}"),
             metavar="NAME",
-            help=f"{what}; code of your own, 'file.py:Class' or 'package.module:Class', has to be "
-            "named here as well, because a file alone never gets code executed",
+            help=f"{what}; your own code, 'file.py:Class' or 'package.module:Class', runs only if "
+            "it is named here",
         )
 
 

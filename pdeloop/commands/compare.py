@@ -15,7 +15,7 @@ def add(commands: Commands) -> None:
         commands,
         "compare",
         _compare,
-        help="finished runs beside each other: costs, and the parameters that differ",
+        help="costs of finished runs side by side, and the parameters that differ",
         description="Show the costs of finished runs in one table, each adapted policy against the "
         "first one's on the same initial fields, with a bootstrap interval of 95 percent over the "
         "fields, and the parameters in which the runs differ. Where these change the plant, the cost "

@@ -41,7 +41,7 @@ def add(commands: Commands) -> None:
         action="store_true",
         help="the mean of the initial distribution instead of sampled fields",
     )
-    add_set(evaluate, "the policies under another parameter of the plant or the cost: any")
+    add_set(evaluate, "evaluate under another value of a parameter of the plant or the cost")
     add_own_code(evaluate, ("equation", "plant", "optimizer", "law"))
     add_json(evaluate, "print the costs as JSON: {controller: [[cost a field] a seed]}")
 

@@ -25,10 +25,12 @@ def add(commands: Commands) -> None:
     )
     add_argument = export.add_argument
     add_argument("folder", type=a_path, metavar="RUN", help="folder of a finished run")
-    add_argument("--out", type=a_path, metavar="FILE", help="the law, as .npz or .c")
+    add_argument("--out", type=a_path, metavar="FILE", help="write the law to this .npz or .c")
     add_argument("--law", choices=("adapted", "lqt"), help="which law [adapted]")
-    add_argument("--seed", type=int, metavar="S", help="of which training seed [the first]")
-    add_argument("--curve", type=a_path, metavar="FILE", help="the curve of all seeds, as .csv")
+    add_argument("--seed", type=int, metavar="S", help="training seed of the law [the first]")
+    add_argument(
+        "--curve", type=a_path, metavar="FILE", help="write the curves of all seeds to this .csv"
+    )
 
 
 def _export(options: argparse.Namespace) -> int:

@@ -22,7 +22,7 @@ def add(commands: Commands) -> None:
         commands,
         "identify",
         _identify,
-        help="reduced model from recorded episodes or own measurements",
+        help="reduced model from recorded episodes or your own measurements",
         description="Identify a reduced model by least squares in reduced coordinates, design "
         "LQ-tracking gains, and show which order the data support: singular values, and errors on "
         "held-out steps. From the exploratory episodes of a bag (all episodes if none is), of this "

@@ -35,9 +35,23 @@ def add(commands: Commands) -> None:
         metavar="DIR",
         help="folder of a run: show this one only [the newest that runs]",
     )
-    add("--port", type=int, default=PORT, metavar="N", help=f"0: a free one [{PORT}]")
-    add("--namespace", metavar="NS", help="of the pair to show first [the first there is]")
-    add("--environment", type=int, default=0, metavar="M", help="of each episode [0]")
+    add(
+        "--port",
+        type=int,
+        default=PORT,
+        metavar="N",
+        help=f"port of the page; 0: any free one [{PORT}]",
+    )
+    add(
+        "--namespace", metavar="NS", help="namespace of the pair to show first [the first there is]"
+    )
+    add(
+        "--environment",
+        type=int,
+        default=0,
+        metavar="M",
+        help="environment to show of each episode [0]",
+    )
     add("--open", action="store_true", help="open the page in the browser")
     add(
         "--network",

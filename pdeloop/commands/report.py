@@ -30,7 +30,9 @@ def add(commands: Commands) -> None:
         "folder", type=a_path, metavar="DIR", help="folder of a finished run or reproduction"
     )
     add_own_code(report, ("equation", "plant", "optimizer", "law"))
-    report.add_argument("--out", type=a_path, metavar="DIR", help="[DIR/report]")
+    report.add_argument(
+        "--out", type=a_path, metavar="DIR", help="folder of the report [DIR/report]"
+    )
 
 
 def _report(options: argparse.Namespace) -> int:

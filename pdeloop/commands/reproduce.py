@@ -29,7 +29,7 @@ def add(commands: Commands) -> None:
         commands,
         "reproduce",
         _reproduce,
-        help="the paper's experiment: its four controllers and Gauss-Newton, several seeds, a table",
+        help="the paper's experiment, over several seeds: its four controllers and Gauss-Newton",
         description="For each problem and seed: no control, LQT, LQT-PO and pure PO of the paper, and "
         "Gauss-Newton, with the cost of every policy on the evaluation fields. Ctrl-C interrupts; "
         "--out DIR of an interrupted reproduction continues it.",

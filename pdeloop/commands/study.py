@@ -35,7 +35,7 @@ def add(commands: Commands) -> None:
         commands,
         "study",
         _study,
-        help="many trainings, problems by variants by seeds, on this machine or a cluster, a table",
+        help="many trainings (problems, variants, seeds) on this machine or a cluster",
         description="Train every problem of a study with every variant and every seed, each in a "
         "process of its own, and compare them. Ctrl-C interrupts; --out DIR of an interrupted study "
         "continues it. docs/scaling.md shows a study's file.",
