@@ -26,7 +26,7 @@ from pdeloop.output import print_json
 
 PROGRAMS = {
     "first_run": "where the time of the first `make run` in a fresh clone goes",
-    "rtt": "rounds a second of the loop beside a bare ping-pong",
+    "rtt": "rounds per second of the loop, compared with a bare ping-pong",
     "batch": "environment-steps a second against the batch",
     "train": "a whole training: topics against in-process",
     "realtime": "jitter and missed deadlines at P1's 20 Hz and at 1 kHz",
@@ -38,7 +38,7 @@ PROGRAMS = {
     "linearised": "what the LQR law of the exact linearisation at the target costs",
     "environments": "steps a second of the Gymnasium environments",
     "participants": "memory and processor time of many idle nodes that know each other",
-    "kernel": "time of a step beside other implementations",
+    "kernel": "time of a step, compared with other implementations",
 }
 
 

@@ -1,8 +1,8 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """`python -m benchmarks environments`: environment-steps a second of the Gymnasium environments.
 
-The batch of `VectorEnvironment` beside Gymnasium's own vector environments of as many single ones, in
-one process (sync) and in a process each (async), and beside those of controlgym's environment of the
+The batch of `VectorEnvironment` against Gymnasium's own vector environments of as many single ones, in
+one process (sync) and in a process each (async), and against those of controlgym's environment of the
 same equation, grid, actuators and steps, under constant actions.
 """
 

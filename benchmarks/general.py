@@ -166,7 +166,7 @@ def bound(name: str) -> dict[str, float]:
 
 
 def keep_bound(name: str, found: Mapping[str, float]) -> None:
-    """Write the bounds of a case beside those of the others."""
+    """Write the bounds of a case next to those of the others."""
     known = read_json(BOUNDS) if BOUNDS.exists() else {}
     known[name] = dict(found)
     BOUNDS.write_text(json.dumps(dict(sorted(known.items())), indent=1) + "\n")

@@ -85,13 +85,13 @@ def server_command() -> tuple[list[str], str]:
     Raises
     ------
     BenchError
-        There is no such program, neither beside Python nor on the path.
+        There is no such program, neither next to Python nor on the path.
     """
     beside = str(Path(sys.executable).parent)
     program = shutil.which(SERVER, path=beside) or shutil.which(SERVER)
     if program is None:
         raise BenchError(
-            f"expected the program {SERVER} beside Python or on the path, found none; install Fast "
+            f"expected the program {SERVER} next to Python or on the path, found none; install Fast "
             "DDS's tools, or choose --discovery multicast"
         )
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:

@@ -82,7 +82,7 @@ AGENTS = {"plain": plain, "informed": informed}
 
 
 class Episodes(VecEnvWrapper):  # type: ignore[misc, unused-ignore]  # untyped where it is not installed
-    """The plants as an agent is told of them; `ended` counts their episodes."""
+    """The plants as an agent sees them; `ended` counts their episodes."""
 
     def __init__(self, plants: VecEnvironment, signals: Signals, reward: float) -> None:
         self._signals, self._factor = signals, reward / signals.unit

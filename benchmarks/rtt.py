@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""`python -m benchmarks rtt`: the loop's rounds a second beside a bare ping-pong, in one run.
+"""`python -m benchmarks rtt`: the loop's rounds per second against a bare ping-pong, in one run.
 
 Both run all the time, in processes of their own, and take turns of a fraction of a second, so that
 what else the machine does weighs on both alike; the figures are medians over the turns. A round of

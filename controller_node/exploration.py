@@ -17,7 +17,7 @@ from loop_interfaces.topics import COMPLETED, MODEL_IDENTIFIED, VOID, CostColumn
 class Exploration:
     """The exploratory episode that a start begins.
 
-    outcomes: what came out of it, by plant, filled in by the responder; nbytes: size of the states
+    outcomes: results, by plant, filled in by the responder; nbytes: size of the states
     that are kept, and of what keeps them.
     """
 

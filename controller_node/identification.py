@@ -139,7 +139,7 @@ def check_sizes(settings: DesignSettings, state_size: int, steps: int) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Designed:
-    """A law, and of the identification "field" what came of a model of the whole field."""
+    """A law and, for the identification "field", the report on the model of the whole field."""
 
     rows: ModelRows
     field: FieldLaw | None = None

@@ -114,7 +114,7 @@ class ProjectedLaw:
         self._set = True
 
     def _take(self, gains: Array, index: IndexArray) -> None:
-        # A plain sum over the modes, one environment beside the other.
+        # A plain sum over the modes, one environment next to the other.
         constant: Array = np.zeros(gains.shape[:2])
         for j in range(self._n_s):
             constant += gains[:, :, self._n_s + j] * self._reduced_targets[index, j, None]

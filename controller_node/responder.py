@@ -113,7 +113,7 @@ class Responder:
     def start(self, frame: Frame) -> Sequence[Publication | ModelFailure]:
         """Take the start of an episode: whether it explores, and which model each environment uses.
 
-        Repeated, it is answered with what came out of an exploration; one of an earlier episode is
+        A repeated one is answered with the result of an exploration; one of an earlier episode is
         ignored. Another one for the same episode asks for a new one, as the plant may have taken
         either. FrameError for rows that are none of a start, and where there is no room for another
         run.

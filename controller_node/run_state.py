@@ -12,7 +12,7 @@ from loop_interfaces.signature import digest_of
 from loop_method.laws.base import Law
 
 MAX_KEPT = 4
-"""Policies, and sets of reduced models, that are kept of a run: a stranger's beside the tuner's."""
+"""Policies, and sets of reduced models, kept per run: room for a stranger's besides the tuner's."""
 
 
 @dataclass(frozen=True)

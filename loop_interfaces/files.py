@@ -139,7 +139,7 @@ def try_lock(file: BinaryIO | BufferedReader, *, shared: bool = False) -> bool:
     except OSError as error:
         raise FileError(
             f"cannot be locked ({error.strerror}), so nothing would keep two processes "
-            "from writing beside it at once; expected a file system with locks, such as a local disk"
+            "from writing at the same time; expected a file system with locks, such as a local disk"
         ) from error
     return True
 

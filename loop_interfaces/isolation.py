@@ -44,8 +44,8 @@ def check_profile() -> None:
             return
         reason = "it has no element <profiles>"
     raise ValueError(
-        f"{PROFILE}={path} is no Fast DDS profile ({reason}); Fast DDS would send to every interface: "
-        "correct it, or unset the variable to stay on this machine"
+        f"{PROFILE}={path} is not a Fast DDS profile ({reason}); Fast DDS would send to every "
+        "interface: correct it, or unset the variable to stay on this machine"
     )
 
 

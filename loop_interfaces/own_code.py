@@ -87,7 +87,7 @@ class OwnCode:
             )
 
     def load(self, name: str) -> Any:
-        """What a name stands for; code is executed, whoever wrote it.
+        """The object that a name stands for. This executes code, whoever wrote it.
 
         Raises
         ------
@@ -207,7 +207,7 @@ def load_file(path: Path, word: str) -> ModuleType:
 
 
 def refuse_while_executed(what: str) -> None:
-    """RuntimeError if a file of own code, which is being executed to get at a name, does `what`.
+    """RuntimeError if a file of user code, being executed for a name that it defines, does `what`.
 
     A program that trains its own plant over topics would otherwise start itself again in each node.
     """
@@ -220,7 +220,7 @@ def refuse_while_executed(what: str) -> None:
 
 @contextmanager
 def _being_executed(path: Path) -> Iterator[None]:
-    """It finds modules beside it meanwhile, last: they hide none that is installed."""
+    """Meanwhile it finds modules next to it, after all installed ones, which they cannot hide."""
     _executing.append(path)
     folder, before = str(path.parent), list(sys.path)
     sys.path.append(folder)

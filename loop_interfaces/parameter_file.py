@@ -164,7 +164,7 @@ def _blocks(node: yaml.Node, outer: str) -> Iterator[tuple[str, yaml.MappingNode
             raise ValueError(
                 f"{shown(outer)} is not the name of a node (line {_line(key)})"
                 if outer
-                else f"'{_PARAMETERS}' stands below no name of a node in line {_line(key)}"
+                else f"'{_PARAMETERS}' is not below the name of a node in line {_line(key)}"
             )
         if number < len(node.value):  # ROS does not know any more where it stands
             raise ValueError(

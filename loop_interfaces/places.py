@@ -15,7 +15,7 @@ from loop_interfaces.arrays import Array
 from loop_interfaces.grid import Axis, Grid
 
 MOST = 256
-"""Actuators that are told of; more nobody can tell apart in a picture."""
+"""Most actuators that are reported; more could not be told apart in a picture."""
 
 
 @dataclass(frozen=True)

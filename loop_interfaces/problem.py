@@ -67,7 +67,7 @@ def load_parameters(
     """The checked parameters of all nodes: a problem's file, then `options`, then the defaults.
 
     preferred: adds defaults that depend on what is given. `physical.*` and `optimizer_settings.*` are
-    included as given; a relative file of own code ('file.py:Class') is taken relative to the YAML file.
+    included as given; a relative file of user code ('file.py:Class') is relative to the YAML file.
     name: empty where the options name a plant, which needs no file. What a plant of a user's own says
     itself (OF_THE_PLANT) is left out where nothing else is given.
     """

@@ -100,7 +100,7 @@ def run(node: str) -> int:
     code: int = module.main()
     sys.stdout.flush()
     sys.stderr.flush()
-    # All is closed. What is left, to take the interpreter apart, costs a third of a second of a core.
+    # Everything is closed. Tearing down the interpreter would still cost a third of a core second.
     os._exit(code)
 
 

@@ -96,6 +96,6 @@ def _own_plant(values: Mapping[str, Any]) -> tuple[Plant, Mapping[str, Any]]:
             )
     if values.get("cost") and "".join(values["cost"]) != "".join(plant.cost.texts):
         raise ParameterError(
-            f"parameter 'cost' is another one than that of {values['plant']}; leave it out"
+            f"parameter 'cost' differs from that of {values['plant']}; leave it out"
         )
     return plant, made.parameters

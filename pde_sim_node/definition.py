@@ -47,7 +47,7 @@ class Definition:
 def sources_of(kind: type, root: type) -> list[str]:
     """The source of a class and of its base classes below `root`.
 
-    Each with its whole module: constants and functions beside the class are part of it.
+    Each with its whole module: constants and functions next to the class are part of it.
     """
     return [source_of(base) for base in kind.__mro__ if issubclass(base, root)]
 

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Finished runs beside each other: costs, what differs, and whether they compare at all."""
+"""Finished runs side by side: costs, differences, and whether they are comparable at all."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class Comparison:
 
 
 def compare(runs: Sequence[FinishedRun]) -> Comparison:
-    """Finished runs beside each other, in the order given."""
+    """Finished runs side by side, in the order given."""
     names = dict.fromkeys(name for run in runs for name in run.values)
     differing = {}
     for name in names:

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Own measurements in files, .npz or .csv (docs/identification.md), as trajectories."""
+"""The user's measurements in files, .npz or .csv (docs/identification.md), as trajectories."""
 
 from __future__ import annotations
 

@@ -179,7 +179,7 @@ def _sample_time(times: Array, rows: Array, parts: Sequence[slice]) -> float:
     every = np.sort(np.concatenate(steps))
     median = float(
         every[(len(every) - 1) // 2]
-    )  # one that is there, of two different ones the shorter
+    )  # an existing one; of two different ones, the shorter
     # A clock that counts since 1970 has steps that are rounded themselves.
     rounding = 4 * np.finfo(np.float64).eps * float(np.abs(times).max())
     for part, own in zip(parts, steps, strict=True):
@@ -187,7 +187,7 @@ def _sample_time(times: Array, rows: Array, parts: Sequence[slice]) -> float:
             k = part.start + 1 + int(wrong[0])
             raise ValueError(
                 f"expected equal steps of t, got {own[wrong[0]]:g} s before row {rows[k]} where the "
-                f"others are {median:g} s: fill the gap or sample the log anew, or cut the file in two "
+                f"others are {median:g} s: fill the gap or resample the log, or cut the file in two "
                 "there, as several files can be given"
             )
     return median

@@ -31,7 +31,7 @@ class StreamConsole(Console):
         raise BrokenPipeError
 
     def print(self, *objects: Any, **how: Any) -> None:
-        """What is not written (a full disk) is lost, and so are the lines after it."""
+        """A line that cannot be written (full disk) is lost, and so are all later ones."""
         try:
             super().print(*objects, **how)
         except BrokenPipeError:

@@ -46,7 +46,7 @@ class Identified:
     sources: which trajectories, by episode and environment or by file and number; study: the orders on
     held-out data, None where these are too few; determined: how well the data determine the model;
     trajectory: the longest one; sample_time in s, None where it is not known; remarks: on the data;
-    field: what came of a model of the whole field, of the identification "field".
+    field: the report on the model of the whole field, for the identification "field".
     """
 
     model: ModelRows | ReducedModel

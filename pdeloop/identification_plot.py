@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A picture of what was identified: orders, the model beside the data, and the law on the model."""
+"""A picture of what was identified: orders, the model against the data, and the law on the model."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def draw(found: Identified, path: Path) -> None:
     """Write the picture; its suffix says in which format."""
     with matplotlib.rc_context(STYLE):
         figure = plot(found)
-        # Without a format a folder would become the name of a file beside it.
+        # Without a format a folder would become the name of a file next to it.
         figure.savefig(path, dpi=150, format=path.suffix[1:] or "png")
 
 

@@ -42,7 +42,7 @@ def drop_unwritable() -> None:
 
 
 def aligned(rows: Sequence[Sequence[str]], names: int = 1) -> list[str]:
-    """The rows of a table as lines, the columns beside each other; the first `names` are words.
+    """The rows of a table as lines, the columns side by side; the first `names` are words.
 
     Examples
     --------

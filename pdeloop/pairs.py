@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The nodes of a run: which plants and controllers serve one tuner, and what each is told.
+"""The nodes of a run: which plants and controllers serve one tuner, and their parameters.
 
 `pdeloop train` starts them as processes (pdeloop.supervisor); `ros2 launch` by the files in launch/.
 """
@@ -30,7 +30,7 @@ PAIRS = Spec("pairs", 1, 1, MAX_PAIRS).means("plants with a controller each")
 
 @dataclass(frozen=True)
 class LoopNode:
-    """A node of a run: name of its process, package, and parameters beside those of the problem.
+    """A node of a run: name of its process, package, and parameters besides those of the problem.
 
     namespace: relative to that of the run, empty: the run's own; cores: those that all its threads
     may use, empty: any.
@@ -157,7 +157,7 @@ class Transport:
     def nodes(self, folder: Path) -> list[LoopNode]:
         """The nodes of the training in `folder`, a run that was begun (RunFolder.create).
 
-        The recorder, if any, comes first; it is told its bag when it is started. Recorder and viewer
+        The recorder, if any, comes first, and receives its bag when it is started. Recorder and viewer
         leave the cores of the pairs to them, if there are others.
         """
         serving = {"pairs": namespaces(self.pairs)}

@@ -38,7 +38,7 @@ MAX_LINEARISED = 2048
 SMALL = 1e-6
 """Size of the perturbations whose answers are differenced."""
 DRAWN = 5
-"""Initial fields that are drawn beside their mean."""
+"""Number of initial fields drawn around their mean."""
 
 
 @dataclass(frozen=True)
@@ -259,5 +259,5 @@ def draw(values: Mapping[str, Any], path: Path) -> None:
     ax.set_xlabel(axis.label)
     known = figure.axes[actuated].get_legend_handles_labels()
     figure.legend(*known, loc="outside upper center", ncols=3, frameon=False)
-    # Without a format a folder would become the name of a file beside it.
+    # Without a format a folder would become the name of a file next to it.
     figure.savefig(path, dpi=150, format=path.suffix[1:] or "png")

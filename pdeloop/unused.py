@@ -37,7 +37,7 @@ def refuse_unused(
     """ParameterError for a parameter that was given for a training and changes nothing in it.
 
     given: those that the user named, not those of a problem's file; values: all of them, resolved;
-    viewed: whether a viewer runs beside it.
+    viewed: whether a viewer runs as well.
     """
     for name in given:
         reason = _reason(name, values, in_process=in_process, viewed=viewed)

@@ -2,7 +2,7 @@
 """A recording: the loop's messages in one bag. No ROS.
 
 bag/bag.mcap, bag/metadata.yaml    the bag
-bag/parameters.json                the nodes' parameters by run, as far as they have answered; the
+bag/parameters.json                the parameters, by run, of the nodes that have answered; the
                                    same stands in the bag, under PARAMETERS_TOPIC
 """
 
@@ -26,7 +26,7 @@ CDR = bytes.fromhex("00010000")
 
 
 class Recording(BagWriter):
-    """A bag of the messages that `take` is given, with the nodes' parameters beside it."""
+    """A bag of the messages that `take` is given, with the nodes' parameters next to it."""
 
     def __init__(self, path: Path, what: Sequence[Source]) -> None:
         super().__init__(path, [source.channel for source in (*what, NOTES)])
@@ -42,7 +42,7 @@ class Recording(BagWriter):
         self.write(source.channel.topic, when, raw)
 
     def note(self, run: int, parameters: Mapping[str, Any]) -> None:
-        """Keep the parameters of a run, beside what is already known of them."""
+        """Add to the known parameters of a run."""
         self._notes[str(run)] = self._notes.get(str(run), {}) | dict(parameters)
         text = json.dumps({str(run): self._notes[str(run)]}).encode() + b"\0"
         when = self._last if self.messages else time.time_ns()

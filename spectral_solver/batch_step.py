@@ -1,7 +1,7 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """The loop of a compiled step over the environments: each is advanced, costed and checked.
 
-An environment is computed alone and by the same instructions whatever stands beside it, so its
+An environment is computed alone and by the same instructions whatever else is in the batch, so its
 result does not depend on the batch, nor on which thread computes it.
 """
 

@@ -6,7 +6,7 @@ The spectra v_f of the components f of an environment become
     v_f' = sum_g E_fg v_g + sum_j B_fj a_j
 
 with E and B of `exact_propagator` for a whole sampling time and a held action. As in `kernel`, an
-environment is computed alone and by the same instructions whatever stands beside it.
+environment is computed alone and by the same instructions whatever else is in the batch.
 """
 
 from typing import Any

@@ -152,7 +152,7 @@ class PolynomialStep:
         found = np.empty((len(z), 2, self._last + 1))
         if self._whole:
             analysed(z, found, self._plans)
-        else:  # row by row: in a batch, rounding depends on what stands beside
+        else:  # row by row: in a batch, rounding depends on the other rows
             for i, row in enumerate(z):
                 spectrum = np.fft.rfft(row) / self._n_x
                 found[i] = spectrum.real, spectrum.imag

@@ -124,7 +124,7 @@ class SolverThreads:
         os.register_at_fork(after_in_child=self.forget)
 
     def pool(self) -> ThreadPoolExecutor:
-        """Those beside the thread that asks for a step."""
+        """The worker threads, apart from the one that asks for a step."""
         if self._pool is None:
             helpers = len(self.cores) - 1
             self._pool = ThreadPoolExecutor(helpers, "solver", join_solver, (self.cores,))

@@ -53,7 +53,7 @@ class BatchResult:
     steps: frozenset[int] = frozenset()
 
     def rollouts(self) -> list[RolloutResult]:
-        """As an optimiser is told them; of an exploration they mean nothing."""
+        """Results in the form that optimisers take; meaningless for an exploration."""
         seen = self.trajectories if self.trajectories is not None else repeat(None)
         return [
             RolloutResult(

@@ -55,7 +55,7 @@ def read_model(path: Path, n_a: int) -> NDArray[np.float64]:
     except ValueError as error:
         raise ValueError(f"{path} holds the model of another plant: {error}") from error
     if not basis.any(axis=0).all():
-        raise ValueError(f"the model in {path} has modes that are zero; identify one anew")
+        raise ValueError(f"the model in {path} has modes that are zero; identify a new one")
     return model
 
 

@@ -7,7 +7,7 @@ from loop_interfaces.diagnostics import ConditionTimer, Level, Rate, Status
 from tuner_node.session import Session
 
 FOUND = 1.0
-"""Seconds in which a node that is there is found."""
+"""Seconds within which a running node is discovered."""
 RECENT = 10.0
 """Seconds for which a repeated episode is worth a warning."""
 

@@ -158,8 +158,8 @@ class RunFolder:
             known = read_json(self.path / "run.json")
             if "contradiction" in known:
                 raise RunFolderError(
-                    f"the run in {self.path} cannot be continued, as it has used what was contradicted "
-                    f"({known['contradiction']})"
+                    f"the run in {self.path} cannot be continued, because it used results "
+                    f"that were contradicted later ({known['contradiction']})"
                 )
             self._check_same(known["parameters"], parameters)
             paused = bool(known.get("paused", False))
@@ -214,7 +214,7 @@ class RunFolder:
         return known
 
     def values(self) -> dict[str, Any]:
-        """The parameters of the training here, with the present defaults of what is not in its file."""
+        """The parameters of the training here, with current defaults where its file has none."""
         try:
             return recorded_values(self.parameters())
         except ParameterError as error:
@@ -258,7 +258,8 @@ class RunFolder:
                 ) from error
             if not free:
                 raise RunFolderError(
-                    f"another process works on the run in {self.path}; let it end, or stop it"
+                    f"another process is working on the run in {self.path}; wait for it to end, or "
+                    "stop it"
                 )
             yield
 
@@ -308,7 +309,7 @@ class RunFolder:
             }
         except ValueError as error:
             raise RunFolderError(
-                f"{path} cannot be read ({error}); write it anew: delete it and "
+                f"{path} cannot be read ({error}); to rewrite it, delete it and "
                 f"result.json, then {resuming(self.path)}"
             ) from error
 

@@ -74,7 +74,7 @@ class RunWriter:
         self._save_at = now + max(CHECKPOINT_PERIOD, took / CHECKPOINT_SHARE)
 
     def give_up(self, reason: str) -> None:
-        """Let nobody continue the training, which has used what was contradicted."""
+        """Prevent the training, which used contradicted results, from being continued."""
         try:
             self._folder.give_up(reason)
         except (OSError, FileError) as error:

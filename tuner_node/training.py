@@ -244,7 +244,7 @@ class Training:
         return rows
 
     def _excitation(self, m: int, explored: Trajectory) -> list[dict[str, Any]]:
-        """Rows of what is hardly determined by an exploration, whoever's controller drew its actions.
+        """History rows about what an exploration hardly determines, whoever drew its actions.
 
         NotIdentifiableError if the effects of its inputs cannot be told apart.
         """

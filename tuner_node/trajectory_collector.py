@@ -16,7 +16,7 @@ from loop_interfaces.topics import COMPLETED
 from loop_method.adapt import Trajectory
 
 MAX_BYTES = 2**30
-"""Bytes that are kept of the samples of one episode, whoever sends them."""
+"""Most bytes kept of the samples of one episode."""
 
 
 @dataclass

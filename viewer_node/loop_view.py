@@ -37,7 +37,7 @@ class LoopView:
     """Follows the loop of one plant and controller.
 
     only: the run to follow, any by default; curve_from_topics: whether the learning curve comes
-    from the costs on the topics; horizon, weights: steps of an episode, q and r, as far as known;
+    from the costs on the topics; horizon, weights: steps of an episode, q and r, where known;
     components: their names.
     """
 

@@ -18,7 +18,7 @@ Key = TypeVar("Key")
 MAX_KEPT = 100
 """Episodes whose gains are remembered until their costs come."""
 MAX_BYTES = 2**26
-"""Of all that is remembered of one kind."""
+"""Most remembered items of each kind."""
 MAX_MODELS = 4
 """Generations of models."""
 

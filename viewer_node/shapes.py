@@ -14,7 +14,7 @@ from viewer_node.picture import NONE, diverging
 MOST_CELLS = 10_000
 """Of a component; of a finer grid every n-th along each axis."""
 APART = 1.1
-"""Distance of two pictures beside each other, in their size."""
+"""Distance of two pictures side by side, relative to their size."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """How functions are compiled, and when a compiled one on disk is out of date.
 
-Numba keeps compiled functions beside the source (or in the user's cache folder where that cannot be
+Numba keeps compiled functions next to the source (or in the user's cache folder where that cannot be
 written; `kept_on_disk` knows a third) and takes them for current while the file that holds the function
 is unchanged. What the function calls from other files does not count. So the name of what is kept on
 disk here, which is also that of its file, has a `fingerprint` of all the sources it is made of.

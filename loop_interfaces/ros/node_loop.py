@@ -205,7 +205,7 @@ class NodeLoop(EventLoop):
                     continue
                 takes = [take for handle, take in self._takes.items() if handle.pointer in ready]
                 self._handled += sum(take() for take in takes)
-        self.introspection.log_refused()  # also what came since the last report
+        self.introspection.log_refused()  # including those since the last report
         return self._stop_reason or "shutdown"
 
     def _round(

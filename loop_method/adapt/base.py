@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What every optimiser of a policy is: it asks for rollouts, and is told their outcome.
+"""The interface of optimisers: they ask for rollouts and are told the results.
 
     while not optimizer.done:
         rollouts = optimizer.ask()                # the same until tell
@@ -204,13 +204,13 @@ class Optimizer(Protocol):
     so that the plant is explored once and no law is checked before."""
     any_cost: ClassVar[bool] = False
     """Whether it can use any quadratic cost (`loop_interfaces.cost.Cost`), if it needs trajectories;
-    otherwise weights that are numbers and a constant target. One that is told costs alone can."""
+    otherwise scalar weights and a constant target. Optimisers that need only costs can."""
     judges_first_law: ClassVar[bool] = False
     """Whether it does so always."""
     explorations: ClassVar[int] = 1
     """Rollouts of an exploration, from as many initial fields."""
     with_sensors: ClassVar[str] = ""
-    """The optimiser in its place where the state is that of few sensors; empty: none."""
+    """The optimiser used instead when the state is that of few sensors; empty: none."""
     iteration_rollouts: ClassVar[int] = 0
     """Rollouts of an iteration, for a budget that is counted in them; 0: it counts none."""
     preferences: ClassVar[Mapping[str, Any]] = {}

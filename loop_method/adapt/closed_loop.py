@@ -90,7 +90,7 @@ class ClosedLoop:
                     error = states[k] - self.target
                     costs += self.state_weight * np.einsum("fi,fi->f", error, error)
                     costs += self.action_weight * np.einsum("fi,fi->f", a, a)
-                # What is not finite stays so; the others go on from numbers that a model can take.
+                # Diverged fields stay marked and continue with numbers that a model can take.
                 finite &= np.isfinite(costs)
                 a[~finite] = 0.0
                 actions[k] = a

@@ -41,7 +41,7 @@ IndexArray = NDArray[np.int64]
 # move.
 _LINEAR_RIDGE = 1e-5
 _ACTION_RIDGE = 1e-8
-# What is left of the mean square of an input, or of a combination of inputs, beside the state.
+# Share of the mean square of an input, or a combination of inputs, not explained by the state.
 _DETERMINED = 1e-13
 # Samples whose features are in memory at a time.
 _BLOCK = 1024

@@ -73,7 +73,7 @@ class Loop:
         return float(cost) / max(math.prod(actions.shape[:-1]), 1)
 
     def cost_of(self, record: Record) -> float:
-        """Mean stage cost of a measured rollout, as far as it was recorded."""
+        """Mean stage cost of the recorded part of a rollout."""
         return self.mean_cost(record.acted_from, record.actions)
 
     def mean_cost_of(self, records: Sequence[Record]) -> float:

@@ -27,7 +27,7 @@ OWN_OPTIMIZERS = OwnCode("optimizer", "PDELOOP_OPTIMIZERS", _ours())
 
 
 def offered() -> list[str]:
-    """The names of what is installed, ours among them."""
+    """The names of the installed optimisers, including ours."""
     return sorted({entry.name for entry in entry_points(group=GROUP)})
 
 

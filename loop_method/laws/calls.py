@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Calls of a law, whoever wrote it: what it returns is checked, what it raises is one sentence."""
+"""Calls of a law's methods: return values are checked, and exceptions become one sentence."""
 
 from __future__ import annotations
 

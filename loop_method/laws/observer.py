@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A law with an observer: feedback of an estimate of the reduced state, not of what is measured."""
+"""A law with an observer: feedback of an estimate of the reduced state instead of the measurement."""
 
 from __future__ import annotations
 

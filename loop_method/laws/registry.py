@@ -26,7 +26,7 @@ _handed_over: dict[str, type[Law]] = {}
 
 
 def offered() -> list[str]:
-    """The names of what is installed, ours first."""
+    """The names of the installed laws, ours first."""
     others = {entry.name for entry in entry_points(group=OWN_LAWS.group)} - set(OWN_LAWS.shipped)
     return [*OWN_LAWS.shipped, *sorted(others)]
 

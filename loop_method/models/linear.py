@@ -106,7 +106,7 @@ def fit_convolution(
 ) -> LinearModel | None:
     """Least squares where A is the same at every place of a ring: circulant blocks.
 
-    Each wavenumber has a regression of its own, of `components` unknowns beside the inputs.
+    Each wavenumber has a regression of its own, of `components` unknowns besides the inputs.
 
     ridge: of normalised columns.
     """

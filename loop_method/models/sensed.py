@@ -163,7 +163,7 @@ class _Equation:
         return after
 
     def _rate(self, z: Spectrum, force: Spectrum) -> Spectrum:
-        """What is not linear, on a grid that has room for the products."""
+        """The nonlinear terms, on a grid fine enough for the products."""
         count = z.shape[-1]
         field = 2.0 * np.fft.irfft(z, 2 * self.n)
         square = field * field

@@ -154,7 +154,7 @@ def _regression(model: SpectralModel, samples: Samples, form: Form) -> Regressio
 
 
 def substeps_of(symbols: Spectrum, largest: float, settings: FieldModelSettings) -> int:
-    """So many that the fastest rate of the nonlinear part, of what is dealiased, is followed."""
+    """Enough substeps to follow the fastest rate of the dealiased nonlinear part."""
     return int(_counts(symbols, largest, settings)[-1])
 
 

@@ -14,7 +14,7 @@ from loop_interfaces.arrays import Array
 SHOWN = 6
 """Channels that a sentence names at most."""
 UNITS = 1e-12
-"""A number of the state that is smaller than this beside another is lost in the other's rounding."""
+"""Numbers of the state smaller than this, relative to another one, are lost in its rounding."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def cut_off(names: Sequence[str], shares: Sequence[float], p: int) -> str:
 
 
 def state_faults(states: Array, channels: Channels = NUMBERED) -> list[str]:
-    """Which numbers of the state never moved, are multiples of others, or are lost beside them.
+    """Which numbers of the state never moved, are multiples of others, or are lost in their rounding.
 
     states : (N, n_z) array
     """

@@ -123,7 +123,7 @@ def study_orders(
     ----------
     trajectories : sequence of (states (N + 1, n_z), actions (N, n_a))
         z_0 .. z_N and a_0 .. a_{N-1}; a_k is held from z_k to z_{k+1}.
-        A trajectory that is there twice counts once.
+        A duplicated trajectory counts once.
     orders : iterable of int
         Those to try, of which the ones remain that the data determine without the held-out steps:
         n_s + n_a of them must be left, for one.

@@ -104,7 +104,7 @@ class Steps:
 def steps_of(trajectories: Sequence[tuple[ArrayLike, ArrayLike]]) -> Steps:
     """The steps of trajectories (states (N + 1, n_z), actions (N, n_a)) of one plant, pooled.
 
-    A trajectory that is there twice counts once. ValueError for shapes that do not fit, NaN and
+    A duplicated trajectory counts once. ValueError for shapes that do not fit, NaN and
     infinity.
     """
     befores, afters, inputs = [], [], []

@@ -117,7 +117,7 @@ class DynamicsPlant(BatchPlant):
 
     @property
     def definition(self) -> Definition:
-        """The object's arguments, the source of its class, and what a problem sets in its place."""
+        """The object's arguments, the source of its class, and what a problem overrides."""
         settings = {name: getattr(self, name) for name in SETTABLE}
         arguments = {
             f"physical.{name}": described(name, value)

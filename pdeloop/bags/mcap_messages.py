@@ -37,7 +37,7 @@ from recorder_node.bag import METADATA, BagError
 RATIO, SLACK = 100, 64 * 2**20
 """A file of n bytes may decompress to RATIO n + SLACK bytes."""
 MAX_TEXT = 100_000_000
-"""Bytes of a text beside the bag."""
+"""Bytes of a text next to the bag."""
 CONVERTED = "-mcap"
 """How the name of a bag ends that was converted as we advise; the rest is that of the bag it was."""
 MAX_NAME = 256
@@ -200,7 +200,7 @@ def _conversion(folder: Path, begin: str = "Convert") -> str:
 
 
 def text_of(path: Path) -> str:
-    """The content of a text file beside a bag; empty if there is none."""
+    """The content of a text file next to a bag; empty if there is none."""
     try:
         return read_bounded(path, MAX_TEXT).decode(errors="replace") if path.exists() else ""
     except FileError as error:

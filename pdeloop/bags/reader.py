@@ -73,10 +73,10 @@ class Bag:
         return found
 
     def parameters(self) -> dict[int, dict[str, Any]]:
-        """The nodes' parameters by run, as far as the bag or what it came from knows them.
+        """The nodes' parameters by run, where the bag or its source has them.
 
-        They stand in the bag itself, if it was recorded by this version or a later one, and beside
-        it; beside the bag that it was converted from, if it lies where our advice puts it; and in
+        They stand in the bag itself, if it was recorded by this version or a later one, and next to
+        it; next to the bag that it was converted from, if it lies where our advice puts it; and in
         the folder of the run.
         """
         known: dict[int, dict[str, Any]] = {}
@@ -92,7 +92,7 @@ class Bag:
         return known
 
     def contradicting_parameters(self) -> list[str]:
-        """Where parameters beside the bag are others than in it, in words."""
+        """Where the parameters next to the bag differ from those in it, in words."""
         return [
             f"{PARAMETERS} has other parameters of run {run} than the bag itself: {name}"
             for run, values in _beside(self.path / PARAMETERS).items()

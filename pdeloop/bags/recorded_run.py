@@ -55,7 +55,7 @@ class RecordedRun:
             self._note(
                 "its parameters are not in the bag, so nothing is recomputed (give them with "
                 "--parameters FILE: the parameters.yaml of the run, or the parameters.json that the "
-                "recorder wrote beside its bag)"
+                "recorder wrote next to its bag)"
             )
             return
         self._given = set(values)

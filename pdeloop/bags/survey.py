@@ -49,7 +49,7 @@ class FileSurvey:
 class Survey:
     """All files of a bag.
 
-    parameters: those of the nodes, by run, as far as they stand in the files; target: z_r, None if
+    parameters: those of the nodes, by run, where the files have them; target: z_r, None if
     there is none.
     """
 

@@ -67,7 +67,7 @@ def verify(*paths: Path, parameters: Path | None = None) -> Report:
 
 
 def recorded_parameters(*paths: Path, parameters: Path | None = None) -> list[Mapping[str, Any]]:
-    """The parameters of the runs that `verify` computes with the same arguments, as far as known."""
+    """The parameters of the runs that `verify` computes with the same arguments, where known."""
     bags = [] if parameters is not None else [bag for path in paths for bag in bags_of(path)]
     known, every = _known(bags, parameters)
     runs = [*known.values(), *([every] if every else [])]
@@ -75,7 +75,7 @@ def recorded_parameters(*paths: Path, parameters: Path | None = None) -> list[Ma
 
 
 def _check_files(bag: Bag, report: Report) -> None:
-    """Hold the files of a bag against its metadata, and its parameters against those beside it."""
+    """Compare the files of a bag with its metadata, and its parameters with those next to it."""
     where = f" ({bag.path})" if report.bag != str(bag.path) else ""
     try:
         findings = bag.findings()

@@ -108,7 +108,7 @@ def forget_named_anew(given: dict[str, object], own: Mapping[str, str]) -> None:
 
 
 def refuse_other_code(options: argparse.Namespace, *runs: Mapping[str, object]) -> None:
-    """ParameterError if a flag of own code names none that these parameters of runs name."""
+    """ParameterError if a flag names user code that none of these runs' parameters name."""
     for word in _OWN_CODE:
         named = getattr(options, word, None)
         known = sorted({str(values.get(word, "")) for values in runs})

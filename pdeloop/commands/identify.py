@@ -79,7 +79,7 @@ def add(commands: Commands) -> None:
         "--plot",
         type=a_path,
         metavar="FILE",
-        help="draw the orders, the model beside the data, and the law on the model to this .png, .svg "
+        help="draw the orders, the model against the data, and the law on the model to this .png, .svg "
         "or .pdf",
     )
     add_json(identify)

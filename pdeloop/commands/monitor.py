@@ -79,7 +79,7 @@ def _monitor(options: argparse.Namespace) -> int:
         way, quoted = "continue it with: pdeloop train --resume", shlex.quote(str(folder))
         if (folder / "result.json").exists():
             way = "it is finished and is shown by: pdeloop report"
-        raise ParameterError(f"no loop works on the run in {folder}; {way} {quoted}")
+        raise ParameterError(f"no loop is working on the run in {folder}; {way} {quoted}")
     from pdeloop.monitor.node import show_loops  # here, as it needs ROS
 
     page = Page(options.environment)

@@ -70,7 +70,7 @@ def add(commands: Commands) -> None:
     add(
         "--view",
         action="store_true",
-        help="a viewer_node beside the others, for RViz, Foxglove and PlotJuggler (docs/watching.md)",
+        help="also start a viewer_node, for RViz, Foxglove and PlotJuggler (docs/watching.md)",
     )
     add = train.add_argument_group("machine").add_argument
     add(

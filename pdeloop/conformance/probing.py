@@ -35,7 +35,7 @@ Ask: TypeAlias = Callable[[], None]
 
 
 class UnexpectedError(Exception):
-    """The node does otherwise than it has to: what was expected, and what came."""
+    """The node breaks a rule: what was expected, and what was received."""
 
 
 class NoAnswerError(UnexpectedError):

@@ -56,14 +56,14 @@ def told(plant: Plant, costs: Array) -> dict[str, Array]:
 
 
 def one(info: Mapping[str, Array], m: int) -> dict[str, Any]:
-    """What is told of environment m, its numbers as Python's."""
+    """The info of environment m, with Python numbers."""
     return {
         name: value[m].copy() if value.ndim > 1 else float(value[m]) for name, value in info.items()
     }
 
 
 def masked(info: Mapping[str, Array], mask: NDArray[np.bool_]) -> dict[str, Any]:
-    """What is told of the environments of a mask, as Gymnasium's vector environments have it.
+    """The info of the environments of a mask, in the form of Gymnasium's vector environments.
 
     Zeros elsewhere, and with each entry `name` its mask `_name`.
     """

@@ -27,7 +27,7 @@ class ServiceCall:
         self._future: Any = None
 
     def poll(self, operation: Operation) -> bool:
-        """Go on; True when it is over, and what came of it is noted."""
+        """Proceed; True when the call is over and its result is stored."""
         now = time.monotonic()
         if self._future is None and self._client.service_is_ready():
             self._future = self._client.call_async(Trigger.Request())

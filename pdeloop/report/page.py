@@ -134,7 +134,7 @@ def _of_problem(problem: ProblemData) -> Drawn:
         f"{name}-behaviour",
         "Behaviour",
         f"From the mean initial field (seed {seed}): the field in space and time, the actions, and "
-        "the initial and the final field beside the target.",
+        "the initial field, the final field and the target.",
         figures.behaviour(problem),
     )
     if problem.affine:

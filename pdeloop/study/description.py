@@ -99,7 +99,7 @@ class Study:
         ):
             raise StudyError(
                 "the settings or a variant have 'seed' or 'seeds'; leave them out, and give 'seeds' "
-                "beside 'problems'"
+                "next to 'problems'"
             )
         files = {}
         for word in problems:

@@ -33,7 +33,7 @@ CAVEAT = (
 )
 ABOVE = "A negative percentage is one above LQT."
 MARK = "*"
-"""Of what was computed in other environments."""
+"""Mark of results computed in other environments."""
 AVERAGES = ("ratio of the means", "mean of the ratios")
 """Of the seeds' costs and LQT's: see `pdeloop.finished_run.Reduction`."""
 

@@ -460,7 +460,7 @@ def test_every_start_of_a_tuner_has_a_number_of_its_own_and_the_folder_to_itself
             assert identity.incarnation == incarnation
             assert json.loads((tmp_path / "run" / "run.json").read_text())["plant"] == 77
             values["resume"] = True
-            with pytest.raises(RunFolderError, match="another process works on the run"):
+            with pytest.raises(RunFolderError, match="another process is working on the run"):
                 open_run(values, build_training(values), others, print)
 
 

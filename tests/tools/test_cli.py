@@ -292,7 +292,7 @@ def test_a_folder_that_another_process_works_on_is_left_alone(tmp_path, capsys):
     (out / "result.json").unlink()
     with RunFolder(out).locked():
         line = error_of(capsys, "train", "--resume", str(out), "--in-process")
-    assert "another process works on the run" in line
+    assert "another process is working on the run" in line
 
 
 def test_a_file_that_expands_without_end_is_refused(tmp_path, capsys):

@@ -348,7 +348,10 @@ def test_an_error_for_which_a_stranger_may_be_the_reason_names_the_stranger(loop
         (line,) = loop.wait(start_tuner(loop, out, **options), LIMIT, code=1).splitlines()[-1:]
         # What it has used is in its checkpoint.
         again = loop.wait(start_tuner(loop, out, **options, resume=True), LIMIT, code=1)
-    assert "cannot be continued, as it has used what was contradicted (two different" in again
+    assert (
+        "cannot be continued, because it used results that were contradicted later (two different"
+        in again
+    )
     assert not (out / "result.json").exists()
     assert "expected one plant and one controller in this namespace" in line
     assert (

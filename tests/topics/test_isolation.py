@@ -76,7 +76,7 @@ def test_a_profile_that_is_none_is_refused_before_there_is_a_socket(tmp_path, mo
     if content is not None:
         path.write_text(content)
     monkeypatch.setenv(PROFILE, str(path))
-    with pytest.raises(ValueError, match="is no Fast DDS profile") as refusal:
+    with pytest.raises(ValueError, match="is not a Fast DDS profile") as refusal:
         check_profile()
     assert str(path) in str(refusal.value) and "\n" not in str(refusal.value)
     command = [sys.executable, "-m", "controller_node.node"]

@@ -72,7 +72,7 @@ def test_nothing_is_written_into_a_folder_that_another_process_has_locked(tmp_pa
     out.mkdir()
     with RunFolder(out).locked():
         before = sorted(path.name for path in out.iterdir())
-        with pytest.raises(RunFolderError, match="another process works on the run"):
+        with pytest.raises(RunFolderError, match="another process is working on the run"):
             RunFolder(out).create(parameters())
         assert sorted(path.name for path in out.iterdir()) == before
     RunFolder(out).create(parameters())

@@ -39,7 +39,7 @@ COLOUR_PERIOD = 0.5
 PARAMETERS = ("problem", "n_a", "horizon", "sample_time")
 """Parameters that the page needs, with what `axes_of` and `places_of` read."""
 MOST_PANELS = 4
-"""Components that are shown beside each other; of more, one is chosen."""
+"""Components shown side by side; of more, one is chosen."""
 Axes = list[dict[str, Any]]
 Range = tuple[float, float]
 
