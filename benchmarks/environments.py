@@ -26,9 +26,9 @@ from pdeloop.environments import environment_id
 
 MODES = {"vector_entry_point": "batch", "sync": "sync", "async": "async"}
 SECONDS = 0.5
-"""Of a measurement."""
+"""Duration of a measurement (s)."""
 LIMIT = 1.0
-"""Of the actions, so that no environment diverges."""
+"""Bound of the actions, so that no environment diverges."""
 
 
 def run(

@@ -63,7 +63,7 @@ def reference(equation: Equation, grid: Grid) -> ReferenceStep:
 
 
 def least_microseconds(step: Callable[[], object], batch: int) -> float:
-    """Of many repeats the fastest: what makes the others slower is other programs, not the method."""
+    """The fastest of many repeats: the others are slowed by other programs, not by the method."""
     step()
     times: list[float] = []
     end = time.perf_counter() + SECONDS

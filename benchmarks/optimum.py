@@ -51,9 +51,9 @@ Law = tuple[Array, Array]
 TRAINING_SEED = 7000
 """Draws the fields that a law is optimised on: no evaluation uses it."""
 RIDGE = 1e-2
-"""Of the scaling of a law's gains, relative to the mean square of the features."""
+"""Ridge of the scaling of a law's gains, relative to the mean square of the features."""
 FLOOR = 1e-4
-"""Of the eigenvalues of the Hessian in the scaling, relative to the largest."""
+"""Least eigenvalue of the Hessian in the scaling, relative to the largest."""
 
 
 def evaluation_seeds(seed: int, fields: int) -> list[int]:

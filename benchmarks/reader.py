@@ -32,7 +32,7 @@ def tell() -> None:
 
 
 def read_views() -> None:
-    """As RViz, Foxglove and PlotJuggler together would."""
+    """Read as RViz, Foxglove and PlotJuggler together would."""
     keep_on_this_machine()
     rclpy.init()
     node = rclpy.create_node("reader")
@@ -47,7 +47,7 @@ def read_views() -> None:
 
 
 async def read_page(address: str) -> None:
-    """As a browser would, as fast as it comes."""
+    """Read as a browser would, as fast as data arrive."""
     origin = {"Origin": address.rstrip("/")}
     async with (
         aiohttp.ClientSession() as session,

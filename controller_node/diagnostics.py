@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""How the controller is, as its /diagnostics show it. Pure."""
+"""Controller status for /diagnostics. Pure."""
 
 from controller_node.responder import Responder
 from loop_interfaces.diagnostics import ConditionTimer, Level, Rate, Status

@@ -97,7 +97,7 @@ class Exploration:
         return [failure]
 
     def _divergence(self, cost: Frame) -> str:
-        """That the plant diverged, in words; and if its states went on, who else may have said so."""
+        """Message that the plant diverged; if its states continued, who else may have claimed it."""
         ended = cost.values[:, CostColumn.ENDED]
         env, step = int(ended.argmax()), int(ended.max())
         told = f"the plant diverged under exploration at step {step}; lower exploration_variance"

@@ -48,9 +48,9 @@ class LawBatch:
         self._next = 0
         """The step to which the memories belong."""
         self._answered: dict[int, tuple[int, Array]] = {}
-        """Of a law with memory by step: a digest of the states, and the actions."""
+        """By step, for a law with memory: a digest of the states, and the actions."""
         self.nbytes = 0
-        """Of the actions that are kept."""
+        """Bytes of the stored actions."""
 
     @property
     def compiled(self) -> ProjectedLaw | None:

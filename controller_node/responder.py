@@ -70,7 +70,7 @@ class Responder:
         """Events, counted by name."""
         self.answered = 0
         self.episode = self.step = -1
-        """Of the last answer."""
+        """Episode and step of the last answer."""
         self.last_cost: float | None = None
         """Mean stage cost of the last episode's environments."""
         self.failure = ""
@@ -370,7 +370,7 @@ class Responder:
         return run.law[1]
 
     def _forgotten(self, state: Frame, reason: str) -> ModelFailure:
-        """That the episode has to be run again, as the law's memory is not known."""
+        """Message that the episode must be run again, because the law's memory is unknown."""
         self.counters["memories lost"] += 1
         text = f"{reason}, on which the memory of the law '{self._law_kind.name}' depends"
         return ModelFailure(state.run, state.episode, True, text)

@@ -47,11 +47,11 @@ EpisodeInputs: TypeAlias = tuple[Frame, Models]
 
 @dataclass
 class RunState:
-    """What came in the name of one run, and what was made of it. policies, models: the newest ones."""
+    """Messages and results of one run. policies, models: the newest ones."""
 
     start: Frame | None = None
     exploration: Exploration | None = None
-    """Of the episode, if it explores."""
+    """The exploration, if the episode is one."""
     policies: deque[Frame] = field(default_factory=lambda: deque(maxlen=MAX_KEPT))
     models: deque[Models] = field(default_factory=lambda: deque(maxlen=MAX_KEPT))
     answering: Answering | None = None
@@ -61,7 +61,7 @@ class RunState:
 
     @property
     def nbytes(self) -> int:
-        """Of all arrays that are kept."""
+        """Bytes of all stored arrays."""
         frames = [
             frame.values.nbytes for frame in (self.start, *self.policies) if frame is not None
         ]

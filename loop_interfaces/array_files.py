@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from loop_interfaces.files import FileError, open_ordinary
 
 MAX_ARRAY_BYTES = 2**30
-"""Of all arrays in a file of policies or models."""
+"""Most bytes of all arrays in a file of policies or models."""
 Arrays = Mapping[str, NDArray[Any]]
 _TYPES: Mapping[str, type] = {"f": np.float64, "i": np.int64, "b": np.bool_}
 """What is written of each NumPy kind; others would give other results, or cannot be written again."""

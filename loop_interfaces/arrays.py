@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What numbers are computed with: float64, everywhere."""
+"""The numeric type of all computations, float64."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray

@@ -159,7 +159,7 @@ class Cost:
 
     @property
     def texts(self) -> list[str]:
-        """As a parameter has it; none where numbers and a constant target say everything."""
+        """The text of the parameter; empty if scalar weights and a constant target suffice."""
         if self.plain:
             return []
         arrays = {name: getattr(self, name) for name in _ARRAYS}

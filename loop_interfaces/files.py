@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 from loop_interfaces.documents import parse_json
 
 MAX_JSON_BYTES = 2**27
-"""Of a file in JSON; a training's history takes some 200 bytes a rollout."""
+"""Most bytes of a JSON file; a training's history takes about 200 bytes per rollout."""
 
 
 class FileError(ValueError):

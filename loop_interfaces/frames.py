@@ -66,13 +66,13 @@ def digest(values: NDArray[np.float64]) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Layout:
-    """What stands in front of the numbers of a message, and what it says of them."""
+    """The bytes in front of the numbers of a message, and their meaning."""
 
     prefix: bytes
     shape: tuple[int, ...]
     count: int
     length: int
-    """Of the whole message."""
+    """Bytes of the whole message."""
     type: np.dtype[np.float64]
     swapped: bool
     """Whether its numbers are in big-endian order."""

@@ -70,7 +70,7 @@ class Axis:
 
     @property
     def label(self) -> str:
-        """Of the axis of a figure."""
+        """Label of the axis in a figure."""
         return f"{self.name} ({self.unit})" if self.unit else self.name
 
 
@@ -117,7 +117,7 @@ class Grid:
 
     @classmethod
     def vector(cls, numbers: int, name: str = "z", unit: str = "") -> Grid:
-        """Of a state that is not a field.
+        """The grid of a state that is not a field.
 
         Parameters
         ----------
@@ -144,7 +144,7 @@ class Grid:
         periodic: bool = True,
         walls: bool = True,
     ) -> Grid:
-        """Of fields on [0, length].
+        """The grid of fields on [0, length].
 
         Parameters
         ----------
@@ -165,7 +165,7 @@ class Grid:
 
     @property
     def text(self) -> str:
-        """As a parameter has it; see `parse`."""
+        """The text of the parameter; see `parse`."""
         axes = [[a.name, a.length, a.size, a.periodic, a.walls, a.unit] for a in self.axes]
         return json.dumps([axes, list(self.components), self.unit, self.numbers])
 

@@ -40,7 +40,7 @@ def read_problem(path: Path) -> dict[str, Any]:
 
 
 def nothing_for(whom: str, files: Sequence[ParameterFile]) -> str:
-    """That these files have nothing for a node, and for whom they have something."""
+    """Message that these files have nothing for a node, naming the nodes they are for."""
     names = ", ".join(str(file.path) for file in files)
     blocks = [name for file in files for name in file.blocks]
     if not blocks:

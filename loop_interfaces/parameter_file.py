@@ -255,7 +255,7 @@ _LIBC.strtoll.restype = ctypes.c_longlong
 
 
 def _converted(function: Any, text: str, *base: int) -> int | float | None:
-    """What strtoll or strtod makes of a whole text without an error; None if that is nothing."""
+    """The number that strtoll or strtod reads from a whole text; None if it is not one."""
     content = ctypes.create_string_buffer(text.encode())
     end = ctypes.c_void_p()
     ctypes.set_errno(0)

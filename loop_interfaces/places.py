@@ -86,7 +86,7 @@ def _side(axis: Axis, inside: NDArray[np.bool_]) -> tuple[float, float]:
 
 
 def text_of(boxes: Sequence[Box]) -> str:
-    """As the parameter `actuators` of a plant has them."""
+    """The text of a plant's parameter `actuators`."""
     rounded = [
         [box.component, *[[float(f"{end:.5g}") for end in side] for side in box.sides]]
         for box in boxes

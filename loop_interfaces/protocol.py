@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What the protocols of the three nodes return: messages to send. No ROS import.
+"""Messages to send, as returned by the protocols of the three nodes. No ROS import.
 
 A node's protocol is an object without clock, thread or network: an event comes in (a frame, or the
 time), messages come out, and the node's only job is to move them. So every fault is a unit test.

@@ -26,7 +26,7 @@ from loop_interfaces.frames import FrameError
 
 STATE_KIND, ACTION_KIND = 0, 1
 CLOCK_KIND = 2
-"""Of the message on /clock that goes with a state, for readers of samples; not in a batch."""
+"""Kind of the message on /clock that accompanies a state, for readers of samples; not in a batch."""
 LIMIT = 512 * 1024
 """Bytes after which a batch is sent: a few milliseconds of a fast loop."""
 NO_TIME = -1.0

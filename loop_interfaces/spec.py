@@ -66,7 +66,7 @@ class Spec:
 
     @property
     def flag(self) -> str:
-        """As the command line writes it."""
+        """The flag on the command line."""
         return f"--{self.name.replace('_', '-')}"
 
     @property

@@ -7,7 +7,7 @@ import operator
 from pde_sim_node.equations import Equation, LinearEquation
 
 MAX_INTERNAL_STEPS = 10**7
-"""Of one sampling time; more are a mistake in a unit, and would be waited for for ever."""
+"""Most internal steps of one sampling time; more would be a mistake in a unit and take for ever."""
 
 
 def grid_points(equation: Equation, n_z: int) -> int:

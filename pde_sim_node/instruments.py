@@ -176,7 +176,7 @@ class InstrumentedPlant:
         return self._published
 
     def restart(self, environments: NDArray[np.intp], seeds: ArrayLike) -> Array:
-        """As `Plant.restart`; the noise of a step stays that of this step of the episode."""
+        """Like `Plant.restart`; a step keeps the noise of that step of the episode."""
         self.plant.restart(environments, seeds)
         for m, seed in zip(environments.tolist(), field_seeds(seeds), strict=True):
             self._seeds[m] = self._seeds[m][0], seed

@@ -175,7 +175,7 @@ class PlantNode:
         return was
 
     def _record_run(self) -> None:
-        """So that a plant that is started again stays paused, and asks for the run's signatures."""
+        """Record the run, so that a restarted plant stays paused and asks for the run's signatures."""
         lockstep = self._lockstep
         try:
             self._run_record.keep(lockstep.paused, lockstep.signed_run)

@@ -44,7 +44,7 @@ class EpisodeCosts:
     diverged_step: NDArray[np.int64]
 
     def rows(self) -> Array:
-        """As the topic `episode/cost` has them.
+        """The rows of the topic `episode/cost`.
 
         Returns
         -------

@@ -127,7 +127,7 @@ class TakenActions:
 
 
 def two_actions(action: Frame) -> str:
-    """That another action than this one was taken, in words."""
+    """Message that a different action was taken."""
     return (
         f"two different actions came for step {action.step} of episode {episode_name(action.episode)}; "
         "expected one controller, which answers a repeated state with the same action"
@@ -135,7 +135,7 @@ def two_actions(action: Frame) -> str:
 
 
 def two_starts(start: Frame) -> str:
-    """That another start than this one was taken, in words."""
+    """Message that a different start was taken."""
     return (
         f"two different starts came for episode {episode_name(start.episode)}; expected one tuner"
     )

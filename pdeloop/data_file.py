@@ -19,7 +19,7 @@ from pdeloop.data_table import Columns, read_table
 __all__ = ["Measurements", "read_measurements"]
 
 MAX_TEXT_BYTES = 2**28
-"""Of a .csv file."""
+"""Most bytes of a .csv file."""
 MAX_TRAJECTORIES = 100_000
 LARGEST = 1e100
 """Magnitude of a number, so that squares and their sums stay finite."""

@@ -27,7 +27,7 @@ class StreamConsole(Console):
         super().__init__(file=stream, highlight=False, soft_wrap=True)
 
     def on_broken_pipe(self) -> None:
-        """Of a reader who has left. It ends the command: rich would do so with 1."""
+        """Raise when the reader has left. That ends the command; rich would exit with 1."""
         raise BrokenPipeError
 
     def print(self, *objects: Any, **how: Any) -> None:

@@ -27,7 +27,7 @@ _C = Path(__file__).parent / "commands" / "template" / "law.c.txt"
 
 @dataclass(frozen=True, eq=False)
 class Parameters:
-    """Of a law that has no gains: theta, by its name, with the model that it is a law of.
+    """Export of a law without gains: theta, its name, and the model it belongs to.
 
     law: None where it is code that is not allowed, so that theta has no parts.
     """
@@ -73,7 +73,7 @@ class GainLaw:
     name: str
 
     def npz(self) -> bytes:
-        """As of `pdeloop identify --out`, which `pdeloop train --model` takes."""
+        """Arrays in the form of `pdeloop identify --out`, which `pdeloop train --model` takes."""
         arrays: dict[str, Any] = {
             name: getattr(self.model, name) for name in self.model.__dataclass_fields__
         }

@@ -273,7 +273,7 @@ class Gradients:
     def _gradient(
         self, episode: EpisodeRecord, argument: Array, U: Array | None = None
     ) -> CostGradient:
-        """Of the episode's cost, by its actions or, with U, by the law theta."""
+        """Gradient of the episode's cost with respect to its actions or, with U, to theta."""
         plant = self.plant
         T, M = plant.horizon, len(episode.costs.mean)
         gradient, eta = np.zeros_like(argument), np.zeros((M, plant.n_z))

@@ -49,7 +49,7 @@ class ClosedLoop:
         return last / first if first > 0.0 else float("inf") if last > 0.0 else 0.0
 
     def summary(self) -> dict[str, Any]:
-        """As data."""
+        """The findings as data."""
         return {
             "spectral_radius": self.radius,
             "steps": len(self.actions),

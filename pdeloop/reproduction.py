@@ -20,7 +20,7 @@ LEARNED = {
 PAPER = {"burgers": 28.0, "allen-cahn": 15.8, "kdv": 36.4}
 """Percent by which LQT-PO lies below LQT after 40 iterations, arXiv:2403.01005."""
 DEFAULTS = {"seeds": 6, "iterations": 40, "seed": 0}
-"""As the paper."""
+"""The paper's numbers."""
 
 
 def study_of(problems: Sequence[str], options: Mapping[str, Any]) -> Study:

@@ -99,7 +99,7 @@ class Supervisor:
     log_folder: Path
     tell: Callable[[str], None]
     environment: Mapping[str, str]
-    """Of the nodes (loop_interfaces.ros_environment)."""
+    """Environment variables of the nodes (loop_interfaces.ros_environment)."""
     stopped: bool = False
     """Whether the main node ended because an operator asked it to, through its service."""
     _environment: dict[str, str] = field(default_factory=dict)

@@ -280,7 +280,7 @@ class Waiting:
         self._said = ""
 
     def look(self, now: float, happened: bool) -> None:
-        """To be called often; happened: whether the training has gone on since the last call."""
+        """Look after the nodes; call it often. happened: whether the training has advanced since."""
         if happened:
             self._since, self._said = now, ""
         if now - self._since < QUIET or now - self._looked < 1.0:

@@ -22,7 +22,7 @@ from loop_interfaces.files import write_atomically
 
 FILE, METADATA = "bag.mcap", "metadata.yaml"
 VERSION = 9
-"""Of metadata.yaml: that of ROS 2 Jazzy."""
+"""Version of metadata.yaml in ROS 2 Jazzy."""
 LARGE, LARGEST = 2**20, 2**26
 """Bytes of a chunk that is closed at the next pause, and of one that is closed at once."""
 QOS, HASH = "offered_qos_profiles", "topic_type_hash"

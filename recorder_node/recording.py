@@ -31,7 +31,7 @@ class Recording(BagWriter):
     def __init__(self, path: Path, what: Sequence[Source]) -> None:
         super().__init__(path, [source.channel for source in (*what, NOTES)])
         self.run = 0
-        """That of the newest episode; 0 before the first."""
+        """The run of the newest episode; 0 before the first."""
         self._notes: dict[str, Any] = {}
 
     def take(self, source: Source, when: int, raw: bytes) -> None:

@@ -77,7 +77,7 @@ PLAN_AND_TAPE = np.dtype(
 
 @jit
 def taped(w: int, d: int, plan: Any, c: int, e: int, tape: int) -> int:
-    """As `kernel.nonlinear`, and g'(u) to `tape`."""
+    """Like `kernel.nonlinear`, and writes g'(u) to `tape`."""
     t = plan.fine
     rfft_unpack(w, plan.x, plan.z1, d, t, c, e)
     z = inverse(w, plan.z1, plan.z2, d, t, c, e)

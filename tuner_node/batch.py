@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What a training asks for and gets: batches of rollouts and their results; and what defines it."""
+"""Batches of rollouts and their results, and the definition of a training."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""How the training is, as the tuner's /diagnostics show it. Pure."""
+"""Training status for the tuner's /diagnostics. Pure."""
 
 import numpy as np
 

@@ -59,7 +59,7 @@ def settings_of(kind: type[Optimizer], values: Mapping[str, Any]) -> Any:
 
 
 def training_parameters(name: str, options: Mapping[str, Any]) -> dict[str, Any]:
-    """As `load_parameters`, with the defaults that the optimiser prefers, and its settings.
+    """Like `load_parameters`, with the optimiser's preferred defaults and its settings.
 
     options: by dotted names, or nested, as optimizer_settings={"fields": 5}.
     """

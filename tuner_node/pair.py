@@ -68,7 +68,7 @@ class Pair:
     last_sent: float = 0.0
     samples: TrajectoryCollector = field(default_factory=TrajectoryCollector)
     former_samples: TrajectoryCollector = field(default_factory=TrajectoryCollector)
-    """Of the episode before: one that comes late can still contradict them."""
+    """Samples of the previous episode, which a late one can still contradict."""
     pending_cost: Frame | None = None
     """The cost of the episode, while the last samples of its trajectories are missing."""
     pending_since: float = 0.0
@@ -189,7 +189,7 @@ class Pair:
         self.samples.take(what, frame)
 
     def used_samples(self) -> list[TrajectoryCollector]:
-        """Of the last two episodes, if they were used."""
+        """Samples of the last two episodes, if they were used."""
         return [known for known in (self.samples, self.former_samples) if known.used]
 
     def lost_samples(self, n_z: int) -> int:

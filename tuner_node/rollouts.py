@@ -24,7 +24,7 @@ NOISE = {
     "check": Purpose.CHECK_NOISE,
     "adapt": Purpose.ADAPT_NOISE,
 }
-"""Of the phases in which every rollout has noise of its own."""
+"""Purpose of the noise seeds in the phases where each rollout has its own noise."""
 
 
 def explorations(

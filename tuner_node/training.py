@@ -69,7 +69,7 @@ class Training:
     """How those rollouts ended (see CostColumn.ENDED), of the same shape."""
     plant: int = UNKNOWN_PLANT
     steps: int = 0
-    """Of an episode; 0: not known yet."""
+    """Steps of an episode; 0: not known yet."""
     explorations: list[Trajectory | None] = field(default_factory=list)
     """The exploratory trajectory of every seed, where the optimiser wants trajectories."""
     target: Array | None = None

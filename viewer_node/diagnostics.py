@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""How the viewer is, as its /diagnostics show it. Pure."""
+"""Viewer status for /diagnostics. Pure."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""What is known of one loop: the one core of the ROS views and of the web page. Pure.
+"""State of one loop, shared by the ROS views and the web page. Pure.
 
 Frames of the loop's topics go in; episodes, numbers, learning curve and the state of the nodes come
 out. `now` is any monotonic time in s.
@@ -53,7 +53,7 @@ class LoopView:
         self.only, self.curve_from_topics = only, curve_from_topics
         self.horizon, self.weights, self.components = horizon, weights, list(components)
         self.grid: Grid | None = None
-        """Of the state, if it is known."""
+        """Grid of the state, if known."""
         self.environment = 0
         """The one that is shown; of a smaller episode the last one is."""
         self.nodes = LoopNodes()

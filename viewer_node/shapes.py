@@ -12,7 +12,7 @@ from loop_interfaces.grid import Grid
 from viewer_node.picture import NONE, diverging
 
 MOST_CELLS = 10_000
-"""Of a component; of a finer grid every n-th along each axis."""
+"""Most cells drawn of a component; on a finer grid every n-th along each axis."""
 APART = 1.1
 """Distance of two pictures side by side, relative to their size."""
 

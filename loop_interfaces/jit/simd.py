@@ -137,7 +137,7 @@ def splat(typing_context: Any, number: Any) -> Any:
 
 @intrinsic
 def backwards(typing_context: Any, below: Any, above: Any) -> Any:
-    """Of sixteen numbers in a row the ninth, the eighth, ..., the second."""
+    """Select from sixteen consecutive numbers the ninth, the eighth, ..., the second."""
 
     def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return shuffle(builder, args[0], args[1], range(WIDTH, 0, -1))

@@ -75,7 +75,7 @@ def reader_qos(topic: Topic, depth: int = READER_DEPTH) -> QoSProfile:
 
 
 def samples_qos(depth: int) -> QoSProfile:
-    """Of the topic `samples`: reliable, for it is not repeated by the protocol."""
+    """QoS of the topic `samples`: reliable, because the protocol does not repeat it."""
     return QoSProfile(
         reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=depth
     )
@@ -185,7 +185,7 @@ class SampleBatcher:
             publisher.flush()
 
     def poll(self, now: float) -> None:
-        """To be called now and then: looks for subscribers, and publishes what has waited for long."""
+        """Look for subscribers, and publish samples that have waited long. Call it regularly."""
         before = self._viewers
         self._full.open, self._viewers = (publisher.poll(now) for publisher in self._publishers)
         self._throttled.open = self._viewers and (self._throttled.open or not before)

@@ -92,7 +92,7 @@ class Introspection:
         self._diagnostics = status
 
     def round(self, now: float) -> None:
-        """To be called at every housekeeping; works once a second."""
+        """Do the work of one round, once a second. Call it at every housekeeping."""
         if now < self._due:
             return
         # A steady period, though the housekeeping comes a little late each time.

@@ -93,7 +93,7 @@ class _WaitSet:
 
 
 Handler = tuple[Topic, Callable[[bytes], Frame], Callable[[Frame], None]]
-"""Of samples: their topic, what decodes them, and who is called with them."""
+"""A topic of samples, its decoder, and the callback for its frames."""
 
 
 class NodeLoop(EventLoop):

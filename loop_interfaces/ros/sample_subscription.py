@@ -48,7 +48,7 @@ class SerializedSubscription:
         self._type, self._depth = message_type, depth
         self._left: tuple[bytes, dict[str, Any]] | None = None
         self._until = 0
-        """Of the call that has left it."""
+        """The time limit of the call that left it."""
 
     def take(self, until: int | None = None) -> Iterator[tuple[bytes, dict[str, Any]]]:
         """What has come in. until: only what arrived by then (ns since the epoch).

@@ -152,7 +152,7 @@ class LocalSearch:
 
     @property
     def _costs_before(self) -> Array:
-        """Of the law that the steps began with, on the fields from 0 on."""
+        """Costs of the law that the steps began with, on the fields from 0 on."""
         first = np.array([record.cost for record in self._records])
         return (self._none_costs if self._from_none else first)[: self._settings.judging]
 

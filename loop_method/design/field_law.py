@@ -71,7 +71,7 @@ class FieldLaw:
         return self.rows is not None and self.cost < self.other_cost
 
     def summary(self) -> dict[str, Any]:
-        """As data."""
+        """The report as data."""
         fitted = self.fitted
         return {
             "kind": fitted and fitted.model.kind,
@@ -84,7 +84,7 @@ class FieldLaw:
         }
 
     def text(self) -> list[str]:
-        """For people."""
+        """The report as text."""
         fitted = self.fitted
         if fitted is None:
             return ["no model of the whole field can be fitted: the law is that of the regression"]

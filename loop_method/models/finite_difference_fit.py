@@ -18,7 +18,7 @@ from loop_method.models.finite_difference import FiniteDifferenceModel, features
 from loop_method.models.settings import FieldModelSettings
 
 LARGEST_RATE = (1.0, 1.0, 4.0)
-"""Of the differences of order 0, 1, 2 on a unit grid."""
+"""Largest rates of the differences of order 0, 1, 2 on a unit grid."""
 
 
 def fit_finite_difference(
@@ -67,7 +67,7 @@ def fit_finite_difference(
 def _coefficients(
     X: Array, y: Array, common: Array, ridge: float | None, settings: FieldModelSettings
 ) -> Array:
-    """Of every point, (n_x, F, components)."""
+    """Coefficients of every point, (n_x, F, components)."""
     basis = orthonormal(common)
     X, y = (values - basis @ (basis.T @ values) for values in (X, y))
     scale = np.sqrt(np.sum(X**2, axis=(0, 1)))

@@ -34,7 +34,7 @@ LOW_RANKS = {"modes8": 8, "modes16": 16, "modes32": 32, "modes64": 64}
 SIMPLEST = 4
 """Forms of the fewest unknowns, the first ones."""
 FEWEST_POINTS = 8
-"""Of a spectral model."""
+"""Fewest grid points of a spectral model."""
 
 
 @dataclass(frozen=True, eq=False)

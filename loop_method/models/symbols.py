@@ -18,7 +18,7 @@ from loop_method.models.settings import FieldModelSettings
 from loop_method.models.spectral import Spectrum
 
 ORDERS = (4, 2, 2, 1, 1, 1, 1)
-"""Of the highest derivative in the symbols of z, z^2, ..; (ik)^3 of z^2 lets the first pass explode."""
+"""Highest derivative in the symbols of z, z^2, ...; (ik)^3 of z^2 makes the first pass explode."""
 Symbols = tuple[Spectrum, Spectrum, Array]
 """L, and m_q and C_qp as in `SpectralModel`."""
 

@@ -71,7 +71,7 @@ def listed(names: Sequence[str]) -> str:
 
 
 def never_moved(names: Sequence[str], values: Sequence[float]) -> str:
-    """Of inputs that are constant."""
+    """Message about constant inputs."""
     one, at = len(names) == 1, ", ".join(dict.fromkeys(f"{value:.4g}" for value in values[:SHOWN]))
     return (
         f"the input{'' if one else 's'} {listed(names)} never moved (constant at {at}), which says "
@@ -81,7 +81,7 @@ def never_moved(names: Sequence[str], values: Sequence[float]) -> str:
 
 
 def moved_together(name: str, terms: Mapping[str, float], offset: float) -> str:
-    """Of an input that is the sum of `terms`, factors of other inputs, and `offset`."""
+    """Message about an input that is the sum of `terms`, factors of other inputs, and `offset`."""
     text = " + ".join(f"{factor:.4g} {other}" for other, factor in terms.items())
     text += f" + {offset:.4g}" if offset else ""
     return (
@@ -92,7 +92,7 @@ def moved_together(name: str, terms: Mapping[str, float], offset: float) -> str:
 
 
 def followed_the_state(names: Sequence[str]) -> str:
-    """Of inputs, or a combination of inputs, that is a function of the state."""
+    """Message about inputs, or a combination of inputs, that are a function of the state."""
     one = len(names) == 1
     what = f"the input {names[0]}" if one else f"a combination of the inputs {listed(names)}"
     return (
@@ -103,7 +103,7 @@ def followed_the_state(names: Sequence[str]) -> str:
 
 
 def hardly_independent(names: Sequence[str], shares: Sequence[float]) -> str:
-    """Of inputs that hardly moved by themselves; shares: how much of their variation was their own."""
+    """Message about inputs that hardly moved by themselves; shares: that part of their variation."""
     own = ", ".join(f"{100 * share:.2g} %" for share in shares[:SHOWN])
     return (
         f"of the variation of {listed(names)} only {own} is independent of the state and the other "
@@ -113,7 +113,7 @@ def hardly_independent(names: Sequence[str], shares: Sequence[float]) -> str:
 
 
 def cut_off(names: Sequence[str], shares: Sequence[float], p: int) -> str:
-    """Of inputs that a truncation to p directions leaves out; shares: what it keeps of their moves."""
+    """Message about inputs that a truncation to p directions cuts; shares: what it keeps of them."""
     kept = ", ".join(f"{100 * share:.2g} %" for share in shares[:SHOWN])
     return (
         f"the rank p = {p} keeps {kept} of a move of {listed(names)}, and as little of the effect: "

@@ -136,7 +136,7 @@ class DynamicsPlant(BatchPlant):
         return _DynamicsAdjoint(self)
 
     def refined(self) -> Plant | None:
-        """Of the object's `refined`."""
+        """The plant of the object's `refined`."""
         finer = self.dynamics.refined()
         if finer is None:
             return None

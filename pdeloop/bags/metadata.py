@@ -15,7 +15,7 @@ from pdeloop.bags.survey import FileSurvey, Survey
 from recorder_node.bag import METADATA, BagError
 
 MAX_BYTES, MAX_NODES = 20_000_000, 1_000_000
-"""Of metadata.yaml: some 50 entries a topic and 10 a file."""
+"""Limits of metadata.yaml, which has about 50 entries per topic and 10 per file."""
 NAMED = 5
 """Topics whose counts differ and that are named; the others are only counted."""
 

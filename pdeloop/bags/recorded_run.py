@@ -47,7 +47,7 @@ class RecordedRun:
         self._complete: set[bytes] = set()
         """Those of complete episodes."""
         self._numbers: set[int] = set()
-        """Of all episodes, whatever was recorded of them."""
+        """Numbers of all episodes, whatever was recorded of them."""
         self._models: dict[int, Frame] = {}
         """The models that policies are about, by their number."""
         self._values: dict[str, Any] | None = None

@@ -50,7 +50,7 @@ SPREAD = 0.5
 """Largest error of a sample covariance, relative to the variance: six standard errors."""
 
 Row = tuple[Array, int, Array]
-"""Of an episode under policies: gains, index of the model, state."""
+"""A row of an episode under policies: gains, index of the model, state."""
 
 
 class ControllerCheck(Check):
@@ -365,7 +365,7 @@ class ControllerCheck(Check):
 
 
 def variance(seed: int) -> float:
-    """Of the actions of an excitation seed."""
+    """Variance of the actions of an excitation seed."""
     return 0.1 * (1 + seed % 2)
 
 

@@ -32,7 +32,7 @@ DIVERGED = 1e9
 BEGINNING = 8
 """Steps of an episode that is then left."""
 MAX_BYTES = 2**28
-"""Of the states of one episode."""
+"""Most bytes of the states of one episode."""
 HELD, AT_ONCE, GIVE_UP = 10.0, 5.0, 60.0
 """Seconds for which the run of a killed check may hold a plant, in which a released one answers, and
 after which an episode is given up, if --patience is not more."""

@@ -56,7 +56,7 @@ class TunerCheck(Check):
         self.start = self.cost = self.models = self.frame([])
         """What is under way, without rows before and after the run; the last of the others."""
         self.policies: Array | None = None
-        """Of the episode under way; None if it explores."""
+        """Policies of the episode under way; None if it explores."""
         self.rollouts, self.knows_gains = 0, False
         self._answers: list[tuple[Topic, Message]] = []
         n_s = 3 if self.n_a == 4 else 2  # no policy is a square matrix, so that its sides are told

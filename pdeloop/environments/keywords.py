@@ -17,7 +17,7 @@ from pde_sim_node.plants.loading import as_plant
 from pdeloop.api import Problem
 
 Source = str | Path | Problem | Plant | Dynamics
-"""What an environment is made of: a problem's name or file, or what Python has of it."""
+"""The source of an environment: a problem's name or file, or a Python object."""
 
 OTHERS = {
     "dt": "sample_time (the time that an action is held) or integration_time (the internal step)",

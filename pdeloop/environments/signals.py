@@ -15,7 +15,7 @@ from pde_sim_node.plant import MEAN_FIELD, Plant
 
 
 def spaces(plant: Plant) -> tuple[Space[Any], Space[Any]]:
-    """Of an observation (state_size,) and of an action (n_a,)."""
+    """The spaces of an observation (state_size,) and of an action (n_a,)."""
     own = plant.instruments
     bound = np.inf if own.measurement_noise or own.sensors else plant.divergence_bound
     limit = own.action_limit or action_scale(plant)

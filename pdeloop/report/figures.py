@@ -187,7 +187,7 @@ def spectrum(problem: ProblemData) -> Figure:
 
 
 def _closed_loop(model: ModelRows, policy: Array) -> Eigenvalues:
-    """Of A + B K_a with the gains of a policy [K_a K_b]."""
+    """Eigenvalues of A + B K_a with the gains of a policy [K_a K_b]."""
     values: Eigenvalues = np.linalg.eigvals(model.A + model.B @ policy[:, : len(model.A)])
     return values
 

@@ -13,7 +13,7 @@ from pde_sim_node.plant import Plant
 from pdeloop.report.style import FIELD_MAP, image
 
 HEIGHT = 0.06
-"""Of a curve's axes, that the supports of the actuators take."""
+"""Share of a curve's axes that the actuators' supports take."""
 
 
 def supports_of(plant: Plant, component: int) -> Array | None:

@@ -132,7 +132,7 @@ def middle(values: Array) -> Array:
 
 
 def _range(parts: Sequence[Array], plant: Plant, component: int) -> tuple[float, float]:
-    """Of the colours of a component."""
+    """Range of the colours of a component."""
     values = np.concatenate([part.ravel() for part in parts])
     return field_range(values, plant.field_target[plant.grid.part(component)])
 

@@ -16,7 +16,7 @@ from pdeloop.training_run import resolve
 from tuner_node.build import build_training
 
 MAX_SEEDS = 1_000_000
-"""Of a study that gives their number."""
+"""Most seeds of a study that gives their number."""
 MAX_PATH = 1000
 """Characters of a problem's name or file."""
 _NAME = re.compile(r"[\w.+-]{1,60}")

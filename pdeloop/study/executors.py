@@ -30,7 +30,7 @@ WORKER = f"{SAFE_PATH}=1 dask worker {{address}} --nthreads 1"
 
 @contextlib.contextmanager
 def processes(count: int | None = None) -> Iterator[Executor]:
-    """So many processes of this machine, a core each; as many as cores by default.
+    """This many processes on this machine, one core each; by default as many as cores.
 
     An exception in the block ends them at once, in the middle of what they do.
     """
@@ -99,7 +99,7 @@ def cluster(address: str) -> Iterator[Executor]:
 
 
 def no_worker(pool: Executor) -> str:
-    """That a Dask cluster has no worker left, in words; empty if it has, and for other executors."""
+    """Message that a Dask cluster has no worker left; empty if it has, and for other executors."""
     client = getattr(pool, "client", None)
     with contextlib.suppress(OSError):  # no scheduler, either: the trainings fail
         if client is not None and not client.scheduler_info()["workers"]:

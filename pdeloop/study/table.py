@@ -35,7 +35,7 @@ ABOVE = "A negative percentage is one above LQT."
 MARK = "*"
 """Mark of results computed in other environments."""
 AVERAGES = ("ratio of the means", "mean of the ratios")
-"""Of the seeds' costs and LQT's: see `pdeloop.finished_run.Reduction`."""
+"""Averages of the seeds' costs relative to LQT's: see `pdeloop.finished_run.Reduction`."""
 
 
 def rows(study: Study, folder: Path) -> list[dict[str, Any]]:

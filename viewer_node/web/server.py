@@ -86,12 +86,12 @@ class Server:
 
     @property
     def url(self) -> str:
-        """Of the page that may look; see `address`."""
+        """Address of the page without its buttons; see `address`."""
         return f"http://{HOST}:{self.port}/"
 
     @property
     def address(self) -> str:
-        """Of the page that may also use its buttons."""
+        """Address of the page with its buttons."""
         return f"{self.url}?token={self.token}"
 
     def start(self) -> None:
