@@ -127,9 +127,12 @@ class _Training:
         limit = time.monotonic() + LIMIT
         while not (self._out / "result.json").exists():
             if time.monotonic() > limit:
+                for pid, _ in self._nodes():  # each prints where its threads are
+                    with contextlib.suppress(ProcessLookupError):
+                        os.kill(pid, signal.SIGABRT)
                 self._end_of(process, kill=True)
-                last = self._log.read_text(errors="replace").strip().splitlines()[-1:]
-                raise RuntimeError(f"a training did not end within {LIMIT:g} s: {last}")
+                said = self._log.read_text(errors="replace")[-20_000:]
+                raise RuntimeError(f"a training did not end within {LIMIT:g} s: {said}")
             if process.poll() is not None:
                 self._end_of(process)
                 report.resumes += 1
@@ -166,7 +169,12 @@ class _Training:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 # Nodes do not look for modules in the working directory; the relay is one of them.
-                env={**os.environ, MARK: str(self._out), "PYTHONPATH": str(ROOT)},
+                env={
+                    **os.environ,
+                    MARK: str(self._out),
+                    "PYTHONPATH": str(ROOT),
+                    "PYTHONFAULTHANDLER": "1",
+                },
                 start_new_session=True,
                 preexec_fn=_hear_interruptions,
             )
