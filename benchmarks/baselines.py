@@ -284,11 +284,48 @@ def limit(problem: str, settings: Mapping[str, Any]) -> float | None:
     return None if known is None else float(known.mean())
 
 
+def one_line_each(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Rows in which methods that cost the same, for every budget and seed of a problem, are one.
+
+    Examples
+    --------
+    >>> row = {"problem": "p", "budget": 20, "costs": [1.0]}
+    >>> rows = [{**row, "method": "mpc"}, {**row, "method": "lqt-again"}]
+    >>> [row["method"] for row in one_line_each(rows)]
+    ['lqt-again, mpc']
+    """
+    costs: dict[tuple[str, str], dict[int, list[float]]] = {}
+    for row in rows:
+        costs.setdefault((row["problem"], row["method"]), {})[row["budget"]] = row["costs"]
+    groups: list[list[tuple[str, str]]] = []
+    for key, own in costs.items():
+        for group in groups:
+            if group[0][0] == key[0] and _same(costs[group[0]], own):
+                group.append(key)
+                break
+        else:
+            groups.append([key])
+    names = {group[0]: ", ".join(sorted(method for _, method in group)) for group in groups}
+    return [
+        {**row, "method": names[row["problem"], row["method"]]}
+        for row in rows
+        if (row["problem"], row["method"]) in names
+    ]
+
+
+def _same(a: Mapping[int, Sequence[float]], b: Mapping[int, Sequence[float]]) -> bool:
+    """Whether costs agree but for rounding."""
+    return a.keys() == b.keys() and all(
+        len(a[budget]) == len(b[budget]) and np.allclose(a[budget], b[budget], rtol=1e-9, atol=0.0)
+        for budget in a
+    )
+
+
 def text(result: Mapping[str, Any]) -> str:
     """A Markdown table for each problem, the method first that is the best after the last budget."""
     lines: list[str] = []
     for problem, bound in result["limits"].items():
-        rows = [row for row in result["rows"] if row["problem"] == problem]
+        rows = [row for row in one_line_each(result["rows"]) if row["problem"] == problem]
         budgets = list(dict.fromkeys(row["budget"] for row in rows))
         cells = {(row["method"], row["budget"]): cell(row) for row in rows}
         last = {row["method"]: row["cost"] for row in rows}
@@ -328,7 +365,7 @@ def plot(result: Mapping[str, Any], path: Path) -> None:
 
     from pdeloop.report.style import STYLE, panels, plain_log
 
-    shown = [row for row in result["rows"] if finished(row["cost"])]
+    shown = [row for row in one_line_each(result["rows"]) if finished(row["cost"])]
     methods = list(dict.fromkeys(row["method"] for row in shown))
     with rc_context(STYLE):
         figure, axes = panels(len(result["limits"]), 3.2, 3.0, 4.6)
@@ -336,7 +373,7 @@ def plot(result: Mapping[str, Any], path: Path) -> None:
             for method in methods:
                 own = [r for r in shown if (r["problem"], r["method"]) == (problem, method)]
                 ends = np.array([r["interval"] or (r["cost"],) * 2 for r in own]).reshape(-1, 2)
-                color, line = LOOKS.get(method.partition("+")[0], ("black", ":x"))
+                color, line = LOOKS.get(method.split(", ")[0].partition("+")[0], ("black", ":x"))
                 x = [r["budget"] for r in own]
                 ax.plot(x, [r["cost"] for r in own], line, ms=4, lw=1, color=color, label=method)
                 ax.fill_between(x, *ends.T, alpha=0.15, lw=0, color=color)

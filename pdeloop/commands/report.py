@@ -31,6 +31,9 @@ def add(commands: Commands) -> None:
     )
     add_own_code(report, ("equation", "plant", "optimizer", "law"))
     report.add_argument(
+        "--animate", action="store_true", help="with a moving picture, as of `pdeloop animate`"
+    )
+    report.add_argument(
         "--out", type=a_path, metavar="DIR", help="folder of the report [DIR/report]"
     )
 
@@ -42,7 +45,7 @@ def _report(options: argparse.Namespace) -> int:
     allow_own_code(options)
     data = gather(options.folder)
     refuse_other_code(options, *(one.first.values for one in data.problems))
-    page = report(data, options.out)
+    page = report(data, options.out, animate=options.animate)
     for sentence in data.missing:
         print(f"not shown: {printable(sentence)}")
     print(f"report in {page}")

@@ -20,6 +20,9 @@ Rows = Sequence[Mapping[str, Any]]
 EDGE = 1.5
 """Candidates that cost more, relative to the incumbent, or diverged stand at this height."""
 
+TENFOLD = 10.0
+"""Ratio of costs beyond which their axis is logarithmic."""
+
 
 def training_curves(problems: Sequence[ProblemData]) -> Figure:
     """Cost against rollouts: mean and standard deviation over the seeds.
@@ -141,7 +144,7 @@ def bars(problems: Sequence[ProblemData]) -> Figure:
     widest = max(len(problem.costs) for problem in problems)
     figure, axes = panels(len(problems), height=2.8, width=0.35 + 0.58 * widest, least=3.6)
     for ax, problem in zip(axes, problems, strict=True):
-        high = 0.0
+        high, most, low = 0.0, 0.0, np.inf
         for i, (name, costs) in enumerate(problem.costs.items()):
             good = costs[costs < DIVERGED_COST]
             if not good.size:
@@ -150,11 +153,16 @@ def bars(problems: Sequence[ProblemData]) -> Figure:
             mean, std = float(good.mean()), float(good.std())
             star = "*" * bool(good.size < costs.size)
             ax.bar(i, mean, color=COLOURS[name], width=0.72)
-            ax.errorbar(i, mean, std, color="0.5", linewidth=0.9, capsize=3)
+            below = min(std, 0.9 * mean)  # the axis may be logarithmic
+            ax.errorbar(i, mean, [[below], [std]], color="0.5", linewidth=0.9, capsize=3)
             number = f"{mean:#.3g}".rstrip(".") + star
             ax.text(i, mean + std, number, ha="center", va="bottom", fontsize=8)
-            high = max(high, mean + std)
-        ax.set_ylim(0, 1.12 * high or 1.0)
+            high, most, low = max(high, mean + std), max(most, mean), min(low, mean)
+        if most > TENFOLD * low > 0:  # else the bars of the good ones could not be told apart
+            plain_log(ax, 2 * high / low)
+            ax.set_ylim(0.5 * low, 1.5 * high)
+        else:
+            ax.set_ylim(0, 1.12 * high or 1.0)
         labels = [NAMES[n].replace(" ", "\n", 1).replace("-N", "-\nN") for n in problem.costs]
         ax.set_xticks(range(len(labels)), labels, fontsize=7.5)
         ax.set_xlim(-0.6, len(labels) - 0.4)

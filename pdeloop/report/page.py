@@ -11,6 +11,7 @@ import base64
 import io
 import time
 from collections.abc import Iterator, Sequence
+from math import inf, isfinite
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +20,10 @@ import matplotlib
 from matplotlib.figure import Figure
 
 from loop_interfaces.files import make_own_folder, write_atomically
+from pdeloop.animation import pictures, write
+from pdeloop.finished_run import field_means
 from pdeloop.report import figures, learning
+from pdeloop.report.dark import darken
 from pdeloop.report.data import ProblemData, ReportData
 from pdeloop.report.style import COLOURS, NAMES, STYLE
 from pdeloop.reproduction import PAPER, beside_the_paper
@@ -35,17 +39,23 @@ PIXELS_PER_INCH = 115
 
 
 class Picture(NamedTuple):
-    """A figure on the page: file name, heading, caption, width there in pixels, PNG in base64."""
+    """A figure on the page: file name, heading, caption, width there in pixels, PNG in base64.
+
+    dark: the same on a dark background; empty of an animation, which has one for both.
+    """
 
     name: str
     heading: str
     caption: str
     width: int
     png: str
+    dark: str
 
 
-def report(data: ReportData, out: Path | None) -> Path:
+def report(data: ReportData, out: Path | None, *, animate: bool = False) -> Path:
     """Write a report to `out`, DIR/report if not given; returns the path of the page.
+
+    animate: with a moving picture of each problem, where its behaviour is shown, too.
 
     RunFolderError where it cannot be written.
     """
@@ -62,21 +72,43 @@ def report(data: ReportData, out: Path | None) -> Path:
                 [_save(target, *given) for given in _of_problem(problem)]
                 for problem in data.problems
             ]
-        write_atomically(page, _page(data, shared, own).encode())
+        moving = [_moving(target, problem) for problem in data.problems if animate]
+        write_atomically(page, _page(data, shared, own, moving).encode())
     except OSError as error:
         raise RunFolderError(f"cannot write the report to {target}: {error.strerror}") from error
     return page
 
 
 def _save(target: Path, name: str, heading: str, caption: str, figure: Figure) -> Picture:
-    png, svg = io.BytesIO(), io.BytesIO()
+    png, svg, dark = io.BytesIO(), io.BytesIO(), io.BytesIO()
     figure.savefig(png, format="png")
     figure.set_layout_engine("none")  # it is laid out, which takes as long as a drawing
     figure.savefig(svg, format="svg", metadata={"Date": None})
     for kind, content in (("png", png), ("svg", svg)):
         write_atomically(target / f"{name}.{kind}", content.getvalue())
+    darken(figure)
+    figure.savefig(dark, format="png")
     width = round(PIXELS_PER_INCH * figure.get_figwidth())
-    return Picture(name, heading, caption, width, base64.b64encode(png.getvalue()).decode())
+    shown = (base64.b64encode(kind.getvalue()).decode() for kind in (png, dark))
+    return Picture(name, heading, caption, width, *shown)
+
+
+def _moving(target: Path, problem: ProblemData) -> Picture | None:
+    """The animation of a problem; None where its behaviour cannot be computed."""
+    if not problem.behaviours:
+        return None
+    drawn = pictures(problem)
+    name = f"{problem.name}-animation"
+    write(target / f"{name}.gif", drawn)
+    return Picture(
+        name,
+        "Moving picture",
+        f"From a field of the closing evaluation, the same for all (seed "
+        f"{problem.first.seeds[problem.shown]}): the field, its target (dashed), and the actions.",
+        drawn[0].shape[1],
+        base64.b64encode((target / f"{name}.gif").read_bytes()).decode(),
+        "",
+    )
 
 
 Drawn = Iterator[tuple[str, str, str, Figure]]
@@ -166,7 +198,12 @@ def _of_problem(problem: ProblemData) -> Drawn:
     )
 
 
-def _page(data: ReportData, shared: list[Picture], own: list[list[Picture]]) -> str:
+def _page(
+    data: ReportData,
+    shared: list[Picture],
+    own: list[list[Picture]],
+    moving: Sequence[Picture | None],
+) -> str:
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -181,6 +218,8 @@ def _page(data: ReportData, shared: list[Picture], own: list[list[Picture]]) -> 
         title="Reproduction of the paper's experiment" if data.study else f"Training of {names}",
         facts=_facts(data),
         missing=data.missing,
+        outcomes=[_outcome(problem) for problem in problems],
+        moving=[picture for picture in moving if picture is not None],
         shared=shared,
         problems=list(zip(problems, own, strict=True)),
         results=_results(problems, table),
@@ -191,6 +230,23 @@ def _page(data: ReportData, shared: list[Picture], own: list[list[Picture]]) -> 
         first_model=problems[0].first.values["identification_attempts"] == 1,
         budget=_budget(problems),
     )
+
+
+def _outcome(problem: ProblemData) -> tuple[str, str, str]:
+    """What a problem came to, of its best adapted controller: name, cost and what that says."""
+    means = {name: float(field_means(costs).mean()) for name, costs in problem.costs.items()}
+    adapted = {name: cost for name, cost in means.items() if name in problem.runs}
+    best = min(adapted, key=lambda name: adapted[name] if isfinite(adapted[name]) else inf)
+    cost, lqt, none = adapted[best], means["lqt"], means["none"]
+    if not isfinite(cost):
+        return problem.name, "diverged", f"a rollout of the {NAMES[best]} law diverged"
+    said = [f"mean stage cost, {NAMES[best]}"]
+    if isfinite(lqt):
+        share = 100 * (1 - cost / lqt)
+        said.append(f"{abs(share):.1f} % {'below' if share >= 0 else 'above'} {NAMES['lqt']}")
+    if isfinite(none) and none > 0:
+        said.append(f"{100 * cost / none:.3g} % of the cost without control is left")
+    return problem.name, cost_text(cost), "; ".join(said)
 
 
 Table = tuple[Sequence[str], list[tuple[str, ...]]]

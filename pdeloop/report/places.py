@@ -38,7 +38,10 @@ def mark_places(ax: Axes, plant: Plant, component: int) -> None:
     for j, support in enumerate([] if supports is None else supports.T):
         if support.any():
             height, grey = HEIGHT * support / support.max(), ("0.55", "0.75")[j % 2]
-            ax.fill_between(x, height, transform=below, color=grey, step="mid", linewidth=0)
+            acts = support > 1e-3 * support.max()
+            ax.fill_between(
+                x, height, where=acts, transform=below, color=grey, step="mid", linewidth=0
+            )
     if len(points):
         ax.plot(x[points], np.zeros(len(points)), "k.", transform=below, ms=4, clip_on=False)
 

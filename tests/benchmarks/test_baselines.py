@@ -218,6 +218,8 @@ def test_the_table_has_a_column_for_each_budget_and_says_which_methods_diverged(
         {**row, "budget": 40, "cost": 2.0},
         {**row, "method": "b", "budget": 40, "cost": DIVERGED_COST, "diverged": 2},
     ]
+    for each in rows:
+        each["costs"] = [each["cost"]]
     lines = baselines.text({"limits": {"p": None}, "rows": rows}).splitlines()
     assert lines == [
         "| p | 20 rollouts | 40 rollouts | over the limit |",

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import base64
 import stat
 import sys
 from pathlib import Path
@@ -77,6 +78,17 @@ def test_without_a_name_it_is_in_the_folder_of_the_run(
     path = run / "animation.gif"
     assert str(path) in capsys.readouterr().out
     assert path.read_bytes().startswith(b"GIF89a")
+
+
+def test_a_report_has_it_on_its_page_when_asked(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(animation, "FRAMES_PER_SECOND", 1)
+    assert main(["report", str(run), "--animate", "--out", str(tmp_path)]) == 0
+    film = (tmp_path / "small-animation.gif").read_bytes()
+    page = (tmp_path / "index.html").read_text()
+    assert film.startswith(b"GIF89a") and base64.b64encode(film).decode() in page
+    assert page.index('id="small-animation"') < page.index('id="costs"')
 
 
 def test_ffmpeg_is_given_every_pixel(

@@ -7,17 +7,22 @@ import json
 import re
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import matplotlib
 import numpy as np
 import pytest
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 
+from loop_interfaces.colour_scale import DARK
 from loop_interfaces.controllers import CONTROLLERS
+from pdeloop.report.dark import BACK, INK, darken
 from pdeloop.report.data import gather
-from pdeloop.report.learning import EDGE, steps
-from pdeloop.report.style import STYLE
+from pdeloop.report.learning import EDGE, bars, steps
+from pdeloop.report.style import FIELD_MAP, STYLE
 from tests.support.browser import browser
 from tests.support.loop_harness import processes
 from tests.support.made_once import made_once
@@ -179,11 +184,70 @@ def test_contents_lead_to_every_problem_and_figure(folder, tab):
         "[...document.querySelectorAll('nav a')].map((a) => [a.getAttribute('href').slice(1),"
         " a.textContent, document.querySelector(a.getAttribute('href'))?.innerText ?? ''])"
     )
-    assert {"results", "small", "budget", "parameters", *FIGURES} == {
-        target for target, *_ in links
-    }
+    sections = {"results", "small", "budget", "parameters", "about"}
+    assert sections | set(FIGURES) == {target for target, *_ in links}
     for target, text, found in links:
         assert found.startswith(text), target
+
+
+def test_result_and_figures_are_on_the_first_screen_and_what_it_is_about_at_the_end(folder, tab):
+    tab.size(1280, 900)
+    tab.go((folder / "report" / "index.html").as_uri())
+    top = "document.querySelector(%r).getBoundingClientRect().top"
+    outcome, figure, about = (tab.ask(top % at) for at in (".outcome b", "figure img", "#about"))
+    assert outcome < 200 and figure < 800
+    assert about > tab.ask(top % "#parameters") > tab.ask(top % "#small-behaviour") > figure
+    costs = gather(folder).problems[0].costs
+    best = min(costs[name].mean() for name in controllers_of(folder))
+    shown = float(tab.ask("document.querySelector('.outcome b').textContent"))
+    assert shown == pytest.approx(best, rel=1e-3)
+
+
+def test_figures_follow_the_dark_scheme(folder, tab):
+    page = (folder / "report" / "index.html").as_uri()
+    corner = """(async () => {
+      const image = document.querySelector("#costs img");
+      await image.decode();
+      const canvas = new OffscreenCanvas(4, 4).getContext("2d");
+      canvas.drawImage(image, 0, 0);
+      return [...canvas.getImageData(1, 1, 1, 1).data];
+    })()"""
+    for scheme, colour in (("light", [255, 255, 255, 255]), ("dark", [20, 23, 28, 255])):
+        tab.scheme(scheme)
+        tab.go(page)
+        assert tab.ask(corner) == colour
+    tab.scheme("light")
+
+
+def test_a_dark_figure_has_the_same_colours_turned_around():
+    figure = Figure()
+    ax = figure.subplots()
+    (black,) = ax.plot([0, 1], color="black")
+    (lqt,) = ax.plot([0, 1], color=CONTROLLERS["lqt"].colour, alpha=0.5)
+    (green,) = ax.plot([0, 1], color="#009e00")
+    field = ax.imshow([[0.0, 0.5, 1.0]], cmap=FIELD_MAP)
+    figure.colorbar(field)
+    darken(figure)
+    assert to_hex(figure.get_facecolor()) == to_hex(ax.get_facecolor()) == BACK
+    assert to_hex(black.get_color()) == to_hex(ax.title.get_color()) == INK
+    assert to_hex(lqt.get_color()) == CONTROLLERS["lqt"].on_dark and lqt.get_alpha() == 0.5
+    assert to_hex(green.get_color()) == "#009e00"
+    levels = [to_hex(field.to_rgba(value)) for value in (0.0, 1.0)]
+    assert levels == [DARK[0], DARK[-1]]
+
+
+@pytest.mark.parametrize(("without", "scale"), [(9.0, "linear"), (11.0, "log")])
+def test_costs_that_differ_tenfold_have_a_logarithmic_axis(without, scale):
+    costs = {
+        "none": np.full((1, 3), without),
+        "lqt": np.full((1, 3), 2.0),
+        "adapted": np.ones((1, 3)),
+    }
+    ax = bars([SimpleNamespace(costs=costs, name="p")]).axes[0]
+    assert ax.get_yscale() == scale
+    low, high = ax.get_ylim()
+    assert low < 1.0 and high > without
+    assert [bar.get_height() for bar in ax.patches] == [without, 2.0, 1.0]
 
 
 def test_on_a_phone_tables_scroll_inside_their_box(folder, tab):
