@@ -26,7 +26,7 @@ import numpy as np
 from loop_interfaces.arrays import Array
 from loop_interfaces.grid import Axis, Grid
 from pde_sim_node.arguments import internal_steps, positive, whole
-from pde_sim_node.dynamics import Dynamics
+from pde_sim_node.dynamics import Dynamics, arguments_of
 
 
 class Cavity(Dynamics):
@@ -157,8 +157,7 @@ class Cavity(Dynamics):
 
     def refined(self) -> Cavity:
         """With half the internal time step."""
-        arguments, named = getattr(self, "_given", ((), {}))
-        return type(self)(*arguments, **{**named, "step_time": self.dt / 2})
+        return type(self)(**{**arguments_of(self), "step_time": self.dt / 2})
 
 
 def _laplacian(f: Array, dx: float) -> Array:

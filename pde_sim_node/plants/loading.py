@@ -21,10 +21,29 @@ from pde_sim_node.definition import described
 from pde_sim_node.dynamics import Dynamics, arguments_of, signature_of
 from pde_sim_node.plant import Plant
 from pde_sim_node.plants.cavity import Cavity
+from pde_sim_node.plants.convection import Convection
 from pde_sim_node.plants.dynamics_plant import DynamicsPlant
 from pde_sim_node.plants.interval import Interval
+from pde_sim_node.plants.reactions import (
+    Brusselator,
+    ComplexGinzburgLandau,
+    FitzHughNagumo,
+    GrayScott,
+    Plate,
+)
 
-PLANTS: Mapping[str, type[Dynamics]] = MappingProxyType({"interval": Interval, "cavity": Cavity})
+PLANTS: Mapping[str, type[Dynamics]] = MappingProxyType(
+    {
+        "interval": Interval,
+        "cavity": Cavity,
+        "convection": Convection,
+        "plate": Plate,
+        "gray-scott": GrayScott,
+        "brusselator": Brusselator,
+        "fitzhugh-nagumo": FitzHughNagumo,
+        "complex-ginzburg-landau": ComplexGinzburgLandau,
+    }
+)
 """Those that are shipped, by name."""
 OWN_PLANTS = OwnCode("plant", "PDELOOP_PLANTS", PLANTS)
 OBJECT = "object of a Python program:"

@@ -1,0 +1,220 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Rayleigh-Bénard convection in a square, controlled by the temperatures of its lower wall.
+
+    u_t + div(u u) = -grad p + sqrt(Pr/Ra) lap u + T e_y,    div u = 0
+    T_t + div(u T) = lap T / sqrt(Pr Ra)
+
+No slip; adiabatic sides; T = -1/2 on the upper wall and 1/2 + a_j on ten equal parts of the lower one.
+Actions are made to have mean zero and then divided by max(1, max|a| / bound), as in beacon's task
+`rayleigh-v0`. The conducting state u = 0, T = 1/2 - y is to be held; above Ra = 2585 it is unstable. An
+episode begins with the convection that develops without control.
+
+Staggered grid: T in the centres of n x n cells, u and v in the middle of their left and lower faces.
+Explicit Euler with central differences in conservative form, then a projection with cosine transforms
+for its Poisson equation: first order in time, second in space.
+
+References
+----------
+Viquerat, Hachem, "Beacon, a lightweight deep reinforcement learning benchmark library for flow
+control", 2023. Ouertatani et al., "Numerical simulation of two-dimensional Rayleigh-Bénard convection
+in an enclosure", C. R. Mécanique 336, 2008.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from loop_interfaces.arrays import Array
+from loop_interfaces.grid import Axis, Grid
+from loop_interfaces.jit.cache import cached_njit
+from pde_sim_node.arguments import positive, whole
+from pde_sim_node.dynamics import Dynamics, arguments_of
+
+_STABLE = 0.8
+"""Time step as a share of the limit dx^2 / 4 kappa of the explicit diffusion."""
+_STARTED = 100.0
+"""Time in which convection develops from a roll of the size of the box."""
+
+
+class Convection(Dynamics):
+    """A fluid that is heated from below and is to be kept at rest.
+
+    Parameters
+    ----------
+    cells
+        n of each direction, a multiple of the number of heaters.
+    rayleigh, prandtl
+        Ra and Pr.
+    heaters
+        n_a.
+    bound
+        Largest change of a heater's temperature.
+    action_cost
+        R.
+    steps
+        T.
+    refinement
+        Time steps in place of one that is stable.
+
+    Raises
+    ------
+    ValueError
+        A value is out of its range; the message names it.
+    """
+
+    sample_time, batched = 2.0, True
+    grid: Grid
+
+    def __init__(
+        self,
+        cells: int = 50,
+        rayleigh: float = 1e4,
+        prandtl: float = 0.71,
+        heaters: int = 10,
+        bound: float = 0.75,
+        action_cost: float = 0.01,
+        steps: int = 100,
+        refinement: int = 1,
+    ) -> None:
+        n, self.n_a = whole("cells", cells, 4), whole("heaters", heaters, 1)
+        if n % self.n_a:
+            raise ValueError(f"cells must be a multiple of the {heaters} heaters, got {cells}")
+        axes = (Axis(name, 1.0, n, periodic=False, walls=False, unit="") for name in "yx")
+        self.grid = Grid(tuple(axes), ("T", "u", "v"))
+        self.bound, self.horizon = positive("bound", bound), whole("steps", steps, 1)
+        self.state_weight = 1.0 / n**2
+        self.action_weight = positive("action_cost", action_cost)
+        self.kappa = 1.0 / math.sqrt(positive("prandtl", prandtl) * positive("rayleigh", rayleigh))
+        self.nu = prandtl * self.kappa
+        self.refinement = whole("refinement", refinement, 1)
+        limit = _STABLE / (4 * n**2 * max(self.kappa, self.nu))
+        self.substeps = math.ceil(self.sample_time / limit) * self.refinement
+        wave = np.arange(n)
+        self._cosines = np.cos(np.pi * wave[:, None] * (wave + 0.5) / n) * math.sqrt(2.0 / n)
+        self._cosines[0] = math.sqrt(1.0 / n)
+        symbol = 2.0 * n**2 * (np.cos(np.pi * wave / n) - 1.0)
+        self._inverse = np.zeros((n, n))
+        self._inverse.ravel()[1:] = 1.0 / np.add.outer(symbol, symbol).ravel()[1:]
+        y = self.grid.axes[0].points
+        rest = np.zeros((3, n, n))
+        rest[0] = 0.5 - y[:, None]
+        self.target = rest.ravel()
+        heated = np.zeros((3, n, n, self.n_a))
+        for i in range(n):
+            heated[0, 0, i, i * self.n_a // n] = 1.0
+        self.supports = heated.reshape(-1, self.n_a)
+        self._developed: Array | None = None
+
+    def actuated(self, a: Array) -> Array:
+        """Of mean zero, and none beyond the bound."""
+        balanced = a - a.mean()
+        taken: Array = balanced / max(1.0, float(np.abs(balanced).max()) / self.bound)
+        return taken
+
+    def initial_state(self, rng: np.random.Generator) -> Array:
+        """The convection that has developed without control."""
+        return self.mean_state()
+
+    def mean_state(self) -> Array:
+        """The same."""
+        if self._developed is None:
+            n, points = self.grid.shape[0], self.grid.axes[0].points
+            z = self.target.reshape(3, n, n).copy()
+            z[0] += 0.3 * np.sin(np.pi * points)[:, None] * np.cos(np.pi * points)
+            z = z.reshape(1, -1)
+            for _ in range(round(_STARTED / self.sample_time)):
+                z = self.step(z, np.zeros((1, self.n_a)))
+            self._developed = z[0]
+        return self._developed.copy()
+
+    def step(self, z: Array, a: Array) -> Array:
+        """See `Dynamics.step`."""
+        fields = self.grid.fields(z).copy()
+        below = np.repeat(0.5 + a, self.grid.shape[1] // self.n_a, axis=1)
+        dt = self.sample_time / self.substeps
+        for m in range(len(z)):
+            flow(fields[m], below[m], self.kappa, self.nu, dt, self.substeps, *self._solver)
+        return fields.reshape(len(z), -1)
+
+    @property
+    def _solver(self) -> tuple[Array, Array]:
+        return self._cosines, self._inverse
+
+    def nusselt(self, z: Array) -> Array:
+        """Nu of states (..., n_z): the heat through the lower wall, 1 where it is only conducted."""
+        lowest, dy = self.grid.fields(z)[..., 0, 0, :], self.grid.axes[0].spacing
+        found: Array = np.mean(0.5 - lowest, axis=-1) / (dy / 2)
+        return found
+
+    def refined(self) -> Convection:
+        """With half the internal time step."""
+        return type(self)(**{**arguments_of(self), "refinement": 2 * self.refinement})
+
+
+@cached_njit()
+def flow(
+    fields: Array,
+    below: Array,
+    kappa: float,
+    nu: float,
+    dt: float,
+    steps: int,
+    cosines: Array,
+    inverse: Array,
+) -> None:
+    """Advance T, u, v (3, n, n), in place; below (n,): temperatures of the lower wall."""
+    T, u, v = fields[0], fields[1], fields[2]
+    n = len(T)
+    h, d2 = dt * n, n * n
+    waves = np.ascontiguousarray(cosines.T)
+    new, moved_u, moved_v = np.empty_like(T), np.zeros_like(u), np.zeros_like(v)
+    source = np.empty((n, n))
+    for _ in range(steps):
+        for j in range(n):
+            for i in range(n):
+                here = T[j, i]
+                west = T[j, i - 1] if i > 0 else here
+                east = T[j, i + 1] if i < n - 1 else here
+                south = T[j - 1, i] if j > 0 else 2.0 * below[i] - here
+                north = T[j + 1, i] if j < n - 1 else -1.0 - here
+                out = u[j, i + 1] * (here + east) if i < n - 1 else 0.0
+                out -= u[j, i] * (here + west)
+                out += v[j + 1, i] * (here + north) if j < n - 1 else 0.0
+                out -= v[j, i] * (here + south)
+                spread = d2 * (west + east + south + north - 4.0 * here)
+                new[j, i] = here + dt * kappa * spread - 0.5 * h * out
+                if i > 0:
+                    c = u[j, i]
+                    w, e = u[j, i - 1], (u[j, i + 1] if i < n - 1 else 0.0)
+                    s = u[j - 1, i] if j > 0 else -c
+                    t = u[j + 1, i] if j < n - 1 else -c
+                    up = 0.25 * (v[j + 1, i - 1] + v[j + 1, i]) * (c + t) if j < n - 1 else 0.0
+                    down = 0.25 * (v[j, i - 1] + v[j, i]) * (c + s)
+                    out = 0.25 * ((c + e) ** 2 - (c + w) ** 2) + up - down
+                    moved_u[j, i] = c + dt * nu * d2 * (w + e + s + t - 4.0 * c) - h * out
+                if j > 0:
+                    c = v[j, i]
+                    s, t = v[j - 1, i], (v[j + 1, i] if j < n - 1 else 0.0)
+                    w = v[j, i - 1] if i > 0 else -c
+                    e = v[j, i + 1] if i < n - 1 else -c
+                    right = 0.25 * (u[j - 1, i + 1] + u[j, i + 1]) * (c + e) if i < n - 1 else 0.0
+                    left = 0.25 * (u[j - 1, i] + u[j, i]) * (c + w)
+                    out = 0.25 * ((c + t) ** 2 - (c + s) ** 2) + right - left
+                    lifted = 0.5 * (T[j - 1, i] + T[j, i])
+                    spread = d2 * (w + e + s + t - 4.0 * c)
+                    moved_v[j, i] = c + dt * (nu * spread + lifted) - h * out
+        for j in range(n):
+            for i in range(n):
+                out = (moved_u[j, i + 1] if i < n - 1 else 0.0) - moved_u[j, i]
+                out += (moved_v[j + 1, i] if j < n - 1 else 0.0) - moved_v[j, i]
+                source[j, i] = n * out
+        p = np.dot(waves, np.dot(np.dot(cosines, np.dot(source, waves)) * inverse, cosines))
+        for j in range(n):
+            for i in range(n):
+                T[j, i] = new[j, i]
+                if i > 0:
+                    u[j, i] = moved_u[j, i] - n * (p[j, i] - p[j, i - 1])
+                if j > 0:
+                    v[j, i] = moved_v[j, i] - n * (p[j, i] - p[j - 1, i])
