@@ -20,6 +20,7 @@ from loop_interfaces.text import shown
 from pde_sim_node.definition import described
 from pde_sim_node.dynamics import Dynamics, arguments_of, signature_of
 from pde_sim_node.plant import Plant
+from pde_sim_node.plants.boundary import ReactionDiffusionBoundary, Transport
 from pde_sim_node.plants.cavity import Cavity
 from pde_sim_node.plants.convection import Convection
 from pde_sim_node.plants.dynamics_plant import DynamicsPlant
@@ -37,6 +38,8 @@ PLANTS: Mapping[str, type[Dynamics]] = MappingProxyType(
         "interval": Interval,
         "cavity": Cavity,
         "convection": Convection,
+        "transport": Transport,
+        "reaction-diffusion": ReactionDiffusionBoundary,
         "plate": Plate,
         "gray-scott": GrayScott,
         "brusselator": Brusselator,

@@ -1,0 +1,138 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""Linear PDEs on [0, 1] that are controlled through their right end, u(1, t) = a.
+
+Transport with recirculation, u_t = u_x + beta(x) u(0, t), and reaction-diffusion, u_t = u_xx + beta(x)
+u with u(0, t) = 0: unstable, with known answers by backstepping. The tasks of PDEControlGym, on its
+grids, with its schemes and time steps: upwind or central differences and explicit Euler, whose product
+over a sampling time is one matrix. First order in space for transport, second for reaction-diffusion.
+
+References
+----------
+Krstic, Smyshlyaev, "Boundary Control of PDEs", SIAM 2008, chapters 4 and 9. Bhan, Bian, Krstic, Shi,
+"PDE Control Gym", L4DC 2024.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+import numpy as np
+
+from loop_interfaces.arrays import Array
+from loop_interfaces.grid import Grid
+from pde_sim_node.arguments import internal_steps, positive, whole
+from pde_sim_node.dynamics import Dynamics
+
+
+class BoundaryControlled(Dynamics):
+    """z = u at the points i / n, i = 0 .. n, the last of which is what was given there.
+
+    Parameters
+    ----------
+    intervals
+        n.
+    strength
+        Factor of beta.
+    rate
+        g of beta = strength cos(g arccos x).
+    action_cost
+        R; Q is 1 / n.
+    step_time
+        Internal time step, of which sample_time is a whole multiple.
+
+    Raises
+    ------
+    ValueError
+        A value is out of its range; the message names it.
+    """
+
+    n_a = 1
+    divergence_bound = 1e6
+    grid: Grid
+
+    def __init__(
+        self, intervals: int, strength: float, rate: float, action_cost: float, step_time: float
+    ) -> None:
+        n = whole("intervals", intervals, 4)
+        self.grid = Grid.interval(1.0, n + 1, periodic=False)
+        self.x = self.grid.axes[0].points
+        self.beta = strength * np.cos(rate * np.arccos(self.x))
+        self.state_weight, self.action_weight = 1.0 / n, positive("action_cost", action_cost)
+        steps = internal_steps(self.sample_time, positive("step_time", step_time))
+        # The held end is a state that does not change within a sampling time.
+        one = np.eye(n + 1)
+        one[:-1] += step_time * self.rates()
+        whole_step = np.linalg.matrix_power(one, steps)
+        self.A, self.B = whole_step.copy(), whole_step[:, -1:].copy()
+        self.A[:, -1] = 0.0
+        self.supports = one[:, -1:] * 0.0
+        self.supports[-1] = 1.0
+
+    @abstractmethod
+    def rates(self) -> Array:
+        """du/dt at all points but the last, as a matrix (n, n + 1)."""
+
+    def initial_state(self, rng: np.random.Generator) -> Array:
+        """A constant from 1 to 10."""
+        return np.full(self.grid.size, rng.uniform(1.0, 10.0))
+
+    def mean_state(self) -> Array:
+        """5.5."""
+        return np.full(self.grid.size, 5.5)
+
+    def step(self, z: Array, a: Array) -> Array:
+        """See `Dynamics.step`."""
+        after: Array = self.A @ z + self.B @ a
+        return after
+
+    def pull_back(self, z: Array, a: Array, y: Array) -> tuple[Array, Array]:
+        """See `Dynamics.pull_back`."""
+        return self.A.T @ y, self.B.T @ y
+
+
+class Transport(BoundaryControlled):
+    """u_t = u_x + beta(x) u(0, t), u(1, t) = a, over a time of 5 with actions held for 0.1."""
+
+    sample_time, horizon = 0.1, 50
+
+    def __init__(
+        self,
+        intervals: int = 100,
+        strength: float = 5.0,
+        rate: float = 7.35,
+        action_cost: float = 0.1,
+        step_time: float = 1e-4,
+    ) -> None:
+        super().__init__(intervals, strength, rate, action_cost, step_time)
+
+    def rates(self) -> Array:
+        """Upwind differences."""
+        n = len(self.x) - 1
+        found = n * (np.eye(n, n + 1, 1) - np.eye(n, n + 1))
+        found[:, 0] += self.beta[:-1]
+        return found
+
+
+class ReactionDiffusionBoundary(BoundaryControlled):
+    """u_t = u_xx + beta(x) u, u(0, t) = 0, u(1, t) = a, over a time of 1 with actions held for 1e-3."""
+
+    sample_time, horizon = 1e-3, 1000
+
+    def __init__(
+        self,
+        intervals: int = 200,
+        strength: float = 50.0,
+        rate: float = 8.0,
+        action_cost: float = 0.1,
+        step_time: float = 1e-5,
+    ) -> None:
+        super().__init__(intervals, strength, rate, action_cost, step_time)
+        self.A[0], self.B[0] = 0.0, 0.0
+
+    def rates(self) -> Array:
+        """Central differences; the first point is held at 0."""
+        n = len(self.x) - 1
+        found = n**2 * (np.eye(n, n + 1, 1) - 2.0 * np.eye(n, n + 1) + np.eye(n, n + 1, -1))
+        found += np.diag(self.beta)[:-1]
+        found[0] = 0.0
+        return found
