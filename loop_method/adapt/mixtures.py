@@ -60,7 +60,7 @@ def mixtures(
     n, n_z = fields.shape
     mean = fields.mean(axis=0)
     deviations = fields - mean
-    if n < 2 or not deviations.any():
+    if n < 2 or most < 2 or not deviations.any():
         return np.empty((0, n_z))
     rho = invariant_share(fields, components) if periodic else 0.0
     covariance = (1.0 - rho) * deviations.T @ deviations / (n - 1)

@@ -41,6 +41,7 @@ from loop_method.adapt.local_search import ENDED as LOCAL_ENDED
 from loop_method.adapt.local_search import LocalSearch, part_of
 from loop_method.adapt.renewal import renew
 from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.adapt.starts import forgets, initial_fields, measured_states
 from loop_method.adapt.trajectories import Records, denoised
 from loop_method.adapt.verdict import ADAPTED, FIRST, NONE, choose, evidence_of
 from loop_method.models.files import model_of
@@ -242,9 +243,7 @@ class ModelBased(Optimizer):
             self._none_is_close = bool(none <= (1.0 + self._settings.close) * own)
 
     def _fields(self) -> Array:
-        """The measured initial fields, each once, (n, n_z)."""
-        fields = [record.states[0] for record in self._data()]
-        return np.stack(list({field.tobytes(): field for field in fields}.values()))
+        return initial_fields(self._data())
 
     def _renew(self, row: Row) -> None:
         """Improve the law on the model that predicts the rollouts, or search for one without."""
@@ -280,15 +279,21 @@ class ModelBased(Optimizer):
         # A first law that is worse than no control is nothing to stay near to.
         self._safe = bool(loop.costs(first, fields).mean() < loop.costs(none, fields).mean())
         base, near = (first, self._first) if self._safe else (none, self._none)
+        settings, parts = self._settings, self._parts
+        if forgets(loop, fields):
+            row["chaotic"] = True
+            fields = measured_states(self._data(), settings.chaotic_fields)
+            # Others than last time, so that the laws of the parts may know those of their own part.
+            settings, parts = replace(settings, mixtures=0), []
         rng = np.random.default_rng([self._seed, _MIXTURE_STREAM, self._records.count])
         found = renew(
             loop,
             base,
             base if self._improved is None else self._improved,
-            self._parts,
+            parts,
             fields,
             rng,
-            self._settings,
+            settings,
             components=belief.components,
             periodic=self._context.periodic,
             final=final,

@@ -43,6 +43,13 @@ class ModelBasedSettings(Settings):
         24,
         "initial fields drawn around the measured ones, at most; half as many where the law is not the "
         "final one",
+        0,
+        1000,
+    )
+    chaotic_fields: int = setting(
+        32,
+        "measured states that are taken for initial fields of a chaotic plant, which forgets where it "
+        "began; no fields are drawn then",
         4,
         1000,
     )

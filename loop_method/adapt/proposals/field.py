@@ -1,10 +1,8 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """A law that is improved on a model of the whole field.
 
-Applies where such a model predicts the rollouts. Of a chaotic plant, which forgets where it began, it
-predicts pieces of them alone. There a cost depends on the initial field as if by chance, and a law that
-is better from a few of them is not from others. So it is improved from many measured states, and tried
-only where it is better from others.
+Applies where such a model predicts the rollouts, or, of a chaotic plant, pieces of them. There the law
+is improved from many measured states (`starts`), and tried only where it is better from others.
 """
 
 from __future__ import annotations
@@ -22,13 +20,14 @@ from loop_method.adapt.proposals.proposal import COMPARED, LEAST_FALL, TRUST, Pr
 from loop_method.adapt.renewal import curvature_of
 from loop_method.adapt.sensitivity import ISOTROPY
 from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.adapt.starts import forgets, initial_fields, measured_states
 
 SETTINGS = ModelBasedSettings(isotropy=ISOTROPY)
 # Chaos: the error of a rollout is more than this many times that of its pieces; noise adds up more
 # slowly.
 _GROWTH, _PIECES = 20.0, 8
-# A law is improved from this many measured states, one of three, and judged by its cost from others.
-_STARTS, _HELD_OUT = 80, 3
+# One of so many measured states is a field to begin with, the others judge.
+_HELD_OUT = 3
 
 
 def field_model(
@@ -56,12 +55,11 @@ def propose(
 ) -> Proposal | None:
     """The best law on the model near to a policy, or None where that gains nothing."""
     loop = belief.loop(context)
-    if whole:
-        fields = list({record.states[0].tobytes(): record.states[0] for record in data}.values())
-        chosen, others = spread(np.stack(fields[-COMPARED:])), None
+    fields, others = initial_fields(data), None
+    if whole and not forgets(loop, fields):
+        chosen = spread(fields[-COMPARED:])
     else:
-        states = np.concatenate([record.states for record in data])
-        every = states[np.linspace(0, len(states) - 1, _STARTS * _HELD_OUT).astype(int)]
+        every = measured_states(data, SETTINGS.chaotic_fields * _HELD_OUT)
         held_out = np.arange(len(every)) % _HELD_OUT > 0
         chosen, others = every[~held_out], every[held_out]
     first = loop.theta(policy)

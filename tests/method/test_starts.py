@@ -1,0 +1,44 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""From which fields a law is improved: a chaotic plant is told from others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from loop_method.adapt.base import Record
+from loop_method.adapt.closed_loop import ClosedLoop
+from loop_method.adapt.starts import forgets, initial_fields, measured_states
+
+N_Z = 12
+
+
+@dataclass
+class Logistic:
+    """z' = r z (1 - z) at every point, chaotic at r = 3.9 and at rest in 1 - 1/r at r = 2.5."""
+
+    r: float
+    n_a = 1
+
+    def step(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        return self.r * states * (1.0 - states)
+
+
+@pytest.mark.parametrize(("r", "chaotic"), [(3.9, True), (2.5, False)])
+def test_small_changes_grow_in_a_chaotic_plant_alone(r: float, chaotic: bool) -> None:
+    loop = ClosedLoop(Logistic(r), np.eye(N_Z, 3), np.full(N_Z, 0.6), 1.0, 1.0, 40)  # type: ignore[arg-type]
+    fields = np.random.default_rng(0).uniform(0.2, 0.8, (4, N_Z))
+    assert forgets(loop, fields) == chaotic
+    assert not forgets(loop, fields[:1])  # one field tells nothing
+
+
+def test_states_are_taken_from_all_rollouts_and_initial_fields_once_each() -> None:
+    rng = np.random.default_rng(1)
+    one, two = (rng.normal(size=(21, N_Z)) for _ in range(2))
+    records = [Record(np.zeros((1, 6)), 1.0, z, np.zeros((20, 1))) for z in (one, two, one)]
+    np.testing.assert_array_equal(initial_fields(records), [one[0], two[0]])
+    states = measured_states(records, 5)
+    np.testing.assert_array_equal(states[[0, -1]], [one[0], one[-1]])
+    assert len(states) == 5 and len(measured_states(records, 1000)) == 63
