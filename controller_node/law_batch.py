@@ -21,8 +21,16 @@ from loop_method.laws.base import Law, Parts
 from loop_method.laws.calls import action, one_thread, updated
 
 
-class ForgottenError(Exception):
-    """An action depends on steps of the episode that are not known; the text says which."""
+class MemoryUnknownError(Exception):
+    """An action depends on what is not known of the episode; the text says on what.
+
+    contradicted: because two different states came for one step, so that what was answered may be
+    wrong; otherwise because steps were missed.
+    """
+
+    def __init__(self, text: str, *, contradicted: bool = False) -> None:
+        super().__init__(text)
+        self.contradicted = contradicted
 
 
 class LawBatch:
@@ -99,7 +107,7 @@ class LawBatch:
     def actions(self, step: int, states: Array) -> Array:
         """The actions (M, n_a) that answer the states (M, n_z) of a step.
 
-        ForgottenError where the law has a memory and the steps before were not seen, or had other
+        MemoryUnknownError where the law has a memory and the steps before were not seen, or had other
         states.
         """
         if self.compiled:
@@ -113,11 +121,15 @@ class LawBatch:
             if known == seen:
                 return answer.copy()
             if step:
-                raise ForgottenError(f"two different states came for step {step}")
+                raise MemoryUnknownError(
+                    f"two different states came for step {step}", contradicted=True
+                )
         if step == 0:
             self._begin()
         elif step != self._next:
-            raise ForgottenError(f"the states before step {step} are not known, or not all of them")
+            raise MemoryUnknownError(
+                f"the states before step {step} are not known, or not all of them"
+            )
         with one_thread():
             actions = self._computed(step, states)
             self._memories = [

@@ -18,7 +18,7 @@ import numpy as np
 from controller_node.answered_steps import AnsweredSteps
 from controller_node.exploration import Exploration
 from controller_node.identification import DesignSettings
-from controller_node.law_batch import ForgottenError, LawBatch
+from controller_node.law_batch import LawBatch, MemoryUnknownError
 from controller_node.run_state import (
     Answering,
     EpisodeInputs,
@@ -211,8 +211,8 @@ class Responder:
         if answering.law is not None:
             try:
                 actions = answering.law.actions(frame.step, frame.values)
-            except ForgottenError as error:
-                return [self._forgotten(frame, str(error))]
+            except MemoryUnknownError as error:
+                return [self._unknown(frame, error)]
             if answering.law.remembers and not self._has_room(frame.run, 0):
                 answering.law.forget_answers()
         else:
@@ -343,7 +343,7 @@ class Responder:
         if run.exploration is None:
             if (inputs := run.inputs_for(start, self._settings.action_limit)) is None:
                 return None
-            law = self._law(run, start, inputs, target)
+            law = self._law(run, frame.plant, start, inputs, target)
         signed = NOT_SIGNED
         if start.plant:
             digest = digest_of_start(start, inputs, self._settings.action_limit)
@@ -352,7 +352,7 @@ class Responder:
         return run.answering
 
     def _law(
-        self, run: RunState, start: Frame, inputs: EpisodeInputs, target: np.ndarray
+        self, run: RunState, plant: int, start: Frame, inputs: EpisodeInputs, target: np.ndarray
     ) -> LawBatch:
         """The law set for an episode: the one in use, with its memory, if it is made from the same."""
         policy, models = inputs
@@ -363,17 +363,19 @@ class Responder:
             )
         limit = self._settings.action_limit
         made_from = start.episode, digest_of_start(start, inputs, limit), digest_of(target)
-        if run.law is None or run.law[0] != made_from:
+        known = run.laws.get(plant)
+        if known is None or known[0] != made_from:
             law = LawBatch(models.laws, target, limit)
             law.set(policy.values, index)
-            run.law = made_from, law
-        return run.law[1]
+            known = made_from, law
+        run.use_law(plant, known)
+        return known[1]
 
-    def _forgotten(self, state: Frame, reason: str) -> ModelFailure:
-        """Message that the episode must be run again, because the law's memory is unknown."""
-        self.counters["memories lost"] += 1
-        text = f"{reason}, on which the memory of the law '{self._law_kind.name}' depends"
-        return ModelFailure(state.run, state.episode, True, text)
+    def _unknown(self, state: Frame, error: MemoryUnknownError) -> ModelFailure:
+        """Message that the episode must be run again, or was contradicted: the memory is unknown."""
+        self.counters["states without the memory before"] += 1
+        text = f"{error}, on which the memory of the law '{self._law_kind.name}' depends"
+        return ModelFailure(state.run, state.episode, not error.contradicted, text)
 
     def _answer_pending(self) -> list[Publication | ModelFailure]:
         return self.state(self._pending) if self._pending is not None else []

@@ -12,7 +12,7 @@ from loop_interfaces.signature import digest_of
 from loop_method.laws.base import Law
 
 MAX_KEPT = 4
-"""Policies, and sets of reduced models, kept per run: room for a stranger's besides the tuner's."""
+"""Policies, sets of reduced models, and laws kept per run: room for a stranger's besides its own."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,8 @@ class Models:
     laws: list[Law]
 
 
+KnownLaw: TypeAlias = tuple[tuple[int, ...], LawBatch]
+"""What identifies an episode and all that its law is made from, and the law."""
 EpisodeInputs: TypeAlias = tuple[Frame, Models]
 """Policies and models that answer an episode."""
 
@@ -56,8 +58,8 @@ class RunState:
     models: deque[Models] = field(default_factory=lambda: deque(maxlen=MAX_KEPT))
     answering: Answering | None = None
     """Dropped with whatever arrives that changes it."""
-    law: tuple[tuple[int, ...], LawBatch] | None = None
-    """The one in use, and what identifies its episode and all that it is made from."""
+    laws: dict[int, KnownLaw] = field(default_factory=dict)
+    """By plant those in use: their memories are of its states."""
 
     @property
     def nbytes(self) -> int:
@@ -68,9 +70,16 @@ class RunState:
         rows = [law.model for models in self.models for law in models.laws]
         matrices = [a.nbytes for model in rows for a in (model.U, model.A, model.B)]
         samples = self.exploration.nbytes if self.exploration else 0
-        answers = self.law[1].nbytes if self.law else 0
+        answers = sum(law.nbytes for _, law in self.laws.values())
         # The law has a copy of every U.
         return sum(frames) + 2 * sum(matrices) + samples + answers
+
+    def use_law(self, plant: int, law: KnownLaw) -> None:
+        """Keep a plant's law, and those that were used last."""
+        self.laws.pop(plant, None)
+        self.laws[plant] = law
+        while len(self.laws) > MAX_KEPT:
+            del self.laws[next(iter(self.laws))]
 
     def policies_of(self, episode: int) -> list[Frame]:
         """All that came for an episode."""

@@ -21,6 +21,7 @@ from launch_ros.actions import Node
 from loop_interfaces.isolation import NETWORK
 from loop_interfaces.parameters import OF_THE_PLANT, flags
 from loop_interfaces.problem import find_problem, load_parameters, shipped_problems
+from loop_method.laws.registry import OWN_LAWS
 from pde_sim_node.build import complete
 from pde_sim_node.equations import OWN_EQUATIONS
 from pde_sim_node.plants.loading import OWN_PLANTS
@@ -40,6 +41,7 @@ ARGUMENTS = {
         "",
         "a plant instead of it; code of your own (file.py:Class) also has to be named here",
     ),
+    "law": ("", "the control law; code of your own (file.py:Class) also has to be named here"),
     **{spec.name: ("", f"{spec.description} [the problem's]") for spec in PLANT_FLAGS},
     "network": ("false", "true: let messages leave this machine; false: loopback only"),
     "log_level": ("info", "least severe messages that are shown"),
@@ -72,7 +74,7 @@ def pairs_of_nodes(context: LaunchContext) -> list[Any]:
     given = context.launch_configurations
     own = {spec.name: spec.parse(given[spec.name]) for spec in PLANT_FLAGS if given[spec.name]}
     actions: list[Any] = []
-    for kind in (OWN_EQUATIONS, OWN_PLANTS):
+    for kind in (OWN_EQUATIONS, OWN_PLANTS, OWN_LAWS):
         if given[kind.word]:
             own[kind.word] = kind.allow(given[kind.word])
             allowed = context.environment[kind.variable]
@@ -80,9 +82,9 @@ def pairs_of_nodes(context: LaunchContext) -> list[Any]:
     if given["network"] == "true":
         actions.append(SetEnvironmentVariable(NETWORK, "1"))
     # Also read here, so that errors appear before a node starts, and because the nodes would
-    # look for a relative file of an equation in their working directory.
+    # look for a relative file of an equation or a law in their working directory.
     values = load_parameters(given["problem"], own)
-    own["equation"] = values["equation"]
+    own |= {code: values[code] for code in ("equation", "law")}
     if values["plant"]:  # the other nodes also need what the plant fills in
         _, values = complete(values)
         own |= {name: values[name] for name in ("plant", *OF_THE_PLANT)}

@@ -23,7 +23,7 @@ from launch.events.process import ProcessExited
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch_ros.actions import Node
 
-from loop_interfaces.parameters import flags
+from loop_interfaces.parameters import LAW, flags
 from loop_interfaces.protocol import STOPPED
 from loop_interfaces.spec import ParameterError, assignment
 from loop_method.adapt.registry import OWN_OPTIMIZERS
@@ -38,8 +38,12 @@ OWN_CODE = (OWN_EQUATIONS, OWN_PLANTS, OWN_OPTIMIZERS, OWN_LAWS)
 LOOP = Path(__file__).parent / "loop.launch.py"
 FLAGS = flags()
 ARGUMENTS = {
-    # Those of the plant are arguments of the loop.
-    **{s.name: ("", f"{s.description} [the problem's]") for s in FLAGS if "P" not in s.nodes},
+    # Those of the plant, and the law, are arguments of the loop.
+    **{
+        s.name: ("", f"{s.description} [the problem's]")
+        for s in FLAGS
+        if "P" not in s.nodes and s is not LAW
+    },
     "set": ("", "other parameters as pdeloop train --set has them: NAME=VALUE,NAME=VALUE"),
     "model": ("", "start from this model of pdeloop identify; empty: identify one"),
     "out": ("", "new folder of the results; empty: runs/PROBLEM-TIME"),

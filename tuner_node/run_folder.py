@@ -298,8 +298,9 @@ class RunFolder:
         try:
             arrays = read_arrays(path)
             model = taken(arrays, "model", "f", (seeds, None, None))
-            affine = (seeds, n_a, 2 * model.shape[2])
-            law = affine if values["law"] == "affine" else (seeds, None)
+            law: tuple[int | None, ...] = (seeds, n_a, 2 * model.shape[2])
+            if values["law"] != "affine":  # whose parameters only the law itself can read
+                law = (seeds, *[None] * (arrays["policy"].ndim - 1)) if "policy" in arrays else law
             for rows in model:
                 model_rows.unpack(rows, n_a)
             return {

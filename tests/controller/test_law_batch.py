@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from controller_node.law_batch import ForgottenError, LawBatch
+from controller_node.law_batch import LawBatch, MemoryUnknownError
 from controller_node.policy import ProjectedLaw
 from loop_interfaces.model_rows import ModelRows
 from loop_method.laws import Affine, FeedForward, Law, Observer
@@ -84,16 +84,16 @@ def test_a_memory_that_is_not_known_is_never_made_up() -> None:
     policies, index, states = episode(Observer, 3)
     batch = made(Observer)
     batch.set(policies, index)
-    with pytest.raises(ForgottenError, match="before step 2 are not known"):
+    with pytest.raises(MemoryUnknownError, match="before step 2 are not known"):
         batch.actions(2, states[2])
     first = batch.actions(0, states[0])
-    with pytest.raises(ForgottenError, match="before step 2 are not known"):
+    with pytest.raises(MemoryUnknownError, match="before step 2 are not known"):
         batch.actions(2, states[2])
     batch.actions(1, states[1])
-    with pytest.raises(ForgottenError, match="two different states came for step 1"):
+    with pytest.raises(MemoryUnknownError, match="two different states came for step 1"):
         batch.actions(1, states[1] + 1e-9)
     batch.forget_answers()
-    with pytest.raises(ForgottenError, match=r"step \d"):
+    with pytest.raises(MemoryUnknownError, match=r"step \d"):
         batch.actions(3, states[3])
     # Another state 0 begins the episode anew, as a machine does that cannot repeat one.
     other = batch.actions(0, states[0] + 1.0)

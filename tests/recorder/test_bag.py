@@ -34,7 +34,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability
 
 from loop_interfaces.episodes import episode_name, episode_number
-from loop_interfaces.frames import ArrayCodec, Frame
+from loop_interfaces.frames import Frame
 from loop_interfaces.spec import ParameterError
 from loop_interfaces.topics import ACTION, COST, START, STATE
 from pdeloop.bags.episodes import EpisodeIndex, RecordedEpisode
@@ -65,7 +65,7 @@ def frame(step: int, *shape: int, episode: int = 7) -> Frame:
 
 
 def encode(topic, content: Frame) -> bytes:
-    return ArrayCodec(topic.labels).encode(content)
+    return topic.codec().encode(content)
 
 
 def recorded_episode(

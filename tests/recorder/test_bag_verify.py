@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 import zstandard
 
-from loop_interfaces.frames import ArrayCodec
 from loop_interfaces.topics import TARGET
 from pdeloop.bags.mcap_messages import Message, read
 from pdeloop.bags.reader import Bag
@@ -316,7 +315,7 @@ def test_an_episode_that_was_repeated_lacks_nothing(run, messages):
             frame = source.codec.decode(message.data)
             if own == number and message.topic in ("/policy", "/episode/start"):
                 doubled.append(message)  # of the episode that came to nothing
-            codec = ArrayCodec(source.array.labels)
+            codec = source.array.codec()
             raw = codec.encode(replace(frame, episode=frame.episode + 1))
             doubled.append(replace(message, data=raw))
         else:

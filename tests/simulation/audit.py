@@ -25,9 +25,9 @@ CAUSES = re.compile(
 
 
 @cache
-def undisturbed(iterations: int, own_plant: bool) -> Training:
+def undisturbed(iterations: int, own_plant: bool, law: str = "affine") -> Training:
     """The training in one process."""
-    return train_here(values(iterations, own_plant))
+    return train_here(values(iterations, own_plant, law))
 
 
 def audit(plan: Plan) -> str:
@@ -43,7 +43,7 @@ def audit(plan: Plan) -> str:
         Other bits, an error that names no cause, or one although only the network was bad; or the end
         of a training that used an episode of which another action or start came later.
     """
-    expected = undisturbed(plan.iterations, plan.own_plant)
+    expected = undisturbed(plan.iterations, plan.own_plant, plan.law)
     with remembering():
         history = History(plan)
         end = history.run()

@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 from loop_interfaces.episodes import EPISODES_PER_START
-from loop_interfaces.frames import ArrayCodec, Frame
+from loop_interfaces.frames import Frame
 from loop_interfaces.protocol import ModelFailure, Publication
 from loop_interfaces.signature import digest_of
 from loop_interfaces.topics import (
@@ -70,7 +70,7 @@ class History:
     """What happens. `run` gives the finished training, or the error with which the tuner ended."""
 
     def __init__(self, plan: Plan) -> None:
-        self.plan, self.values = plan, values(plan.iterations, plan.own_plant)
+        self.plan, self.values = plan, values(plan.iterations, plan.own_plant, plan.law)
         self.rng = random.Random(plan.seed + 1)
         self.time = 0.0
         self.rows: list[Any] = []
@@ -81,7 +81,7 @@ class History:
         self._starts = 0
         self._events: list[tuple[float, int, Callable[[], None]]] = []
         self._numbers = itertools.count()
-        self._codecs = {topic: ArrayCodec(topic.labels) for topic in READERS}
+        self._codecs = {topic: topic.codec() for topic in READERS}
         self._latched: dict[tuple[str, int, Topic], bytes] = {}
         self._sent: deque[tuple[Topic, bytes, int]] = deque(maxlen=RECALLED)
         self._forged: dict[str, float] = {}

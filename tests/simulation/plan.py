@@ -71,7 +71,8 @@ class Plan:
     comes twice, or has a bit changed in what is in front of its values; delay: mean (s); rates: of
     the clocks of the processes; iterations: of the two-point method, 0 for Gauss-Newton, for which
     the tuner reads states and actions; pairs: of plant and controller; own_plant: instead of the small
-    problem's one of a user's own; signs: whether the controller signs its actions.
+    problem's one of a user's own; law: which the controller has, with the two-point method any; signs:
+    whether it signs its actions.
     """
 
     seed: int
@@ -83,6 +84,7 @@ class Plan:
     iterations: int = 1
     pairs: int = 1
     own_plant: bool = False
+    law: str = "affine"
     signs: bool = True
     faults: tuple[Fault, ...] = ()
 
@@ -111,7 +113,17 @@ class Plan:
         for i in range(len(self.faults)):
             yield replace(self, faults=self.faults[:i] + self.faults[i + 1 :])
         quiet = Plan(self.seed)
-        names = "loss", "duplicates", "damage", "delay", "rates", "iterations", "pairs", "own_plant"
+        names = (
+            "loss",
+            "duplicates",
+            "damage",
+            "delay",
+            "rates",
+            "iterations",
+            "pairs",
+            "own_plant",
+            "law",
+        )
         for name in names:
             if getattr(self, name) != getattr(quiet, name):
                 yield replace(self, **{name: getattr(quiet, name)})
@@ -151,6 +163,7 @@ def draw(seed: int) -> Plan:
         iterations=iterations,
         pairs=pairs,
         own_plant=seed % 5 == 4,
+        law="observer" if iterations and seed % 3 == 0 else "affine",
         faults=tuple(sorted(faults, key=lambda fault: fault.time)),
     )
 
@@ -170,10 +183,14 @@ def aimed(seed: int) -> Plan:
     if not late and rng.random() < 0.3:
         who = rng.choice(MAIN[:2])
         faults.append(Fault(rng.uniform(0.0, length), "crash", who, 0.1))
+    law = "observer" if iterations and seed % 3 == 0 else "affine"
+    if law != "affine" and rng.random() < 0.5:  # its memory is lost in the middle of an episode
+        faults = [Fault(rng.uniform(0.1, 1.0) * length, "crash", "controller", 5 * delay)]
     return Plan(
         seed,
         delay=delay,
         iterations=iterations,
+        law=law,
         signs=rng.random() < 0.5,
         faults=tuple(sorted(faults, key=lambda fault: fault.time)),
     )

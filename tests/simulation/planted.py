@@ -40,6 +40,7 @@ class Bug:
 _TAKEN, _LOCKSTEP = "pde_sim_node.taken_actions", "pde_sim_node.lockstep"
 _DISPATCH, _PAIR = "tuner_node.dispatch", "tuner_node.pair"
 _RESPONDER, _RUN = "controller_node.responder", "controller_node.run_state"
+_LAW = "controller_node.law_batch"
 BUGS = {
     "plant: actions of another episode": Bug(
         _LOCKSTEP,
@@ -122,6 +123,10 @@ BUGS = {
     "controller: policies of another episode": Bug(
         _RUN, "if policy.episode == episode]", "if True]"
     ),
+    "controller: a memory that it has not": Bug(_LAW, "elif step != self._next:", "elif False:"),
+    "controller: a memory of another policy": Bug(
+        _RESPONDER, "if known is None or known[0] != made_from:", "if known is None:"
+    ),
     "controller: costs beyond what it answered": Bug(
         "controller_node.answered_steps", "if episode != known or cost.step >= step:", "if True:"
     ),
@@ -181,7 +186,8 @@ def found(name: str, seeds: int = SEEDS) -> tuple[str, int | None, str]:
     """The bug's name, the seed at which the simulation finds it, None if it does not, and how."""
     for iterations in (0, 1, 4):
         for own_plant in (False, True):
-            undisturbed(iterations, own_plant)  # before anything is planted
+            for law in ("affine", "observer") if iterations else ("affine",):
+                undisturbed(iterations, own_plant, law)  # before anything is planted
     with planted(BUGS[name]):
         for seed in range(seeds):
             for plan in (aimed(seed), draw(seed)):

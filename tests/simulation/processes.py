@@ -55,12 +55,13 @@ EVERY_PAIR = -1
 
 
 @cache
-def values(iterations: int, own_plant: bool) -> dict[str, Any]:
+def values(iterations: int, own_plant: bool, law: str = "affine") -> dict[str, Any]:
     """The parameters of the training: as few and as short episodes as have all of its phases."""
     budget: dict[str, Any] = {"optimizer": "gauss_newton", "rollouts": 9}
     if iterations:
         budget = {"optimizer": "two_point", "iterations": iterations}
     limits: dict[str, Any] = {
+        "law": law,
         "reduced_order": 2,
         "evaluation_fields": 1,
         "identification_attempts": 2,

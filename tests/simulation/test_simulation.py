@@ -42,6 +42,7 @@ def test_messages_for_nobody_change_nothing_and_late_contradictions_are_never_ov
         "plant: late starts",
         "tuner: costs that are taken back",
         "controller: states of another episode",
+        "controller: a memory that it has not",
     ],
 )
 def test_a_check_that_is_gone_is_found(name: str):

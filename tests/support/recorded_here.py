@@ -14,7 +14,7 @@ import yaml
 from controller_node.identification import design_each
 from loop_interfaces.arrays import Array
 from loop_interfaces.episodes import EPISODES_PER_START
-from loop_interfaces.frames import ArrayCodec, Frame
+from loop_interfaces.frames import Frame
 from loop_interfaces.topics import (
     ACTION,
     COST,
@@ -53,7 +53,7 @@ class _Sent:
     def __call__(self, topic: Topic, episode: int, step: int, values: Array) -> None:
         self._when += MILLISECOND
         frame = Frame(self._run, episode, step, 0.0, values, self._plant)
-        raw = ArrayCodec(topic.labels).encode(frame)
+        raw = topic.codec().encode(frame)
         self._recording.take(self._sources[topic], self._when, raw)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import pdeloop
+from loop_method.laws import Affine
 from loop_method.laws.registry import OWN_LAWS
 from pdeloop.cli import main
 from pdeloop.evaluation import evaluate
@@ -190,6 +191,52 @@ def test_parameters_for_each_step_fit_one_horizon(tmp_path: Path) -> None:
     assert evaluate(run, **fields, changes={"physical.viscosity": 0.02})["lqt"].shape == (1, 2)
     with pytest.raises(ValueError, match=r"parameters of shape \(216,\) for the changed plant"):
         evaluate(run, **fields, changes={"horizon": 50})
+
+
+class Proportional(Affine):
+    """Gains that start at half of those of LQ tracking: a law with the affine one's compiled form."""
+
+    name = "proportional"
+
+    def start(self):
+        return {name: 0.5 * part for name, part in super().start().items()}
+
+
+class Scaled(pdeloop.Law):
+    """a = c_j times the LQ-tracking law in actuator j: few parameters, and a compiled form."""
+
+    name, compiled = "scaled", True
+
+    def start(self):
+        return {"c": np.ones(N_A)}
+
+    def action(self, theta, z, memory, k):
+        model = self.model
+        return theta["c"] * (model.K_a @ self.reduced(z) + model.K_b @ model.s_r)
+
+    def gains(self, theta):
+        return theta[:, None] * self.model.policy
+
+
+def test_a_law_with_a_compiled_form_is_computed_by_it_and_exported_as_gains(tmp_path: Path) -> None:
+    affine = pdeloop.train(str(SMALL), out=tmp_path / "affine", **BUDGET)
+    run = pdeloop.train(str(SMALL), law=Scaled, out=tmp_path / "run", **BUDGET)
+    assert run.policies.shape == (1, N_A) and run.result["changed"] == [True]
+    assert same_bits(run.costs["lqt"], affine.costs["lqt"])
+    written = tmp_path / "law.npz"
+    assert main(["export", str(run.folder), "--out", str(written)]) == 0
+    with np.load(written) as arrays:
+        found = np.hstack([arrays["K_a"], arrays["K_b"]])
+    assert same_bits(found, run.policies[0][:, None] * run.models[0].policy)
+    assert main(["export", str(run.folder), "--out", str(tmp_path / "law.c")]) == 0
+
+
+def test_a_law_derived_from_the_affine_one_has_its_matrix(tmp_path: Path) -> None:
+    run = pdeloop.train(str(SMALL), law=Proportional, out=tmp_path / "run", **BUDGET)
+    assert run.policies.shape == (1, N_A, 2 * N_S)
+    assert same_bits(run.warm[0], 0.5 * run.models[0].policy)
+    costs = evaluate(run, fields=2, seed=run.values["evaluation_seed"])
+    assert same_bits(costs["adapted"], run.costs["adapted"])
 
 
 def test_the_documents_code_is_that_of_the_example() -> None:
