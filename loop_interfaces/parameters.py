@@ -85,7 +85,7 @@ IDENTIFICATION = Spec(
 
 LAW = Spec("law", "affine", nodes="CT", group="budget and method").means(
     "control law: a shipped or installed name, or code that the user has to allow, "
-    "'package.module:Class' or 'path/to/file.py:Class'"
+    "'file.py:Class' or 'module:Class'"
 )
 
 PROBLEM = _section(
@@ -95,11 +95,11 @@ PROBLEM = _section(
     ),
     Spec("equation", "burgers").means(
         "PDE of the plant: a shipped or installed name, or code that the user has to allow, "
-        "'package.module:Class' or 'path/to/file.py:Class'"
+        "'file.py:Class' or 'module:Class'"
     ),
     Spec("plant", "").means(
         "your own plant instead of an equation: an installed name, or a class or function that the "
-        "user has to allow, 'path/to/file.py:Name' or 'package.module:Name'"
+        "user has to allow, 'file.py:Name' or 'module:Name'"
     ),
     Spec("grid", "", nodes="PTV").means(
         "axes and components of the state as JSON, filled in by the plant; empty: one periodic axis"
@@ -194,7 +194,7 @@ EXECUTION = _section(
 
 OPTIMIZER = Spec("optimizer", "model_based", nodes="T", group="budget and method").means(
     "method of the adapt phase: a shipped or installed name, or code that the user has to allow, "
-    "'package.module:Class' or 'path/to/file.py:Class'; its settings are optimizer_settings.*"
+    "'file.py:Class' or 'module:Class'; its settings are optimizer_settings.*"
 )
 
 TUNER = _section(
