@@ -9,14 +9,17 @@ import numpy as np
 import pytest
 
 import pdeloop
+from loop_method.adapt import Rollout, StepOptimizer
+from loop_method.adapt.registry import OWN_OPTIMIZERS
 from loop_method.laws import Affine
+from loop_method.laws.calls import along
 from loop_method.laws.registry import OWN_LAWS
 from pdeloop.cli import main
 from pdeloop.evaluation import evaluate
 from pdeloop.finished_run import load_run
 from pdeloop.in_process import LocalPair
-from pdeloop.report.data import of_run
-from pdeloop.report.page import _of_problem
+from pdeloop.report.data import ReportData, of_run
+from pdeloop.report.page import _facts, _of_problem
 from tests.support.interpreter import ROOT
 from tests.support.made_once import made_once
 from tests.support.small import SMALL, same_bits
@@ -134,6 +137,7 @@ def test_evaluate_report_and_export_know_it(
         assert same_bits(costs[name], there)
     data = of_run(run)
     assert not data.missing and len(data.behaviours) == 3
+    assert ("Law", OWN) in _facts(ReportData(finished, [data]))
     assert [name for name, *_ in _of_problem(data)] == ["small-behaviour", "small-orders"]
     assert main(["export", str(finished), "--out", str(tmp_path / "law.npz")]) == 0
     with np.load(tmp_path / "law.npz") as arrays:
@@ -182,6 +186,37 @@ def test_an_optimizer_of_ones_own_knows_theta_alone(law: str) -> None:
     run = pdeloop.train(str(SMALL), law=law, optimizer=RANDOM_SEARCH, **BUDGET)
     assert run.result["changed"] == [True]
     assert (run.costs["adapted"] <= 1.2 * run.costs["lqt"]).all()
+
+
+class Observing(StepOptimizer):
+    """Learns from trajectories: it holds their actions against those of the law that it is told."""
+
+    name = "observing"
+    needs_trajectories = True
+
+    def rollouts(self):
+        moved = self.policy + 0.1 * self.generator.standard_normal(self.policy.shape)
+        return [Rollout(moved, self.field_seed)]
+
+    def update(self, results):
+        (result,), (rollout,) = results, self.rollouts()
+        states, actions = result.trajectory.states[:-1], result.trajectory.actions
+        expected = along(self.context.law, rollout.policy, states, actions)
+        np.testing.assert_allclose(actions, np.clip(expected, -0.2, 0.2), atol=1e-12)
+        self.policy = rollout.policy
+        return {"differs": float(np.abs(actions).max())}
+
+
+def test_an_optimizer_that_sees_trajectories_is_told_the_law(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Through limits of the actions and noise, from which the memory follows as in the loop."""
+    monkeypatch.setenv(OWN_OPTIMIZERS.variable, "")
+    limits = {"action_limit": 0.2, "measurement_noise": 0.01}
+    optimizer = f"{__file__}:Observing"
+    run = pdeloop.train(str(SMALL), law="observer", optimizer=optimizer, **BUDGET, **limits)
+    assert len(run.result["history"]) == 12
+    assert max(row["differs"] for row in run.result["history"]) == 0.2
 
 
 def test_parameters_for_each_step_fit_one_horizon(tmp_path: Path) -> None:
