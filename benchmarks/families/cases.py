@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from benchmarks.families import plants
 from pde_sim_node.equations import allow
 
 HERE = Path(__file__).parent
@@ -45,6 +46,11 @@ class Case:
     def parameters(self) -> dict[str, Any]:
         """The parameters that replace those of the base; its code is allowed in this process."""
         given = dict(self.settings)
+        if self.plant:
+            plant = getattr(plants, self.plant)
+            # What its own class of plants would have in its file of parameters.
+            given |= {"plant": plant(), "reduced_order": plant.reduced_order}
+            given["exploration_variance"] = plant.exploration_variance
         given |= {f"physical.{name}": value for name, value in self.physical.items()}
         if self.equation:
             given["equation"] = allow(f"{HERE / 'equations.py'}:{self.equation}")

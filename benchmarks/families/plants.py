@@ -1,7 +1,8 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Plants that no equation of the compiled solver describes, each as z_{k+1} = f(z_k, a_k) in NumPy.
 
-Every step takes a batch: states (M, n_z) and actions (M, n_a) to states (M, n_z).
+The method is told nothing of them, so that a state is a plain vector. Every step takes one state and
+action, or a batch of them.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from loop_interfaces.arrays import Array
+from pde_sim_node.dynamics import Dynamics
 
 
 def runge_kutta(rate: Callable[[Array], Array], z: Array, duration: float, steps: int) -> Array:
@@ -49,7 +51,7 @@ def difference(z: Array, order: int, spacing: float) -> Array:
     return (after - 2 * z + before) / spacing**2
 
 
-class AllenCahnInhomogeneous:
+class AllenCahnInhomogeneous(Dynamics):
     """Allen-Cahn with a potential that depends on x, V(x) = 5 (1 + sin(2 pi x/L)/2), L = 2."""
 
     n_z, n_a = 128, 12
@@ -98,7 +100,7 @@ class ReactionDiffusionInhomogeneous(AllenCahnInhomogeneous):
         return runge_kutta(rate, z, self.sample_time, 4)
 
 
-class FitzHughNagumo:
+class FitzHughNagumo(Dynamics):
     """FitzHugh-Nagumo on a ring, actuated in the voltage: two components, one after the other."""
 
     n_z, n_a = 128, 8
@@ -176,7 +178,7 @@ class SineGordon(FitzHughNagumo):
         return runge_kutta(rate, z, self.sample_time, 4)
 
 
-class BurgersBetweenWalls:
+class BurgersBetweenWalls(Dynamics):
     """Burgers on [0, 1] with u = 0 at both walls, cell by cell, actuated inside."""
 
     n_z, n_a = 96, 6
@@ -207,7 +209,7 @@ class BurgersBetweenWalls:
         return runge_kutta(rate, z, self.sample_time, 24)
 
 
-class Lorenz96:
+class Lorenz96(Dynamics):
     """Lorenz-96 with 40 variables and forcing 8, eight of them actuated: chaotic, no PDE."""
 
     n_z, n_a = 40, 8
@@ -236,7 +238,7 @@ class Lorenz96:
         return runge_kutta(rate, z, self.sample_time, 2)
 
 
-class CoupledPendulums:
+class CoupledPendulums(Dynamics):
     """Sixteen pendulums on a ring with springs between them, every second one driven, to rest."""
 
     n_z, n_a = 32, 8
@@ -263,7 +265,7 @@ class CoupledPendulums:
         return runge_kutta(rate, z, self.sample_time, 4)
 
 
-class RandomLinear:
+class RandomLinear(Dynamics):
     """A random linear system of 64 states, slightly unstable, with four inputs."""
 
     n_z, n_a = 64, 4

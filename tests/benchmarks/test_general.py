@@ -69,13 +69,26 @@ def test_a_plant_steps_a_batch_as_it_steps_each(name: str) -> None:
     assert plant.target.shape == (plant.n_z,)
 
 
-def test_finished_trainings_are_kept_and_errors_are_rows(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", CASES)
+def test_a_case_is_a_problem_that_can_be_trained_on(name: str) -> None:
+    case = CASES[name]
+    own = problem(case.base or None, **case.parameters())
+    plant = own.plant()
+    assert np.isfinite(plant.states).all()
+    if case.plant:
+        expected = getattr(plants, case.plant)
+        assert own.values["reduced_order"] == expected.reduced_order
+        assert (plant.n_z, plant.n_a) == (expected.n_z, expected.n_a)
+
+
+@pytest.mark.parametrize("name", ["allen-cahn", "lorenz-96"])
+def test_finished_trainings_are_kept_and_errors_are_rows(name: str, tmp_path: Path) -> None:
     options = {"fields": 1, "evaluation": 3, "folder": tmp_path}
-    failed = general.train(("allen-cahn", 1, 0), **options)  # one rollout is no budget
+    failed = general.train((name, 1, 0), **options)  # one rollout is no budget
     assert "rollouts" in failed["error"]
     (path,) = tmp_path.iterdir()
     path.write_text(json.dumps({**failed, "error": "kept"}))
-    assert general.train(("allen-cahn", 1, 0), **options)["error"] == "kept"
+    assert general.train((name, 1, 0), **options)["error"] == "kept"
 
 
 def test_the_table_begins_with_what_lost_most() -> None:
