@@ -14,6 +14,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from loop_interfaces.arrays import Array
@@ -70,7 +71,8 @@ class Frames:
         rows = len(grid.components) * (1 if self._flat else 1 + kept)
         with rc_context(STYLE):
             wide = 2.2 if self._flat or count > 1 else 4.0
-            figure = Figure((wide * count + 2.0 * self._flat + 0.9, 1.3 * rows + 1.6), dpi=DOTS)
+            high = 1.75 if self._flat else 1.3
+            figure = Figure((wide * count + 2.0 * self._flat + 0.9, high * rows + 1.6), dpi=DOTS)
             # Fixed, as a layout that follows the ticks would make the pictures of an episode jump.
             width, height = figure.get_size_inches()
             figure.subplots_adjust(
@@ -86,7 +88,7 @@ class Frames:
                 rows + 1,
                 count + self._flat,
                 squeeze=False,
-                height_ratios=[1.3] * rows + [1.0],
+                height_ratios=[high] * rows + [1.0],
             )
             self._shows: list[list[Show]] = [[] for _ in titles]
             self._bars: list[tuple[Any, Axes]] = []
@@ -223,6 +225,7 @@ def _actions(ax: Axes, n_a: int, colour: str, largest: float) -> tuple[Any, Axes
     ax.axhline(0.0, color="0.5", lw=0.7)
     most = 1.05 * largest or 0.1
     ax.set(xlabel="actuator", ylabel="action", ylim=(-most, most))
+    ax.xaxis.set_major_locator(MaxNLocator(6, integer=True, min_n_ticks=1))
     return bars, ax
 
 

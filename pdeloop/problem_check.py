@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
+from scipy import fft, linalg
 
 from controller_node.identification import DesignSettings, design
 from loop_interfaces.arrays import Array
+from loop_interfaces.grid import Grid
 from loop_interfaces.parameters import INSTRUMENTS
 from loop_method.reduce.order import study_orders
 from pde_sim_node.build import build_plant
@@ -112,9 +113,10 @@ def _halving(plant: Plant, values: Mapping[str, Any], explored: EpisodeRecord) -
 class Reach:
     """The unstable modes of the linearised plant, and how well actuators reach them.
 
-    growth (n,): ln|lambda| / sample_time; waves (n,): the strongest wave number j of exp(2 pi i j x/L)
-    in the mode; margins (n,): smallest singular value of [lambda I - A, B] on the subspace of these
-    modes, relative to the norm of B (Popov-Belevitch-Hautus; 0: out of reach).
+    growth (n,): ln|lambda| / sample_time; waves (n, axes): the strongest wave in the mode, along each
+    axis j of exp(2 pi i j x/L) if it is periodic, otherwise j of cos(pi j x/L); margins (n,):
+    smallest singular value of [lambda I - A, B] on the subspace of these modes, relative to the norm
+    of B (Popov-Belevitch-Hautus; 0: out of reach).
     """
 
     growth: Array
@@ -149,12 +151,40 @@ def reach(plant: Plant) -> Reach:
     eigenvalues, vectors = linalg.eig(T, left=True, right=False)
     pencils = [np.hstack([value * np.eye(count) - T, W.T @ B]) for value in eigenvalues]
     margins = [linalg.svdvals(pencil)[-1] for pencil in pencils]
-    fields = plant.grid.fields((W @ vectors).T)
-    spectra = np.abs(np.fft.fft(fields)).sum(axis=1)[:, : plant.grid.points // 2 + 1]
+    waves = _strongest_waves(plant.grid, (W @ vectors).T)
     growth = np.log(np.abs(eigenvalues)) / plant.sample_time
     order = np.argsort(-growth)
     relative = np.array(margins) / max(float(linalg.norm(B, 2)), 1e-300)
-    return Reach(growth[order], spectra.argmax(axis=1)[order], relative[order])
+    return Reach(growth[order], waves[order], relative[order])
+
+
+def _strongest_waves(grid: Grid, modes: NDArray[np.complex128]) -> NDArray[np.int64]:
+    """Of each mode (n, n_z), the wave of largest magnitude over all components, (n, axes)."""
+    spectra: NDArray[Any] = modes.reshape(len(modes), len(grid.components), *grid.shape)
+    axes = grid.axes or (grid.line,)
+    for d, axis in enumerate(axes, start=2):
+        transform = fft.fft if axis.periodic else fft.dct
+        spectra = transform(spectra, axis=d)
+    largest = np.abs(spectra).sum(axis=1).reshape(len(modes), -1).argmax(axis=1)
+    found = np.unravel_index(largest, grid.shape)
+    folded = [
+        np.minimum(j, axis.size - j) if axis.periodic else j
+        for j, axis in zip(found, axes, strict=True)
+    ]
+    return np.stack(folded, axis=1).astype(np.int64)
+
+
+def _named_waves(grid: Grid, waves: NDArray[np.int64]) -> str:
+    """The waves of modes (n, axes) in words."""
+    if not grid.axes:
+        return f"{len(waves)} of these modes"
+    told = sorted({tuple(row) for row in waves.tolist()})
+    numbers = ", ".join(str(row[0] if len(row) == 1 else row) for row in told)
+    if grid.is_circle:
+        return f"all of wave number {numbers}"
+    names = ", ".join(axis.name for axis in grid.axes)
+    counted = "half waves" if not any(axis.periodic for axis in grid.axes) else "waves"
+    return f"the {counted} {numbers} along {names}"
 
 
 def _actuators(plant: Plant) -> Finding:
@@ -167,16 +197,16 @@ def _actuators(plant: Plant) -> Finding:
     if not len(found.growth):
         return Finding(name, True, "none is unstable at the target")
     text = f"{len(found.growth)} unstable at the target, growing at up to {found.growth[0]:.3g} 1/s"
-    lost = sorted(set(found.waves[found.margins < REACHED].tolist()))
-    if not lost:
+    lost = found.waves[found.margins < REACHED]
+    if not len(lost):
         return Finding(
             name, True, f"{text}; the actuators reach all, the least by {found.margins.min():.2g}"
         )
-    waves = ", ".join(map(str, lost))
+    waves = _named_waves(plant.grid, lost)
     return Finding(
         name,
         False,
-        f"{text}; the actuators do not reach all of wave number {waves}: move, add or narrow some",
+        f"{text}; the actuators do not reach {waves}: move, add or narrow some",
     )
 
 

@@ -40,7 +40,7 @@ def add(commands: Commands) -> None:
         help="initial field of the closing evaluation, by its number [0]",
     )
     add("--seconds", type=float, default=6.0, metavar="S", help="duration in seconds [6]")
-    add_own_code(animate, ("equation", "plant", "optimizer"))
+    add_own_code(animate, ("equation", "plant", "optimizer", "law"))
 
 
 def _animate(options: argparse.Namespace) -> int:

@@ -9,11 +9,15 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+import scipy.fft
 
+import pdeloop
 from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from pde_sim_node.equations import LinearEquation
 from pde_sim_node.plants import SpectralPlant
+from pde_sim_node.plants.loading import as_plant
+from pdeloop import problem_check
 from pdeloop.cli import FAILED, main
 from pdeloop.problem_check import check, reach
 from tests.support.plants import plant_of
@@ -44,7 +48,7 @@ def plant(n_a: int, width: float) -> SpectralPlant:
 
 def test_the_unstable_modes_are_those_of_the_operator_and_enough_actuators_reach_them() -> None:
     found = reach(plant(5, 0.1))
-    assert found.waves.tolist() == [0, 1, 1, 2, 2]
+    assert found.waves[:, 0].tolist() == [0, 1, 1, 2, 2]
     np.testing.assert_allclose(found.growth, [1.0, 0.8, 0.8, 0.2, 0.2], atol=1e-7)
     assert found.margins.min() > 0.1
 
@@ -55,7 +59,7 @@ def test_waves_on_which_equally_spaced_actuators_have_one_phase_are_not_reached(
 ) -> None:
     """A pair cos, sin of one growth rate needs two columns of B, and they see wave n_a / 2 as one."""
     found = reach(plant(n_a, 0.1))
-    assert sorted(set(found.waves[found.margins < 1e-6])) == lost
+    assert sorted(set(found.waves[found.margins < 1e-6, 0].tolist())) == lost
 
 
 @pytest.mark.parametrize(
@@ -71,6 +75,42 @@ def test_four_actuators_reach_the_unstable_modes_of_the_equilibria(
     grows = found.growth > 1e-3
     np.testing.assert_allclose(np.sort(found.growth[grows])[::-1], growth, atol=2e-4)
     assert found.margins[grows].min() > 0.2
+
+
+class GrowingPlate(pdeloop.Dynamics):
+    """Between walls, cos(i pi y) cos(j pi x / 2) grows at 1 - 0.9 i^2 - 0.2 j^2.
+
+    The only actuator is in the middle, so what is odd in y or in x is out of its reach.
+    """
+
+    horizon, sample_time, n_a = 5, 0.1, 1
+
+    def __init__(self) -> None:
+        walls = {"periodic": False, "walls": False}
+        y, x = pdeloop.Axis("y", 1.0, 6, **walls), pdeloop.Axis("x", 2.0, 8, **walls)
+        self.grid = pdeloop.Grid((y, x))
+        rates = 1.0 - 0.9 * np.arange(6.0)[:, None] ** 2 - 0.2 * np.arange(8.0) ** 2
+        self.factors = np.exp(0.1 * rates)
+        away = (y.points[:, None] - 0.5) ** 2 + (x.points - 1.0) ** 2
+        self.supports = np.exp(-away / 0.1).reshape(-1, 1)
+
+    def initial_state(self, rng: np.random.Generator) -> np.ndarray:
+        return np.zeros(48)
+
+    def step(self, z: np.ndarray, a: np.ndarray) -> np.ndarray:
+        waves = scipy.fft.dctn(z.reshape(6, 8), norm="ortho")
+        advanced = scipy.fft.idctn(self.factors * waves, norm="ortho").ravel()
+        return advanced + 0.1 * (self.supports * a).sum(axis=1)
+
+
+def test_modes_between_walls_are_told_by_their_half_waves() -> None:
+    found = reach(as_plant(GrowingPlate()))
+    assert {tuple(row) for row in found.waves.tolist()} == {(0, 0), (0, 1), (0, 2), (1, 0)}
+    np.testing.assert_allclose(found.growth, [1.0, 0.8, 0.2, 0.1], atol=1e-6)
+    assert (found.margins < 1e-6).tolist() == [False, True, False, True]
+    finding = problem_check._actuators(as_plant(GrowingPlate()))
+    assert not finding.good
+    assert "do not reach the half waves (0, 1), (1, 0) along y, x: move" in finding.text
 
 
 def named(**changes: Any) -> dict[str, tuple[bool, str]]:

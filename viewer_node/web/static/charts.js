@@ -199,7 +199,7 @@ export function curveChart(model) {
         { label: "low", ...hidden },
         ...seeds.map((_, i) => ({ ...hidden, label: `seed ${told.seeds[i]}`, stroke: colour("seed"), width: 1 })),
         ...flat,
-        { label: `while learning (band: ${told.band})`, stroke: colour("adapted"), width: 2, value },
+        { label: `while learning (band: ${told.band})`, stroke: colour("adapted"), width: 2, value, points: { show: x.length === 1 } },
       ],
       bands: [{ series: [1, 2], fill: colour("band") }],
       x: { label: axis, range: [0, end], whole: true },
