@@ -243,9 +243,9 @@ class LoopView:
         if not np.isfinite(seen).any():
             return before
         target = self.target_of(shown.key)
-        known = np.empty(0) if target is None else target
-        if known.size == shown.z.size:
-            known = known[rows_of(len(known), shown.components)][part]
+        known = np.empty(0)
+        if target is not None and target.size == shown.z.size:
+            known = target[rows_of(len(target), shown.components)][part]
         low, high = field_range(seen[:: max(1, seen.size // 20_000)], known)
         size = STEADY * max(high - low, before[1] - before[0])
         same = abs(low - before[0]) <= size and abs(high - before[1]) <= size

@@ -30,14 +30,16 @@ from loop_interfaces.ros.observer import Observer
 from loop_interfaces.ros.parameters import declare, given_parameters, on_change
 from loop_interfaces.topics import VIEWS
 from viewer_node.diagnostics import ViewerDiagnostics
-from viewer_node.episode_samples import MAX_COMPONENTS, rows_of
+from viewer_node.episode_samples import MAX_COMPONENTS
 from viewer_node.loop_reader import PERIOD, LoopReader
 from viewer_node.loop_view import LoopView
-from viewer_node.picture import NONE, plane, space_time
+from viewer_node.picture import Range, plane, space_time
 from viewer_node.shapes import shape_of
 
 GRAPH_PERIOD = 0.5
 """Period (s) of polling the ROS graph."""
+COLOUR_PERIOD = 0.5
+"""Seconds between two computations of the range of the colours."""
 FRAME_ID = "field"
 """Frame of the markers and the image: x is the place, y the value of the field or, of one on two axes,
 the other place; no transform needed."""
@@ -61,6 +63,9 @@ class ViewerNode:
             curve_from_topics=False,
             components=self._grid.components,
         )
+        kept = min(len(self._grid.components), MAX_COMPONENTS)
+        self._ranges: list[Range] = [(0.0, 1.0)] * kept
+        self._coloured = 0.0
         self._diagnostics = ViewerDiagnostics(self._view)
         self._due = loop.now()
         self._adjust({spec.name: values[spec.name] for spec in VIEWER})
@@ -103,19 +108,20 @@ class ViewerNode:
         profile = self._view.profile()
         if profile is None:
             return
+        if now >= self._coloured:
+            self._coloured = now + COLOUR_PERIOD
+            self._ranges = [
+                self._view.colours(i, before, now) for i, before in enumerate(self._ranges)
+            ]
         z, target = profile
-        for name in ("field", "target"):
-            if (name == "field" or target is not None) and self._wanted(name):
-                self._publishers[name].publish(self._marker(name, z, target))
+        for name, values in (("field", z), ("target", target)):
+            if values is not None and self._wanted(name):
+                self._publishers[name].publish(self._marker(name, values))
         if self._wanted("spacetime"):
-            self._publishers["spacetime"].publish(self._picture(self._colours(now, z, target)))
+            self._publishers["spacetime"].publish(self._picture(self._colours(now, z)))
 
-    def _marker(
-        self, name: str, z: NDArray[np.float64], target: NDArray[np.float64] | None
-    ) -> Marker:
-        shape = shape_of(
-            self._grid, z, NONE if target is None else target, is_target=name == "target"
-        )
+    def _marker(self, name: str, values: NDArray[np.float64]) -> Marker:
+        shape = shape_of(self._grid, values, self._ranges, beside=name == "target")
         marker = Marker(ns=name, id=list(COLOURS).index(name))
         marker.header.frame_id = FRAME_ID
         marker.header.stamp = self._node.get_clock().now().to_msg()
@@ -134,18 +140,14 @@ class ViewerNode:
             marker.colors = [ColorRGBA(r=r, g=g, b=b, a=1.0) for r, g, b in shape.colours.tolist()]
         return marker
 
-    def _colours(
-        self, now: float, z: NDArray[np.float64], target: NDArray[np.float64] | None
-    ) -> NDArray[np.uint8]:
+    def _colours(self, now: float, z: NDArray[np.float64]) -> NDArray[np.uint8]:
         """The picture of a field on two axes or more as it is now, of others over space and time."""
-        known = NONE if target is None else target
         if len(self._grid.axes) > 1 and z.size == self._grid.size:
-            return plane(self._grid, z, known)
+            return plane(self._grid, z, self._ranges)
         shown, fields = self._view.shown(now), self._view.space_time(now)
         assert shown is not None and fields is not None  # there is a profile
-        kept = rows_of(z.size, shown.components)
         parts = [shown.part(i) for i in range(min(shown.components, MAX_COMPONENTS))]
-        return space_time(fields, parts, known[kept] if known.size else known)
+        return space_time(fields, parts, self._ranges[: len(parts)])
 
     def _picture(self, colours: NDArray[np.uint8]) -> Image:
         height, width, _ = colours.shape

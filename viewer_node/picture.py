@@ -4,28 +4,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from loop_interfaces.arrays import Array
-from loop_interfaces.colour_scale import colours, field_range
+from loop_interfaces.colour_scale import colours
 from loop_interfaces.grid import Grid
 
 UNSEEN = (128, 128, 128)
 """Colour of steps that were not seen."""
-NONE: Array = np.empty(0)
+Range: TypeAlias = tuple[float, float]
+"""Lowest and highest value of the colours; see `loop_interfaces.colour_scale.field_range`."""
 
 
-def diverging(
-    fields: NDArray[np.floating], target: Array = NONE, all_fields: NDArray[np.floating] = NONE
-) -> NDArray[np.uint8]:
-    """Colours (..., 3) of numbers (...): the target or 0 is white; see `field_range`.
-
-    NaN stands for what was not seen; target: of any shape, empty if it is not known; all_fields: what
-    the range of the colours is taken from, if not from `fields`.
-    """
-    low, high = field_range(all_fields if all_fields.size else fields, target)
+def diverging(fields: NDArray[np.floating], limits: Range) -> NDArray[np.uint8]:
+    """Colours (..., 3) of numbers (...), in which NaN stands for what was not seen."""
+    low, high = limits
     seen = np.isfinite(fields)
     picture = colours((np.where(seen, fields, low) - low) / (high - low))
     picture[~seen] = UNSEEN
@@ -33,24 +29,27 @@ def diverging(
 
 
 def space_time(
-    fields: NDArray[np.floating], parts: Sequence[slice], target: Array = NONE
+    fields: NDArray[np.floating], parts: Sequence[slice], ranges: Sequence[Range]
 ) -> NDArray[np.uint8]:
-    """Fields (steps, points) of components side by side, one row a step, each with its own range."""
-    shown = [diverging(fields[:, part], target[part]) for part in parts]
+    """Fields (steps, points) of components side by side, one row a step."""
+    shown = [diverging(fields[:, part], own) for part, own in zip(parts, ranges, strict=True)]
     return np.concatenate(shown, axis=1)
 
 
-def plane(grid: Grid, state: Array, target: Array = NONE) -> NDArray[np.uint8]:
-    """The components of a state on two axes or more, one below the other, each with its own range.
+def plane(grid: Grid, state: Array, ranges: Sequence[Range]) -> NDArray[np.uint8]:
+    """The components of a state on two axes or more, one below the other, as many as have a range.
 
     The last axis to the right, the one before upwards; of others the middle.
     """
-    known = target.size == state.size
-    shown = []
-    for component in range(len(grid.components)):
-        part = grid.part(component)
-        values = grid.fields(state)[component]
-        while values.ndim > 2:
-            values = values[len(values) // 2]
-        shown.append(diverging(values, target[part] if known else NONE, state[part])[::-1])
+    shown = [
+        diverging(middle(values), limits)[::-1]
+        for values, limits in zip(grid.fields(state), ranges, strict=False)
+    ]
     return np.concatenate(shown)
+
+
+def middle(values: Array) -> Array:
+    """A component on its last two axes; of others the middle."""
+    while values.ndim > 2:
+        values = values[len(values) // 2]
+    return values

@@ -209,17 +209,17 @@ def test_axes_and_places_are_those_that_the_plant_says():
         (axis,) = axes_of({"grid": grid.text})
         assert axis == {"label": "x (m)", "length": 2.0, "ends": ends}
     assert axes_of({"grid": Grid.vector(3).text})[0]["label"] == "number"
-    assert axes_of({"grid": walls.text, "sensors": 4})[0] == {
-        "label": "sensor",
-        "length": 0.0,
-        "ends": None,
-    }
+    for grid, count in ((walls, 2), (cells, 4), (Grid.interval(1.0, 128), 8)):
+        (axis,) = axes_of({"grid": grid.text, "sensors": count})
+        points = grid.line.points[grid.equally_spaced(count)]
+        assert axis["ends"] == pytest.approx([points[0], points[-1]])
     assert axes_of({"length": 3.0})[0]["length"] == 3.0
     boxes = text_of([Box(0, ((0.0, 1.0),))])
     assert places_of({"grid": walls.text, "actuators": boxes})["actuators"] == [
         {"component": 0, "sides": ((0.0, 1.0),)}
     ]
     plane = Grid((Axis("y", 1.0, 2), Axis("x", 1.0, 2))).text
+    assert axes_of({"grid": plane, "sensors": 4})[0]["label"] == "sensor"
     for told in (boxes, "", "[[0, [0, NaN]]]", "[[0]]", "7", "<script>"):
         assert places_of({"grid": plane, "actuators": told})["actuators"] == []
 

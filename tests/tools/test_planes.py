@@ -8,10 +8,12 @@ import pytest
 from matplotlib.figure import Figure
 
 import pdeloop
+from loop_interfaces.frames import Frame
 from loop_interfaces.places import Box, boxes_of, parse, text_of
 from pde_sim_node.plants.loading import as_plant
 from pdeloop.monitor.node import component_names
 from pdeloop.report import planes
+from viewer_node.loop_view import LoopView
 from viewer_node.picture import UNSEEN, plane, space_time
 from viewer_node.shapes import shape_of
 
@@ -41,45 +43,54 @@ def test_a_component_is_drawn_over_its_axes_with_y_upwards() -> None:
 
 
 def test_a_picture_for_ros_has_the_components_one_below_the_other() -> None:
-    picture = plane(GRID, STATE)
+    picture = plane(GRID, STATE, [(-11.0, 11.0), (-23.0, 23.0)])
     assert picture.shape == (6, 4, 3)
-    # Each in its own range, 0 white: u is 0 .. 11 upwards, v 12 .. 23.
+    # u is 0 .. 11 upwards, v 12 .. 23; 0 is white.
     assert picture[2, 0].tolist() == [247, 247, 247] and picture[0, 3].tolist() == [103, 0, 31]
     assert picture[3, 3].tolist() == [103, 0, 31]
-    about = plane(GRID, STATE, np.full(24, 11.0))
-    assert about[0, 3].tolist() == [247, 247, 247] and about[2, 0].tolist() == [5, 48, 97]
-    assert (about[3:, :, 0] > about[3:, :, 2]).all()
+    assert plane(GRID, STATE, [(0.0, 22.0)])[0, 3].tolist() == [247, 247, 247]
+
+
+def test_the_range_of_a_field_that_decays_is_that_of_its_episode() -> None:
+    """Else what is left of it at the end would have the full colours."""
+    view = LoopView(components=GRID.components)
+    view.grid = GRID
+    for k in range(20):
+        view.state(Frame(1, 1, k, 0.1 * k, 0.5**k * STATE[np.newaxis], 3), 0.0)
+    low, high = view.colours(0, (0.0, 1.0), 0.0)
+    assert high == -low > 2.0
+    assert np.abs(plane(GRID, view.current.z, [(low, high)] * 2).astype(int) - 247).max() < 3
 
 
 def test_a_marker_has_a_cell_at_each_point_with_the_target_beside_the_field() -> None:
-    shape, target = (
-        shape_of(GRID, STATE, np.zeros(24), is_target=is_it) for is_it in (False, True)
-    )
+    ranges = [(-11.0, 11.0), (-23.0, 23.0)]
+    shape = shape_of(GRID, STATE, ranges)
+    target = shape_of(GRID, np.zeros(24), ranges, beside=True)
     assert shape.points[:5].tolist() == [[0, 0], [0.5, 0], [1, 0], [1.5, 0], [0, 0.5]]
     assert shape.size == (0.5, 0.5) and len(shape.points) == len(shape.colours) == 24
     assert shape.points[12].tolist() == [0.0, pytest.approx(-1.1)]  # v below u
     np.testing.assert_allclose(target.points - shape.points, [[2.2, 0.0]] * 24)
     assert np.ptp(target.colours, axis=0).tolist() == [0, 0, 0]
     fine = pdeloop.Grid((pdeloop.Axis("y", 1.0, 300), pdeloop.Axis("x", 1.0, 300)))
-    assert 2_500 <= len(shape_of(fine, np.zeros(90_000)).points) <= 10_000
+    assert 2_500 <= len(shape_of(fine, np.zeros(90_000), ranges).points) <= 10_000
 
 
 def test_a_marker_of_fields_on_one_axis_joins_no_two_components() -> None:
     state = np.array([1.0, 2.0, 3.0, 7.0, 8.0, 9.0])
-    one = shape_of(pdeloop.Grid.interval(3.0, 6), state)
+    one = shape_of(pdeloop.Grid.interval(3.0, 6), state, [])
     assert not one.pairs and one.points[:, 1].tolist() == state.tolist()
     assert one.points[:, 0].tolist() == [0.0, 0.5, 1.0, 1.5, 2.0, 2.5]
     walls = pdeloop.Grid.interval(2.0, 3, "uv", periodic=False)
-    two = shape_of(walls, state)
+    two = shape_of(walls, state, [])
     assert two.pairs and two.points[:, 1].tolist() == [1, 2, 2, 3, 7, 8, 8, 9]
     assert two.points[:, 0].tolist() == [0, 1, 1, 2] * 2
-    sensors = shape_of(walls, state[:4], state[2:], is_target=True)
+    sensors = shape_of(walls, state[2:], [])
     assert sensors.points.tolist() == [[0.0, 3.0], [0.5, 7.0], [1.0, 8.0], [1.5, 9.0]]
 
 
 def test_a_history_for_ros_has_its_own_range_for_each_component() -> None:
     fields = np.array([[0.0, 1.0, 0.0, 100.0], [np.nan] * 4])
-    picture = space_time(fields, [slice(0, 2), slice(2, 4)], np.zeros(4))
+    picture = space_time(fields, [slice(0, 2), slice(2, 4)], [(-1.0, 1.0), (-100.0, 100.0)])
     assert np.array_equal(picture[0, 1], picture[0, 3]) and (picture[1] == UNSEEN).all()
 
 

@@ -157,7 +157,7 @@ def test_a_finished_episode_is_shown_until_the_next_has_run_for_a_while():
     shown.cost(frame([(1.0, 10.0, -1)], step=10), 0.0)
     assert shown.numbers()["final_error"] == pytest.approx(np.sqrt(np.mean((1.0 - TARGET) ** 2)))
     shown.state(frame([np.full(N_Z, -1.0)], episode=2), 5.0)
-    red, white = (diverging(shown.space_time(now), TARGET) for now in (5.1, 7.0))
+    red, white = (diverging(shown.space_time(now), (-1.0, 1.0)) for now in (5.1, 7.0))
     assert red.shape == (11, N_Z, 3)
     assert (red[..., 0] > red[..., 2]).all()
     assert (white[0, :, 2] > white[0, :, 0]).all()
@@ -173,7 +173,7 @@ def test_a_picture_has_a_row_for_every_step_or_shares_them(horizon):
     assert len(rows) <= COLUMNS
     per_row = -(-(horizon + 1) // len(rows))
     assert len(rows) == -(-(horizon + 1) // per_row)
-    assert not (diverging(rows) == UNSEEN).all(axis=(1, 2)).any()
+    assert not (diverging(rows, (-1.0, 1.0)) == UNSEEN).all(axis=(1, 2)).any()
 
 
 def test_a_viewer_that_sees_nothing_any_more_is_stale():

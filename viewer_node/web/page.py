@@ -49,14 +49,21 @@ def axes_of(values: Mapping[str, Any]) -> Axes:
 
     One of a field on one axis or of numbers, the last two of a field on more.
     """
-    if values.get("sensors"):
-        return [_numbers("sensor")]
+    sensors = int(values.get("sensors") or 0)
     try:
         grid = Grid.parse(str(values["grid"]))
     except (KeyError, ValueError):
+        if sensors:
+            return [_numbers("sensor")]
         length = float(values.get("length") or 0.0)
         return [_axis("x (m)", length)] if length > 0 else [_numbers("grid point")]
+    if sensors and (len(grid.axes) != 1 or sensors > grid.points):
+        return [_numbers("sensor")]
     told = [_axis(axis.label, axis.length, _ends(axis)) for axis in grid.axes[-2:]]
+    if sensors:  # they are at the points of Grid.equally_spaced
+        first, spacing, n = told[0]["ends"][0], grid.axes[0].spacing, grid.points
+        ends = (n // (2 * sensors), (2 * sensors - 1) * n // (2 * sensors))
+        told[0]["ends"] = [first + i * spacing for i in ends]
     return told or [_numbers("number")]
 
 
@@ -87,7 +94,7 @@ def places_of(values: Mapping[str, Any]) -> dict[str, Any]:
     fitting = [box for box in boxes if len(box.sides) == dimensions]
     told = [{"component": box.component, "sides": box.sides[-2:]} for box in fitting]
     sensors = int(values.get("sensors") or 0)
-    return {"actuators": [] if sensors else told, "sensors": sensors}
+    return {"actuators": [] if sensors and dimensions > 1 else told, "sensors": sensors}
 
 
 @dataclass(frozen=True)
