@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -48,6 +49,8 @@ class Axis:
     unit: str = "m"
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "length", float(self.length))
+        object.__setattr__(self, "size", operator.index(self.size))
         if not (0 < self.length < math.inf and self.size >= 1):
             raise ValueError(
                 f"the axis {self.name} must have a positive length and 1 or more points, got "
@@ -108,6 +111,7 @@ class Grid:
     numbers: int = 0
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "numbers", int(self.numbers))  # NumPy's cannot be written as JSON
         if not self.components:
             raise ValueError("a grid has one component or more, got none")
         if bool(self.axes) == bool(self.numbers):

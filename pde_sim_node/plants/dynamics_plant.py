@@ -75,7 +75,7 @@ class DynamicsPlant(BatchPlant):
         return vars(self) | {"_blas": None}
 
     def _checked_grid(self) -> Grid:
-        grid, n_z = self.dynamics.grid, self.dynamics.n_z
+        grid, n_z = self.dynamics.grid, whole("n_z", self.dynamics.n_z, 0)
         if grid is None:
             if not n_z:
                 raise ValueError("expected n_z, the size of a state, or a grid")

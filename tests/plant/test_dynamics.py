@@ -220,6 +220,15 @@ def test_an_initial_state_that_is_wrong_is_told_and_changes_nothing() -> None:
         assert np.array_equal(plant.states, before) and plant.step_index == 1
 
 
+def test_sizes_may_be_whole_numbers_of_numpy() -> None:
+    linear = Linear()
+    vars(linear).update(n_z=np.int32(3), n_a=np.int64(2), horizon=np.int16(4))
+    plant = DynamicsPlant(linear)
+    assert pdeloop.Grid.parse(plant.grid.text) == plant.grid == pdeloop.Grid.vector(3)
+    axis = pdeloop.Axis("x", np.float32(2.0), np.int32(5))
+    assert pdeloop.Grid.parse(pdeloop.Grid((axis,)).text) == pdeloop.Grid((axis,))
+
+
 def test_a_state_may_have_the_shape_of_its_grid() -> None:
     class Shaped(pdeloop.Dynamics):
         n_a = 1
