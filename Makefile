@@ -6,29 +6,53 @@ SHELL := /bin/bash
 # Python is not to import what lies in this folder (loop_interfaces/module_path.py).
 export PYTHONSAFEPATH := 1
 
-.PHONY: setup run test coverage packages lint types docs check clean
+.PHONY: setup run test coverage packages lint types docs check lock audit clean
 
 setup: .venv/ready
 
 # A fresh virtual environment with pinned versions, made again when the pins change: what running
-# needs, and then what the tests need. What is imported first is compiled to bytecode then.
-install = $(BIN)/python -m pip install --no-compile --disable-pip-version-check -c constraints.txt -e '.[$(1)]' \
+# needs, and then what the tests need. Each archive must have one of the digests in requirements/. What is
+# imported first is compiled to bytecode then.
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+install = $(PIP) install --no-compile --require-hashes -r requirements/$(1).txt \
 	| sed -un 's/^Collecting \([^ ]*\).*/  \1/p; s/^Installing collected.*/  installing/p'
 
-.venv/runs: pyproject.toml constraints.txt
+.venv/runs: pyproject.toml requirements/run.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 		|| { echo "pdeloop needs Python 3.11 or newer; set PYTHON=/path/to/python3" >&2; exit 1; }
 	@test -d .venv || echo "setting up .venv, once: Python packages and ROS 2"
 	@test -d .venv || $(PYTHON) -m venv .venv
-	@$(call install,ros)
+	@$(call install,run)
+	@$(PIP) install --quiet --no-deps --no-build-isolation -e .
 	@touch $@
 
-.venv/ready: .venv/runs
+.venv/ready: .venv/runs requirements/test.txt
 	@echo "setting up .venv for tests, once"
-	@$(call install,ros$(comma)dev)
+	@$(call install,test)
 	@touch $@
 
-comma := ,
+# uv writes the digests, pip-audit asks for advisories; neither is part of what pdeloop runs on.
+.venv/supply:
+	@test -d .venv || $(PYTHON) -m venv .venv
+	@$(PYTHON) -m venv .venv/supply.new
+	@.venv/supply.new/bin/python -m pip install -qq --disable-pip-version-check uv==0.13.9 pip-audit==2.10.1
+	@mv .venv/supply.new $@
+
+# The digests of all archives of the pinned versions; a version is changed in constraints.txt.
+lock: .venv/supply
+	@for part in run:ros test:ros,dev; do \
+		echo setuptools | .venv/supply/bin/python -m uv pip compile --quiet --universal --generate-hashes --no-annotate \
+			--no-header --constraint constraints.txt $$(echo $${part#*:} | tr , '\n' | sed 's/^/--extra /') \
+			--output-file requirements/$${part%:*}.txt pyproject.toml - || exit 1; \
+		sed -i "s/ ; python_full_version >= '3.11.5' and python_full_version < '3.15' and sys_platform == 'linux'//" \
+			requirements/$${part%:*}.txt; \
+	done
+
+# Which of the pinned versions are no longer the newest, and which have known vulnerabilities.
+audit: setup .venv/supply
+	@$(PIP) list --outdated
+	@.venv/supply/bin/python -m pip_audit --requirement requirements/test.txt --require-hashes --disable-pip \
+		--progress-spinner off
 
 run: .venv/runs
 	$(BIN)/pdeloop train burgers

@@ -102,3 +102,29 @@ def test_the_citation_has_what_its_format_asks_for(name: str) -> None:
     assert CITATION[name]
     assert CITATION["cff-version"] == "1.2.0" and CITATION["type"] == "software"
     assert CITATION["date-released"].isoformat() == str(CITATION["date-released"])
+
+
+def pins(text: str) -> dict[str, str]:
+    """Version by normalised name of each line NAME==VERSION."""
+    found = re.findall(r"^([\w.-]+)==([^\s;]+)", text, re.MULTILINE)
+    return {re.sub(r"[-_.]+", "-", name).lower(): version for name, version in found}
+
+
+@pytest.mark.parametrize(("part", "extras"), [("run", ["ros"]), ("test", ["ros", "dev"])])
+def test_what_is_installed_is_pinned_and_has_digests(part: str, extras: list[str]) -> None:
+    text = (ROOT / "requirements" / f"{part}.txt").read_text()
+    constrained = pins((ROOT / "constraints.txt").read_text())
+    for requirement in re.split(r"\n(?=\S)", text.strip()):
+        assert re.search(r"--hash=sha256:[0-9a-f]{64}", requirement), requirement
+    found = pins(text)
+    assert {n: v for n, v in found.items() if constrained.get(n, v) != v} == {}, "make lock"
+    needed = [*PROJECT["dependencies"]]
+    while extras:
+        for words in PROJECT["optional-dependencies"][extras.pop()]:
+            nested = re.fullmatch(r"pdeloop\[(.*)\]", words)
+            if nested:
+                extras += nested[1].split(",")
+            else:
+                needed.append(words)
+    names = {re.sub(r"[-_.]+", "-", re.match(r"[\w.-]+", n)[0]).lower() for n in needed}  # type: ignore[index]
+    assert names <= set(found), "make lock"
