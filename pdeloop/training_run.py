@@ -157,7 +157,7 @@ def run(folder: Path, values: dict[str, Any], transport: Transport, as_json: boo
         display.line(f"  {time.monotonic() - started:.1f} s with start-up")
     for text in narration.warnings(summary):
         display.warn(text)
-    return int(narration.failed(summary))
+    return narration.exit_code(summary)
 
 
 def carry_out(

@@ -8,6 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 Row = Mapping[str, Any]
+COSTLIER = 3
+"""Exit code where a law costs more than no control."""
 _TOGETHER = ("designed", "checked", "evaluated")
 """Events that every seed has, one after the other."""
 
@@ -137,7 +139,23 @@ def closing_lines(problem: str, summary: Row, folder: object) -> list[str]:
     elif worse := _worse_than_lqt(summary):
         which = f" for {len(worse)} of {seeds} seeds: {_listed(worse)}" if seeds > 1 else ""
         lines.append(f"  the adapted law costs more than the LQT law{which}")
+    lines += _reasons(summary)
     return [*lines, f"  results in {folder}"] if folder else lines
+
+
+def _reasons(summary: Row) -> list[str]:
+    """Why seeds kept their first law, or have no control, as their optimisers say."""
+    seeds_of: dict[str, list[int]] = {}
+    for m, (own, changed) in enumerate(
+        zip(summary.get("outcome", []), summary["changed"], strict=False)
+    ):
+        if own["reason"] and not (changed and own["verdict"] == "better"):
+            seeds_of.setdefault(own["reason"], []).append(summary["seed"] + m)
+    several = summary["seeds"] > 1
+    return [
+        f"  {f'seed {_listed(seeds)}: ' if several else 'the optimizer says: '}{reason}"
+        for reason, seeds in seeds_of.items()
+    ]
 
 
 def against_lqt(reduction: float) -> str:
@@ -190,6 +208,18 @@ def warnings(summary: Row) -> list[str]:
         )
         found.append(f"after adaptation the cost is not below that without control{which}")
     return found
+
+
+def costlier_than_none(summary: Row) -> bool:
+    """Whether the law of a seed costs more than no control."""
+    costs = summary["costs"]
+    pairs = zip(costs["none"], costs["adapted"], strict=True)
+    return any(not adapted <= none for none, adapted in pairs)
+
+
+def exit_code(summary: Row) -> int:
+    """Of the command that shows the outcome: 0, 1 where `failed`, or 3 where a law is costlier."""
+    return 1 if failed(summary) else COSTLIER * costlier_than_none(summary)
 
 
 def failed(summary: Row) -> bool:

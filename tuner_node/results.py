@@ -2,7 +2,7 @@
 """What a training came to: the contents of `result.json` and `policy.npz`."""
 
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from typing import Any
 
@@ -17,6 +17,7 @@ from tuner_node.training import Training
 
 WORDS = ("event", "role", "model", "chosen", "reason")
 """Entries of a row of the history that are not numbers."""
+WORSE_THAN_NONE = "worse than no control"
 
 
 def check_result(content: Mapping[str, Any], seed: int, seeds: int) -> None:
@@ -43,6 +44,11 @@ def check_result(content: Mapping[str, Any], seed: int, seeds: int) -> None:
         raise ValueError(f"its 'rollouts' are not a table of {', '.join(kinds)} for each seed")
     if not all(_texts(content.get(name, {})) for name in ("versions", "environment")):
         raise ValueError("its 'versions' or 'environment' are not a table of texts")
+    outcome = content.get("outcome", [])
+    if not isinstance(outcome, list) or not all(
+        _texts(own) and {"verdict", "reason"} <= set(own) for own in outcome
+    ):
+        raise ValueError("its 'outcome' is not a list of verdicts with reasons")
     controller = content.get("controller", {})
     nodes = controller.get("nodes", []) if isinstance(controller, dict) else None
     several = content.get("several_publishers", {})
@@ -88,13 +94,17 @@ def summarise(training: Training) -> dict[str, Any]:
     reduction: how far the adapted cost lies below LQT's, as the mean over seeds of the ratios and as
     the ratio of the means over seeds (each cost already a mean over the evaluation fields).
     rollouts: what those of each seed were for; changed: whether its policy is another one than the
-    one it began with.
+    one it began with; outcome: what came of each seed, and why, as its optimiser says.
     """
     assert training.evaluation is not None and training.ended is not None
     diverged = (training.ended != COMPLETED).sum(axis=(0, 2))
     costs = training.evaluation
     mean = costs.mean(axis=2)
     none, lqt, adapted = (mean[:, EVALUATED.index(name)] for name in EVALUATED)
+    changed = [
+        bool((own != start).any())
+        for own, start in zip(training.policies(), training.starts(), strict=True)
+    ]
     return {
         "costs": {name: mean[:, i].tolist() for i, name in enumerate(EVALUATED)},
         "costs_by_field": {name: costs[:, i].tolist() for i, name in enumerate(EVALUATED)},
@@ -109,12 +119,41 @@ def summarise(training: Training) -> dict[str, Any]:
         "seed": training.settings.seed,
         "seeds": training.settings.seeds,
         "rollouts": training.budget.by_purpose(),
-        "changed": [
-            bool((own != start).any())
-            for own, start in zip(training.policies(), training.starts(), strict=True)
+        "changed": changed,
+        "outcome": [
+            {
+                "verdict": verdict(*mean[m].tolist(), changed=moved),
+                "reason": last_reason(training.history, training.settings.seed + m),
+            }
+            for m, moved in enumerate(changed)
         ],
         "history": training.history,
     }
+
+
+def verdict(none: float, lqt: float, adapted: float, *, changed: bool) -> str:
+    """What came of a seed, from its mean costs; changed: whether its law is not the first one.
+
+    >>> verdict(4.0, 2.0, 1.0, changed=True), verdict(4.0, 5.0, 5.0, changed=False)
+    ('better', 'worse than no control')
+    >>> verdict(4.0, 2.0, 2.0, changed=False), verdict(4.0, 2.0, 3.0, changed=True)
+    ('the first law', 'worse than the first law')
+    >>> verdict(4.0, 5.0, 4.0, changed=True)
+    'no control'
+    """
+    if not adapted <= none:
+        return WORSE_THAN_NONE
+    if adapted == none:
+        return "no control"
+    if not changed:
+        return "the first law"
+    return "better" if adapted <= lqt else "worse than the first law"
+
+
+def last_reason(history: Sequence[Mapping[str, Any]], seed: int) -> str:
+    """The last reason that the optimiser of a seed gave; empty: none."""
+    given = [str(row["reason"]) for row in history if row["seed"] == seed and row.get("reason")]
+    return given[-1] if given else ""
 
 
 def versions() -> dict[str, str]:

@@ -74,4 +74,4 @@ def _evaluate(options: argparse.Namespace) -> int:
     summary = outcome(costs, run.seeds[0])
     for text in narration.warnings(summary):
         print(f"WARNING: {text}", file=sys.stderr)
-    return int(narration.failed(summary))
+    return narration.exit_code(summary)

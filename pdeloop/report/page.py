@@ -246,6 +246,11 @@ def _outcome(problem: ProblemData) -> tuple[str, str, str]:
         said.append(f"{abs(share):.1f} % {'below' if share >= 0 else 'above'} {NAMES['lqt']}")
     if isfinite(none) and none > 0:
         said.append(f"{100 * cost / none:.3g} % of the cost without control is left")
+    outcome = problem.runs[best].result.get("outcome", [])
+    for own in {own["verdict"]: own for own in outcome if own["verdict"] != "better"}.values():
+        count = sum(other["verdict"] == own["verdict"] for other in outcome)
+        which = f"{count} of {len(outcome)} seeds" if len(outcome) > 1 else "outcome"
+        said.append(f"{which}: {own['verdict']}" + f" ({own['reason']})" * bool(own["reason"]))
     return problem.name, cost_text(cost), "; ".join(said)
 
 

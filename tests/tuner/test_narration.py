@@ -15,7 +15,7 @@ from pdeloop.display import Display
 from pdeloop.in_process import LocalPair
 from tests.support.small import SMALL, parameters
 from tuner_node.build import build_training
-from tuner_node.narration import Narration, closing_lines, failed, warnings
+from tuner_node.narration import Narration, closing_lines, exit_code, failed, warnings
 from tuner_node.rollouts import CHECK
 
 
@@ -187,6 +187,35 @@ def test_a_cost_above_no_control_is_a_warning_that_names_the_seeds():
         "after adaptation the cost is not below that without control for seed 1"
     ]
     assert not failed(worse)
+
+
+def test_a_law_that_costs_more_than_no_control_has_an_exit_code_of_its_own():
+    assert exit_code(summary()) == 0
+    assert exit_code(summary(costs={"none": [4, 4], "lqt": [2, 5], "adapted": [1, 4.5]})) == 3
+    # No control itself, to the bit, is no worse; nor is a law that is not known to the last number.
+    assert exit_code(summary(costs={"none": [4, 4], "lqt": [2, 5], "adapted": [1, 4]})) == 0
+    assert exit_code(summary(costs={"none": [4, 4], "lqt": [2, 5], "adapted": [1, np.nan]})) == 3
+    lost = {"none": 0, "lqt": 0, "adapted": 4}
+    assert (
+        exit_code(summary(diverged=lost, costs={**summary()["costs"], "adapted": [1e9, 1e9]})) == 1
+    )
+
+
+def test_why_an_adaptation_did_not_help_is_said():
+    outcome = [
+        {"verdict": "the first law", "reason": "no other law is better"},
+        {"verdict": "better", "reason": "better by more than chance"},
+    ]
+    lines = closing_lines("kdv", summary(changed=[False, True], outcome=outcome), "")
+    assert lines[-1] == "  seed 0: no other law is better"
+    alone = summary(
+        seeds=1,
+        changed=[False],
+        outcome=outcome[:1],
+        costs={"none": [4], "lqt": [2], "adapted": [2]},
+    )
+    assert closing_lines("kdv", alone, "")[-1] == "  the optimizer says: no other law is better"
+    assert not any("more than chance" in line for line in lines)
 
 
 @pytest.mark.parametrize(
