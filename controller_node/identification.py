@@ -203,7 +203,9 @@ def designed(
     if settings.identification != "field":
         return Designed(rows)
     with threadpool_limits(limits=1):  # as in the identification itself
-        found = field_law([*trajectories, *further], target, rows, **weights)
+        found = field_law(
+            [*trajectories, *further], target, rows, action_limit=settings.action_limit, **weights
+        )
     return Designed(found.rows if found.better and found.rows else rows, found)
 
 

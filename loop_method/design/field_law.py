@@ -31,7 +31,7 @@ from loop_interfaces.cost import Cost
 from loop_interfaces.model_rows import ModelRows
 from loop_method.design.finite_horizon import finite_horizon, finite_horizon_of
 from loop_method.models import FieldModel, FittedModel, Measured, affine_law, fit_field_model
-from loop_method.models.base import Law
+from loop_method.models.base import Law, saturated
 from loop_method.models.prediction import predicted
 from loop_method.reduce.reduced_model import Trajectory, pieces
 
@@ -110,7 +110,9 @@ def _cost(cost: float) -> str:
     return f"{cost:.4g}" if np.isfinite(cost) else "none, as it runs away,"
 
 
-def best_model(trajectories: Sequence[Trajectory], target: Array) -> FittedModel | None:
+def best_model(
+    trajectories: Sequence[Trajectory], target: Array, action_limit: float = 0.0
+) -> FittedModel | None:
     """The model of the whole field that predicts the trajectories best, or pieces of them.
 
     Pieces, as a chaotic plant forgets where it began.
@@ -119,7 +121,8 @@ def best_model(trajectories: Sequence[Trajectory], target: Array) -> FittedModel
         return None
     best: FittedModel | None = None
     for parts in (trajectories, pieces(trajectories, PIECES)):
-        found = fit_field_model([Measured(z, a) for z, a in parts if len(a)], target)
+        rollouts = [Measured(z, a) for z, a in parts if len(a)]
+        found = fit_field_model(rollouts, target, action_limit=action_limit)
         if found is not None and (best is None or found.error < best.error):
             best = found
         if best is not None and best.error <= REPRODUCED:
@@ -135,6 +138,7 @@ def field_law(
     state_weight: float,
     action_weight: float,
     cost: Cost | None = None,
+    action_limit: float = 0.0,
 ) -> FieldLaw:
     """A law from a model of the whole field, with as many modes as another has.
 
@@ -150,8 +154,10 @@ def field_law(
         q and r.
     cost : Cost, optional
         In place of them.
+    action_limit : float
+        Magnitude at which actions saturate, in the data and under both laws; 0: none.
     """
-    fitted = best_model(trajectories, target)
+    fitted = best_model(trajectories, target, action_limit)
     if fitted is None or fitted.error > REPRODUCED:
         return FieldLaw(fitted)
     model, n_s = fitted.model, other.U.shape[1]
@@ -170,7 +176,7 @@ def field_law(
     if not (np.isfinite(K).all() and np.isfinite(b).all()):
         return FieldLaw(fitted)
     fields = [states[0] for states, _ in trajectories]
-    best = affine_law(K, b - K @ target)
+    best = saturated(affine_law(K, b - K @ target), action_limit)
     none = affine_law(np.zeros_like(K), np.zeros_like(b))
     visited = [z for law in (best, none) for z in states_under(model, law, fields, horizon)]
     U = _basis(K, np.concatenate(visited)[::THINNING], target, n_s)
@@ -182,7 +188,7 @@ def field_law(
     rows = ModelRows(A=U.T @ A @ U, B=U.T @ B, U=U, K_a=K_a, K_b=K_b, s_r=s_r)
 
     def predicted_cost(rows: ModelRows) -> float:
-        law = affine_law(rows.K_a @ rows.U.T, rows.K_b @ rows.s_r)
+        law = saturated(affine_law(rows.K_a @ rows.U.T, rows.K_b @ rows.s_r), action_limit)
         total = 0.0
         for states in states_under(model, law, fields, horizon):
             if len(states) < horizon:

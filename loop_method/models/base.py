@@ -90,6 +90,17 @@ def affine_law(K: Array, b: Array) -> Law:
     return law
 
 
+def saturated(law: Law, limit: float) -> Law:
+    """The law with actions of at most this magnitude; 0: as it is."""
+    if not limit:
+        return law
+
+    def limited(k: int, states: Array) -> Array:
+        return np.clip(law(k, states), -limit, limit)
+
+    return limited
+
+
 @dataclass(frozen=True, eq=False)
 class Samples:
     """Steps of the plant: z_k, a_k, z_{k+1}, a row each, (N, n_z), (N, n_a), (N, n_z)."""

@@ -10,14 +10,14 @@ worse than the best. It is then fitted to all rollouts.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from loop_interfaces.arrays import Array
-from loop_method.models.base import FieldModel, Law, Measured, Samples
+from loop_method.models.base import FieldModel, Measured, Samples, saturated
 from loop_method.models.kinds import Kind, kinds_of
 from loop_method.models.prediction import errors, pieces
 from loop_method.models.settings import FieldModelSettings
@@ -149,10 +149,5 @@ def _limited(rollout: Measured, limit: float) -> Measured:
     return replace(
         rollout,
         actions=np.clip(rollout.actions, -limit, limit),
-        law=None if law is None else _saturated(law, limit),
+        law=None if law is None else saturated(law, limit),
     )
-
-
-def _saturated(law: Law, limit: float) -> Law:
-    wrapped: Callable[[int, Array], Array] = lambda k, z: np.clip(law(k, z), -limit, limit)  # noqa: E731
-    return wrapped

@@ -89,6 +89,22 @@ def test_gives_way_to_a_law_that_costs_no_more() -> None:
     assert again.rows is not None and not again.better
 
 
+def test_actions_that_saturate_are_known_as_such() -> None:
+    """Explored beyond the limit, the plant answers to less than what was asked for."""
+    true, target, limit = plant(), np.zeros(N_Z), 0.05
+    _, asked = episode(true)
+    states = [episode(true)[0][0]]
+    for a in np.clip(asked, -limit, limit):
+        states.append(true.step(states[-1][None], a[None])[0])
+    other = design([(np.array(states), asked)], target, settings("regression"))
+    given = [(np.array(states), asked)], target, other
+    found = field_law(*given, state_weight=Q, action_weight=R, action_limit=limit)
+    without = field_law(*given, state_weight=Q, action_weight=R)
+    assert found.fitted is not None and found.fitted.error < 1e-4
+    assert without.fitted is None or without.fitted.error > 100 * found.fitted.error
+    np.testing.assert_allclose(found.fitted.model.B, true.B, atol=0.02 * np.abs(true.B).max())
+
+
 def test_takes_the_regression_where_no_model_reproduces_the_episode() -> None:
     target = np.zeros(N_Z)
     noisy = [episode(plant(), noise=1.0)]
