@@ -87,7 +87,7 @@ class Report:
             lines += [f"    {text}" for text in self.differences[1:]]
         elif self.compared and self.missing:
             lines.append(
-                "  no difference to the bit in what is there; missing parts were not compared"
+                "  everything that is there is the same to the bit; missing parts were not compared"
             )
         elif self.compared:
             lines.append("  no difference, to the bit")
