@@ -29,7 +29,7 @@ Task = Literal["lid", "convection", "transport", "reaction-diffusion"]
 Row = dict[str, Any]
 PROBES = 16
 """Of the convection, 4 x 4."""
-EXPLORED, HELD = 5, 8
+EXPLORED, HELD = 10, 8
 """Rollouts from rest with which the convection is explored, and their actions."""
 QUIET = 1e-3
 """Standard deviation of these actions: so small that what they begin is still linear."""

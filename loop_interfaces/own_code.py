@@ -163,14 +163,14 @@ def name_of(kind: type) -> str:
     return f"{source}:{kind.__qualname__}"
 
 
-def located(error: Exception) -> str:
+def located(error: BaseException) -> str:
     """An exception in one line, with the line of the function that the `try` block called."""
     called = error.__traceback__.tb_next if error.__traceback__ else None
     where = f"{called.tb_frame.f_code.co_filename}, line {called.tb_lineno}: " if called else ""
     return f"{where}{in_one_line(error)}"
 
 
-def in_one_line(error: Exception) -> str:
+def in_one_line(error: BaseException) -> str:
     """Kind and text of an exception."""
     return f"{type(error).__name__}: {' '.join(str(error).split())}"
 

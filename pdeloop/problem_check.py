@@ -34,10 +34,17 @@ GROWS = 1e-8
 """A mode is unstable whose eigenvalue is further outside of the unit circle than this."""
 REACHED = 1e-6
 """Smallest singular value of [lambda I - T, W^T B], relative to |B|, of a mode that actuators reach."""
-MAX_LINEARISED = 2048
-"""Numbers of a state beyond which the linearisation, a square matrix of them, is left out."""
+MAX_LINEARISED = 1024
+"""Numbers of a state beyond which the linearisation is not a square matrix of them, but Krylov's."""
+MODES = 12
+"""Leading modes that are looked for there."""
+KRYLOV_ACCURACY = 1e-6
+POWERS = 400
+"""Powers of A, at most, after which what inputs do is a matter of the unstable modes alone."""
 SMALL = 1e-6
 """Size of the perturbations whose answers are differenced."""
+REPEATED = 5
+"""Steps that are computed again."""
 DRAWN = 5
 """Number of initial fields drawn around their mean."""
 
@@ -59,6 +66,8 @@ def check(values: Mapping[str, Any]) -> Iterator[Finding]:
     """The findings about a problem's resolved parameters, one after the other."""
     plant = _field_plant(values)
     explored = _explore(plant, values)
+    if values["plant"]:
+        yield _repeatable(plant, explored)
     yield _halving(plant, values, explored)
     yield _actuators(plant)
     if explored.costs.diverged_step.max() >= 0:
@@ -109,6 +118,28 @@ def _halving(plant: Plant, values: Mapping[str, Any], explored: EpisodeRecord) -
     return Finding("integration step", True, text)
 
 
+def _repeatable(plant: Plant, explored: EpisodeRecord) -> Finding:
+    """Whether a step has the same bits when it is computed again, and in a batch of another size."""
+    name = "repeatability"
+    if not plant.settable:
+        return Finding(name, True, "not checked: the state of the plant cannot be set")
+    some = np.unique(np.linspace(0, len(explored.actions) - 1, REPEATED).astype(int))
+    states, actions = explored.fields[some, 1], explored.actions[some, 1]
+    together = plant.evaluate(states, actions)[0]
+    if not np.array_equal(plant.evaluate(states, actions)[0], together):
+        told = "a step of the same state and action is another one when it is computed again: keep "
+        return Finding(
+            name, False, f"{told}nothing from one call to the next, and draw nothing in it"
+        )
+    alone = [plant.evaluate(z[None], a[None])[0][0] for z, a in zip(states, actions, strict=True)]
+    if not np.array_equal(alone, together):
+        told = (
+            "a step depends on the other states of its batch, if only by rounding: set batched = "
+        )
+        return Finding(name, False, f"{told}False, or avoid matrix products over a batch")
+    return Finding(name, True, f"{len(some)} steps have the same bits again, alone and in a batch")
+
+
 @dataclass(frozen=True)
 class Reach:
     """The unstable modes of the linearised plant, and how well actuators reach them.
@@ -143,6 +174,8 @@ def reach(plant: Plant) -> Reach:
     Left invariant subspace of the unstable eigenvalues: W^T A = T W^T with W orthonormal, from an
     ordered real Schur form of A^T; mode by mode the test is then one of small matrices.
     """
+    if plant.n_z > MAX_LINEARISED:
+        return _reach_by_powers(plant)
     A, B = linearisation(plant)
     T, W, count = linalg.schur(A.T, sort=lambda re, im: np.hypot(re, im) > 1 + GROWS)
     if not count:
@@ -156,6 +189,55 @@ def reach(plant: Plant) -> Reach:
     order = np.argsort(-growth)
     relative = np.array(margins) / max(float(linalg.norm(B, 2)), 1e-300)
     return Reach(growth[order], waves[order], relative[order])
+
+
+def _reach_by_powers(plant: Plant) -> Reach:
+    """The same of the leading modes alone, from products A v by differences, for large states.
+
+    Right eigenvectors V come from Arnoldi's method. A^p B is a matter of the unstable ones alone once p
+    is large: A^p B = V diag(lambda^p) W^* B, of which least squares give W^* B.
+    """
+    from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigs
+
+    nothing, z_r = np.zeros((1, plant.n_a)), plant.field_target
+
+    def moved(states: Array, actions: Array) -> Array:
+        plus, _ = plant.evaluate(z_r + states, actions)
+        minus, _ = plant.evaluate(z_r - states, -actions)
+        change: Array = 0.5 * (plus - minus)
+        return change
+
+    def product(v: Array) -> Array:
+        size = max(float(np.abs(v).max()), 1e-300)
+        image: Array = size * moved(SMALL * v.reshape(1, -1) / size, nothing)[0] / SMALL
+        return image
+
+    A = LinearOperator((plant.n_z, plant.n_z), matvec=product, dtype=np.float64)
+    start = np.random.default_rng(0).standard_normal(plant.n_z)
+    try:
+        found = eigs(A, k=MODES, v0=start, tol=KRYLOV_ACCURACY, ncv=4 * MODES)
+    except ArpackNoConvergence as error:
+        found = error.eigenvalues, error.eigenvectors
+    grows = np.abs(found[0]) > 1 + 10 * KRYLOV_ACCURACY
+    eigenvalues, V = found[0][grows], found[1][:, grows]
+    if not len(eigenvalues):
+        return Reach(np.empty(0), np.empty((0, len(plant.grid.axes)), dtype=np.int64), np.empty(0))
+    states = moved(np.zeros((plant.n_a, plant.n_z)), SMALL * np.eye(plant.n_a)) / SMALL
+    size = float(linalg.norm(states))
+    reached, power = np.zeros((len(eigenvalues), plant.n_a), dtype=complex), 0
+    while power < POWERS:
+        power += 1
+        states = np.stack([product(row) for row in states])
+        coefficients = np.linalg.lstsq(V, states.T.astype(complex))[0]
+        rest = float(linalg.norm(states.T - V @ coefficients))
+        reached = coefficients / eigenvalues[:, None] ** power
+        if rest <= REACHED * float(linalg.norm(states)) or linalg.norm(states) > 1 / SMALL:
+            break
+    margins = linalg.norm(reached, axis=1) / max(size, 1e-300)
+    growth = np.log(np.abs(eigenvalues)) / plant.sample_time
+    order = np.argsort(-growth)
+    waves = _strongest_waves(plant.grid, V.T)
+    return Reach(growth[order], waves[order], margins[order])
 
 
 def _strongest_waves(grid: Grid, modes: NDArray[np.complex128]) -> NDArray[np.int64]:
@@ -191,8 +273,6 @@ def _actuators(plant: Plant) -> Finding:
     name = "modes"
     if not plant.settable:
         return Finding(name, True, "not checked: the state of the plant cannot be set")
-    if plant.n_z > MAX_LINEARISED:
-        return Finding(name, True, f"not checked: a state of more than {MAX_LINEARISED} numbers")
     found = reach(plant)
     if not len(found.growth):
         return Finding(name, True, "none is unstable at the target")

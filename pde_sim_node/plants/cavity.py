@@ -26,7 +26,7 @@ import numpy as np
 from loop_interfaces.arrays import Array
 from loop_interfaces.grid import Axis, Grid
 from pde_sim_node.arguments import internal_steps, positive, whole
-from pde_sim_node.dynamics import Dynamics, arguments_of
+from pde_sim_node.dynamics import Dynamics
 
 
 class Cavity(Dynamics):
@@ -154,10 +154,6 @@ class Cavity(Dynamics):
         transform[:, 0, 0] = 0.0
         inside = idctn(transform, axes=(1, 2), norm="ortho")
         return np.pad(inside, ((0, 0), (1, 1), (1, 1)), mode="edge")
-
-    def refined(self) -> Cavity:
-        """With half the internal time step."""
-        return type(self)(**{**arguments_of(self), "step_time": self.dt / 2})
 
 
 def _laplacian(f: Array, dx: float) -> Array:

@@ -219,7 +219,7 @@ class DynamicsPlant(BatchPlant):
         with self._blas.limit(limits=1), np.errstate(over="ignore", invalid="ignore"):
             try:
                 return function(*arguments)
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 raise OwnCodeError(f"{self.name}.{method} fails: {located(error)}") from error
 
     def _numbers(self, method: str, returned: Any, count: int) -> Array:
@@ -235,7 +235,8 @@ class DynamicsPlant(BatchPlant):
             got = f"{type(returned).__name__}, which is not an array of real numbers"
         else:
             if numbers.shape in shapes:
-                return numbers.reshape(count, grid.size)
+                # A copy: solvers like to return the array that they compute the next step in.
+                return numbers.reshape(count, grid.size).copy()
             got = f"an array of shape {numbers.shape}"
         expected = " or ".join(str(shape) for shape in dict.fromkeys(shapes))
         raise OwnCodeError(

@@ -144,7 +144,7 @@ class GymnasiumPlant(BatchPlant):
     def _begin(self, env: Env[Any, Any], seed: int) -> Array:
         try:
             observation, _ = env.reset(seed=0 if seed == MEAN_FIELD else seed)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise OwnCodeError(f"{self._first}.reset fails: {located(error)}") from error
         state = self._numbers("reset", observation)
         if not np.isfinite(state).all():
@@ -152,7 +152,7 @@ class GymnasiumPlant(BatchPlant):
         return state
 
     def _numbers(self, method: str, observation: Any) -> Array:
-        numbers = np.asarray(observation, dtype=np.float64)
+        numbers = np.array(observation, dtype=np.float64)  # a copy: it may be reused for the next
         if numbers.size != self.n_z:
             raise OwnCodeError(
                 f"{self._first}.{method} returned an observation of shape {numbers.shape}; expected "
@@ -167,7 +167,7 @@ class GymnasiumPlant(BatchPlant):
             action = self.actions[m].reshape(self._shape).astype(self._space.dtype)
             try:
                 observation, reward, terminated, truncated, _ = self._envs[m].step(action)
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 raise OwnCodeError(f"{self._first}.step fails: {located(error)}") from error
             if truncated and self.step_index + 1 < self.horizon:
                 raise OwnCodeError(

@@ -98,7 +98,7 @@ def make(values: Mapping[str, Any]) -> Made:
     arguments = fitting(maker, physical, name)
     try:
         made = maker(**arguments)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ValueError(f"the plant {shown(name)} cannot be made: {located(error)}") from error
     if not isinstance(made, Dynamics | Plant):
         raise ValueError(

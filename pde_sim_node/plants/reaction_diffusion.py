@@ -1,9 +1,9 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
 """Reaction and diffusion of one or several components, on an interval or a rectangle.
 
-    w_t = K lap w + f(w) + sum_j Phi_j(x) a_j(t) e,        w = (w_1, ..., w_c)
+    w_t = K lap w + f(w) + sum_j Phi_j(x) a_j(t) e_j,        w = (w_1, ..., w_c)
 
-with a c x c matrix K, a pointwise reaction f, and forcing of one component. A wave of the domain is a
+with a c x c matrix K, a pointwise reaction f, and forcing of some components. A wave of the domain is a
 multiple of itself under lap, so diffusion is solved exactly in waves: Fourier modes of a periodic
 domain, cosines between walls without flux, sines between walls where w = 0. Strang splitting: half a
 step of reaction and forcing by the classical Runge-Kutta scheme, a step of diffusion, half a step.
@@ -57,8 +57,8 @@ class ReactionDiffusion(Dynamics):
     """
 
     components: ClassVar[tuple[str, ...]] = ("u",)
-    forced: ClassVar[int] = 0
-    """The component that the actuators act on."""
+    forced: ClassVar[Sequence[int]] = (0,)
+    """The components that actuators act on, those of the first one first."""
     batched = True
     grid: Grid
 
@@ -87,9 +87,12 @@ class ReactionDiffusion(Dynamics):
         self._steps = internal_steps(self.sample_time, self._dt)
         places = np.meshgrid(*(axis.points for axis in axes), indexing="ij")
         self._supports = self._placed(places, [whole("actuators", n, 1) for n in actuators])
-        self.n_a = len(self._supports)
+        count = len(self._supports)
+        self.n_a = count * len(self.forced)
         self.supports = np.zeros((self.grid.size, self.n_a))
-        self.supports[self.grid.part(self.forced)] = self._supports.reshape(self.n_a, -1).T
+        for i, component in enumerate(self.forced):
+            own = slice(i * count, (i + 1) * count)
+            self.supports[self.grid.part(component), own] = self._supports.reshape(count, -1).T
         self.target = np.repeat(np.asarray(self.rest, dtype=float), self.grid.points)
         self._waves = self._lowest(places)
         self._propagator = self._propagate()
@@ -176,8 +179,9 @@ class ReactionDiffusion(Dynamics):
         """See `Dynamics.step`."""
         w = self.grid.fields(z).copy()
         forcing = np.zeros_like(w)
-        for j, support in enumerate(self._supports):
-            forcing[:, self.forced] += a[:, j].reshape(-1, *[1] * support.ndim) * support
+        for i, component in enumerate(self.forced):
+            for j, support in enumerate(self._supports, start=i * len(self._supports)):
+                forcing[:, component] += a[:, j].reshape(-1, *[1] * support.ndim) * support
         for _ in range(self._steps):
             w = self._reacted(w, forcing, 0.5 * self._dt)
             w = self._diffused(w)

@@ -234,10 +234,13 @@ class FitzHughNagumo(ReactionDiffusion):
 class ComplexGinzburgLandau(ReactionDiffusion):
     """A_t = A + (1 + i alpha) A_xx - (1 + i beta) |A|^2 A + a; the state is Re A, Im A, rest is 0.
 
+    Actuators force the real part, and as many the imaginary one, without which not all waves of one
+    length could be reached.
     Waves with |k| < 1 grow at rest. For alpha beta < -1 no wave is stable, and A is chaotic.
     """
 
     components = ("Re A", "Im A")
+    forced = (0, 1)
     horizon, sample_time = 100, 0.1
     state_weight, action_weight = 0.1, 0.1
 

@@ -212,7 +212,7 @@ class SpectralPlant(BatchPlant):
                 f"{what} of the equation must return {' x '.join(map(str, shape))} finite numbers "
                 f"for x of shape ({n_x},), got shape {values.shape}"
             )
-        return values.ravel()
+        return values.flatten()
 
     def _advance(self) -> None:
         self.parallel.step(self.step_index)

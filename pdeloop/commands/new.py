@@ -1,5 +1,5 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""`pdeloop new NAME`: a folder with a PDE that runs, to be changed into one's own."""
+"""`pdeloop new NAME`: a folder with a PDE or plant that runs, to be changed into one's own."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from string import Template
 from loop_interfaces.files import FileError, write_atomically
 from loop_interfaces.problem import shipped_problems
 from loop_interfaces.spec import ParameterError
+from pde_sim_node.plants.loading import PLANTS
 from pdeloop.commands.common import Commands, command
 
 _NAME = re.compile(r"[a-z][a-z0-9]*([-_][a-z0-9]+)*")
@@ -22,8 +23,10 @@ _NAME = re.compile(r"[a-z][a-z0-9]*([-_][a-z0-9]+)*")
 _TEMPLATES = Path(__file__).parent / "template"
 
 
-def write(name: str, into: Path) -> tuple[list[Path], str]:
+def write(name: str, into: Path, *, plant: bool = False) -> tuple[list[Path], str]:
     """Write class, YAML and test of a PDE into a new folder; the files, and what --equation names.
+
+    plant: of a plant instead, which --plant names.
 
     name: of the problem and its folder, small letters, digits, '-' and '_'; into: where the folder
     goes. ParameterError for another name, one that a shipped problem, Python, pytest or the class's
@@ -37,7 +40,7 @@ def write(name: str, into: Path) -> tuple[list[Path], str]:
     module = name.replace("-", "_")
     words = module.split("_")
     kind = "".join(word.capitalize() for word in words)
-    _refuse_taken(name, module, kind)
+    _refuse_taken(name, module, kind, plant=plant)
     filled = {
         "name": name,
         "module": module,
@@ -49,11 +52,10 @@ def write(name: str, into: Path) -> tuple[list[Path], str]:
         folder.mkdir()
     except FileExistsError:
         raise ParameterError(f"{folder} is there already; take another name") from None
-    files = {
-        f"{module}.py": "equation.py.txt",
-        f"{name}.yaml": "problem.yaml.txt",
-        f"test_{module}.py": "test.py.txt",
-    }
+    own = ("plant.py", "plant.yaml", "test_plant.py")
+    templates = own if plant else ("equation.py", "problem.yaml", "test.py")
+    names = (f"{module}.py", f"{name}.yaml", f"test_{module}.py")
+    files = {file: f"{template}.txt" for file, template in zip(names, templates, strict=True)}
     try:
         for file, template in files.items():
             text = Template((_TEMPLATES / template).read_text()).substitute(filled)
@@ -64,9 +66,11 @@ def write(name: str, into: Path) -> tuple[list[Path], str]:
     return [folder / file for file in files], f"{folder / module}.py:{kind}"
 
 
-def _refuse_taken(name: str, module: str, kind: str) -> None:
-    """ParameterError if a problem, its module or its class cannot have this name."""
+def _refuse_taken(name: str, module: str, kind: str, *, plant: bool) -> None:
+    """ParameterError if a problem or plant, its module or its class cannot have this name."""
     another = "; take another name"
+    if plant and name in PLANTS:
+        raise ParameterError(f"'{name}' is a shipped plant{another}")
     if module in {problem.replace("-", "_") for problem in shipped_problems()}:
         raise ParameterError(f"'{name}' is a shipped problem{another}")
     if iskeyword(module) or _is_module(module):
@@ -92,18 +96,24 @@ def add(commands: Commands) -> None:
         commands,
         "new",
         _new,
-        help="write class, YAML and test of a PDE of your own, as a start",
-        description="Write a folder with the class, the YAML file and the test of a PDE that runs, to "
-        "be changed into your own (docs/bring-your-own.md).",
+        help="write class, YAML and test of a PDE or plant of your own, as a start",
+        description="Write a folder with the class, the YAML file and the test of a PDE that runs, or "
+        "of any other plant, to be changed into your own (docs/bring-your-own.md).",
         example="pdeloop new my-pde",
     )
     new.add_argument("name", metavar="NAME", help="name of the problem and of its new folder")
+    new.add_argument(
+        "--plant",
+        action="store_true",
+        help="of a plant, for which any solver will do, instead of a periodic spectral PDE",
+    )
 
 
 def _new(options: argparse.Namespace) -> int:
-    files, equation = write(options.name, Path())
+    files, named = write(options.name, Path(), plant=options.plant)
+    flag = "--plant" if options.plant else "--equation"
     for file in files:
         print(file)
-    print(f"next: pdeloop check {files[1]} --equation {equation} --picture {options.name}.png")
-    print(f"      pdeloop train {files[1]} --equation {equation}")
+    print(f"next: pdeloop check {files[1]} {flag} {named} --picture {options.name}.png")
+    print(f"      pdeloop train {files[1]} {flag} {named}")
     return 0

@@ -122,6 +122,8 @@ class Breaking(Linear):
             case "changes a":
                 a[0] = 0.25
                 return z
+            case "exits":
+                raise SystemExit(3)
         raise KeyError("no such\nmode")
 
 
@@ -154,6 +156,7 @@ def test_numbers_that_are_not_finite_are_a_divergence(how: str) -> None:
             "raises",
             r"Breaking.step fails: .*test_dynamics.py, line \d+: KeyError: 'no such\\nmode'$",
         ),
+        ("exits", r"Breaking.step fails: .*test_dynamics.py, line \d+: SystemExit: 3$"),
     ],
 )
 def test_a_step_that_is_wrong_is_told_in_one_sentence(how: str, words: str) -> None:
@@ -162,6 +165,29 @@ def test_a_step_that_is_wrong_is_told_in_one_sentence(how: str, words: str) -> N
     with pytest.raises(OwnCodeError, match=words) as refused:
         plant.step(np.zeros((1, 2)))
     assert "\n" not in str(refused.value)
+
+
+class Reusing(Linear):
+    """Returns the array that it computes in, as solvers do."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.own = np.zeros(3)
+
+    def initial_state(self, rng: np.random.Generator) -> np.ndarray:
+        self.own[:] = super().initial_state(rng)
+        return self.own
+
+    def step(self, z: np.ndarray, a: np.ndarray) -> np.ndarray:
+        self.own[:] = super().step(z, a)
+        return self.own
+
+
+def test_a_plant_may_return_the_array_that_it_computes_the_next_state_in() -> None:
+    reusing, plant = DynamicsPlant(Reusing()), DynamicsPlant(Linear())
+    assert np.array_equal(reusing.reset([0, 1, 2]), plant.reset([0, 1, 2]))
+    for a in actions(3):
+        assert np.array_equal(reusing.step(a), plant.step(a))
 
 
 class Unfit(Linear):

@@ -13,6 +13,7 @@ import pytest
 
 from loop_interfaces.problem import read_problem, shipped_problems
 from loop_interfaces.spec import ParameterError
+from pde_sim_node.plants.loading import OWN_PLANTS
 from pdeloop.cli import FAILED, main
 from pdeloop.commands.new import write
 
@@ -199,3 +200,25 @@ def test_every_shipped_problem_is_refused(folder: Path) -> None:
     for name in shipped_problems():
         with pytest.raises(ParameterError, match="shipped"):
             write(name, folder)
+
+
+def test_a_plant_that_new_writes_runs_and_passes_its_own_tests(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(OWN_PLANTS.variable, "")
+    assert main(["new", "interval", "--plant"]) == FAILED
+    assert "'interval' is a shipped plant" in capsys.readouterr().err
+    assert main(["new", "my-rod", "--plant"]) == 0
+    *_, told, _ = capsys.readouterr().out.splitlines()
+    words = told.removeprefix("next: pdeloop ").split()
+    assert main(["check", "my-rod/my-rod.yaml"]) == FAILED  # a file alone runs no code
+    assert "name it yourself: --plant" in capsys.readouterr().err
+    assert main([*words, "--json"]) == 0
+    findings = json.loads(capsys.readouterr().out)
+    assert len(findings) == 6 and all(one["good"] for one in findings)
+    monkeypatch.syspath_prepend(str(folder / "my-rod"))
+    found = runpy.run_path(str(folder / "my-rod" / "test_my_rod.py"))
+    assert (
+        len([name for name in found if name.startswith("test_")]) == 2
+    )  # the other one is a check
+    found["test_a_small_wave_grows_at_its_rate_and_the_error_falls_with_the_grid_and_the_step"]()

@@ -16,7 +16,9 @@ from loop_interfaces.problem import load_parameters
 from pde_sim_node.build import build_plant
 from pde_sim_node.equations import LinearEquation
 from pde_sim_node.plants import SpectralPlant
+from pde_sim_node.plants.convection import Convection
 from pde_sim_node.plants.loading import as_plant
+from pde_sim_node.plants.reactions import Plate
 from pdeloop import problem_check
 from pdeloop.cli import FAILED, main
 from pdeloop.problem_check import check, reach
@@ -182,3 +184,44 @@ def test_a_picture_that_cannot_be_written_is_refused_before_the_check(
     assert main(["check", "burgers", "--picture", str(tmp_path / "none" / "x.png")]) == FAILED
     told = capsys.readouterr()
     assert not told.out and "No such file" in told.err
+
+
+@pytest.mark.parametrize("plant", [Plate(10, 8, across=1, up=1), Convection(10)])
+def test_of_a_large_state_the_leading_modes_are_those_of_the_whole_matrix(plant: Any) -> None:
+    """One actuator in the middle of a plate does not reach what is odd about it."""
+    made = as_plant(plant)
+    whole, leading = reach(made), problem_check._reach_by_powers(made)
+    np.testing.assert_allclose(leading.growth, whole.growth, atol=1e-5)
+    assert leading.waves.tolist() == whole.waves.tolist()
+    lost = whole.margins < problem_check.REACHED
+    assert (leading.margins < problem_check.REACHED).tolist() == lost.tolist()
+    assert lost.sum() == (3 if isinstance(plant, Plate) else 0)
+
+
+class Forgetful(pdeloop.Dynamics):
+    """A step that is another one each time, or in a batch."""
+
+    n_z, n_a, horizon, batched = 4, 1, 12, True
+
+    def __init__(self, how: str = "counts") -> None:
+        self.how, self.calls = how, 0
+
+    def initial_state(self, rng: np.random.Generator) -> np.ndarray:
+        return rng.standard_normal(4)
+
+    def step(self, z: np.ndarray, a: np.ndarray) -> np.ndarray:
+        self.calls += self.how == "counts"
+        shared = np.zeros_like(z) if self.how == "counts" else z.mean(axis=0)
+        return 0.5 * z + a + 0.1 * shared + 1e-3 * self.calls
+
+
+@pytest.mark.parametrize(
+    ("how", "told"),
+    [
+        ("counts", "another one when it is computed again"),
+        ("shares", "depends on the other states"),
+    ],
+)
+def test_a_step_that_cannot_be_repeated_is_bad(how: str, told: str) -> None:
+    first = next(iter(check(pdeloop.problem(plant=Forgetful(how)).values)))
+    assert first.name == "repeatability" and not first.good and told in first.text
