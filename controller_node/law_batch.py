@@ -50,7 +50,9 @@ class LawBatch:
 
     def __init__(self, laws: Sequence[Law], target: ArrayLike, action_limit: float = 0.0) -> None:
         self._laws, self._limit = list(laws), action_limit
-        self._projected = ProjectedLaw([law.model.U for law in laws], target, action_limit)
+        projected = ProjectedLaw([law.model.U for law in laws], target, action_limit)
+        self.compiled = projected if self._laws[0].compiled else None
+        """The compiled form, if the law has one."""
         self._environments: list[tuple[Law, Parts]] = []
         self._memories: list[Array] = []
         self._next = 0
@@ -59,11 +61,6 @@ class LawBatch:
         """By step, for a law with memory: a digest of the states, and the actions."""
         self.nbytes = 0
         """Bytes of the stored actions."""
-
-    @property
-    def compiled(self) -> ProjectedLaw | None:
-        """The compiled form, if the law has one."""
-        return self._projected if self._laws[0].compiled else None
 
     @property
     def n_a(self) -> int:
@@ -95,7 +92,7 @@ class LawBatch:
             raise ValueError("policies must be finite, but there is NaN or infinity in them.")
         index = checked_index(model_index, len(theta), len(self._laws))
         laws = [self._laws[i] for i in index.tolist()]
-        if self.compiled:
+        if self.compiled is not None:
             gains = [law.gains(own) for law, own in zip(laws, _vectors(theta), strict=True)]
             self.compiled.set(np.stack(gains), index)
             return
@@ -110,7 +107,7 @@ class LawBatch:
         MemoryUnknownError where the law has a memory and the steps before were not seen, or had other
         states.
         """
-        if self.compiled:
+        if self.compiled is not None:
             return self.compiled.actions(states)
         if not self.remembers:
             with one_thread():

@@ -15,6 +15,7 @@ from threadpoolctl import ThreadpoolController
 from loop_interfaces.arrays import Array, float_array
 from loop_interfaces.model_rows import ModelRows
 from loop_interfaces.own_code import OwnCodeError, located
+from loop_method.laws.affine import Affine
 from loop_method.laws.base import Law, Parts
 
 MAX_NUMBER = 1e9
@@ -55,19 +56,43 @@ def _copied(model: ModelRows) -> ModelRows:
 def _checked(kind: type[Law], model: ModelRows, horizon: int) -> Law:
     with one_thread():
         law: Law = _called(kind.name, "__init__", kind, model, horizon)
+        _called(kind.name, "start", law.start)  # by itself, so that an error names its line
         start = _called(kind.name, "start", lambda: law.theta_start)
         if not start.size or not np.isfinite(start).all():
             raise OwnCodeError(f"{kind.name}.start must give finite numbers, one at the least")
-        if not kind.compiled:
-            none = np.zeros_like(start)
-            first = _called(kind.name, "memory_start", law.memory_start)
-            acted = action(law, law.parts(none), np.ones(len(model.U)), first, 0)
-            if acted.any():
-                raise OwnCodeError(
-                    f"{kind.name}.action gives an action other than zero for theta = 0, which must be "
-                    "no control: every law is compared with it"
-                )
+        if kind is not Affine:
+            _check_actions(law)
     return law
+
+
+def _check_actions(law: Law) -> None:
+    """OwnCodeError where theta = 0 is not no control, or a compiled form is another law."""
+    z, first = np.ones(len(law.model.U)), _called(law.name, "memory_start", law.memory_start)
+    for theta in (np.zeros_like(law.theta_start), law.theta_start):
+        acted = action(law, law.parts(theta), z, first, 0)
+        if acted.any() and not theta.any():
+            raise OwnCodeError(
+                f"{law.name}.action gives an action other than zero for theta = 0, which must be "
+                "no control: every law is compared with it"
+            )
+        if law.compiled and not np.allclose(_by_gains(law, theta, z), acted):
+            raise OwnCodeError(
+                f"{law.name}.gains must be [K_a K_b] of the law that {law.name}.action computes, but "
+                "they give another action"
+            )
+
+
+def _by_gains(law: Law, theta: Array, z: Array) -> Array:
+    """The action of the compiled form."""
+    gains = _called(law.name, "gains", law.gains, theta)
+    expected = law.model.policy.shape
+    if np.shape(gains) != expected:
+        raise OwnCodeError(
+            f"{law.name}.gains returned an array of shape {np.shape(gains)}; expected {expected}"
+        )
+    K_a, K_b = np.hsplit(np.asarray(gains), 2)
+    a: Array = K_a @ law.reduced(z) + K_b @ law.model.s_r
+    return a
 
 
 def action(law: Law, theta: Parts, z: Array, memory: Array, k: int) -> Array:

@@ -159,10 +159,22 @@ def test_numbers_that_are_not_finite_count_as_large_ones() -> None:
     [
         ({"start": lambda self: {}}, "start must give finite numbers, one at the least"),
         ({"start": lambda self: {"K": np.full((N_A, N_S), np.nan)}}, "start must give finite"),
-        ({"start": lambda self: 1 / 0}, r"Changed.start fails: .* line \d+: ZeroDivisionError"),
+        (
+            {"start": lambda self: 1 / 0},
+            r"Changed.start fails: .*test_laws.py, line \d+: ZeroDivisionError",
+        ),
+        ({"compiled": True}, "Changed.gains fails: .*NotImplementedError"),
+        ({"compiled": True, "gains": lambda self, t: t}, r"shape \(6,\); expected \(2, 6\)"),
+        (
+            {
+                "compiled": True,
+                "gains": lambda self, t: np.hstack([2 * t.reshape(N_A, N_S), 0 * K_b]),
+            },
+            "must be .* of the law that Changed.action computes",
+        ),
         ({"action": lambda self, *given: np.ones(N_A)}, "other than zero for theta = 0"),
         ({"action": lambda self, *given: np.zeros(3)}, r"shape \(3,\); expected 2 numbers"),
-        ({"action": lambda self, *given: None}, "no array of real numbers; expected 2 numbers"),
+        ({"action": lambda self, *given: None}, "not an array of real numbers; expected 2 numbers"),
         ({"action": lambda self, *given: [][0]}, "Changed.action fails: .*IndexError"),
         ({"memory_start": lambda self: 1 / 0}, "Changed.memory_start fails"),
     ],
