@@ -32,6 +32,7 @@ from pdeloop.display import ProgressFile
 from pdeloop.live import Live
 from pdeloop.monitor.finder import Finder, run_id
 from pdeloop.monitor.service_call import ServiceCall
+from viewer_node.episode_samples import EpisodeSamples
 from viewer_node.learning_curve import LearningCurve
 from viewer_node.loop_nodes import ROLES, Endpoint
 from viewer_node.loop_reader import PERIOD, LoopReader
@@ -43,6 +44,8 @@ REQUEST_PERIOD = 0.1
 """Period (s) of serving the page's requests and of polling the answers of nodes."""
 GRAPH_PERIOD = 1.0
 """Period (s) of polling the ROS graph, and which loop runs."""
+KEPT = 20.0
+"""Seconds after which another episode is read while no page is open, for the one that will be."""
 REFRESH = 0.5
 """Period (s) of updating rates and progress."""
 
@@ -66,6 +69,8 @@ class MonitorNode:
         self._node, self._loop, self._page, self._live = node, loop, page, live
         self._finder, self._given = finder, namespace is not None
         self._reader: LoopReader | None = None
+        self._kept: EpisodeSamples | None = None
+        self._kept_at = 0.0
         self._calls: list[ServiceCall] = []
         self._peers = Peers(node)
         self._out: Path | None = None
@@ -107,8 +112,11 @@ class MonitorNode:
             return
         with self._page.lock:
             self._reader.read()
+        now = self._loop.now()
+        if self._view.finished is not self._kept:
+            self._kept, self._kept_at = self._view.finished, now
         # A page that is opened later has an episode to show at once.
-        self._reader.listen(self._page.open or self._view.finished is None)
+        self._reader.listen(self._page.open or self._kept is None or now - self._kept_at > KEPT)
 
     def _serve_requests(self) -> None:
         with contextlib.suppress(queue.Empty):

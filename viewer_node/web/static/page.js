@@ -186,7 +186,7 @@ function Result({ status, curve, controllers }) {
         ${evaluated && html`<${Costs} costs=${references} controllers=${controllers} />`}
       </div>
       <div class="advance">
-        <progress id="progress" max=${budget || 1} value=${budget ? Math.min(paid[0], budget) : 0} aria-label="rollouts of the budget"></progress>
+        <progress id="progress" max=${budget || 1} value=${phase === "done" ? budget || 1 : budget ? Math.min(paid[0], budget) : 0} aria-label="rollouts of the budget"></progress>
         <dl id="figures" class="figures">
           ${rows.map(
             ([name, value, unit = ""]) => html`
