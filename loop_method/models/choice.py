@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 from loop_interfaces.arrays import Array
 from loop_method.models.base import FieldModel, Measured, Samples, saturated
 from loop_method.models.kinds import Kind, kinds_of
-from loop_method.models.prediction import errors, pieces
+from loop_method.models.prediction import errors, finite, pieces
 from loop_method.models.settings import FieldModelSettings
 
 FEWEST_SAMPLES = 4
@@ -67,7 +67,8 @@ def fit_field_model(
     components : int
         Fields that stand one after the other in a state.
     noise : float
-        Standard deviation of the noise on every number of the states; 0 for none, or unknown.
+        Standard deviation of the noise on every number of the states; 0 for none, or unknown. Its share
+        of E is no fault of a model.
     action_limit : float
         Magnitude at which actions saturate; 0 for none.
     first : str, optional
@@ -79,6 +80,9 @@ def fit_field_model(
     rollouts = [_limited(rollout, action_limit) for rollout in rollouts]
     if len(Samples.of(rollouts)) < FEWEST_SAMPLES:
         return None
+    if noise:
+        share = _noise_share(rollouts, target, noise)
+        settings = replace(settings, reproduced=settings.reproduced + share)
     kinds = kinds_of(len(target), components, settings, line=line)
     kinds.sort(key=lambda kind: kind.name != first)
     judged: dict[Kind, float] = {}
@@ -99,6 +103,13 @@ def fit_field_model(
                 seen = [(kind.name, error) for kind, error in judged.items()]
                 return FittedModel(model, judged[kind], seen)
     return None
+
+
+def _noise_share(rollouts: Sequence[Measured], target: Array, noise: float) -> float:
+    """What the noise has in sum |z - z_r|^2 of the rollouts: the E of a perfect model."""
+    states = np.concatenate([finite(rollout).states for rollout in rollouts])
+    total = float(np.sum((states - target) ** 2))
+    return min(noise**2 * states.size / total, 1.0) if total > 0.0 else 0.0
 
 
 def _error(
