@@ -15,7 +15,6 @@ import numpy as np
 import pdeloop
 from benchmarks.backstepping import reaction_gain, transport_gain
 from loop_interfaces.arrays import Array
-from loop_method.design.tracking import track_horizon
 from pde_sim_node.dynamics import Dynamics
 from pde_sim_node.plants import DynamicsPlant
 from pde_sim_node.plants.boundary import BoundaryControlled, ReactionDiffusionBoundary, Transport
@@ -129,7 +128,7 @@ def _constant(action: Array, k: int, z: Array) -> Array:
 def _tracking(plant: DynamicsPlant, *trajectories: tuple[Array, Array]) -> Law:
     """LQ tracking with a reduced model of some trajectories."""
     model = pdeloop.identify(*trajectories, n_s=ORDER)
-    K, b = track_horizon(model.A, model.B, plant.cost, model.U)
+    K, b = pdeloop.track_horizon(model.A, model.B, plant.cost, model.U)
     return lambda k, z: (z @ model.U) @ K[k].T + b[k]
 
 
@@ -247,5 +246,5 @@ def _one_dimension(known: BoundaryControlled, budgets: list[int], seeds: int) ->
         ]
         spent = max(count for _, count in laws)
         yield row("`pdeloop.train`", [law for law, _ in laws], spent)
-    K, _ = track_horizon(known.A, known.B, plant.cost, np.eye(plant.n_z))
+    K, _ = pdeloop.track_horizon(known.A, known.B, plant.cost, np.eye(plant.n_z))
     yield row("limit: exact LQR of the horizon", [lambda i, z: z @ K[i].T], "")

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from loop_interfaces.grid import Axis as Axis
     from loop_interfaces.grid import Grid as Grid
     from loop_method.design.lqt import track as track
+    from loop_method.design.tracking import track_horizon as track_horizon
     from loop_method.laws.base import Law as Law
     from loop_method.reduce.identifiability import IdentifiabilityWarning as IdentifiabilityWarning
     from loop_method.reduce.identifiability import NotIdentifiableError as NotIdentifiableError
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
 _NAMES = {
     "loop_method.reduce.identifiability": ("IdentifiabilityWarning", "NotIdentifiableError"),
     "loop_method.design.lqt": ("track",),
+    "loop_method.design.tracking": ("track_horizon",),
     "loop_method.laws.base": ("Law",),
     "loop_method.reduce.order": ("study_orders",),
     "loop_method.reduce.reduced_model": ("ReducedModel",),

@@ -31,7 +31,15 @@ from loop_interfaces.cost import Cost
 
 
 class TimeVaryingGains(NamedTuple):
-    """The law a_k = K_k s_k + b_k: K (T, n_a, n_s), b (T, n_a)."""
+    """The law a_k = K_k s_k + b_k.
+
+    Attributes
+    ----------
+    K : (T, n_a, n_s) array
+        Feedback of each step.
+    b : (T, n_a) array
+        Feedforward of each step.
+    """
 
     K: Array
     b: Array
@@ -56,6 +64,7 @@ def track_horizon(
     Returns
     -------
     TimeVaryingGains
+        K (T, n_a, n_s) and b (T, n_a).
 
     Examples
     --------

@@ -32,12 +32,14 @@ from pde_sim_node.plants.reactions import (
     GrayScott,
     Plate,
 )
+from pde_sim_node.plants.vorticity import Kolmogorov
 
 PLANTS: Mapping[str, type[Dynamics]] = MappingProxyType(
     {
         "interval": Interval,
         "cavity": Cavity,
         "convection": Convection,
+        "kolmogorov": Kolmogorov,
         "transport": Transport,
         "reaction-diffusion": ReactionDiffusionBoundary,
         "plate": Plate,
