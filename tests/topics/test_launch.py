@@ -16,7 +16,7 @@ import pytest
 
 from tests.support.colcon_workspace import ROOT, Workspace
 from tests.support.loop_harness import Processes, until
-from tests.support.small import SMALL
+from tests.support.small import SMALL, parameters, train_here
 from tests.support.small_loop import adapted, assert_same_training, in_process
 
 LIMIT = 240.0
@@ -81,14 +81,16 @@ def test_nodes_that_are_killed_in_a_launched_training_are_started_again(
 def test_a_launched_loop_serves_a_tuner_and_ends_by_an_interrupt(
     installed: Processes, workspace: Workspace, tmp_path: Path
 ) -> None:
-    started = launch(installed, workspace, "loop.launch.py", problem=SMALL, namespace="lab")
+    options = {"problem": SMALL, "namespace": "lab", "law": "feedforward"}
+    started = launch(installed, workspace, "loop.launch.py", **options)
     tuner = installed.node(
         "tuner_node",
         *("--params-file", str(SMALL), "-r", "__ns:=/lab"),
-        *("-p", f"out:={tmp_path / 'run'}", "-p", "iterations:=20"),
+        *("-p", f"out:={tmp_path / 'run'}", "-p", "iterations:=20", "-p", "law:=feedforward"),
     )
     installed.wait(tuner, LIMIT)
-    assert_same_training(tmp_path / "run", in_process())
+    expected = train_here(parameters(law="feedforward", iterations=20))
+    assert_same_training(tmp_path / "run", expected)
     os.killpg(started.pid, signal.SIGINT)  # as Ctrl-C does: to launch and to the nodes
     said = installed.wait(started, LIMIT, code=0)
     assert "Traceback" not in said
