@@ -19,6 +19,7 @@ from pdeloop import animation
 from pdeloop.animation import FRAMES_PER_SECOND, HOLD, pictures
 from pdeloop.cli import FAILED, main
 from pdeloop.finished_run import load_run
+from pdeloop.report import page
 from pdeloop.report.data import ProblemData, behaviours
 from tests.support.small import SMALL
 
@@ -56,10 +57,10 @@ def test_all_controllers_begin_with_one_field_and_cost_what_the_evaluation_measu
 
 def test_a_gif_has_the_pictures_and_rests_on_the_last(run: Path, tmp_path: Path) -> None:
     path = tmp_path / "small.gif"
-    assert main(["animate", str(run), "--out", str(path), "--seconds", "0.5", "--field", "1"]) == 0
-    drawn = pictures(shown(run), field=1, seconds=0.5)
+    assert main(["animate", str(run), "--out", str(path), "--seconds", "0.25", "--field", "1"]) == 0
+    drawn = pictures(shown(run), field=1, seconds=0.25)
     with Image.open(path) as film:
-        assert film.n_frames == len(drawn) == round(0.5 * FRAMES_PER_SECOND)
+        assert film.n_frames == len(drawn) == round(0.25 * FRAMES_PER_SECOND)
         assert film.info["loop"] == 0
         for k, one in enumerate(drawn):
             film.seek(k)
@@ -83,12 +84,13 @@ def test_without_a_name_it_is_in_the_folder_of_the_run(
 def test_a_report_has_it_on_its_page_when_asked(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(animation, "FRAMES_PER_SECOND", 1)
+    monkeypatch.setattr(animation, "FRAMES_PER_SECOND", 0.5)
+    monkeypatch.setattr(page, "_of_problem", lambda problem: iter(()))  # no other figures
     assert main(["report", str(run), "--animate", "--out", str(tmp_path)]) == 0
     film = (tmp_path / "small-animation.gif").read_bytes()
-    page = (tmp_path / "index.html").read_text()
-    assert film.startswith(b"GIF89a") and base64.b64encode(film).decode() in page
-    assert page.index('id="small-animation"') < page.index('id="costs"')
+    text = (tmp_path / "index.html").read_text()
+    assert film.startswith(b"GIF89a") and base64.b64encode(film).decode() in text
+    assert text.index('id="small-animation"') < text.index('id="costs"')
 
 
 def test_ffmpeg_is_given_every_pixel(
