@@ -51,13 +51,14 @@ def run(
     bounds: bool = False,
     jobs: int | None = None,
     folder: Path = Path("runs/general"),
+    save: Path | None = None,
 ) -> dict[str, Any]:
     """Train on every case and compare.
 
     Parameters
     ----------
     cases
-        Names, or beginnings of names; none: all.
+        Names, or what several names begin with; none: all.
     seeds
         Trainings of each case and budget.
     budgets
@@ -72,9 +73,14 @@ def run(
         Processes; one a core if not given.
     folder
         Where finished trainings are kept.
+    save
+        File for all rows and bounds, as JSON.
     """
+    beginnings = tuple(word for word in cases if word not in CASES)
     chosen = {
-        name: case for name, case in CASES.items() if not cases or name.startswith(tuple(cases))
+        name: case
+        for name, case in CASES.items()
+        if not cases or name in cases or name.startswith(beginnings)
     }
     if not chosen:
         raise ValueError(f"no case begins with {' or '.join(cases)}; known: {', '.join(CASES)}")
@@ -103,7 +109,10 @@ def run(
                 flush=True,
             )
     known = read_json(BOUNDS) if BOUNDS.exists() and not tuning else {}
-    return {"rows": rows, "bounds": {name: known[name] for name in chosen if name in known}}
+    result = {"rows": rows, "bounds": {name: known[name] for name in chosen if name in known}}
+    if save is not None:
+        save.write_text(json.dumps(result, indent=1) + "\n")
+    return result
 
 
 def train(

@@ -104,3 +104,31 @@ def test_the_table_begins_with_what_lost_most() -> None:
     assert lines[0].endswith("| 1 |")
     assert "diverged" in lines[1]
     assert "| 0.5 |" in lines[2] and "0.50 1.50" in lines[2]
+
+
+def test_a_name_is_that_case_and_a_beginning_all_that_have_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def row(task: tuple[str, int, int], **_: object) -> dict[str, object]:
+        case, budget, seed = task
+        return {"case": case, "budget": budget, "seed": seed, "adapted": 1.0}
+
+    class Here:
+        map = staticmethod(map)
+
+        def __enter__(self) -> Here:
+            return self
+
+        def __exit__(self, *_: object) -> None: ...
+
+    monkeypatch.setattr(general, "train", row)
+    monkeypatch.setattr(general, "processes", lambda _: Here())
+    given = {"seeds": 1, "budgets": (20,), "folder": tmp_path}
+
+    def trained(*cases: str) -> list[str]:
+        general.run(cases, save=tmp_path / "rows.json", **given)
+        return [each["case"] for each in json.loads((tmp_path / "rows.json").read_text())["rows"]]
+
+    assert trained("burgers") == ["burgers"]
+    assert len(trained("burgers", "kdv-modes,")) > 2
+    assert set(trained()) == set(CASES)
