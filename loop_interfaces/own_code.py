@@ -15,6 +15,7 @@ import importlib
 import os
 import shlex
 import sys
+import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -128,7 +129,7 @@ class OwnCode:
         (entry,) = found.values()
         try:
             return entry.load()
-        except Exception as error:
+        except FAILURES as error:
             raise ValueError(
                 f"{self.word} {shown(name)}: {entry.value} cannot be loaded: {error}"
             ) from error
@@ -136,7 +137,7 @@ class OwnCode:
     def _load_module(self, dotted: str) -> ModuleType:
         try:
             return importlib.import_module(dotted)
-        except Exception as error:
+        except FAILURES as error:
             raise ValueError(
                 f"the {self.word} module {shown(dotted)} cannot be imported: {error}"
             ) from error
@@ -163,11 +164,24 @@ def name_of(kind: type) -> str:
     return f"{source}:{kind.__qualname__}"
 
 
-def located(error: BaseException) -> str:
-    """An exception in one line, with the line of the function that the `try` block called."""
-    called = error.__traceback__.tb_next if error.__traceback__ else None
-    where = f"{called.tb_frame.f_code.co_filename}, line {called.tb_lineno}: " if called else ""
-    return f"{where}{in_one_line(error)}"
+FAILURES = Exception, SystemExit
+"""What a call of own code may raise that is its failure: also that it calls exit."""
+
+
+def located(error: BaseException, module: str = "") -> str:
+    """An exception in one line, with the last line that ran in one file.
+
+    It is that of the module, or the file that the `try` block called where that did not run.
+    """
+    frames = [
+        (frame.f_globals.get("__name__"), frame.f_code.co_filename, line)
+        for frame, line in traceback.walk_tb(error.__traceback__)
+    ][1:]
+    if not frames:
+        return in_one_line(error)
+    own = [(file, line) for name, file, line in frames if name == module]
+    file, line = own[-1] if own else [f for f in frames if f[1] == frames[0][1]][-1][1:]
+    return f"{file}, line {line}: {in_one_line(error)}"
 
 
 def in_one_line(error: BaseException) -> str:
@@ -194,7 +208,7 @@ def load_file(path: Path, word: str) -> ModuleType:
     try:
         with _being_executed(path):
             exec(compile(source, path, "exec"), vars(module))
-    except Exception as error:
+    except FAILURES as error:
         del sys.modules[module.__name__]
         raise ValueError(
             f"the {word} file {shown(str(path))} cannot be executed: {error}"

@@ -29,7 +29,7 @@ from loop_interfaces.arrays import Array
 from loop_interfaces.cost import Cost
 from loop_interfaces.frames import digest
 from loop_interfaces.topics import COMPLETED, CostColumn
-from loop_method.adapt import Context, Optimizer, Record, Rollout, Trajectory
+from loop_method.adapt import Context, Optimizer, Record, Rollout, Trajectory, calls
 from loop_method.laws import Law
 from loop_method.laws.calls import laws_of
 from loop_method.reduce.identifiability import examine_excitation
@@ -362,7 +362,10 @@ class Training:
 
     def _asked(self) -> list[list[Rollout]]:
         """What each optimiser asks for; its policies may be vectors."""
-        return [[] if optimizer.done else optimizer.ask() for optimizer in self.optimizers]
+        return [
+            [] if optimizer.done else calls.ask(optimizer, law.size)
+            for optimizer, law in zip(self.optimizers, self.laws(), strict=True)
+        ]
 
     def _tell(self, result: BatchResult) -> list[dict[str, Any]]:
         rows, results, laws = [], iter(result.rollouts()), self.laws()
@@ -374,7 +377,7 @@ class Training:
                 seen = [measured.trajectory for measured in own]
                 check_law(asked, laws[m], seen, self.settings.action_limit)
                 self.law_seen = True
-            report = optimizer.tell(own)
+            report = calls.tell(optimizer, own)
             self.budget.count("adapt", [m] * len(asked))
             paid = int(self.budget.paid[m])
             rows.append(

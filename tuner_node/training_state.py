@@ -13,6 +13,7 @@ from loop_interfaces import model_rows
 from loop_interfaces.array_files import taken
 from loop_interfaces.documents import parse_json
 from loop_interfaces.text import shown
+from loop_method.adapt import calls
 from loop_method.adapt.trajectories import (
     record_arrays,
     taken_record,
@@ -52,7 +53,7 @@ def arrays_of(training: Training) -> Arrays:
         if (array := getattr(training, name)) is not None:
             arrays[name] = array
     for m, optimizer in enumerate(training.optimizers):
-        arrays |= {f"optimizer{m}.{key}": value for key, value in optimizer.state().items()}
+        arrays |= {f"optimizer{m}.{key}": value for key, value in calls.state(optimizer).items()}
     return arrays
 
 
@@ -102,7 +103,7 @@ def _fill(training: Training, arrays: Arrays) -> None:
     for m, optimizer in enumerate(training.optimizers):
         prefix = f"optimizer{m}."
         own = {key: value for key, value in arrays.items() if key.startswith(prefix)}
-        optimizer.restore({key.removeprefix(prefix): value for key, value in own.items()})
+        calls.restore(optimizer, {key.removeprefix(prefix): value for key, value in own.items()})
 
 
 def _check(training: Training) -> None:

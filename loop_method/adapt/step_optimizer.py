@@ -114,7 +114,11 @@ class StepOptimizer(Optimizer):
             "rollouts": (self._tells + 1) * self.step_rollouts,
             "diverged": sum(not result.usable for result in results),
         }
-        row |= self.update(results)
+        found = self.update(results)
+        if not isinstance(found, Mapping):
+            kind = type(found).__name__
+            raise ValueError(f"{type(self).__name__}.update returned {kind}; expected a dict")
+        row |= found
         self._tells += 1
         return row
 

@@ -22,7 +22,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from loop_interfaces.own_code import located
+from loop_interfaces.own_code import FAILURES, located
 from loop_interfaces.text import shown
 from pde_sim_node.supports import indicator_supports
 
@@ -55,7 +55,7 @@ def result_of(method: Callable[..., Any], *arguments: Any) -> Any:
     """
     try:
         return method(*arguments)
-    except Exception as error:
+    except FAILURES as error:
         raise ValueError(f"{method.__name__} of the equation fails: {located(error)}") from error
 
 

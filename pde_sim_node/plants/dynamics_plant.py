@@ -13,7 +13,7 @@ from threadpoolctl import ThreadpoolController
 from loop_interfaces.arrays import Array, float_array
 from loop_interfaces.cost import Cost
 from loop_interfaces.grid import Grid
-from loop_interfaces.own_code import OwnCodeError, located
+from loop_interfaces.own_code import FAILURES, OwnCodeError, located
 from pde_sim_node.action_set import ActionSet
 from pde_sim_node.arguments import positive, whole
 from pde_sim_node.definition import Definition, described, sources_of
@@ -219,7 +219,7 @@ class DynamicsPlant(BatchPlant):
         with self._blas.limit(limits=1), np.errstate(over="ignore", invalid="ignore"):
             try:
                 return function(*arguments)
-            except (Exception, SystemExit) as error:
+            except FAILURES as error:
                 raise OwnCodeError(f"{self.name}.{method} fails: {located(error)}") from error
 
     def _numbers(self, method: str, returned: Any, count: int) -> Array:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from loop_interfaces.arrays import Array, float_array
 from loop_interfaces.grid import Grid
-from loop_interfaces.own_code import OwnCodeError, located
+from loop_interfaces.own_code import FAILURES, OwnCodeError, located
 from pde_sim_node.definition import Definition, described, source_of
 from pde_sim_node.plant import MEAN_FIELD
 from pde_sim_node.plants.batch import BatchPlant
@@ -144,7 +144,7 @@ class GymnasiumPlant(BatchPlant):
     def _begin(self, env: Env[Any, Any], seed: int) -> Array:
         try:
             observation, _ = env.reset(seed=0 if seed == MEAN_FIELD else seed)
-        except (Exception, SystemExit) as error:
+        except FAILURES as error:
             raise OwnCodeError(f"{self._first}.reset fails: {located(error)}") from error
         state = self._numbers("reset", observation)
         if not np.isfinite(state).all():
@@ -167,7 +167,7 @@ class GymnasiumPlant(BatchPlant):
             action = self.actions[m].reshape(self._shape).astype(self._space.dtype)
             try:
                 observation, reward, terminated, truncated, _ = self._envs[m].step(action)
-            except (Exception, SystemExit) as error:
+            except FAILURES as error:
                 raise OwnCodeError(f"{self._first}.step fails: {located(error)}") from error
             if truncated and self.step_index + 1 < self.horizon:
                 raise OwnCodeError(

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from loop_interfaces.own_code import OwnCode, located, name_of
+from loop_interfaces.own_code import FAILURES, OwnCode, located, name_of
 from loop_interfaces.spec import ParameterError
 from loop_interfaces.text import shown
 from pde_sim_node.definition import described
@@ -100,7 +100,7 @@ def make(values: Mapping[str, Any]) -> Made:
     arguments = fitting(maker, physical, name)
     try:
         made = maker(**arguments)
-    except (Exception, SystemExit) as error:
+    except FAILURES as error:
         raise ValueError(f"the plant {shown(name)} cannot be made: {located(error)}") from error
     if not isinstance(made, Dynamics | Plant):
         raise ValueError(

@@ -1,0 +1,89 @@
+# Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
+"""What an optimiser of one's own raises or returns ends a training with one sentence."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+
+from loop_interfaces.own_code import OwnCodeError
+from loop_method.adapt import Rollout, RolloutResult, StepOptimizer, calls
+from loop_method.adapt.two_point import TwoPoint, TwoPointSettings
+
+POLICY = np.zeros((2, 3))
+SIZE = POLICY.size
+
+
+class Own(StepOptimizer):
+    """Takes one rollout a step; `faulty` is done by the method of that name."""
+
+    name = "own"
+    step_rollouts = 1
+
+    def __init__(self, **faulty: Any) -> None:
+        super().__init__(POLICY, seed=0, rollouts=3, settings=None)
+        self.faulty = faulty
+
+    def rollouts(self) -> Any:
+        return self.faulty["rollouts"]() if "rollouts" in self.faulty else [Rollout(POLICY, 1)]
+
+    def update(self, results: Any) -> Any:
+        return self.faulty["update"]() if "update" in self.faulty else {}
+
+
+def asks(policy: Any) -> Own:
+    return Own(rollouts=lambda: [Rollout(policy, 1)])
+
+
+def test_rollouts_and_reports_go_through_as_they_are() -> None:
+    (asked,) = calls.ask(Own(), SIZE)
+    assert asked.policy is POLICY and asked.field_seed == 1
+    (flat,) = calls.ask(asks(POLICY.ravel()), SIZE)
+    assert flat.policy.shape == (SIZE,)
+    assert calls.tell(Own(update=lambda: {"own": 2.0}), [RolloutResult(1.0)])["own"] == 2.0
+
+
+@pytest.mark.parametrize(
+    ("optimizer", "words"),
+    [
+        (
+            Own(rollouts=lambda: 1 / 0),
+            r"Own.ask fails: .*test_optimizer_calls.py, line \d+: ZeroDiv",
+        ),
+        (Own(rollouts=sys.exit), r"Own.ask fails: .*test_optimizer_calls.py, line \d+: SystemExit"),
+        (Own(rollouts=lambda: 3), "Own.ask returned int; expected a list of Rollout"),
+        (Own(rollouts=lambda: [3.0]), "Own.ask returned a list with float; expected a list"),
+        (asks("gains"), "Own.ask: a policy is str, which is not an array of real numbers"),
+        (asks(POLICY[:1]), r"a policy is an array of shape \(1, 3\); expected 6 finite numbers"),
+        (asks(POLICY + np.nan), "a policy is NaN or infinity; expected 6 finite numbers"),
+    ],
+)
+def test_what_it_asks_for_is_checked(optimizer: Own, words: str) -> None:
+    with pytest.raises(OwnCodeError, match=words):
+        calls.ask(optimizer, SIZE)
+
+
+@pytest.mark.parametrize(
+    ("update", "words"),
+    [
+        (lambda: [][0], r"Own.tell fails: .*test_optimizer_calls.py, line \d+: IndexError"),
+        (
+            lambda: sys.exit(0),
+            r"Own.tell fails: .*test_optimizer_calls.py, line \d+: SystemExit: 0",
+        ),
+        (lambda: 7, "Own.update returned int; expected a dict"),
+    ],
+)
+def test_what_it_reports_is_checked(update: Any, words: str) -> None:
+    with pytest.raises(OwnCodeError, match=words):
+        calls.tell(Own(update=update), [RolloutResult(1.0)])
+
+
+def test_a_shipped_optimizer_says_itself_what_is_wrong() -> None:
+    with pytest.raises(ValueError, match="result"):
+        calls.tell(
+            TwoPoint(POLICY, seed=0, rollouts=4, settings=TwoPointSettings(learning_rate=0.1)), []
+        )
