@@ -12,7 +12,7 @@ from loop_interfaces.arrays import Array
 from loop_interfaces.grid import Grid
 from viewer_node.picture import Range, diverging, middle
 
-MOST_CELLS = 10_000
+MOST_CELLS = 4096
 """Most cells drawn of a component; on a finer grid every n-th along each axis."""
 APART = 1.1
 """Distance of two pictures side by side, relative to their size."""

@@ -26,6 +26,8 @@ from loop_interfaces.spec import ParameterError, Spec, check_names
 
 UNANSWERED = 1.0
 """Seconds after which a request that got no answer is made again."""
+TOLD = ("actuators",)
+"""Parameters that a node sets itself; a file with all its parameters has them, too."""
 _LARGEST = 1.7976931348623157e308
 
 
@@ -38,7 +40,7 @@ def given_parameters(node: Node, package: str) -> dict[str, Any]:
         # rcl knows no type of an empty list, and gives it no value.
         name: [] if parameter.value is None else parameter.value
         for name, parameter in node._parameter_overrides.items()
-        if not of_ros(name)
+        if not of_ros(name) and name not in TOLD
     }
     given = with_names(given)
     check_names(given, [spec.name for spec in table()])

@@ -6,6 +6,8 @@ from __future__ import annotations
 import re
 from dataclasses import fields
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -305,3 +307,14 @@ def test_a_node_refuses_a_problem_that_nobody_knows(package, given, known):
     else:
         with pytest.raises(Refused, match=r"unknown problem 'stokes'.*burgers, .*kdv"):
             completed(given, package)
+
+
+def test_what_a_plant_tells_of_itself_is_not_taken_from_a_file_of_all_its_parameters() -> None:
+    from loop_interfaces.ros.parameters import given_parameters
+
+    overrides = {"actuators": "[[0, [0.0, 0.5]]]", "n_a": 3}
+    node: Any = SimpleNamespace(
+        _parameter_overrides={n: SimpleNamespace(value=v) for n, v in overrides.items()}
+    )
+    given = given_parameters(node, "pde_sim_node")
+    assert "actuators" not in given and given["n_a"] == 3
