@@ -78,7 +78,12 @@ class FinishedRun:
 
         ValueError if it is code that is not allowed.
         """
-        return laws_of(law_kind(self.values["law"]), self.models, self.values["horizon"])
+        return laws_of(
+            law_kind(self.values["law"]),
+            self.models,
+            self.values["horizon"],
+            self.values.get("cost", ()),
+        )
 
     @property
     def before(self) -> list[int]:

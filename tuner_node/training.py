@@ -169,7 +169,9 @@ class Training:
         made_from = digest(self.models)
         if not self._laws or self._made_from != made_from:
             models = [model_rows.unpack(rows, self.settings.n_a) for rows in self.models]
-            self._laws = laws_of(self.settings.law, models, self.settings.horizon)
+            self._laws = laws_of(
+                self.settings.law, models, self.settings.horizon, self.settings.cost
+            )
             self._made_from = made_from
         return self._laws
 

@@ -35,6 +35,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loop_interfaces.arrays import Array
+from loop_interfaces.cost import Cost
 from loop_interfaces.model_rows import ModelRows
 
 Parts: TypeAlias = Mapping[str, Array]
@@ -61,6 +62,8 @@ class Law(ABC):
     ----------
     memory_size : int
         Numbers of the memory; 0: the law has none.
+    cost : Cost or None
+        The plant's cost, where it is more than numbers and a constant target; not yet in `__init__`.
 
     Examples
     --------
@@ -74,6 +77,7 @@ class Law(ABC):
     axes: ClassVar[int] = 1
     """Axes of theta in messages and files, where all laws but the affine one have a vector."""
     memory_size: int = 0
+    cost: Cost | None = None
 
     def __init_subclass__(cls, **named: Any) -> None:
         super().__init_subclass__(**named)

@@ -13,6 +13,7 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from loop_interfaces.arrays import Array, float_array
+from loop_interfaces.cost import Cost
 from loop_interfaces.model_rows import ModelRows
 from loop_interfaces.own_code import FAILURES, OwnCodeError, located
 from loop_method.laws.affine import Affine
@@ -33,9 +34,12 @@ def one_thread() -> Iterator[None]:
         yield
 
 
-def laws_of(kind: type[Law], models: Sequence[ModelRows], horizon: int) -> list[Law]:
+def laws_of(
+    kind: type[Law], models: Sequence[ModelRows], horizon: int, cost: Sequence[str] = ()
+) -> list[Law]:
     """The law of each model, whose start was looked at.
 
+    cost: as the parameter has it (`loop_interfaces.cost.Cost.texts`).
     A model from a message may lie at any address and in any order, for which products round otherwise:
     each law has a copy of its own.
 
@@ -44,7 +48,8 @@ def laws_of(kind: type[Law], models: Sequence[ModelRows], horizon: int) -> list[
     OwnCodeError
         A law cannot be made, its start is not usable, or theta = 0 is not no control.
     """
-    return [_checked(kind, _copied(model), horizon) for model in models]
+    known = Cost.parse(cost)
+    return [_checked(kind, _copied(model), horizon, known) for model in models]
 
 
 def _copied(model: ModelRows) -> ModelRows:
@@ -53,9 +58,10 @@ def _copied(model: ModelRows) -> ModelRows:
     )
 
 
-def _checked(kind: type[Law], model: ModelRows, horizon: int) -> Law:
+def _checked(kind: type[Law], model: ModelRows, horizon: int, cost: Cost | None) -> Law:
     with one_thread():
         law: Law = _called(kind.name, "__init__", kind, model, horizon)
+        law.cost = cost
         _called(kind.name, "start", law.start)  # by itself, so that an error names its line
         start = _called(kind.name, "start", lambda: law.theta_start)
         if not start.size or not np.isfinite(start).all():

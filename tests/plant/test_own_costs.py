@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 
 import pdeloop
+from loop_interfaces.model_rows import ModelRows
 from loop_interfaces.spec import ParameterError
 from loop_method.design.finite_horizon import finite_horizon_of
 from loop_method.design.tracking import track_horizon
+from loop_method.laws.calls import laws_of
+from loop_method.laws.feedforward import FeedForward
 from pde_sim_node.action_set import ActionSet
 from pde_sim_node.dynamics import Dynamics
 from pde_sim_node.plants import DynamicsPlant
@@ -66,6 +69,25 @@ def test_no_law_costs_less_than_lq_tracking_over_the_horizon() -> None:
         shift = size * rng.standard_normal((T, N_A))
         up, down = cost(shift) - best, cost(-shift) - best
         assert up == pytest.approx(down, rel=1e-6) and up > 0.0  # the slope is zero there
+
+
+def test_the_law_with_a_feedforward_looks_ahead_from_its_start() -> None:
+    """From s = 0 it takes the best way, with one feedback for all steps."""
+    plant, one = DynamicsPlant(Servo()), np.ones((N_A, N_Z))
+    rows = ModelRows(A=A, B=B, U=np.eye(N_Z), K_a=one, K_b=one, s_r=plant.field_target)
+    (law,) = laws_of(FeedForward, [rows], T, plant.cost.texts)
+    start, best = law.parts(law.theta_start), track_horizon(A, B, plant.cost, np.eye(N_Z))
+    rest = np.zeros((1, N_Z))
+    found, expected = (
+        pdeloop.rollout(plant, own, rest)
+        for own in (
+            lambda k, z: law.action(start, z[0], np.zeros(0), k)[None],
+            lambda k, z: z @ best.K[k].T + best.b[k],
+        )
+    )
+    np.testing.assert_allclose(found.actions, expected.actions, atol=1e-10)
+    (constant,) = laws_of(FeedForward, [rows], T)
+    assert np.ptp(constant.parts(constant.theta_start)["b"], axis=0).max() == 0.0
 
 
 def test_a_training_designs_and_adapts_for_it() -> None:
