@@ -20,6 +20,7 @@ OWN_FLAGS = {
     "pairs": "--pairs",
     "recorder": "--record",
     "bag": "--record",
+    "cost": "--plant",
 }
 """Parameters that follow from a flag of the command, or are not a training's."""
 
