@@ -87,7 +87,9 @@ def pairs_of_nodes(context: LaunchContext) -> list[Any]:
     own |= {code: values[code] for code in ("equation", "law")}
     if values["plant"]:  # the other nodes also need what the plant fills in
         _, values = complete(values)
-        own |= {name: values[name] for name in ("plant", *OF_THE_PLANT)}
+        filled = {name: values[name] for name in ("plant", *OF_THE_PLANT)}
+        # The type of an empty list cannot be told.
+        own |= {name: value for name, value in filled.items() if value != []}
     problem = find_problem(given["problem"]).resolve()
     return actions + [
         Node(
