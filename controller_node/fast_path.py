@@ -17,7 +17,7 @@ from fast_path import channel
 from fast_path.handler import FastPath, fast_handler, plan_type
 from fast_path.messages import FIRST, STEP, TIME, write_answer
 from loop_interfaces.frames import MAX_ID, ArrayCodec, Frame
-from loop_interfaces.jit.cache import jit
+from loop_interfaces.jit.cache import jit_in_closure
 from loop_interfaces.jit.simd import load_unaligned
 from loop_interfaces.topics import ACTION
 
@@ -31,7 +31,7 @@ PLAN = plan_type(
 )
 
 
-@jit
+@jit_in_closure
 def respond(plan: Any, head: int, message: int, length: int) -> bool:
     """Fill in the action that the law answers with."""
     step = load_unaligned(head, STEP)

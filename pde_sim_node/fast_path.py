@@ -22,7 +22,7 @@ from fast_path.messages import (
     write_answer,
 )
 from loop_interfaces.frames import ArrayCodec, digest
-from loop_interfaces.jit.cache import jit
+from loop_interfaces.jit.cache import jit, jit_in_closure
 from loop_interfaces.jit.native import CLOCK, MonotonicClock, call_c, monotonic_ns
 from loop_interfaces.jit.simd import load_unaligned, write
 from loop_interfaces.samples import ACTION_KIND, NO_TIME, SAMPLE_HEADER, STATE_KIND
@@ -70,7 +70,7 @@ def add_sample(plan: Any, kind: int, time: float, raw: int, length: int) -> None
             append(batch, kind, stamp, time, raw, length)
 
 
-@jit
+@jit_in_closure
 def advance(plan: Any, head: int, message: int, length: int) -> bool:
     """Apply the awaited action, and fill in the next state."""
     if load_unaligned(head, STEP) != plan.step or plan.steps == plan.limit:

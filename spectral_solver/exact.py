@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from loop_interfaces.jit import native, simd
-from loop_interfaces.jit.cache import jit
+from loop_interfaces.jit.cache import jit, jit_in_closure
 from loop_interfaces.jit.simd import WIDTH, fma, read, splat, whole_lanes
 from spectral_solver import fft, spectra
 from spectral_solver.batch_step import environments_of
@@ -94,7 +94,7 @@ def advance_component(
         put(w, plan.x + k, d, total)
 
 
-@jit
+@jit_in_closure
 def advance(state: int, action: int, w: int, d: int, plan: Any, c: int, e: int) -> None:
     """The state a sampling time later, in the scratch."""
     for f in range(plan.components):

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from loop_interfaces.jit import native, simd
-from loop_interfaces.jit.cache import jit
+from loop_interfaces.jit.cache import jit, jit_in_closure
 from loop_interfaces.jit.native import call_c
 from loop_interfaces.jit.simd import WIDTH, fma, read, splat, whole_lanes
 from spectral_solver import fft, spectra
@@ -141,7 +141,7 @@ def force(action: int, w: int, d: int, plan: Any, c: int, e: int) -> None:
         put(w, plan.ff + k, d, product(c, plan.f + k, e, total))
 
 
-@jit
+@jit_in_closure
 def advance(state: int, action: int, w: int, d: int, plan: Any, c: int, e: int) -> None:
     """The state a sampling time later, in the scratch."""
     force(action, w, d, plan, c, e)

@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 import numba
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
+from numba.extending import register_jitable
 
 from loop_interfaces.files import private_folder
 
@@ -59,12 +60,28 @@ class _PartCompiler(Compiler):  # type: ignore[misc, unused-ignore]
         super().__init__(typing, target, parts, *how)  # type: ignore[no-untyped-call, unused-ignore]
 
 
+# Options of the CPU target that Numba's declarations of njit leave out.
+_PART: dict[str, Any] = {
+    "pipeline_class": _PartCompiler,
+    "no_cpython_wrapper": True,
+    "no_cfunc_wrapper": True,
+}
+
+
 def jit(function: F) -> F:
     """Compile as a part of a function that is cached; only compiled code can call it."""
-    # Options of the CPU target that Numba's declarations of njit leave out.
-    entries: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-    compiled: F = numba.njit(pipeline_class=_PartCompiler, **entries)(function)
+    compiled: F = numba.njit(**_PART)(function)
     return compiled
+
+
+def jit_in_closure(function: F) -> F:
+    """As `jit`, for what a cached function closes over.
+
+    What is closed over is a part of the key on disk. A function has the same one in each process, and
+    what Numba makes of it has not: so the function stays as it is.
+    """
+    registered: F = register_jitable(**_PART)(function)
+    return registered
 
 
 def inlined_njit(function: F) -> F:

@@ -20,11 +20,13 @@ from pde_sim_node.equations import (
 )
 from pde_sim_node.plant import DIVERGED_COST
 from pde_sim_node.plants import SpectralPlant
+from pdeloop.training_run import load_compiled, resolve
 from spectral_solver import workers
 from spectral_solver.kernel import fine_length
 from spectral_solver.reference import ReferenceStep
 from tests.support.interpreter import python
 from tests.support.plants import plant_of
+from tests.support.small import SMALL
 
 DATA = Path(__file__).parents[1] / "data"
 
@@ -580,3 +582,30 @@ def test_a_second_plant_does_not_compile_again() -> None:
     one, other = (make(Burgers(), **P1).parallel for _ in range(2))
     assert one.code == other.code
     assert one.plans["pointwise"][0] == other.plans["pointwise"][0]
+
+
+COMPILED_AGAIN = """
+from numba.core import event
+
+made = []
+
+class Seen(event.Listener):
+    def on_start(self, event):
+        made.append(event.data["dispatcher"].py_func.__name__.split("-")[0])
+
+    def on_end(self, event):
+        pass
+
+event.register("numba:compile", Seen())
+from pdeloop.training_run import load_compiled, resolve
+from tests.support.small import SMALL
+
+load_compiled(resolve(str(SMALL), {}))
+print(*made)
+"""
+
+
+def test_what_a_training_runs_on_is_compiled_once_for_all_processes() -> None:
+    load_compiled(resolve(str(SMALL), {}))
+    again = set(python("-c", COMPILED_AGAIN).stdout.split())
+    assert again & {"environments", "advance", "integrate", "control", "respond", "act"} == set()
