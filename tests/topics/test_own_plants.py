@@ -21,7 +21,7 @@ pytestmark = pytest.mark.topics
 PLANTS = ROOT / "examples" / "plants"
 LINEAR, PLATE = f"{PLANTS}/random_linear.py:RandomLinear", f"{PLANTS}/plate.py:Plate"
 PENDULUM = f"{PLANTS}/pendulum.py:upright"
-BUDGET = {"rollouts": 9, "evaluation_fields": 2, "reduced_order": 3}
+BUDGET = {"rollouts": 9, "evaluation_fields": 2, "reduced_order": 6}
 FLAGS = [
     word for name, value in BUDGET.items() for word in (f"--{name.replace('_', '-')}", str(value))
 ]
