@@ -251,12 +251,15 @@ def test_a_training_that_must_be_recorded_stops_when_the_recorder_does(loop, tmp
     assert verify(hand.bag).count == 0
 
 
-@pytest.mark.parametrize(("recorder", "iterations"), [("start", 300), ("required", 100_000)])
+@pytest.mark.parametrize(
+    ("recorder", "iterations", "pace"), [("start", 300, 300.0), ("required", 100_000, 100.0)]
+)
 def test_a_full_disk_ends_the_recording_and_the_training_as_the_user_chose(
-    loop, tmp_path, recorder, iterations
+    loop, tmp_path, recorder, iterations, pace
 ):
     with small_disk(tmp_path / "disk", megabytes=2) as disk:
-        hand = Hand(loop, disk / "bag", tmp_path / "run", recorder, iterations)
+        # At this pace the disk takes several chunks: what is cut short is the last of them alone.
+        hand = Hand(loop, disk / "bag", tmp_path / "run", recorder, iterations, pace=pace)
         text = loop.wait(hand.recorder, LIMIT, code=3)
         last = text.strip().splitlines()[-1]
         assert last.startswith(f"recorder_node: cannot write to {disk / 'bag'}: ")
