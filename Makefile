@@ -38,11 +38,12 @@ install = $(PIP) install --no-compile --require-hashes -r requirements/$(1).txt 
 	@.venv/supply.new/bin/python -m pip install -qq --disable-pip-version-check uv==0.13.9 pip-audit==2.10.1
 	@mv .venv/supply.new $@
 
-# The digests of all archives of the pinned versions; a version is changed in constraints.txt.
+# The digests of all archives of the pinned versions; a version is changed in constraints.txt. With its extras,
+# since pip holds name[extra], which a package asks for, to the pin of name[extra] alone.
 lock: .venv/supply
 	@for part in run:ros test:ros,dev; do \
-		echo setuptools | .venv/supply/bin/python -m uv pip compile --quiet --universal --generate-hashes --no-annotate \
-			--no-header --constraint constraints.txt $$(echo $${part#*:} | tr , '\n' | sed 's/^/--extra /') \
+		echo setuptools | .venv/supply/bin/python -m uv pip compile --quiet --universal --generate-hashes --no-strip-extras \
+			--no-annotate --no-header --constraint constraints.txt $$(echo $${part#*:} | tr , '\n' | sed 's/^/--extra /') \
 			--output-file requirements/$${part%:*}.txt pyproject.toml - || exit 1; \
 		sed -i "s/ ; python_full_version >= '3.11.5' and python_full_version < '3.15' and sys_platform == 'linux'//" \
 			requirements/$${part%:*}.txt; \

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import re
 import shlex
@@ -11,6 +12,8 @@ from pathlib import Path
 
 import pytest
 import yaml
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from tests.support.interpreter import ROOT
 
@@ -106,8 +109,8 @@ def test_the_citation_has_what_its_format_asks_for(name: str) -> None:
 
 def pins(text: str) -> dict[str, str]:
     """Version by normalised name of each line NAME==VERSION."""
-    found = re.findall(r"^([\w.-]+)==([^\s;]+)", text, re.MULTILINE)
-    return {re.sub(r"[-_.]+", "-", name).lower(): version for name, version in found}
+    found = re.findall(r"^([\w.-]+)(?:\[[\w,-]+\])?==([^\s;]+)", text, re.MULTILINE)
+    return {canonicalize_name(name): version for name, version in found}
 
 
 @pytest.mark.parametrize(("part", "extras"), [("run", ["ros"]), ("test", ["ros", "dev"])])
@@ -126,5 +129,22 @@ def test_what_is_installed_is_pinned_and_has_digests(part: str, extras: list[str
                 extras += nested[1].split(",")
             else:
                 needed.append(words)
-    names = {re.sub(r"[-_.]+", "-", re.match(r"[\w.-]+", n)[0]).lower() for n in needed}  # type: ignore[index]
-    assert names <= set(found), "make lock"
+    assert {canonicalize_name(Requirement(n).name) for n in needed} <= set(found), "make lock"
+
+
+def test_each_extra_that_a_package_asks_for_is_pinned_with_its_extra() -> None:
+    """pip looks for the newest version of ``name[extra]`` unless that, not only ``name``, is pinned."""
+    pinned = re.findall(r"^(\S+)==", (ROOT / "requirements" / "test.txt").read_text(), re.MULTILINE)
+    requirements = [Requirement(words) for words in pinned]
+    extras = {canonicalize_name(r.name): r.extras for r in requirements}
+    asked = [
+        Requirement(words)
+        for installed in importlib.metadata.distributions()
+        if canonicalize_name(installed.name) in extras
+        for words in installed.requires or []
+    ]
+    asked = [
+        r for r in asked if r.extras and (r.marker is None or r.marker.evaluate({"extra": ""}))
+    ]
+    assert asked
+    assert {str(r) for r in asked if not r.extras <= extras[canonicalize_name(r.name)]} == set()
