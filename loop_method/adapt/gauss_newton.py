@@ -44,7 +44,7 @@ from loop_method.adapt.base import (
     require_positive,
     require_results,
 )
-from loop_method.adapt.proposals import Proposer
+from loop_method.adapt.proposer import Proposer
 from loop_method.adapt.trajectories import Records
 from loop_method.seeds import field_seed
 from loop_method.settings import Settings, setting

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from loop_interfaces.arrays import Array
-from loop_method.adapt.fit import LocalModel
+from loop_method.adapt.local_model import LocalModel
 from loop_method.adapt.sensitivity import ReducedTrajectory, predict_difference
 
 # Ridges of the quadratic part.

@@ -30,7 +30,7 @@ import numpy as np
 from scipy import linalg
 
 from loop_interfaces.arrays import Array
-from loop_method.adapt.fit import LocalModel
+from loop_method.adapt.local_model import LocalModel
 
 # Share of the trust region that bounds all gains alike, relative to the one in input energy.
 ISOTROPY = 0.3

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from loop_method.adapt import Context, GaussNewton, Rollout, RolloutResult, Trajectory
-from loop_method.adapt.proposals import Proposer
+from loop_method.adapt.proposer import Proposer
 from loop_method.design.lqt import track
 from loop_method.reduce.reduced_model import ReducedModel
 from tests.support.small import parameters, same_bits, train_here

@@ -11,7 +11,7 @@ import pdeloop
 from loop_method.adapt import Context, GaussNewton, Rollout, RolloutResult, Trajectory
 from loop_method.adapt.base import Record
 from loop_method.adapt.loop import Loop
-from loop_method.adapt.proposals.sensed import SensedProposals
+from loop_method.adapt.sensed_step import SensedProposals
 from loop_method.models.sensed import fit_sensed, grid_points, interpolated, sensed_model
 from loop_method.models.spectral import SpectralModel
 from pdeloop.episode import rollout

@@ -33,7 +33,7 @@ from loop_interfaces.topics import (
     TARGET,
     Topic,
 )
-from loop_method.adapt.proposals import Proposer
+from loop_method.adapt.proposer import Proposer
 from pde_sim_node.build import build_plant, complete
 from pde_sim_node.lockstep import Lockstep, Timing
 from pde_sim_node.plant import Plant

@@ -18,7 +18,7 @@ import pdeloop
 from loop_interfaces.loop_parameters import read_problem
 from loop_interfaces.own_code import OwnCodeError
 from loop_interfaces.problem import load_parameters
-from loop_method.adapt.proposals import field
+from loop_method.adapt import field_step
 from pde_sim_node.build import build_plant, complete
 from pde_sim_node.plants import DynamicsPlant, loading
 from pde_sim_node.plants.loading import OWN_PLANTS
@@ -303,7 +303,7 @@ def test_no_model_of_a_periodic_field_is_fitted_to_another_plant(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A convolution fits a walled plate passably, and leads to worse laws than local models."""
-    monkeypatch.setattr(field, "field_model", lambda *_: pytest.fail("was fitted"))
+    monkeypatch.setattr(field_step, "field_model", lambda *_: pytest.fail("was fitted"))
     settings = {"optimizer": "gauss_newton", "physical.nx": 6}
     run = pdeloop.train(plant=PLATE, rollouts=12, evaluation_fields=2, **settings)
     assert run.costs["adapted"].mean() < run.costs["lqt"].mean()

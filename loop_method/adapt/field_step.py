@@ -16,7 +16,7 @@ from loop_method.adapt.base import Context, Record
 from loop_method.adapt.belief import Belief, believe
 from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.improve import improve
-from loop_method.adapt.proposals.proposal import COMPARED, LEAST_FALL, TRUST, Proposal, spread
+from loop_method.adapt.proposal import COMPARED, LEAST_FALL, TRUST, Proposal, spread
 from loop_method.adapt.renewal import curvature_of
 from loop_method.adapt.sensitivity import ISOTROPY
 from loop_method.adapt.settings import ModelBasedSettings

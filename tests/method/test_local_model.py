@@ -9,7 +9,7 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from loop_method.adapt.fit import LocalModel, extended_basis, fit
+from loop_method.adapt.local_model import LocalModel, extended_basis, fit
 from loop_method.adapt.selection import KAPPAS, Comparison, choices, mismatches
 from loop_method.adapt.sensitivity import (
     ReducedTrajectory,

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from loop_method.adapt import field_step
 from loop_method.adapt.belief import Belief
-from loop_method.adapt.proposals import field
 from loop_method.adapt.trajectories import Records
 from loop_method.models.linear import LinearModel
 from tests.method.test_gauss_newton import N_Z, Plant
@@ -37,9 +37,9 @@ def test_a_plant_that_forgets_is_told_from_one_that_is_disturbed(
     plant = Plant()
     errors = {1: whole, 8: parts}
     monkeypatch.setattr(
-        field, "believe", lambda _, __, ___, pieces=1: Belief(model(plant), errors[pieces], 1)
+        field_step, "believe", lambda _, __, ___, pieces=1: Belief(model(plant), errors[pieces], 1)
     )
-    found, as_a_whole = field.field_model(plant.context(), [], "", 0.05)
+    found, as_a_whole = field_step.field_model(plant.context(), [], "", 0.05)
     assert as_a_whole == (believed == "whole")
     assert (found and found.error) == (None if believed is None else errors[8 - 7 * as_a_whole])
 
@@ -52,7 +52,7 @@ def test_a_law_is_improved_on_the_model_until_that_gains_nothing(whole: bool) ->
     belief = Belief(model(plant), 0.0, 1)
     falls = []
     for _ in range(20):
-        proposal = field.propose(plant.context(), belief, whole, data, policy, 1e-3)
+        proposal = field_step.propose(plant.context(), belief, whole, data, policy, 1e-3)
         if proposal is None or proposal.fall < 1e-3:
             break
         assert proposal.kind == proposal.believed == "linear"

@@ -1,5 +1,14 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""Chooses the kind of proposal, and asks for one."""
+"""Proposes the next policy of Gauss-Newton, a function of the remembered trajectories.
+
+A proposal is of the first of three kinds that applies:
+
+1. `sensed_step`: there are few point sensors, and a model of the field between them reproduces their
+   readings. It also depends on the equation that was fitted before, with which the next fit begins.
+2. `field_step`: a model of the whole field predicts the rollouts or, if the plant is chaotic, pieces of
+   them.
+3. `local_step`: always; local models of the plant agree on a direction.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +19,12 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from loop_interfaces.arrays import Array
+from loop_method.adapt import field_step, local_step
 from loop_method.adapt.base import Context, Record
 from loop_method.adapt.loop import Loop
-from loop_method.adapt.proposals import field, local
-from loop_method.adapt.proposals.proposal import Proposal
-from loop_method.adapt.proposals.sensed import MOST_SENSORS, SensedProposals
+from loop_method.adapt.proposal import Proposal
 from loop_method.adapt.selection import LOCAL
+from loop_method.adapt.sensed_step import MOST_SENSORS, SensedProposals
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.trajectories import denoised
 
@@ -118,14 +127,14 @@ class Proposer:
         shares = [min(1.0, level / max(loop.cost_of(record), 1e-300)) ** 2 for record in data]
         believed = ""
         if self._periodic and first is not None:
-            belief, whole = field.field_model(self._context, data, first, self._believed)
+            belief, whole = field_step.field_model(self._context, data, first, self._believed)
             if belief is not None:
                 believed = belief.model.kind
-                if not rejected or not whole or field.ranks(self._context, belief, rejected):
-                    return field.propose(
+                if not rejected or not whole or field_step.ranks(self._context, belief, rejected):
+                    return field_step.propose(
                         *(self._context, belief, whole, data, policy, damping),
                     )
-        proposal = local.propose(
+        proposal = local_step.propose(
             *(loop, data, shares, incumbents, others), damping=damping, accepted=accepted
         )
         return proposal and replace(proposal, believed=believed)

@@ -12,9 +12,9 @@ import numpy as np
 
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Record
-from loop_method.adapt.fit import LocalModel, extended_basis, fit
+from loop_method.adapt.local_model import LocalModel, extended_basis, fit
 from loop_method.adapt.loop import Loop
-from loop_method.adapt.proposals.proposal import LEAST_FALL, MODES, Proposal
+from loop_method.adapt.proposal import LEAST_FALL, MODES, Proposal
 from loop_method.adapt.selection import KAPPAS, LOCAL, RIDGES, Comparison, choices, mismatches
 from loop_method.adapt.sensitivity import damped_step
 

@@ -13,9 +13,9 @@ import numpy as np
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Record
 from loop_method.adapt.closed_loop import ClosedLoop
+from loop_method.adapt.field_step import improved
 from loop_method.adapt.loop import Loop
-from loop_method.adapt.proposals.field import improved
-from loop_method.adapt.proposals.proposal import BEYOND, COMPARED, Proposal, spread
+from loop_method.adapt.proposal import BEYOND, COMPARED, Proposal, spread
 from loop_method.models.sensed import KIND, SHARED, fit_sensed, interpolated, sensed_model
 
 # The readings are reproduced up to this share of their sum of squares.
