@@ -13,9 +13,9 @@ from threadpoolctl import threadpool_limits
 
 from controller_node.policy import ProjectedLaw
 from loop_interfaces.cost import Cost
-from loop_interfaces.model_rows import ModelRows, pack
+from loop_interfaces.model_rows import FILTERED, ModelRows, pack
 from loop_interfaces.parameters import model_order
-from loop_method.design import lqt
+from loop_method.design import lqg, lqt
 from loop_method.design.field_law import FieldLaw, field_law
 from loop_method.reduce import dmdc, regression
 from loop_method.reduce.channels import NUMBERED, Channels
@@ -200,13 +200,15 @@ def designed(
     gains = lqt.track(model, **weights)
     s_r = ProjectedLaw([model.U], target).reduced_targets[0]
     rows = ModelRows(A=model.A, B=model.B, U=model.U, K_a=gains.K_a, K_b=gains.K_b, s_r=s_r)
+    filtered = settings.law in FILTERED
     if settings.identification != "field":
-        return Designed(rows)
+        return Designed(lqg.with_filter(rows, trajectories) if filtered else rows)
     with threadpool_limits(limits=1):  # as in the identification itself
         found = field_law(
             [*trajectories, *further], target, rows, action_limit=settings.action_limit, **weights
         )
-    return Designed(found.rows if found.better and found.rows else rows, found)
+    chosen = found.rows if found.better and found.rows else rows
+    return Designed(lqg.with_filter(chosen, trajectories) if filtered else chosen, found)
 
 
 def design_each(

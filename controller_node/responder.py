@@ -179,7 +179,9 @@ class Responder:
         digest, before = digest_of(frame.values), run.models_of(frame.step)
         if digest not in [known.digest for known in before]:
             n_a = self._settings.n_a
-            rows = [model_rows.unpack(rows.copy(), n_a) for rows in frame.values]
+            rows = [
+                model_rows.unpack(rows.copy(), n_a, self._settings.law) for rows in frame.values
+            ]
             laws = laws_of(self._law_kind, rows, self._settings.horizon, self._settings.cost)
             run.models.append(Models(frame.step, digest, laws))
             run.answering = None

@@ -10,6 +10,7 @@ Every part has n_s columns (or is transposed to have), so the parts stack:
     n_a               K_a      feedback gain
     n_a               K_b      gain of the target
     1                 s_r      U^T z_r, the target in reduced coordinates
+    n_s or none       L        filter gain, where the law is one of FILTERED
 
 n_s is the number of columns, n_a that of the axis `actuator`; n_z follows from the row count.
 """
@@ -20,12 +21,16 @@ import numpy as np
 
 from loop_interfaces.arrays import Array
 
+FILTERED = ("observer",)
+"""Laws whose models come with a filter gain."""
+
 
 @dataclass(frozen=True)
 class ModelRows:
     """A reduced model, its warm-start gains and its target.
 
-    A (n_s, n_s), B (n_s, n_a), U (n_z, n_s), K_a and K_b (n_a, n_s), s_r (n_s,).
+    A (n_s, n_s), B (n_s, n_a), U (n_z, n_s), K_a and K_b (n_a, n_s), s_r (n_s,). L (n_s, n_s): the
+    estimate after a measurement is p + L (U^T z - p), with p the one before it; None: there is none.
     """
 
     A: Array
@@ -34,6 +39,7 @@ class ModelRows:
     K_a: Array
     K_b: Array
     s_r: Array
+    L: Array | None = None
 
     @property
     def policy(self) -> Array:
@@ -42,12 +48,13 @@ class ModelRows:
 
 
 def pack(model: ModelRows) -> Array:
-    """The rows of `model`, shape (n_z + n_s + 3 n_a + 1, n_s)."""
-    return np.vstack([model.U, model.A, model.B.T, model.K_a, model.K_b, model.s_r[np.newaxis, :]])
+    """The rows of `model`, shape (n_z + n_s + 3 n_a + 1, n_s), with a filter gain n_s more."""
+    parts = [model.U, model.A, model.B.T, model.K_a, model.K_b, model.s_r[np.newaxis, :]]
+    return np.vstack(parts if model.L is None else [*parts, model.L])
 
 
-def unpack(rows: Array, n_a: int) -> ModelRows:
-    """The model in `rows`. ValueError where their number leaves no room for U.
+def unpack(rows: Array, n_a: int, law: str = "affine") -> ModelRows:
+    """The model in `rows`, of the law of that name. ValueError where there is no room for U.
 
     >>> gains = np.ones((1, 2))
     >>> model = ModelRows(np.eye(2), np.ones((2, 1)), np.eye(4)[:, :2], gains, gains, np.ones(2))
@@ -55,11 +62,16 @@ def unpack(rows: Array, n_a: int) -> ModelRows:
     ((10, 2), (4, 2))
     """
     n_s = rows.shape[1]
-    n_z = rows.shape[0] - n_s - 3 * n_a - 1
-    if n_s < 1 or n_z < n_s:
+    filtered = law in FILTERED
+    n_z = rows.shape[0] - (2 if filtered else 1) * n_s - 3 * n_a - 1
+    # A filter may estimate more numbers than are measured.
+    least = 1 if filtered else max(n_s, 1)
+    if n_s < 1 or n_z < least:
         raise ValueError(
             f"a model of {rows.shape[0]} rows and {n_s} columns with {n_a} actuators leaves "
-            f"{n_z} rows for U; expected at least {max(n_s, 1)}"
+            f"{n_z} rows for U; expected at least {least}"
         )
-    U, A, Bt, K_a, K_b, s_r = np.split(rows, np.cumsum([n_z, n_s, n_a, n_a, n_a]))
-    return ModelRows(A=A, B=Bt.T.copy(), U=U, K_a=K_a, K_b=K_b, s_r=s_r[0])
+    U, A, Bt, K_a, K_b, s_r, L = np.split(rows, np.cumsum([n_z, n_s, n_a, n_a, n_a, 1]))
+    return ModelRows(
+        A=A, B=Bt.T.copy(), U=U, K_a=K_a, K_b=K_b, s_r=s_r[0], L=L if filtered else None
+    )

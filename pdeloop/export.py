@@ -43,7 +43,7 @@ class Parameters:
         """`law`, its name, `theta`, its parts as `theta.NAME`, and the reduced model."""
         parts = self.law.parts(self.theta) if self.law else {}
         arrays = {f"theta.{name}": part for name, part in parts.items()}
-        known = {name: getattr(self.model, name) for name in self.model.__dataclass_fields__}
+        known = _parts(self.model)
         return _archive(
             law=np.array(self.kind),
             theta=self.theta,
@@ -74,14 +74,11 @@ class GainLaw:
 
     def npz(self) -> bytes:
         """Arrays in the form of `pdeloop identify --out`, which `pdeloop train --model` takes."""
-        arrays: dict[str, Any] = {
-            name: getattr(self.model, name) for name in self.model.__dataclass_fields__
-        }
         return _archive(
             model=pack(self.model)[np.newaxis],
             sample_time=np.array(self.sample_time),
             action_limit=np.array(self.limit),
-            **arrays,
+            **_parts(self.model),
         )
 
     def c(self) -> bytes:
@@ -136,6 +133,11 @@ def _loaded(run: FinishedRun, m: int) -> Law | None:
         return run.laws[m]
     except ValueError:
         return None
+
+
+def _parts(model: ModelRows) -> dict[str, Array]:
+    parts = {name: getattr(model, name) for name in model.__dataclass_fields__}
+    return {name: part for name, part in parts.items() if part is not None}
 
 
 def _archive(**arrays: Any) -> bytes:

@@ -150,7 +150,7 @@ def load_run(folder: str | Path) -> FinishedRun:
         result,
         policies=arrays["policy"],
         warm=arrays["lqt"],
-        models=[model_rows.unpack(rows, values["n_a"]) for rows in arrays["model"]],
+        models=[model_rows.unpack(rows, values["n_a"], values["law"]) for rows in arrays["model"]],
         costs={name: np.array(result["costs_by_field"][name]) for name in EVALUATED},
         rollouts=result.get("rollouts", []),
     )

@@ -300,7 +300,11 @@ def save(found: Identified, path: Path) -> None:
     in front of their names.
     """
     model = found.model
-    arrays: dict[str, Any] = {name: getattr(model, name) for name in model.__dataclass_fields__}
+    arrays: dict[str, Any] = {
+        name: part
+        for name in model.__dataclass_fields__
+        if (part := getattr(model, name)) is not None
+    }
     if isinstance(model, ModelRows):
         arrays["model"] = pack(model)[np.newaxis]
     if found.sample_time is not None:

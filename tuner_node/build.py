@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from loop_interfaces.array_files import read_arrays
 from loop_interfaces.grid import Grid
-from loop_interfaces.model_rows import unpack
+from loop_interfaces.model_rows import FILTERED, unpack
 from loop_interfaces.parameters import model_order, noisy
 from loop_interfaces.signature import design_digest
 from loop_interfaces.spec import ParameterError
@@ -28,14 +28,15 @@ from tuner_node.run_folder import RunIdentity
 from tuner_node.training import Training
 
 
-def read_model(path: Path, n_a: int) -> NDArray[np.float64]:
-    """The rows of the model that `pdeloop identify --out` wrote. ValueError if there is none."""
+def read_model(path: Path, n_a: int, law: str = "affine") -> NDArray[np.float64]:
+    """The rows of the model that `pdeloop identify --out` wrote, or a ValueError."""
     try:
         arrays = read_arrays(path)
         if "model" not in arrays and "A" in arrays:
             raise ValueError("it has a model without gains; identify with a target")
         rows = arrays["model"].astype(np.float64)
         actuators = len(arrays["B"].T) if "B" in arrays else n_a
+        filtered = "L" in arrays
     except (KeyError, ValueError, TypeError) as error:
         raise ValueError(
             f"{path} holds no reduced model; expected a file of 'pdeloop identify --out' ({error})"
@@ -49,14 +50,25 @@ def read_model(path: Path, n_a: int) -> NDArray[np.float64]:
             f"the model in {path} has {actuators} actuators, the plant has {n_a}; identify one of this "
             "plant"
         )
+    if filtered != (law in FILTERED):
+        other = "observer" if filtered else "affine"
+        raise ValueError(
+            f"the model in {path} was designed for the law '{other}', and the law is '{law}'; give "
+            f"--law to both, 'pdeloop identify' and the training"
+        )
     model: NDArray[np.float64] = rows[0]
     try:
-        basis = unpack(model, n_a).U
+        basis = unpack(model, n_a, law).U
     except ValueError as error:
         raise ValueError(f"{path} holds the model of another plant: {error}") from error
     if not basis.any(axis=0).all():
         raise ValueError(f"the model in {path} has modes that are zero; identify a new one")
     return model
+
+
+def given_model(values: Mapping[str, Any], law: type[Law]) -> NDArray[np.float64] | None:
+    """The rows of the model that the parameters name; None if they name none."""
+    return read_model(Path(values["model"]), values["n_a"], law.name) if values["model"] else None
 
 
 def check_budget(
@@ -156,7 +168,7 @@ def build_training(values: Mapping[str, Any]) -> Training:
         "periodic": grid is None or grid.is_circle,
         "line": grid is None or len(grid.axes) < 2,
         "measurement_noise": values["measurement_noise"] * scale,
-        "model": read_model(Path(values["model"]), values["n_a"]) if values["model"] else None,
+        "model": given_model(values, law),
     }
     settings = TrainingSettings(
         **given,

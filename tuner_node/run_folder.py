@@ -302,7 +302,7 @@ class RunFolder:
             if values["law"] != "affine":  # whose parameters only the law itself can read
                 law = (seeds, *[None] * (arrays["policy"].ndim - 1)) if "policy" in arrays else law
             for rows in model:
-                model_rows.unpack(rows, n_a)
+                model_rows.unpack(rows, n_a, values["law"])
             return {
                 "policy": taken(arrays, "policy", "f", law),
                 "lqt": taken(arrays, "lqt", "f", law),

@@ -168,12 +168,15 @@ class Training:
         assert self.models is not None
         made_from = digest(self.models)
         if not self._laws or self._made_from != made_from:
-            models = [model_rows.unpack(rows, self.settings.n_a) for rows in self.models]
+            models = [self._unpacked(rows) for rows in self.models]
             self._laws = laws_of(
                 self.settings.law, models, self.settings.horizon, self.settings.cost
             )
             self._made_from = made_from
         return self._laws
+
+    def _unpacked(self, rows: Array) -> model_rows.ModelRows:
+        return model_rows.unpack(rows, self.settings.n_a, self.settings.law.name)
 
     def policies(self) -> Array:
         """The adapted policies, of the shape of the warm starts."""
@@ -227,7 +230,7 @@ class Training:
         self.budget.count("identify", np.repeat(self.pending, self.settings.explorations))
         rows, warm = [], self.warm_starts()
         for m, own in zip(self.pending, models, strict=True):
-            model = model_rows.unpack(own, self.settings.n_a)
+            model = self._unpacked(own)
             # What was kept ran without control, whose policy has the shape of the model's.
             zero = np.zeros_like(warm[m])
             self.measured[m] = [replace(kept, policy=zero) for kept in self.measured[m]]
@@ -259,10 +262,7 @@ class Training:
     def _given(self, identified: Array) -> list[dict[str, Any]]:
         """The given model instead of the identified ones, if it is one of this plant's size."""
         assert self.settings.model is not None
-        n_a = self.settings.n_a
-        own, size = (
-            len(model_rows.unpack(rows, n_a).U) for rows in (self.settings.model, identified[0])
-        )
+        own, size = (len(self._unpacked(rows).U) for rows in (self.settings.model, identified[0]))
         if own != size:
             raise ValueError(
                 f"the given model is of a state of {own} numbers, the plant's has {size}; "

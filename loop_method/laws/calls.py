@@ -53,8 +53,9 @@ def laws_of(
 
 
 def _copied(model: ModelRows) -> ModelRows:
+    parts = {item.name: getattr(model, item.name) for item in fields(ModelRows)}
     return ModelRows(
-        *(np.array(getattr(model, item.name), order="C") for item in fields(ModelRows))
+        **{name: np.array(part, order="C") for name, part in parts.items() if part is not None}
     )
 
 

@@ -10,11 +10,18 @@ from loop_method.laws.base import Law, Parts
 
 
 class Observer(Law):
-    """a_k = K x_k + b with the filtered estimate x_k = p_k + L (U^T z_k - p_k) of the reduced state.
+    """A linear compensator of full order, with the newest measurement s_k = U^T z_k as it comes:
 
-    Its memory is the prediction p_{k+1} = A x_k + B a_k; the first measurement is believed as it is.
-    It starts with L = I, the filter for exact measurements, and the LQ-tracking gains, and is then the
-    affine law. A smaller L averages noise over steps, as the Kalman filter does.
+        p_{k+1} = F p_k + G s_k + B a_k + c,        a_k = K p_k + D s_k + b,        p_0 = s_0
+
+    It starts as the LQG law of the model: with its filter gain L, x_k = p_k + L (s_k - p_k) estimates
+    the reduced state, p_{k+1} = A x_k + B a_k predicts it, and the tracking gains act on x_k:
+
+        F = A (I - L),    G = A L,    K = K_a (I - L),    D = K_a L,    b = K_b s_r,    c = 0.
+
+    Its memory is p_k. B is the model's, and a_k is what the plant gets, so that a saturated action
+    misleads no prediction. A model without a filter gain has L = I, the filter for exact measurements:
+    this is then the affine law.
 
     Source: Anderson, Moore, *Optimal Control: Linear Quadratic Methods*, 1990, chapter 8.
     """
@@ -26,46 +33,54 @@ class Observer(Law):
         return len(self.model.A)
 
     def start(self) -> Parts:
-        """K (n_a, n_s), b (n_a,) and L (n_s, n_s)."""
+        """K (n_a, n_s), D (n_a, n_s), b (n_a,), F (n_s, n_s), G (n_s, n_s) and c (n_s,)."""
+        model, eye = self.model, np.eye(len(self.model.A))
+        L = eye if model.L is None else model.L
         return {
-            "K": self.model.K_a,
-            "b": self.model.K_b @ self.model.s_r,
-            "L": np.eye(len(self.model.A)),
+            "K": model.K_a @ (eye - L),
+            "D": model.K_a @ L,
+            "b": model.K_b @ model.s_r,
+            "F": model.A @ (eye - L),
+            "G": model.A @ L,
+            "c": np.zeros(len(eye)),
         }
 
     def action(self, theta: Parts, z: Array, memory: Array, k: int) -> Array:
-        a: Array = theta["K"] @ self._estimate(theta, z, memory, k) + theta["b"]
+        s = self.reduced(z)
+        a: Array = theta["K"] @ self._prediction(s, memory, k) + theta["D"] @ s + theta["b"]
         return a
 
     def memory_update(self, theta: Parts, z: Array, memory: Array, action: Array, k: int) -> Array:
-        x = self._estimate(theta, z, memory, k)
-        predicted: Array = self.model.A @ x + self.model.B @ action
-        return predicted
+        s = self.reduced(z)
+        p = theta["F"] @ self._prediction(s, memory, k) + theta["G"] @ s + theta["c"]
+        after: Array = p + self.model.B @ action
+        return after
 
     def pull_back(
         self, theta: Parts, z: Array, memory: Array, k: int, y: Array
     ) -> tuple[Parts, Array, Array]:
-        x = self._estimate(theta, z, memory, k)
-        by_L, by_z, by_memory = self._pull_back_estimate(theta, z, memory, k, theta["K"].T @ y)
-        return {"K": np.outer(y, x), "b": y, "L": by_L}, by_z, by_memory
+        s = self.reduced(z)
+        own = {"K": np.outer(y, self._prediction(s, memory, k)), "D": np.outer(y, s), "b": y}
+        none = {name: np.zeros_like(theta[name]) for name in ("F", "G", "c")}
+        by_z, by_memory = self._by_inputs(theta["K"].T @ y, theta["D"].T @ y, k)
+        return {**own, **none}, by_z, by_memory
 
     def pull_back_memory(
         self, theta: Parts, z: Array, memory: Array, action: Array, k: int, y: Array
     ) -> tuple[Parts, Array, Array, Array]:
-        by_L, by_z, by_memory = self._pull_back_estimate(theta, z, memory, k, self.model.A.T @ y)
-        none = {"K": np.zeros_like(theta["K"]), "b": np.zeros_like(theta["b"])}
-        return {**none, "L": by_L}, by_z, by_memory, self.model.B.T @ y
-
-    def _estimate(self, theta: Parts, z: Array, memory: Array, k: int) -> Array:
         s = self.reduced(z)
-        x: Array = memory + theta["L"] @ (s - memory) if k else s
-        return x
+        none = {name: np.zeros_like(theta[name]) for name in ("K", "D", "b")}
+        own = {"F": np.outer(y, self._prediction(s, memory, k)), "G": np.outer(y, s), "c": y}
+        by_z, by_memory = self._by_inputs(theta["F"].T @ y, theta["G"].T @ y, k)
+        return {**none, **own}, by_z, by_memory, self.model.B.T @ y
 
-    def _pull_back_estimate(
-        self, theta: Parts, z: Array, memory: Array, k: int, y: Array
-    ) -> tuple[Array, Array, Array]:
-        """The derivatives of `_estimate` by L, z and m."""
+    @staticmethod
+    def _prediction(s: Array, memory: Array, k: int) -> Array:
+        """p_k: nothing is known before the first measurement."""
+        return memory if k else s
+
+    def _by_inputs(self, by_p: Array, by_s: Array, k: int) -> tuple[Array, Array]:
+        """The derivatives by z and m, of those by p and s."""
         if not k:
-            return np.zeros_like(theta["L"]), self.model.U @ y, np.zeros_like(memory)
-        by_s = theta["L"].T @ y
-        return np.outer(y, self.reduced(z) - memory), self.model.U @ by_s, y - by_s
+            return self.model.U @ (by_p + by_s), np.zeros_like(by_p)
+        return self.model.U @ by_s, by_p

@@ -7,6 +7,7 @@ import argparse
 import sys
 from math import isfinite
 
+from loop_interfaces.model_rows import FILTERED
 from loop_interfaces.parameters import IDENTIFICATION
 from loop_interfaces.spec import ParameterError
 from pdeloop.commands.common import Commands, a_path, add_json, command
@@ -69,6 +70,12 @@ def add(commands: Commands) -> None:
         help="a model of the whole field where its law is better, least squares with the inputs whole, "
         "or truncated DMDc [that of the run, or regression]",
     )
+    add(
+        "--law",
+        choices=("affine", *FILTERED),
+        help="the law that the model is for: that of the observer gets a filter gain [that of the run, "
+        "or affine]",
+    )
     add("--rank", type=int, metavar="P", help="p of the identification dmdc [that of the run]")
     add("--episode", metavar="N", help="only this episode, as `pdeloop bag info` names it")
     add("--environment", type=int, metavar="M", help="only this environment of each episode")
@@ -94,6 +101,7 @@ def _identify(options: argparse.Namespace) -> int:
         "dmdc_order": options.order,
         "identification": options.identification,
         "dmdc_rank": options.rank,
+        "law": options.law,
         "state_weight": options.state_weight,
         "action_weight": options.action_weight,
     }

@@ -24,7 +24,8 @@ def models(count: int) -> list[ModelRows]:
         U = np.linalg.qr(rng.standard_normal((N_Z, N_S)))[0]
         A, B = 0.3 * rng.standard_normal((N_S, N_S)), rng.standard_normal((N_S, N_A))
         K_a, K_b = 0.3 * rng.standard_normal((2, N_A, N_S))
-        found.append(ModelRows(A=A, B=B, U=U, K_a=K_a, K_b=K_b, s_r=U.T @ TARGET))
+        L = 0.5 * np.eye(N_S) + 0.1 * rng.standard_normal((N_S, N_S))
+        found.append(ModelRows(A=A, B=B, U=U, K_a=K_a, K_b=K_b, s_r=U.T @ TARGET, L=L))
     return found
 
 

@@ -17,7 +17,8 @@ from loop_interfaces.protocol import ModelFailure
 from loop_method.laws import Observer
 from pdeloop.episode import rollout
 from pdeloop.in_process import LocalPair
-from tests.controller.test_responder import RUN, models, start, target
+from tests.controller.test_responder import RUN, start, target
+from tests.controller.test_responder import models as affine_models
 from tests.support.small import parameters, same_bits
 from tuner_node.batch import Batch
 
@@ -26,8 +27,14 @@ SEEDS = np.array([3, 8])
 ROWS = [(seed, -1, 0, 0) for seed in SEEDS]
 
 
+def models() -> np.ndarray:
+    """Those of the affine law with a filter gain each, which believes half of a measurement."""
+    rows = affine_models()
+    return np.concatenate([rows, [0.5 * np.eye(rows.shape[2])] * len(rows)], axis=1)
+
+
 def policies() -> np.ndarray:
-    law = Observer(unpack(models()[0], 4), 30)
+    law = Observer(unpack(models()[0], 4, "observer"), 30)
     rng = np.random.default_rng(2)
     return np.stack([law.theta_start + 0.1 * rng.standard_normal(law.size) for _ in ROWS])
 

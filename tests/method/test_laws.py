@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -50,7 +51,7 @@ def test_the_affine_law_has_the_gains_side_by_side() -> None:
 
 @pytest.mark.parametrize("kind", [Affine, FeedForward, Observer])
 def test_these_laws_start_as_the_law_of_lq_tracking(kind: type[Law]) -> None:
-    """With L = I the observer believes what is measured, whatever it predicted."""
+    """Without a filter gain the observer believes what is measured, whatever it predicted."""
     states, actions = trajectory()
     law = kind(MODEL, T)
     expected = states @ U @ K_a.T + K_b @ MODEL.s_r
@@ -67,8 +68,8 @@ def test_a_feed_forward_is_added_at_its_step_and_the_last_one_stays() -> None:
 
 def test_the_observer_of_a_plant_that_it_knows_predicts_what_it_does_not_measure() -> None:
     """With L = 0 the estimate is the model's state: exact, if the plant is the model."""
-    law = Observer(MODEL, T)
-    theta = {"K": K_a, "b": np.zeros(N_A), "L": np.zeros((N_S, N_S))}
+    law = Observer(replace(MODEL, K_b=0.0 * K_b, L=np.zeros((N_S, N_S))), T)
+    theta = law.parts(law.theta_start)
     s, memory = RNG.standard_normal(N_S), law.memory_start()
     for k in range(4):
         measured = U @ s if k == 0 else RNG.standard_normal(N_Z)  # noise alone

@@ -183,7 +183,9 @@ def test_an_optimizer_of_gains_refuses_another_law_in_one_sentence(
 
 @pytest.mark.parametrize("law", ["feedforward", "observer"])
 def test_an_optimizer_of_ones_own_knows_theta_alone(law: str) -> None:
-    run = pdeloop.train(str(SMALL), law=law, optimizer=RANDOM_SEARCH, **BUDGET)
+    # The entries of F and G are much larger than gains, to which the size of a change is relative.
+    small = {"optimizer_settings": {"size": 0.005 if law == "observer" else 0.05}}
+    run = pdeloop.train(str(SMALL), law=law, optimizer=RANDOM_SEARCH, **BUDGET, **small)
     assert run.result["changed"] == [True]
     assert (run.costs["adapted"] <= 1.2 * run.costs["lqt"]).all()
 
