@@ -160,12 +160,15 @@ def read_bounded(path: Path, most: int, instead: str = "") -> bytes:
     """
     try:
         with open_ordinary(path) as file:
-            content = file.read(most + 1)
+            content = bytearray()
+            # In pieces: Python makes room for all that it is asked to read, however little there is.
+            while (piece := file.read(2**20)) and len(content) <= most:
+                content += piece
     except OSError as error:
         raise FileError(f"{path} cannot be read: {error.strerror or error}") from error
     if len(content) > most:
         raise FileError(f"{path} is larger than {most} bytes" + (instead and f"; {instead}"))
-    return content
+    return bytes(content)
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from loop_method.laws.registry import law_kind
 from pde_sim_node.build import build_plant
 from pde_sim_node.plant import Plant
 from pdeloop.episode import EpisodeRecord, Law, rollout
-from tuner_node.batch import Batch, BatchResult
+from tuner_node.batch import Batch, BatchResult, most_environments
 from tuner_node.training import Training
 from tuner_node.trajectory_collector import cut
 
@@ -58,6 +58,8 @@ class LocalPair:
 
     def run(self, batch: Batch, max_batch: int = 1024) -> BatchResult:
         """Roll the batch out. ValueError if exploration gives no model."""
+        plant = self.plant
+        max_batch = most_environments(max_batch, plant.state_size, plant.horizon)
         most = max(max_batch // batch.together, 1) * batch.together
         parts = [
             self._episode(

@@ -15,6 +15,20 @@ from loop_method.laws import Affine, Law
 UNKNOWN_PLANT = -1
 """The plant's fingerprint before the first cost."""
 
+MESSAGE_BYTES, EPISODE_BYTES = 2**23, 2**28
+"""States that a message and, with the steps of an episode, a process holds; of one environment more."""
+
+
+def most_environments(max_batch: int, state_size: int, horizon: int) -> int:
+    """Environments of an episode, at most: fewer than `max_batch` where states are large.
+
+    >>> most_environments(1024, 256, 300), most_environments(1024, 65536, 50)
+    (434, 10)
+    """
+    row = 8 * max(state_size, 1)
+    fitting = min(MESSAGE_BYTES // row, EPISODE_BYTES // (row * (horizon + 1)))
+    return max(min(max_batch, fitting), 1)
+
 
 @dataclass(frozen=True)
 class Batch:

@@ -17,6 +17,7 @@ from loop_interfaces.parameters import model_order, noisy
 from loop_interfaces.signature import design_digest
 from loop_interfaces.spec import ParameterError
 from loop_method.adapt import Context, Optimizer
+from loop_method.adapt.in_coordinates import InCoordinates, is_large
 from loop_method.laws import Affine, Law
 from loop_method.laws.registry import law_kind
 from tuner_node.batch import UNKNOWN_PLANT, TrainingSettings
@@ -140,7 +141,13 @@ def build_training(values: Mapping[str, Any]) -> Training:
             if context is not None:
                 measured = [replace(r, policy=r.policy.ravel()) for r in context.measured]
                 context = replace(context, measured=measured)
-        return kind(policy, seed=seed, rollouts=rollouts, settings=chosen, context=context)
+
+        def made(context: Context | None) -> Optimizer:
+            return kind(policy, seed=seed, rollouts=rollouts, settings=chosen, context=context)
+
+        if kind.in_coordinates and context is not None and is_large(context):
+            return InCoordinates(made, context)
+        return made(context)
 
     explorations = 1 if sensors else kind.explorations
     if kind.judges_first_law or (sensors and kind.compares_first_law):
@@ -193,4 +200,6 @@ def build_dispatcher(
         incarnation=identity.incarnation,
         plant=training.plant,
         design=design_digest(values),
+        state_size=values["sensors"] * values["sensor_delays"] or values["n_z"],
+        horizon=values["horizon"],
     )

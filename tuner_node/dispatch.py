@@ -34,7 +34,7 @@ from loop_interfaces.frames import Frame, FrameError
 from loop_interfaces.protocol import ModelFailure, Publication
 from loop_interfaces.signature import digest_of
 from loop_interfaces.topics import START_COLUMNS, VOID, CostColumn, Topic
-from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult
+from tuner_node.batch import UNKNOWN_PLANT, Batch, BatchResult, most_environments
 from tuner_node.errors import ContradictionError, DispatchError
 from tuner_node.pair import Chunk, Pair, PairPublication
 
@@ -53,9 +53,9 @@ class Dispatcher:
 
     run, incarnation: id of the run, in every message, and starts of its tuner so far; pairs: how
     many; max_batch, episode_timeout, max_attempts: see loop_interfaces.parameters.TUNER, they may
-    be set later; plant: fingerprint of the one that this run is about, that of the first cost if
-    not known; design: digest of how the run's models are identified, see loop_interfaces.signature,
-    0: not known.
+    be set later; state_size, horizon: of an episode, 0: not known; plant: fingerprint of the one
+    that this run is about, that of the first cost if not known; design: digest of how the run's
+    models are identified, see loop_interfaces.signature, 0: not known.
     """
 
     def __init__(
@@ -66,6 +66,8 @@ class Dispatcher:
         pairs: int,
         incarnation: int,
         max_batch: int,
+        state_size: int = 0,
+        horizon: int = 0,
         episode_timeout: float,
         max_attempts: int,
         plant: int = UNKNOWN_PLANT,
@@ -75,6 +77,7 @@ class Dispatcher:
         self.run, self.n_a, self.incarnation = run, n_a, incarnation
         self.max_batch, self.episode_timeout = max_batch, episode_timeout
         self.max_attempts = max_attempts
+        self.state_size, self.horizon = state_size, horizon
         self.plant, self.action_limit, self.design = plant, action_limit, design
         self.pairs = [Pair(number) for number in range(pairs)]
         self.counters: Counter[str] = Counter()
@@ -96,7 +99,8 @@ class Dispatcher:
 
     def assign(self, batch: Batch, now: float) -> list[PairPublication]:
         """Begin a batch; the previous one must be complete."""
-        count, most = len(batch.rows) // batch.together, max(self.max_batch // batch.together, 1)
+        largest = most_environments(self.max_batch, self.state_size, self.horizon)
+        count, most = len(batch.rows) // batch.together, max(largest // batch.together, 1)
         parts = max(-(-count // most), min(len(self._present()), count), 1)
         edges = (batch.together * np.linspace(0, count, parts + 1).astype(int)).tolist()
         self._batch = batch

@@ -15,6 +15,7 @@ from loop_interfaces.documents import parse_json
 from loop_interfaces.text import shown
 from loop_method.adapt import calls
 from loop_method.adapt.trajectories import (
+    is_kept,
     record_arrays,
     taken_record,
     taken_trajectory,
@@ -90,9 +91,9 @@ def _fill(training: Training, arrays: Arrays) -> None:
         training.evaluation = taken(arrays, "evaluation", "f", training.evaluation_shape)
         training.ended = taken(arrays, "ended", "f", training.evaluation_shape)
     for m in range(seeds):
-        if f"exploration{m}.states" in arrays:
+        if is_kept(arrays, f"exploration{m}"):
             training.explorations[m] = taken_trajectory(arrays, f"exploration{m}", n_z, n_a)
-        while (name := f"further{m}.{len(training.further[m])}") + ".states" in arrays:
+        while is_kept(arrays, name := f"further{m}.{len(training.further[m])}"):
             training.further[m].append(taken_trajectory(arrays, name, n_z, n_a))
         while (name := f"measured{m}.{len(training.measured[m])}") + ".policy" in arrays:
             shape = (n_a, None) if training.settings.law.axes == 2 else (None,)

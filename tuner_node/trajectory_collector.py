@@ -5,6 +5,7 @@ A sample that was lost is never interpolated: the episode has no trajectories th
 it is when a sample comes twice with different content: which of them was the plant's would be chance.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,6 +15,7 @@ from loop_interfaces.episodes import episode_name
 from loop_interfaces.frames import KEPT_ARRAY, Frame, FrameError
 from loop_interfaces.topics import COMPLETED
 from loop_method.adapt import Trajectory
+from loop_method.adapt.trajectories import kept
 
 MAX_BYTES = 2**30
 """Most bytes kept of the samples of one episode."""
@@ -71,22 +73,24 @@ class TrajectoryCollector:
         ended (M,): as in CostColumn.ENDED. Only when `lost` says that nothing is missing.
         """
         self.used = True
-        states = np.stack([self._samples["states"][plant, k] for k in range(steps + 1)])
-        actions = np.stack([self._samples["actions"][plant, k] for k in range(steps)])
+        states = [self._samples["states"][plant, k] for k in range(steps + 1)]
+        actions = [self._samples["actions"][plant, k] for k in range(steps)]
         return cut(states, actions, ended)
 
 
-def cut(states: Array, actions: Array, ended: Array) -> list[Trajectory]:
+def cut(
+    states: Array | Sequence[Array], actions: Array | Sequence[Array], ended: Array
+) -> list[Trajectory]:
     """The trajectories of the M environments of an episode, each up to where it ended.
 
-    states (T+1, M, n_z), actions (T, M, n_a), ended (M,).
+    states T+1 of (M, n_z), actions T of (M, n_a), ended (M,).
     """
     steps = len(actions)
     last = [steps if end == COMPLETED else int(end) for end in ended]
     return [
-        Trajectory(
-            np.ascontiguousarray(states[: k + 1, m]),
-            np.ascontiguousarray(actions[:k, m]),
+        kept(
+            np.array([z[m] for z in states[: k + 1]]),
+            np.array([a[m] for a in actions[:k]]).reshape(k, actions[0].shape[1]),
         )
         for m, k in enumerate(last)
     ]

@@ -207,6 +207,9 @@ class Optimizer(Protocol):
     otherwise scalar weights and a constant target. Optimisers that need only costs can."""
     judges_first_law: ClassVar[bool] = False
     """Whether it does so always."""
+    in_coordinates: ClassVar[bool] = False
+    """Whether it can be given coordinates in an orthonormal basis of what was measured in place of
+    states of more than 2,048 numbers (`loop_method.adapt.in_coordinates`)."""
     explorations: ClassVar[int] = 1
     """Rollouts of an exploration, from as many initial fields."""
     with_sensors: ClassVar[str] = ""

@@ -164,6 +164,7 @@ class GaussNewton(Optimizer):
     Settings = GaussNewtonSettings
     needs_trajectories = True
     needs_affine_law = True
+    in_coordinates = True
     compares_first_law = True
 
     def __init__(

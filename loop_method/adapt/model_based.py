@@ -79,6 +79,7 @@ class ModelBased(Optimizer):
     needs_trajectories = True
     any_cost = True
     needs_affine_law = True
+    in_coordinates = True
     judges_first_law = True
     explorations = 2
     with_sensors = "gauss_newton"

@@ -3,24 +3,66 @@
 
 import numpy as np
 import scipy.linalg
+from threadpoolctl import threadpool_limits
 
 from loop_interfaces.array_files import Arrays, taken
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Record, RolloutResult, State, Trajectory
+from loop_method.reduce.snapshots import LARGE, factored
+
+
+class LowRankTrajectory(Trajectory):
+    """A trajectory whose states are products of coordinates (L, r) and orthonormal modes (r, n_z)."""
+
+    coordinates: Array
+    modes: Array
+
+    def __init__(self, coordinates: Array, modes: Array, actions: Array) -> None:
+        for name, array in ("coordinates", coordinates), ("modes", modes), ("actions", actions):
+            object.__setattr__(self, name, array)
+
+    @property
+    def states(self) -> Array:
+        """The states, made anew each time."""
+        with threadpool_limits(limits=1):
+            whole: Array = self.coordinates @ self.modes
+        return whole
+
+
+def kept(states: Array, actions: Array) -> Trajectory:
+    """A trajectory to be kept, with large states as factors; states may be a view."""
+    if states.shape[1] > LARGE and np.isfinite(states).all():
+        return LowRankTrajectory(*factored(states), actions)
+    return Trajectory(np.ascontiguousarray(states), actions)
 
 
 def trajectory_arrays(name: str, trajectory: Trajectory | Record) -> State:
     """A trajectory as arrays of a checkpoint."""
+    if isinstance(trajectory, LowRankTrajectory):
+        parts = {"coordinates": trajectory.coordinates, "modes": trajectory.modes}
+        parts["actions"] = trajectory.actions
+        return {f"{name}.{part}": array for part, array in parts.items()}
     return {f"{name}.states": trajectory.states, f"{name}.actions": trajectory.actions}
 
 
 def taken_trajectory(arrays: Arrays, name: str, n_z: int | None, n_a: int) -> Trajectory:
     """The trajectory of that name, or a ValueError. n_z: None if it is not known."""
-    states = taken(arrays, f"{name}.states", "f", (None, n_z))
     actions = taken(arrays, f"{name}.actions", "f", (None, n_a))
+    if f"{name}.modes" in arrays:
+        modes = taken(arrays, f"{name}.modes", "f", (None, n_z))
+        states = taken(arrays, f"{name}.coordinates", "f", (None, len(modes)))
+        found: Trajectory = LowRankTrajectory(states, modes, actions)
+    else:
+        states = taken(arrays, f"{name}.states", "f", (None, n_z))
+        found = Trajectory(states, actions)
     if len(states) - len(actions) not in (0, 1):
         raise ValueError(f"'{name}' has {len(states)} states and {len(actions)} actions")
-    return Trajectory(states, actions)
+    return found
+
+
+def is_kept(arrays: Arrays, name: str) -> bool:
+    """Whether there is a trajectory of that name."""
+    return f"{name}.actions" in arrays
 
 
 def record_arrays(name: str, record: Record) -> State:

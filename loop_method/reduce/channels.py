@@ -15,6 +15,8 @@ SHOWN = 6
 """Channels that a sentence names at most."""
 UNITS = 1e-12
 """Numbers of the state smaller than this, relative to another one, are lost in its rounding."""
+_SAME = 1e-12
+"""How far the cosine of two columns that are multiples of each other may be from 1."""
 
 
 @dataclass(frozen=True)
@@ -150,9 +152,7 @@ def state_faults(states: Array, channels: Channels = NUMBERED) -> list[str]:
 
 def _copies(states: Array, names: Sequence[str]) -> list[str]:
     """Which columns are multiples of earlier ones, in words."""
-    unit, _ = scaled(states)
-    cosines = unit.T @ unit
-    first = np.argmax(np.abs(cosines) > 1.0 - 1e-12, axis=1)
+    first = _first_alike(scaled(states)[0])
     found = []
     for i in np.flatnonzero(first != np.arange(len(first))).tolist():
         one = int(first[i])
@@ -161,3 +161,23 @@ def _copies(states: Array, names: Sequence[str]) -> list[str]:
         times = "" if abs(factor - 1.0) < 1e-6 else f"{factor:.4g} times "
         found.append(f"{names[i]} is always {times}{names[one]}")
     return found
+
+
+def _first_alike(unit: Array) -> NDArray[np.int64]:
+    """For each column of norm 1, the first one that is the same up to its sign and rounding.
+
+    Columns that are the same have the same weighted sum, so that only those whose sums are next to each
+    other are compared: a matrix of all products would grow with the square of a state.
+    """
+    first = np.arange(unit.shape[1])
+    weights = np.random.default_rng(0).standard_normal(len(unit))
+    sums = np.abs(weights @ unit)
+    order = np.argsort(sums, kind="stable")
+    apart = np.sqrt(2.0 * _SAME) * float(np.linalg.norm(weights))
+    for group in np.split(order, np.flatnonzero(np.diff(sums[order]) > apart) + 1):
+        left = np.sort(group)
+        while len(left) > 1:
+            same = np.abs(unit[:, left[0]] @ unit[:, left[1:]]) > 1.0 - _SAME
+            first[left[1:][same]] = left[0]
+            left = left[1:][~same]
+    return first
