@@ -122,17 +122,24 @@ class Bench:
 
         prefix: words in front of the command, such as `ip netns exec`; environment: in addition.
         """
-        words = ["--params-file", str(find_problem(problem))] if problem else []
+        words = ["--params-file", str(find_problem(problem).absolute())] if problem else []
         words += ["-r", f"__ns:=/{namespace}"] if namespace else []
         words += [word for parameter in parameters for word in ("-p", parameter)]
         words += [word for remap in remaps for word in ("-r", remap)]
         command = [*prefix, *program(START, name, *node_arguments(*words))]
-        return self.run(name, command, {**self.environment, **(environment or {})})
+        # Not in the checkout: a process takes its working directory off the module path.
+        return self.run(
+            name, command, {**self.environment, **(environment or {})}, str(self.folder)
+        )
 
     def run(
-        self, name: str, command: Sequence[str], environment: Mapping[str, str] | None = None
+        self,
+        name: str,
+        command: Sequence[str],
+        environment: Mapping[str, str] | None = None,
+        folder: str | None = None,
     ) -> BenchProcess:
-        """Start any command; its log has that name."""
+        """Start any command, in this working directory; its log has that name."""
         log = self.folder / f"{len(self._started)}-{name}.log"
         with log.open("wb") as stderr:
             process = subprocess.Popen(
@@ -142,6 +149,7 @@ class Bench:
                 stderr=stderr,
                 text=True,
                 env=environment or self.environment,
+                cwd=folder,
                 process_group=0,  # Ctrl-C in the terminal reaches the measuring program only
                 preexec_fn=partial(die_with, os.getpid()),
             )

@@ -23,15 +23,15 @@ class Belief:
     def loop(self, context: Context) -> ClosedLoop:
         """The model under laws on the context's basis."""
         return ClosedLoop(
-            self.model,
             context.U,
             context.target,
             context.state_weight,
             context.action_weight,
             context.horizon,
             context.action_limit,
-            context.noise,
-            context.cost,
+            model=self.model,
+            noise=context.noise,
+            cost=context.cost,
         )
 
 

@@ -1,8 +1,8 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""The cost of a law on a model of the whole field, and its exact gradient.
+"""Laws in a closed loop: their cost, and on a model of the whole field its exact gradient.
 
-The law is a = theta [s; 1] with theta = [K_a b] and s = U^T z, saturated at the action limit. From an
-initial field z_0 it costs
+The law is a = theta [s; 1] with theta = [K_a b] and s = U^T z, saturated at the action limit. On a
+model, from an initial field z_0, it costs
 
     J = 1/T sum_{k < T} (q |z_k - z_r|^2 + r |a_k|^2),        z_{k+1} = f(z_k, a_k),
 
@@ -21,23 +21,25 @@ Griewank, Walther, "Evaluating Derivatives", SIAM 2008, chapter 3 (reverse mode)
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
 from loop_interfaces.arrays import Array
 from loop_interfaces.cost import Cost
+from loop_method.adapt.base import Record
 from loop_method.models import FieldModel
 
 
 @dataclass(frozen=True, eq=False)
-class ClosedLoop:
-    """A model of the whole field under laws on the basis U, and their cost.
+class ClosedLoopProblem:
+    """Laws a = K_a U^T z + b, and their cost.
 
     Attributes
     ----------
-    model : FieldModel
     U : (n_z, n_s) array
         Basis of the projected state s = U^T z.
     target : (n_z,) array
@@ -48,6 +50,73 @@ class ClosedLoop:
         T, the steps of an episode.
     action_limit : float
         Magnitude at which actions saturate; 0 for none.
+    """
+
+    U: Array
+    target: Array
+    state_weight: float
+    action_weight: float
+    horizon: int
+    action_limit: float = 0.0
+
+    @cached_property
+    def s_r(self) -> Array:
+        """U^T z_r, (n_s,), as a plain sum like the controller's."""
+        projected: Array = np.sum(self.U * self.target[:, None], axis=0)
+        return projected
+
+    @cached_property
+    def constant_feature(self) -> float:
+        """The last feature of the law: 0 where b = K_b s_r cannot be anything but 0, else 1."""
+        inside = float(np.sum(self.s_r * self.s_r))
+        return 1.0 if inside > 1e-20 * float(np.sum(self.target * self.target)) else 0.0
+
+    def theta(self, policy: Array) -> Array:
+        """[K_a b] of a policy [K_a K_b], (n_a, n_s + 1)."""
+        n_s = self.U.shape[1]
+        return np.column_stack([policy[:, :n_s], policy[:, n_s:] @ self.s_r])
+
+    def policy(self, theta: Array, near: Array) -> Array:
+        """[K_a K_b] of theta; among the K_b with the wanted b the one next to that of `near`."""
+        n_s = self.U.shape[1]
+        return self._changed(near, theta[:, :n_s], theta[:, n_s] - near[:, n_s:] @ self.s_r)
+
+    def moved(self, policy: Array, step: Array) -> Array:
+        """The policy after a step of theta; K_b moves least among those with the wanted b."""
+        n_s = self.U.shape[1]
+        return self._changed(policy, policy[:, :n_s] + step[:, :n_s], step[:, n_s])
+
+    def _changed(self, policy: Array, K_a: Array, change: Array) -> Array:
+        """The policy with other gains K_a, and with b changed by (n_a,)."""
+        n_s, changed = self.U.shape[1], policy.copy()
+        changed[:, :n_s] = K_a
+        if self.constant_feature:
+            changed[:, n_s:] += np.outer(change, self.s_r / float(np.sum(self.s_r * self.s_r)))
+        return changed
+
+    def mean_cost(self, states: Array, actions: Array) -> float:
+        """Mean stage cost of states (..., n_z) and the actions (..., n_a) that answer them."""
+        error = states - self.target
+        cost = self.state_weight * np.sum(error * error)
+        cost += self.action_weight * np.sum(actions * actions)
+        return float(cost) / max(math.prod(actions.shape[:-1]), 1)
+
+    def cost_of(self, record: Record) -> float:
+        """Mean stage cost of the recorded part of a rollout."""
+        return self.mean_cost(record.acted_from, record.actions)
+
+    def mean_cost_of(self, records: Sequence[Record]) -> float:
+        """The mean of their costs."""
+        return float(np.mean([self.cost_of(record) for record in records]))
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedLoop(ClosedLoopProblem):
+    """A model of the whole field under such laws, and what they cost on it.
+
+    Attributes
+    ----------
+    model : FieldModel
     noise : float
         Standard deviation of the noise on every number of the state that the law sees; 0 for none. It
         is the same in every simulation of as many fields.
@@ -55,25 +124,13 @@ class ClosedLoop:
         Another quadratic cost in place of that of q, r and z_r.
     """
 
-    model: FieldModel
-    U: Array
-    target: Array
-    state_weight: float
-    action_weight: float
-    horizon: int
-    action_limit: float = 0.0
-    noise: float = 0.0
-    cost: Cost | None = None
-
-    @cached_property
-    def one(self) -> float:
-        """The last feature of the law: 0 where b = K_b U^T z_r cannot be anything but 0, else 1."""
-        s_r = self.U.T @ self.target
-        return 1.0 if s_r @ s_r > 1e-20 * (self.target @ self.target) else 0.0
+    model: FieldModel = field(kw_only=True)
+    noise: float = field(default=0.0, kw_only=True)
+    cost: Cost | None = field(default=None, kw_only=True)
 
     def simulate(self, theta: Array, fields: Array) -> Simulation:
         """Roll theta (n_a, n_s + 1) out from the fields (F, n_z)."""
-        K, b = theta[:, :-1], self.one * theta[:, -1]
+        K, b = theta[:, :-1], self.constant_feature * theta[:, -1]
         states = np.empty((self.horizon + 1, *fields.shape))
         actions = np.empty((self.horizon, len(fields), len(theta)))
         costs, finite = np.zeros(len(fields)), np.ones(len(fields), dtype=bool)
@@ -140,7 +197,7 @@ class ClosedLoop:
                 g = g * (np.abs(a) < self.action_limit)
             eta = eta + on_z + g @ K @ self.U.T
             gradient[:, :-1] += g.T @ (z @ self.U + noise[k])
-            gradient[:, -1] += self.one * g.sum(axis=0)
+            gradient[:, -1] += self.constant_feature * g.sum(axis=0)
         counted = weights > 0.0
         return float(weights[counted] @ simulation.costs[counted]), gradient
 
@@ -150,21 +207,6 @@ class ClosedLoop:
             return np.zeros((self.horizon, 1, 1))
         size = self.horizon, count, self.U.shape[1]
         return self.noise * np.random.default_rng(0).standard_normal(size)
-
-    def theta(self, policy: Array) -> Array:
-        """[K_a b] of a policy [K_a K_b], (n_a, n_s + 1)."""
-        n_s = self.U.shape[1]
-        return np.column_stack([policy[:, :n_s], policy[:, n_s:] @ (self.U.T @ self.target)])
-
-    def policy(self, theta: Array, near: Array) -> Array:
-        """[K_a K_b] of theta; among the K_b with the wanted b the one next to that of `near`."""
-        n_s, s_r = self.U.shape[1], self.U.T @ self.target
-        policy = near.copy()
-        policy[:, :n_s] = theta[:, :n_s]
-        if self.one:
-            missing = theta[:, n_s] - near[:, n_s:] @ s_r
-            policy[:, n_s:] += np.outer(missing, s_r / float(s_r @ s_r))
-        return policy
 
 
 @dataclass(frozen=True, eq=False)

@@ -112,7 +112,7 @@ def improve(
         return None
     fields, weights = fields[finite], weights[finite] / weights[finite].sum()
     s = simulation.states[:-1, finite] @ loop.U
-    features = np.concatenate([s, np.full((*s.shape[:2], 1), loop.one)], axis=2)
+    features = np.concatenate([s, np.full((*s.shape[:2], 1), loop.constant_feature)], axis=2)
     moment = np.einsum("kfi,kfj,f->ij", features, features, weights) / len(features)
     size = float(np.trace(moment[:-1, :-1])) / (len(moment) - 1)
     if not (size > 0.0 and np.isfinite(moment).all()):

@@ -1,23 +1,46 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A damped Gauss-Newton step on the local models that predict best.
+"""A damped Gauss-Newton step on the local models that predict best how measured trajectories differ.
 
-Always applies; the other kinds of proposals come before it.
+It always applies; the other kinds of proposals come before it.
+
+A model that follows one trajectory well can still be wrong about its neighbours, and a step needs
+the neighbours. So a model is judged by what it will be used for: given the measured difference of
+the initial fields, or the known difference of two policies, predict the difference of two measured
+trajectories,
+
+    delta_{k+1} = gamma ((A_k + B [K 0]) delta_k + B (theta_2 - theta_1) phi(s_k)),
+
+with the law's features phi(s) = [s; 1, ...], and compare:
+E = mean over pairs of min(2, sum_k |error_k|^2 / sum_k |delta_k|^2). No prediction at all has E = 1.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Record
+from loop_method.adapt.closed_loop import ClosedLoopProblem
 from loop_method.adapt.local_model import LocalModel, extended_basis, fit
-from loop_method.adapt.loop import Loop
 from loop_method.adapt.proposal import LEAST_FALL, MODES, Proposal
-from loop_method.adapt.selection import KAPPAS, LOCAL, RIDGES, Comparison, choices, mismatches
-from loop_method.adapt.sensitivity import damped_step
+from loop_method.adapt.sensitivity import ReducedTrajectory, damped_step
 
+# Ridges of the quadratic part.
+RIDGES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
+# Forgetting over an episode: gamma = exp(-kappa / T).
+KAPPAS = (0.0, 5.0, 15.0, 50.0)
+# A comparison with a rollout that costs more than this many times the incumbent is not local.
+LOCAL = 3.0
+# After an accepted step, the least forgetting whose error is within this factor and margin of the
+# best.
+_ENOUGH = (1.5, 0.03)
+# Models are averaged whose error is within this factor and margin of the best, and no further from
+# it than the last.
+_ALIKE = (3.0, 0.03, 0.15)
+_WORST = 2.0
 # Coordinates that the cubic part of a model acts on, at most.
 _CUBIC_MODES = 12
 # Weight of a rollout in the fit: falls with its age, down to a floor, and with its cost.
@@ -25,8 +48,17 @@ _AGEING = 0.9
 _AGEING_FLOOR = 0.3
 
 
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Two measured trajectories, and by how much theta differs, (n_a, n_s + 1)."""
+
+    first: ReducedTrajectory
+    second: ReducedTrajectory
+    change: Array
+
+
 def propose(
-    loop: Loop,
+    loop: ClosedLoopProblem,
     data: Sequence[Record],
     shares: Sequence[float],
     incumbents: Sequence[Record],
@@ -39,7 +71,7 @@ def propose(
 
     Parameters
     ----------
-    loop : Loop
+    loop : ClosedLoopProblem
         The closed loop and its cost.
     data : sequence of Record
         The rollouts that the models are fitted to.
@@ -51,7 +83,7 @@ def propose(
     V = extended_basis(loop.U, [record.states for record in data], max(MODES, loop.U.shape[1]))
     models = _fit(data, shares, V, len(incumbents))
     errors = mismatches(models, _comparisons(loop, V, incumbents, others), loop.horizon)
-    paths = [loop.path_of(record, V) for record in incumbents if len(record.actions)]
+    paths = [path_of(loop, record, V) for record in incumbents if len(record.actions)]
     policy, least = incumbents[0].policy, LEAST_FALL * loop.mean_cost_of(incumbents)
     proposal = None
     for kappa, chosen in choices(errors, accepted):
@@ -101,7 +133,7 @@ def steps_of(
 
 
 def _comparisons(
-    loop: Loop, V: Array, incumbents: Sequence[Record], others: Sequence[Record | None]
+    loop: ClosedLoopProblem, V: Array, incumbents: Sequence[Record], others: Sequence[Record | None]
 ) -> list[Comparison]:
     """Pairs of whole rollouts: two fields, and two policies on one field."""
     chosen = []
@@ -113,9 +145,127 @@ def _comparisons(
             chosen.append((record, other))
     return [
         Comparison(
-            loop.path_of(first, V),
-            loop.path_of(second, V),
+            path_of(loop, first, V),
+            path_of(loop, second, V),
             loop.theta(second.policy) - loop.theta(first.policy),
         )
         for first, second in chosen
     ]
+
+
+def path_of(loop: ClosedLoopProblem, record: Record, V: Array) -> ReducedTrajectory:
+    """A measured rollout in the coordinates x = V^T z, of which s are the first."""
+    K = np.ascontiguousarray(record.policy[:, : loop.U.shape[1]])
+    x = record.acted_from @ V
+    features = np.hstack([x[:, : K.shape[1]], np.full((len(x), 1), loop.constant_feature)])
+    free = None
+    if loop.action_limit:
+        free = (np.abs(record.actions) < loop.action_limit).astype(np.float64)
+    return ReducedTrajectory(x, record.actions, features, K, free)
+
+
+def mismatches(models: Sequence[LocalModel], pairs: Sequence[Comparison], horizon: int) -> Array:
+    """E of every model and kappa, (models, kappas); zeros without pairs."""
+    errors = np.zeros((len(models), len(KAPPAS)))
+    if not pairs:
+        return errors
+    x = np.stack([pair.first.x for pair in pairs])
+    measured = np.stack([pair.second.x for pair in pairs]) - x
+    forcing = np.stack([pair.second.features @ pair.change.T for pair in pairs])
+    size = np.maximum(np.sum(measured**2, axis=(1, 2)), 1e-300)
+    free = None
+    if pairs[0].first.free is not None:
+        free = np.stack([pair.first.free for pair in pairs if pair.first.free is not None])
+    gammas = np.exp(-np.array(KAPPAS) / horizon)
+    for i, model in enumerate(models):
+        # A model that is unstable along the trajectory overflows: it counts as the worst.
+        with np.errstate(over="ignore", invalid="ignore"):
+            predicted = predict_difference(
+                model.jacobians(x),
+                model.B,
+                pairs[0].first.K,
+                initial=measured[:, 0],
+                forcing=forcing,
+                gammas=gammas,
+                free=free,
+            )
+            error = np.sum((predicted - measured) ** 2, axis=(2, 3)) / size
+        error = np.where(np.isfinite(error), np.minimum(error, _WORST), _WORST)
+        errors[i] = error.mean(axis=1)
+    return errors
+
+
+def choices(errors: Array, accepted: bool) -> list[tuple[float, list[int]]]:
+    """Forgetting, and the models to average over with it; the choice to use first comes first.
+
+    Parameters
+    ----------
+    errors : (models, kappas) array
+        From `mismatches`.
+    accepted : bool
+        Whether the last candidate was accepted: if so little forgetting is preferred, as it sees
+        the whole effect of a step, and otherwise the smallest error.
+    """
+    best = errors.min(axis=0)
+    order = [int(j) for j in np.argsort(best, kind="stable")]
+    if accepted:
+        first = int(np.argmax(best <= _ENOUGH[0] * best.min() + _ENOUGH[1]))
+        order = [first, *(j for j in order if j != first)]
+    alike = np.minimum(_ALIKE[0] * best + _ALIKE[1], best + _ALIKE[2])
+    return [(KAPPAS[j], [int(i) for i in np.flatnonzero(errors[:, j] <= alike[j])]) for j in order]
+
+
+def predict_difference(
+    jacobians: Array,
+    B: Array,
+    K: Array,
+    *,
+    initial: Array,
+    forcing: Array,
+    gammas: Array,
+    free: Array | None = None,
+) -> Array:
+    """How far a second trajectory runs from a measured one, to first order.
+
+        delta_{k+1} = gamma ((A_k + B [K 0]) delta_k + B f_k)
+
+    Parameters
+    ----------
+    jacobians : (P, T, r, r) array
+        A_k along the measured trajectories of P pairs.
+    B : (r, n_a) array
+        Input matrix of the model.
+    K : (n_a, n_s) array
+        Feedback of the first trajectory of every pair: one policy, the incumbent's.
+    initial : (P, r) array
+        delta_0.
+    forcing : (P, T, n_a) array
+        f_k = (theta_2 - theta_1) phi(s_k) along the second trajectory.
+    gammas : (C,) array
+        Values of gamma.
+    free : (P, T, n_a) array, optional
+        Of the measured trajectories, see `ReducedTrajectory`.
+
+    Returns
+    -------
+    (C, P, T, r) array
+        delta_0 .. delta_{T-1} for every gamma.
+    """
+    pairs, steps, r, _ = jacobians.shape
+    n_s = K.shape[-1]
+    closed = jacobians.copy()
+    if free is None:
+        closed[..., :n_s] += B @ K
+        drive = forcing @ B.T
+    else:
+        closed[..., :n_s] += (B * free[..., None, :]) @ K
+        drive = (forcing * free) @ B.T
+    # Steps first and gammas last: every step is one product of matrices, of memory that lies together.
+    closed = np.ascontiguousarray(closed.swapaxes(0, 1))
+    difference = np.empty((steps, pairs, r, gammas.size))
+    difference[0] = initial[..., None]
+    for k in range(steps - 1):
+        np.matmul(closed[k], difference[k], out=difference[k + 1])
+        difference[k + 1] += drive[:, k, :, None]
+        difference[k + 1] *= gammas
+    return np.ascontiguousarray(difference.transpose(3, 1, 0, 2))

@@ -21,9 +21,8 @@ import numpy as np
 from loop_interfaces.arrays import Array
 from loop_method.adapt import field_step, local_step
 from loop_method.adapt.base import Context, Record
-from loop_method.adapt.loop import Loop
+from loop_method.adapt.closed_loop import ClosedLoopProblem
 from loop_method.adapt.proposal import Proposal
-from loop_method.adapt.selection import LOCAL
 from loop_method.adapt.sensed_step import MOST_SENSORS, SensedProposals
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.adapt.trajectories import denoised
@@ -40,7 +39,7 @@ class Proposer:
 
     Attributes
     ----------
-    loop : Loop
+    loop : ClosedLoopProblem
         The closed loop and its cost.
     sensed : SensedProposals or None
         None where the states are not one reading of each of a few sensors.
@@ -65,7 +64,7 @@ class Proposer:
                 f"{n_a} numbers, but the shapes are {states.shape} and {actions.shape}."
             )
         weights = context.state_weight, context.action_weight
-        self.loop = Loop(U, target, *weights, context.horizon, context.action_limit)
+        self.loop = ClosedLoopProblem(*(U, target, *weights, context.horizon, context.action_limit))
         # Few readings cannot be cleaned; what is fitted to them knows of their noise.
         self._noise = 0.0 if context.sensors else context.noise
         limits = ModelBasedSettings()
@@ -79,7 +78,7 @@ class Proposer:
         # One component, of which each sensor's last reading is the state.
         if self._periodic and context.sensors == target.size and target.size <= MOST_SENSORS:
             centres = context.actuator_centres(n_a)
-            largest_cost = LOCAL * self.loop.cost_of(self._before[0])
+            largest_cost = local_step.LOCAL * self.loop.cost_of(self._before[0])
             self.sensed = SensedProposals(self.loop, centres, context.noise, largest_cost)
 
     def propose(

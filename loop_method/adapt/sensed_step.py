@@ -12,9 +12,8 @@ import numpy as np
 
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Record
-from loop_method.adapt.closed_loop import ClosedLoop
+from loop_method.adapt.closed_loop import ClosedLoop, ClosedLoopProblem
 from loop_method.adapt.field_step import improved
-from loop_method.adapt.loop import Loop
 from loop_method.adapt.proposal import BEYOND, COMPARED, Proposal, spread
 from loop_method.models.sensed import KIND, SHARED, fit_sensed, interpolated, sensed_model
 
@@ -29,7 +28,7 @@ class SensedProposals:
 
     Parameters
     ----------
-    loop : Loop
+    loop : ClosedLoopProblem
         Its states are one reading of each sensor.
     centres : (n_a,) array
         Of the actuators, as shares of the domain.
@@ -44,7 +43,9 @@ class SensedProposals:
         The unknowns that the rollouts share, as they were fitted last; zero before.
     """
 
-    def __init__(self, loop: Loop, centres: Array, noise: float, largest_cost: float) -> None:
+    def __init__(
+        self, loop: ClosedLoopProblem, centres: Array, noise: float, largest_cost: float
+    ) -> None:
         self._loop, self._centres, self._noise = loop, centres, noise
         self._largest_cost = largest_cost
         self.equation: Array = np.zeros(SHARED)
@@ -65,14 +66,14 @@ class SensedProposals:
         U = np.zeros((n, n_s))
         U[n // (2 * sensors) :: n // sensors] = loop.U
         between = ClosedLoop(
-            sensed_model(shared, sensors, self._centres, BEYOND * largest),
             U,
             interpolated(loop.target),
             loop.state_weight * sensors / n,
             loop.action_weight,
             loop.horizon,
             loop.action_limit,
-            self._noise,
+            model=sensed_model(shared, sensors, self._centres, BEYOND * largest),
+            noise=self._noise,
         )
         own = dict(zip((record.states[0].tobytes() for record in rollouts), fields, strict=True))
         theta = between.theta(policy)

@@ -115,62 +115,6 @@ def expand(
     )
 
 
-def predict_difference(
-    jacobians: Array,
-    B: Array,
-    K: Array,
-    *,
-    initial: Array,
-    forcing: Array,
-    gammas: Array,
-    free: Array | None = None,
-) -> Array:
-    """How far a second trajectory runs from a measured one, to first order.
-
-        delta_{k+1} = gamma ((A_k + B [K 0]) delta_k + B f_k)
-
-    Parameters
-    ----------
-    jacobians : (P, T, r, r) array
-        A_k along the measured trajectories of P pairs.
-    B : (r, n_a) array
-        Input matrix of the model.
-    K : (n_a, n_s) array
-        Feedback of the first trajectory of every pair: one policy, the incumbent's.
-    initial : (P, r) array
-        delta_0.
-    forcing : (P, T, n_a) array
-        f_k = (theta_2 - theta_1) phi(s_k) along the second trajectory.
-    gammas : (C,) array
-        Values of gamma.
-    free : (P, T, n_a) array, optional
-        Of the measured trajectories, see `ReducedTrajectory`.
-
-    Returns
-    -------
-    (C, P, T, r) array
-        delta_0 .. delta_{T-1} for every gamma.
-    """
-    pairs, steps, r, _ = jacobians.shape
-    n_s = K.shape[-1]
-    closed = jacobians.copy()
-    if free is None:
-        closed[..., :n_s] += B @ K
-        drive = forcing @ B.T
-    else:
-        closed[..., :n_s] += (B * free[..., None, :]) @ K
-        drive = (forcing * free) @ B.T
-    # Steps first and gammas last: every step is one product of matrices, of memory that lies together.
-    closed = np.ascontiguousarray(closed.swapaxes(0, 1))
-    difference = np.empty((steps, pairs, r, gammas.size))
-    difference[0] = initial[..., None]
-    for k in range(steps - 1):
-        np.matmul(closed[k], difference[k], out=difference[k + 1])
-        difference[k + 1] += drive[:, k, :, None]
-        difference[k + 1] *= gammas
-    return np.ascontiguousarray(difference.transpose(3, 1, 0, 2))
-
-
 def damped_step(
     models: Sequence[LocalModel],
     paths: Sequence[ReducedTrajectory],

@@ -38,7 +38,7 @@ def bent() -> SpectralModel:
 def loop(limit: float = 0.0) -> ClosedLoop:
     rng = np.random.default_rng(1)
     U = np.linalg.qr(rng.normal(size=(N_Z, N_S)))[0]
-    return ClosedLoop(bent(), U, rng.normal(size=N_Z), 1.5, 0.4, T, limit)
+    return ClosedLoop(U, rng.normal(size=N_Z), 1.5, 0.4, T, limit, model=bent())
 
 
 def fields(count: int) -> np.ndarray:
@@ -147,7 +147,7 @@ def test_the_riccati_law_of_a_linear_plant_is_reached() -> None:
     target = np.array([0.5, -0.2, 0.3, 0.1])
     best = track(ReducedModel(A=A, B=B, U=np.eye(4)), state_weight=2.0, action_weight=0.1).policy
     model = LinearModel("linear", A, B, np.zeros(4))
-    closed = ClosedLoop(model, np.eye(4), target, 2.0, 0.1, 200)
+    closed = ClosedLoop(np.eye(4), target, 2.0, 0.1, 200, model=model)
     start, weights = rng.normal(size=(6, 4)), np.full(6, 1 / 6)
     steady = ModelBasedSettings(iterations=200, least_gain=1e-10)
     riccati = closed.theta(best)

@@ -10,12 +10,17 @@ import numpy as np
 import pytest
 
 from loop_method.adapt.local_model import LocalModel, extended_basis, fit
-from loop_method.adapt.selection import KAPPAS, Comparison, choices, mismatches
+from loop_method.adapt.local_step import (
+    KAPPAS,
+    Comparison,
+    choices,
+    mismatches,
+    predict_difference,
+)
 from loop_method.adapt.sensitivity import (
     ReducedTrajectory,
     damped_step,
     expand,
-    predict_difference,
 )
 from loop_method.reduce.identifiability import NotIdentifiableError
 

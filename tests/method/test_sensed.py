@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_limits
 import pdeloop
 from loop_method.adapt import Context, GaussNewton, Rollout, RolloutResult, Trajectory
 from loop_method.adapt.base import Record
-from loop_method.adapt.loop import Loop
+from loop_method.adapt.closed_loop import ClosedLoopProblem
 from loop_method.adapt.sensed_step import SensedProposals
 from loop_method.models.sensed import fit_sensed, grid_points, interpolated, sensed_model
 from loop_method.models.spectral import SpectralModel
@@ -163,7 +163,7 @@ def test_readings_that_no_equation_explains_make_no_proposal_and_no_start_of_the
     rng = np.random.default_rng(0)
     states, actions = rng.standard_normal((2, 25, 4)), rng.standard_normal((2, 24, 2))
     records = [Record(np.zeros((2, 8)), 1.0, *pair) for pair in zip(states, actions, strict=True)]
-    loop = Loop(np.eye(4), np.zeros(4), 1.0, 1.0, horizon=24, action_limit=0.0)
+    loop = ClosedLoopProblem(np.eye(4), np.zeros(4), 1.0, 1.0, horizon=24, action_limit=0.0)
     proposals = SensedProposals(loop, _equally_spaced(2), noise=0.0, largest_cost=np.inf)
     with threadpool_limits(1):
         assert proposals.propose(records, records[0].policy, damping=1.0) is None

@@ -28,7 +28,7 @@ class Logistic:
 
 @pytest.mark.parametrize(("r", "chaotic"), [(3.9, True), (2.5, False)])
 def test_small_changes_grow_in_a_chaotic_plant_alone(r: float, chaotic: bool) -> None:
-    loop = ClosedLoop(Logistic(r), np.eye(N_Z, 3), np.full(N_Z, 0.6), 1.0, 1.0, 40)  # type: ignore[arg-type]
+    loop = ClosedLoop(np.eye(N_Z, 3), np.full(N_Z, 0.6), 1.0, 1.0, 40, model=Logistic(r))  # type: ignore[arg-type]
     fields = np.random.default_rng(0).uniform(0.2, 0.8, (4, N_Z))
     assert forgets(loop, fields) == chaotic
     assert not forgets(loop, fields[:1])  # one field tells nothing

@@ -100,7 +100,7 @@ def test_a_diagonal_of_equal_numbers_designs_the_law_of_the_number() -> None:
 def test_the_gradient_of_a_closed_loop_is_that_of_its_cost() -> None:
     cost = Cost(N, N_A, T, **WHOLE)
     model = LinearModel("linear", 0.5 * A, B, DRIFT)
-    loop = ClosedLoop(model, np.eye(N), cost.field_target, 1.0, 1.0, T, cost=cost)
+    loop = ClosedLoop(np.eye(N), cost.field_target, 1.0, 1.0, T, model=model, cost=cost)
     theta, fields = RNG.standard_normal((N_A, N + 1)) / 4, RNG.standard_normal((3, N))
     weights, step = np.full(3, 1 / 3), 1e-6
     value, gradient = loop.gradient(theta, fields, weights)
