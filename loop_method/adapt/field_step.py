@@ -2,7 +2,7 @@
 """A law that is improved on a model of the whole field.
 
 Applies where such a model predicts the rollouts, or, of a chaotic plant, pieces of them. There the law
-is improved from many measured states (`starts`), and tried only where it is better from others.
+is improved from many measured states (`initial_fields`), and tried only where it is better from others.
 """
 
 from __future__ import annotations
@@ -15,14 +15,19 @@ from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Context, Record
 from loop_method.adapt.belief import Belief, believe
 from loop_method.adapt.closed_loop import ClosedLoop
-from loop_method.adapt.improve import improve
-from loop_method.adapt.proposal import COMPARED, LEAST_FALL, TRUST, Proposal, spread
-from loop_method.adapt.renewal import curvature_of
+from loop_method.adapt.improve import curvature_of, improve
+from loop_method.adapt.initial_fields import initial_fields, is_chaotic, measured_states
+from loop_method.adapt.proposal import LEAST_FALL, Proposal
 from loop_method.adapt.sensitivity import ISOTROPY
 from loop_method.adapt.settings import ModelBasedSettings
-from loop_method.adapt.starts import forgets, initial_fields, measured_states
 
 SETTINGS = ModelBasedSettings(isotropy=ISOTROPY)
+# Trust region of a law that is improved on a model of the field, per lambda; see `improve`.
+_TRUST = 3e-2
+# The newest rollouts that such a model is about.
+COMPARED = 8
+# Further initial fields are this many times as far from the mean of the measured ones.
+EXTRAPOLATION = 1.5
 # Chaos: the error of a rollout is more than this many times that of its pieces; noise adds up more
 # slowly.
 _GROWTH, _PIECES = 20.0, 8
@@ -56,8 +61,8 @@ def propose(
     """The best law on the model near to a policy, or None where that gains nothing."""
     loop = belief.loop(context)
     fields, others = initial_fields(data), None
-    if whole and not forgets(loop, fields):
-        chosen = spread(fields[-COMPARED:])
+    if whole and not is_chaotic(loop, fields):
+        chosen = extrapolated_fields(fields[-COMPARED:])
     else:
         every = measured_states(data, SETTINGS.chaotic_fields * _HELD_OUT)
         held_out = np.arange(len(every)) % _HELD_OUT > 0
@@ -83,13 +88,25 @@ def improved(
     """The best law on a model near to theta, and by how much its cost is lower."""
     weights = np.full(len(fields), 1.0 / len(fields))
     found = improve(
-        *(loop, theta, fields, weights, curvature_of(loop), SETTINGS), trust=TRUST * damping
+        *(loop, theta, fields, weights, curvature_of(loop), SETTINGS), trust=_TRUST * damping
     )
     return None if found is None else (found.theta, found.before - found.after)
 
 
-def ranks(context: Context, belief: Belief, rejected: Sequence[tuple[Record, Record]]) -> bool:
-    """Whether the rejected candidate costs more than the incumbent on the model, too.
+def extrapolated_fields(fields: Array) -> Array:
+    """The initial fields (F, n_z), and as many that lie further from their mean.
+
+    A law that is best on a few fields is not on their neighbours; on a model, more of them cost no
+    rollouts.
+    """
+    mean = fields.mean(axis=0)
+    return np.concatenate([fields, mean + EXTRAPOLATION * (fields - mean)])
+
+
+def agrees_with_rejections(
+    context: Context, belief: Belief, rejected: Sequence[tuple[Record, Record]]
+) -> bool:
+    """Whether the rejected candidate also costs more than the incumbent on the model.
 
     rejected: rollouts of the incumbent and of the candidate on the same fields.
     """

@@ -24,9 +24,12 @@ from scipy import linalg
 from loop_interfaces.arrays import Array
 from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.settings import ModelBasedSettings
+from loop_method.design.finite_horizon import action_curvature
 
 FAR = 10.0
 """What a law without a finite cost counts, per cost of the law to begin with."""
+LARGEST = 512
+"""Numbers of a state up to which R + B^T P B is worked out; its work grows with their third power."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,3 +186,19 @@ def _descend(
         },
     )
     return Improvement(best.theta, before, best.after, len(values) - 1)
+
+
+def curvature_of(loop: ClosedLoop) -> Array:
+    """R + B^T P B of the model linearised at the target; R where that is not to be had."""
+    n_a, r = loop.model.n_a, loop.action_weight
+    if loop.model.n_z <= LARGEST:
+        A, B = loop.model.linearise(loop.target, np.zeros(n_a))
+        if np.isfinite(A).all() and np.isfinite(B).all():
+            try:
+                found = action_curvature(A, B, loop.state_weight, r, loop.horizon)
+            except np.linalg.LinAlgError:
+                found = np.full((n_a, n_a), np.nan)
+            found = 0.5 * (found + found.T)
+            if np.isfinite(found).all() and np.linalg.eigvalsh(found)[0] > 0.0:
+                return found
+    return r * np.eye(n_a)

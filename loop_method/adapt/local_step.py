@@ -25,7 +25,7 @@ from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Record
 from loop_method.adapt.closed_loop import ClosedLoopProblem
 from loop_method.adapt.local_model import LocalModel, extended_basis, fit
-from loop_method.adapt.proposal import LEAST_FALL, MODES, Proposal
+from loop_method.adapt.proposal import LEAST_FALL, Proposal
 from loop_method.adapt.sensitivity import ReducedTrajectory, damped_step
 
 # Ridges of the quadratic part.
@@ -41,6 +41,8 @@ _ENOUGH = (1.5, 0.03)
 # it than the last.
 _ALIKE = (3.0, 0.03, 0.15)
 _WORST = 2.0
+# Coordinates of the local models and of the sensitivities, at least.
+_MODES = 32
 # Coordinates that the cubic part of a model acts on, at most.
 _CUBIC_MODES = 12
 # Weight of a rollout in the fit: falls with its age, down to a floor, and with its cost.
@@ -80,7 +82,7 @@ def propose(
     incumbents, others, damping, accepted
         As of `Proposer.propose`.
     """
-    V = extended_basis(loop.U, [record.states for record in data], max(MODES, loop.U.shape[1]))
+    V = extended_basis(loop.U, [record.states for record in data], max(_MODES, loop.U.shape[1]))
     models = _fit(data, shares, V, len(incumbents))
     errors = mismatches(models, _comparisons(loop, V, incumbents, others), loop.horizon)
     paths = [path_of(loop, record, V) for record in incumbents if len(record.actions)]

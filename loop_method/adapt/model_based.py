@@ -37,11 +37,11 @@ from loop_method.adapt.base import (
 )
 from loop_method.adapt.belief import Belief, believe
 from loop_method.adapt.closed_loop import ClosedLoop
+from loop_method.adapt.initial_fields import initial_fields, is_chaotic, measured_states
 from loop_method.adapt.local_search import ENDED as LOCAL_ENDED
 from loop_method.adapt.local_search import LocalSearch, part_of
 from loop_method.adapt.renewal import renew
 from loop_method.adapt.settings import ModelBasedSettings
-from loop_method.adapt.starts import forgets, initial_fields, measured_states
 from loop_method.adapt.trajectories import Records, denoised
 from loop_method.adapt.verdict import ADAPTED, FIRST, NONE, choose, evidence_of
 from loop_method.models.files import model_of
@@ -281,7 +281,7 @@ class ModelBased(Optimizer):
         self._safe = bool(loop.costs(first, fields).mean() < loop.costs(none, fields).mean())
         base, near = (first, self._first) if self._safe else (none, self._none)
         settings, parts = self._settings, self._parts
-        if forgets(loop, fields):
+        if is_chaotic(loop, fields):
             row["chaotic"] = True
             fields = measured_states(self._data(), settings.chaotic_fields)
             # Others than last time, so that the laws of the parts may know those of their own part.

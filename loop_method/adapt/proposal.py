@@ -1,26 +1,16 @@
 # Copyright the pdeloop developers. SPDX-License-Identifier: Apache-2.0
-"""A policy to try, and what the kinds of proposals have in common."""
+"""A policy to try, and what the history says of it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Row
 
 LOCAL = "local"
-# Coordinates of the local models and of the sensitivities, at least.
-MODES = 32
 # A step that predicts less than this share of the cost is not worth its rollouts.
 LEAST_FALL = 1e-3
-# Trust region of a law that is improved on a model of the field, per lambda; see `improve`.
-TRUST = 3e-2
-# The newest rollouts that such a model is about.
-COMPARED = 8
-# Further initial fields are this many times as far from the mean of the measured ones.
-BEYOND = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,13 +53,3 @@ class Proposal:
             "mismatch": self.mismatch,
             "model": self.kind,
         }
-
-
-def spread(fields: Array) -> Array:
-    """The initial fields (F, n_z), and as many that lie further from their mean.
-
-    A law that is best on a few fields is not on their neighbours; on a model, more of them cost no
-    rollouts.
-    """
-    mean = fields.mean(axis=0)
-    return np.concatenate([fields, mean + BEYOND * (fields - mean)])

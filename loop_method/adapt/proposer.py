@@ -129,7 +129,11 @@ class Proposer:
             belief, whole = field_step.field_model(self._context, data, first, self._believed)
             if belief is not None:
                 believed = belief.model.kind
-                if not rejected or not whole or field_step.ranks(self._context, belief, rejected):
+                if (
+                    not rejected
+                    or not whole
+                    or field_step.agrees_with_rejections(self._context, belief, rejected)
+                ):
                     return field_step.propose(
                         *(self._context, belief, whole, data, policy, damping),
                     )

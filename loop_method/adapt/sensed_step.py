@@ -13,8 +13,8 @@ import numpy as np
 from loop_interfaces.arrays import Array
 from loop_method.adapt.base import Record
 from loop_method.adapt.closed_loop import ClosedLoop, ClosedLoopProblem
-from loop_method.adapt.field_step import improved
-from loop_method.adapt.proposal import BEYOND, COMPARED, Proposal, spread
+from loop_method.adapt.field_step import COMPARED, EXTRAPOLATION, extrapolated_fields, improved
+from loop_method.adapt.proposal import Proposal
 from loop_method.models.sensed import KIND, SHARED, fit_sensed, interpolated, sensed_model
 
 # The readings are reproduced up to this share of their sum of squares.
@@ -72,12 +72,12 @@ class SensedProposals:
             loop.action_weight,
             loop.horizon,
             loop.action_limit,
-            model=sensed_model(shared, sensors, self._centres, BEYOND * largest),
+            model=sensed_model(shared, sensors, self._centres, EXTRAPOLATION * largest),
             noise=self._noise,
         )
         own = dict(zip((record.states[0].tobytes() for record in rollouts), fields, strict=True))
         theta = between.theta(policy)
-        found = improved(between, theta, spread(np.stack(list(own.values()))), damping)
+        found = improved(between, theta, extrapolated_fields(np.stack(list(own.values()))), damping)
         if found is None:
             return None
         candidate = between.policy(found[0], policy)

@@ -10,7 +10,7 @@ import pytest
 
 from loop_method.adapt.closed_loop import ClosedLoop
 from loop_method.adapt.improve import improve
-from loop_method.adapt.mixtures import averaged_over_shifts, invariant_share, mixtures
+from loop_method.adapt.initial_fields import averaged_over_shifts, invariant_share, mixtures
 from loop_method.adapt.settings import ModelBasedSettings
 from loop_method.design.lqt import track
 from loop_method.models.linear import LinearModel

@@ -10,7 +10,7 @@ import pytest
 
 from loop_method.adapt.base import Record
 from loop_method.adapt.closed_loop import ClosedLoop
-from loop_method.adapt.starts import forgets, initial_fields, measured_states
+from loop_method.adapt.initial_fields import initial_fields, is_chaotic, measured_states
 
 N_Z = 12
 
@@ -30,8 +30,8 @@ class Logistic:
 def test_small_changes_grow_in_a_chaotic_plant_alone(r: float, chaotic: bool) -> None:
     loop = ClosedLoop(np.eye(N_Z, 3), np.full(N_Z, 0.6), 1.0, 1.0, 40, model=Logistic(r))  # type: ignore[arg-type]
     fields = np.random.default_rng(0).uniform(0.2, 0.8, (4, N_Z))
-    assert forgets(loop, fields) == chaotic
-    assert not forgets(loop, fields[:1])  # one field tells nothing
+    assert is_chaotic(loop, fields) == chaotic
+    assert not is_chaotic(loop, fields[:1])  # one field tells nothing
 
 
 def test_states_are_taken_from_all_rollouts_and_initial_fields_once_each() -> None:
